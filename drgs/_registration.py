@@ -16,10 +16,7 @@ BACKENDS = ("scalar_", "llvm_", "cuda_", "metal_")
 
 
 def register_plugins() -> None:
-    """Register for the active variant, if any, and for every one that becomes active later.
-
-    Imports Mitsuba only if something else has done so.
-    """
+    """Register for the active variant, if Mitsuba is imported, and for each that is set later."""
     if "mitsuba" in sys.modules:
         import mitsuba as mi
 
@@ -39,7 +36,7 @@ class _VariantWatch:
 
 
 def _follow_variants() -> None:
-    """Have Mitsuba call :func:`_on_variant` at each change; once is enough, more do no harm."""
+    """Have Mitsuba call :func:`_on_variant` at each change."""
     from drgs.core.private import call_on_variant_change  # imports Dr.Jit
 
     call_on_variant_change(_on_variant)
@@ -63,7 +60,7 @@ class SiblingPluginFinder:
     def find_spec(
         self, name: str, path: object = None, target: object = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """The import protocol: the package's spec, or None for every other module."""
+        """Return the package's spec, or None for every other module."""
         if name != "drgs.plugins":
             return None
         return importlib.util.spec_from_file_location(

@@ -1,9 +1,7 @@
 """``python -m drgs.fit CONFIG.yml|FOLDER``: fit Gaussians to photographs.
 
 Reads the configuration, or makes one that suits the folder, and runs
-:class:`drgs.training.session.FitSession`, which writes the output folder
-(``drgs.results.files``). While it runs there is ``checkpoint.npz``, from which ``--resume``
-continues.
+:class:`drgs.training.session.FitSession`, which writes the output folder.
 """
 
 from __future__ import annotations
@@ -33,14 +31,13 @@ from drgs.results.folder import load_moved_config
 from drgs.training.budget import Budget, parse_duration
 from drgs.training.fit_folder import FitFolder
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.session import Console, FitSession
+from drgs.training.session import FitSession
 
 if TYPE_CHECKING:  # imported with --view
     from drgs.viewer.server import LocalServer
 
 LOADING_SECONDS = 1.2
-"""Before :func:`run`: the interpreter and the libraries; 1.0 to 1.4 s on two cores (AMD Zen 4).
-``--budget`` counts them."""
+"""Before :func:`run`, for the interpreter and the libraries; ``--budget`` counts them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -85,16 +82,10 @@ def add_arguments(parser: CommandParser) -> None:
     )
     parser.add_argument(
         "--budget",
-        type=_duration,
+        type=parse_duration,
         metavar="TIME",
         help="90s, 5m, 1h30m: plan a fit that is done, results written, after this time",
     )
-    _add_looking_on(parser)
-    add_execution_arguments(parser)
-    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
-
-
-def _add_looking_on(parser: CommandParser) -> None:
     group = parser.add_argument_group("looking on", "The result has the same bytes without these.")
     group.add_argument(
         "--view",
@@ -114,6 +105,8 @@ def _add_looking_on(parser: CommandParser) -> None:
         action="store_true",
         help="write the history for TensorBoard, too (extra: tensorboard)",
     )
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -122,22 +115,19 @@ def run(args: argparse.Namespace) -> None:
     comm = communicator(args)
     budget = None if args.budget is None else Budget(args.budget, started + args.budget)
     with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
-        common = {
-            "variant": args.variant,
-            "budget": budget,
-            "check_ranges": check_ranges,
-            "comm": comm,
-        }
+        session = FitSession(
+            None, variant=args.variant, budget=budget, check_ranges=check_ranges, comm=comm
+        )
         if not comm.is_root:
-            FitSession(None, **common).run()
+            session.run()
             return
         server = blocks.enter_context(page_server(args))
         if args.tensorboard:
             required("tensorboardX", "tensorboard", "--tensorboard")
-        config, out = what_to_fit(args)
-        folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
-        start = partial(add_observers, args, server, blocks)
-        session = FitSession(config, folder=folder, console=Console(), on_start=start, **common)
+        session.config, out = read_inputs(args)
+        session.folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
+        session.uses_terminal = True
+        session.on_start = partial(add_observers, args, server, blocks)
         finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
@@ -180,7 +170,7 @@ def add_observers(
 
 
 def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
-    """What serves the page that ``--view`` asks for; None without it.
+    """Return the server of ``--view``'s page; None without it.
 
     Raises ``UserError`` where it cannot be served, before anything is read or written.
     """
@@ -196,8 +186,8 @@ def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer 
     return serving(args.view_address or ADDRESS, args.view_port, options)
 
 
-def what_to_fit(args: argparse.Namespace) -> tuple[FitConfig, Path]:
-    """The configuration that the command line asks for, and the output folder."""
+def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
+    """Return the configuration that the command line specifies, and the output folder."""
     data = [] if args.data is None else [f"data.path={args.data}"]
     if args.resume is not None:
         if args.out is not None or args.overrides or args.overwrite or args.budget is not None:
@@ -213,16 +203,10 @@ def what_to_fit(args: argparse.Namespace) -> tuple[FitConfig, Path]:
             raise UserError(f"--data: {args.config} is a folder already; leave one of them out")
         config, reasons = config_for(args.config, overrides)
         print(reasons)
-        return config, config.output.dir or Path("out") / args.config.resolve().name
-    config = load_config(args.config, overrides)
-    return config, config.output.dir or Path("out") / args.config.stem
-
-
-def _duration(text: str) -> float:
-    try:
-        return parse_duration(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+        name = args.config.resolve().name
+    else:
+        config, name = load_config(args.config, overrides), args.config.stem
+    return config, config.output.dir or Path("out") / name
 
 
 if __name__ == "__main__":

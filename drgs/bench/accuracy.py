@@ -3,12 +3,9 @@
 A trained scene and a stress scene (wide lens, large splats near the camera, layers that
 interpenetrate) are rendered along a ladder of approximations. Each is compared with the most
 accurate form, the float64 numpy reference with splats evaluated along each pixel's ray, all sorted
-at each pixel, to the last transmittance and down to an alpha of a millionth; on crops it is checked
-against the same without any cut. A fit's pictures are also compared with the photographs.
-
-Three things are apart in the tables: *approximations* of one picture, whose error is the distance
-from the most accurate form; *other pictures* (no or another low-pass, samples per pixel, other SH),
-whose distance is no error; and precision.
+at each pixel, to the last transmittance and down to an alpha of a millionth. A fit's images are
+also compared with the photographs. Other images (another low-pass, samples per pixel, other SH) are
+in brackets in the tables: their distance from the most accurate form is no error.
 """
 
 from __future__ import annotations
@@ -26,9 +23,9 @@ import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.sample_points import SamplePoints
-from drgs.bench.output import add_out, machine, markdown_table, write_rows
+from drgs.bench.output import add_out, columns_table, machine, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
-from drgs.bench.timing import seconds
+from drgs.bench.timing import count_operations, seconds
 from drgs.cameras.camera import Camera
 from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations
@@ -50,10 +47,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROUNDS, QUICK_ROUNDS = 9, 3
-SLOW_ROUNDS = 2
-"""Rounds of rungs that need more than ``SLOW`` seconds."""
-
-SLOW = 1.0
+SLOW_S, SLOW_ROUNDS = 1.0, 2
+"""Rungs that take longer than this are timed in so many rounds."""
 
 SIZE = 400
 """px: film of scenes that have no cameras of their own."""
@@ -133,6 +128,11 @@ class Measurement:
     largest_error: float
     photo_psnr: float | None  # dB, against the photographs
 
+    @property
+    def root_mean_square(self) -> float:
+        """The error against the most accurate form."""
+        return 10 ** (-self.psnr / 20)
+
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
@@ -144,7 +144,7 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def add_scene(parser: CommandParser) -> None:
-    """The argument that :func:`load_subject` reads."""
+    """Add the argument that :func:`load_subject` reads."""
     parser.add_argument(
         "scene",
         nargs="?",
@@ -178,36 +178,29 @@ def run(args: argparse.Namespace) -> None:
     write_figure(args.out / "accuracy.png", plot(results))
 
 
-# ----------------------------------------------------------------------------------------------
-# Scenes
-# ----------------------------------------------------------------------------------------------
-
-
 def load_subject(path: Path, num_views: int) -> Subject:
-    """A fit's folder with evenly spaced test views, or a PLY file seen by the bench camera.
+    """Load a fit's folder with evenly spaced test views, or a PLY file seen by the bench camera.
 
-    Of a folder, the Gaussians are those for viewers if it has them: what is measured is by how much
-    the defaults approximate. A 3D smoothing filter becomes part of the Gaussians.
+    The Gaussians of a folder are those for viewers if it has them: they are fitted to the defaults.
+    A 3D smoothing filter becomes part of the Gaussians.
 
     Raises UserError for views that are not those of pinholes at rest.
     """
-    if path.is_dir():
-        ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
-        ply = ply if ply.exists() else path / GAUSSIANS
-        for file in (ply, config_file):
-            if not file.exists():
-                raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
-        config = load_config(str(config_file), [])
-        gaussians = baked(Gaussians.load(ply))
-        dataset = load_dataset(config.data).relative_to(gaussians.origin)
-        step = max(1, len(dataset.test) // num_views)
-        views = dataset.test[::step][:num_views]
-        _check_pinholes(views, config_file, ply)
-        cameras = [camera_of(view, config.model.near_plane) for view in views]
-        return Subject(path.name, gaussians, cameras, list(views), dataset.background)
-    return Subject(
-        path.stem, baked(Gaussians.load(path)), [bench_camera(SIZE)], [], (1.0, 1.0, 1.0)
-    )
+    if not path.is_dir():
+        camera = bench_camera(SIZE)
+        return Subject(path.stem, baked(Gaussians.load(path)), [camera], [], (1.0, 1.0, 1.0))
+    ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
+    ply = ply if ply.exists() else path / GAUSSIANS
+    for file in (ply, config_file):
+        if not file.exists():
+            raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
+    config = load_config(str(config_file), [])
+    gaussians = baked(Gaussians.load(ply))
+    dataset = load_dataset(config.data).relative_to(gaussians.origin)
+    views = dataset.test[:: max(1, len(dataset.test) // num_views)][:num_views]
+    _check_pinholes(views, config_file, ply)
+    cameras = [camera_of(view, config.model.near_plane) for view in views]
+    return Subject(path.name, gaussians, cameras, list(views), dataset.background)
 
 
 def _check_pinholes(views: Sequence[View], config_file: Path, ply: Path) -> None:
@@ -222,19 +215,14 @@ def _check_pinholes(views: Sequence[View], config_file: Path, ply: Path) -> None
 
 
 def camera_of(view: View, near: float) -> reference.Camera:
-    """The camera of a photograph, rounded to single precision."""
+    """Return the camera of a photograph, rounded to single precision."""
     pose = view.camera_to_world.astype(np.float32)
     numbers = (float(np.float32(v)) for v in (view.fx, view.fy, view.cx, view.cy))
     return reference.Camera(pose[:3, :3].T, pose[:3, 3], *numbers, view.width, view.height, near)
 
 
-# ----------------------------------------------------------------------------------------------
-# Rendering
-# ----------------------------------------------------------------------------------------------
-
-
 def positions(samples: int, camera: reference.Camera, float_type: type) -> list[Positions]:
-    """A grid of points in each pixel."""
+    """Return a grid of points in each pixel."""
     if samples == 1:
         return [PixelCenters()]
     side, size = round(np.sqrt(samples)), camera.width * camera.height
@@ -253,8 +241,8 @@ class Renderer:
     background: tuple[float, float, float]
 
     @staticmethod
-    def of(rung: Rung, subject: Subject, camera: reference.Camera) -> Renderer:
-        """Upload."""
+    def from_rung(rung: Rung, subject: Subject, camera: reference.Camera) -> Renderer:
+        """Upload the subject."""
         Float = llvm.Float64 if rung.float64 else llvm.Float
         gaussians = subject.gaussians.to(llvm.TensorXf64 if rung.float64 else llvm.TensorXf)
         points = positions(rung.samples, camera, Float)
@@ -292,12 +280,8 @@ class Renderer:
         dr.sync_thread()
 
     def operations(self) -> int:
-        """Operations in the kernels of a forward pass."""
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            self.frames()
-            kernels = dr.kernel_history([dr.KernelType.JIT])
-        return sum(kernel["operation_count"] for kernel in kernels)
+        """Count the operations in the kernels of a forward pass."""
+        return count_operations(self.frames)
 
 
 def most_accurate(
@@ -306,10 +290,8 @@ def most_accurate(
     least_alpha: float,
     region: tuple[slice, slice] | None = None,
 ) -> np.ndarray:
-    """The picture that errors are measured against, or a part of it: (rows, columns)."""
-    gaussians = reference.Gaussians(
-        **{name: getattr(subject.gaussians, name) for name in PARAMETER_NAMES}
-    )
+    """Return the image that errors are measured against, or a part of it: (rows, columns)."""
+    gaussians = reference.Gaussians(*(getattr(subject.gaussians, n) for n in PARAMETER_NAMES))
     model = reference_rays.ImageModel(
         projection="exact", order="pixel", alpha_cut=least_alpha, transmittance_stop=0.0
     )
@@ -317,10 +299,7 @@ def most_accurate(
 
 
 def check_on_crops(subject: Subject, accurate: np.ndarray) -> float:
-    """Largest difference of the first view from one in which every pixel has every splat.
-
-    On crops in the middle and in two other places.
-    """
+    """Return the largest difference of three crops from ones in which pixels have every splat."""
     camera, errors = subject.cameras[0], []
     for x, y in ((0.5, 0.5), (0.35, 0.6), (0.6, 0.35)):
         column, row = int(x * (camera.width - CROP)), int(y * (camera.height - CROP))
@@ -330,20 +309,15 @@ def check_on_crops(subject: Subject, accurate: np.ndarray) -> float:
     return max(errors)
 
 
-# ----------------------------------------------------------------------------------------------
-# Measuring
-# ----------------------------------------------------------------------------------------------
-
-
 def measure(
     subject: Subject, accurate: Sequence[np.ndarray], rungs: Sequence[Rung], rounds: int
 ) -> list[Measurement]:
-    """Errors of all rungs, and their times on the first view, in turns."""
-    renderers = [Renderer.of(rung, subject, subject.cameras[0]) for rung in rungs]
+    """Measure errors of all rungs, and their times on the first view, in turns."""
+    renderers = [Renderer.from_rung(rung, subject, subject.cameras[0]) for rung in rungs]
     operations = [renderer.operations() for renderer in renderers]  # compiles the kernels
     for renderer in renderers:
         renderer.forward_backward()
-    slow = [seconds(renderer.frames) > SLOW for renderer in renderers]
+    slow = [seconds(renderer.frames) > SLOW_S for renderer in renderers]
     times: list[list[tuple[float, float]]] = [[] for _ in rungs]
     rng = np.random.default_rng(0)
     for turn in range(rounds):
@@ -354,25 +328,22 @@ def measure(
                 times[k].append((seconds(renderer.frames), seconds(renderer.forward_backward)))
     results = []
     for rung, count, spent in zip(rungs, operations, times, strict=True):
-        images = [Renderer.of(rung, subject, camera).image() for camera in subject.cameras]
-        quality = metrics.mean_quality(zip(images, accurate, strict=True))
+        images = [Renderer.from_rung(rung, subject, camera).image() for camera in subject.cameras]
+        pairs = list(zip(images, accurate, strict=True))
+        quality, views = metrics.mean_quality(pairs), subject.photographs
         photos = [
-            (image, view.image, view.mask)
-            for image, view in zip(images, subject.photographs, strict=bool(subject.photographs))
+            (image, view.image, view.mask) for image, view in zip(images, views, strict=bool(views))
         ]
         results.append(
             Measurement(
-                scene=subject.name,
-                rung=rung.name,
-                is_approximation=rung.is_approximation,
-                milliseconds=1e3 * statistics.median(forward for forward, _ in spent),
-                both_milliseconds=1e3 * statistics.median(both for _, both in spent),
+                subject.name,
+                rung.name,
+                rung.is_approximation,
+                *(1e3 * statistics.median(times) for times in zip(*spent, strict=True)),
                 operations=count,
                 psnr=quality.psnr,
                 ssim=quality.ssim,
-                largest_error=max(
-                    np.abs(a - b).max() for a, b in zip(images, accurate, strict=True)
-                ),
+                largest_error=max(np.abs(image - exact).max() for image, exact in pairs),
                 photo_psnr=metrics.mean_quality(photos).psnr if photos else None,
             )
         )
@@ -380,7 +351,7 @@ def measure(
 
 
 def pareto_front(results: Sequence[Measurement]) -> list[Measurement]:
-    """Approximations that none is both faster and closer than, fastest first."""
+    """Return approximations that none is both faster and closer than, fastest first."""
     candidates = sorted(
         (m for m in results if m.is_approximation), key=lambda m: (m.milliseconds, -m.psnr)
     )
@@ -391,39 +362,33 @@ def pareto_front(results: Sequence[Measurement]) -> list[Measurement]:
     return front
 
 
-# ----------------------------------------------------------------------------------------------
-# Output
-# ----------------------------------------------------------------------------------------------
-
-
 def table(results: Sequence[Measurement]) -> str:
     """Format all rungs; times relative to the first."""
     first, front = results[0], pareto_front(results)
-    header = [
-        results[0].scene, "forward", "forward + backward", "operations", "PSNR", "SSIM",
-        "largest error", "PSNR, photographs",
-    ]  # fmt: skip
     rows = []
     for m in results:
         mark = " *" if m in front else ""
         rows.append(
-            [
-                m.rung + mark if m.is_approximation else f"({m.rung})",
-                _times(m.milliseconds, first.milliseconds),
-                _times(m.both_milliseconds, first.both_milliseconds),
-                f"{m.operations:,}",
-                f"{m.psnr:.1f} dB",
-                f"{m.ssim:.5f}",
-                f"{m.largest_error:.2g}",
-                "" if m.photo_psnr is None else f"{m.photo_psnr:.2f} dB",
-            ]
+            {
+                "m": m,
+                "name": m.rung + mark if m.is_approximation else f"({m.rung})",
+                "ratio": m.milliseconds / first.milliseconds,
+                "both_ratio": m.both_milliseconds / first.both_milliseconds,
+                "photographs": "" if m.photo_psnr is None else f"{m.photo_psnr:.2f} dB",
+            }
         )
+    columns = [
+        (first.scene, "{0[name]}"),
+        ("forward", "{0[m].milliseconds:.0f} ms, {0[ratio]:.2f}x"),
+        ("forward + backward", "{0[m].both_milliseconds:.0f} ms, {0[both_ratio]:.2f}x"),
+        ("operations", "{0[m].operations:,}"),
+        ("PSNR", "{0[m].psnr:.1f} dB"),
+        ("SSIM", "{0[m].ssim:.5f}"),
+        ("largest error", "{0[m].largest_error:.2g}"),
+        ("PSNR, photographs", "{0[photographs]}"),
+    ]
     note = "* on the Pareto front of the approximations; (in brackets) other pictures"
-    return f"{markdown_table(header, rows)}\n\n{note}"
-
-
-def _times(milliseconds: float, first: float) -> str:
-    return f"{milliseconds:.0f} ms, {milliseconds / first:.2f}x"
+    return f"{columns_table(columns, rows)}\n\n{note}"
 
 
 def plot(results: Sequence[Measurement]) -> Figure:
@@ -434,10 +399,12 @@ def plot(results: Sequence[Measurement]) -> Figure:
     for scene, axes in axes_of.items():
         here = [m for m in results if m.scene == scene and m.is_approximation]
         front = pareto_front(here)
-        axes.plot([m.milliseconds for m in front], [_rms(m) for m in front], "-", color="0.8")
+        axes.plot(
+            [m.milliseconds for m in front], [m.root_mean_square for m in front], "-", color="0.8"
+        )
         for k, m in enumerate(here):
             axes.plot(
-                m.milliseconds, _rms(m), "o" if m in front else "s", color=f"C{k % 10}",
+                m.milliseconds, m.root_mean_square, "o" if m in front else "s", color=f"C{k % 10}",
                 markersize=8 if m in front else 5, alpha=0.8,
                 markeredgecolor="k" if k >= 10 else "none", label=m.rung,
             )  # fmt: skip
@@ -448,7 +415,3 @@ def plot(results: Sequence[Measurement]) -> Figure:
         axes.grid(alpha=0.3)
     axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1))
     return figure
-
-
-def _rms(m: Measurement) -> float:
-    return 10 ** (-m.psnr / 20)

@@ -1,9 +1,9 @@
 """``python -m drgs.bench effects``: what each effect costs, on the bench scene.
 
-Two tables. The first is of what the integrator simulates: a picture and its derivatives with an
-effect against the same without it. The second is of what takes part in the iterations of a fit. An
-effect and what it is compared with are timed in turns, so that whatever else the machine does meets
-both; medians are reported, and the number of operations in their kernels.
+Two tables: an image and its derivatives with an effect that the integrator simulates, and training
+iterations with one that takes part in a fit; both against the same without it. The two are timed in
+turns, so that other load on the machine meets both; medians are reported, and the number of
+operations in their kernels.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.bench.output import add_out, machine, markdown_table, write_rows
+from drgs.bench.output import add_out, columns_table, machine, write_rows
 from drgs.bench.scenes import (
     Scene,
     bench_camera,
@@ -28,7 +28,7 @@ from drgs.bench.scenes import (
     mitsuba_sensor,
     trainer_of,
 )
-from drgs.bench.timing import seconds
+from drgs.bench.timing import count_operations, seconds
 from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
@@ -37,19 +37,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SIZE = 400
-"""px: width and height of all pictures."""
+"""px: width and height of all images."""
 
 NUM_GAUSSIANS = 100_000
 
 ROUNDS, QUICK_ROUNDS = 31, 3
 
 ENVIRONMENT = (64, 128)
-"""Rows and columns of the environment, and of the picture behind the splats."""
+"""Rows and columns of the environment, and of the image behind the splats."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A picture with an effect, or without any."""
+    """An image with an effect, or without any."""
 
     effect: str
     variant: str
@@ -58,17 +58,25 @@ class Case:
     scene: dict[str, object] = field(default_factory=dict)
     sh_degree: int = 3
     smoothing: bool = False
-    of_camera: bool = False  # whether derivatives of the pose and the lens are asked for
-    against: str = "none"  # variant that it is compared with
+    of_camera: bool = False  # whether there are derivatives of the pose and the lens
+
+
+@dataclass(frozen=True)
+class FittingCase:
+    """A training iteration with an effect, or without any."""
+
+    effect: str
+    variant: str
+    changes: dict[str, object] = field(default_factory=dict)  # of the configuration
+    view: tuple[str, ...] = ()  # what the data has besides colours
 
 
 @dataclass(frozen=True)
 class Price:
-    """Medians, ms, and operations in the kernels; of the case, and of what it is compared with."""
+    """Medians, ms, and operations in the kernels; against the case without an effect."""
 
     effect: str
     variant: str
-    against: str
     forward_ms: float
     both_ms: float
     forward_ratio: float
@@ -99,52 +107,36 @@ def run(args: argparse.Namespace) -> None:
     write_figure(args.out / "effects.png", plot(rendered, fitted))
 
 
-# ----------------------------------------------------------------------------------------------
-# What the integrator simulates
-# ----------------------------------------------------------------------------------------------
-
-
 def rendering_cases() -> list[Case]:
-    """The first is what the others are compared with, unless they say otherwise."""
+    """Return the cases of the integrator; the others are compared with the first."""
     camera = bench_camera(SIZE)
-    focal = camera.fx
-    calibrated = {"type": "calibrated", "fx": focal, "fy": focal}
+    calibrated = {"type": "calibrated", "fx": camera.fx, "fy": camera.fx}
     moving = calibrated | {"to_world_close": mitsuba_pose(camera, 0.02)}
     fox = {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575}
     rational = fox | {"k3": 0.01, "k4": 0.02, "k5": -0.01, "k6": 0.005}
     fisheye = {"k1": 0.03, "k2": -0.01}
     prism = fisheye | {"p1": 0.001, "p2": -0.002, "sx1": 0.003, "sy1": -0.001}
-    sky = {"type": "envmap", "bitmap": _bitmap()}
+    noise = np.random.default_rng(1).uniform(size=(*ENVIRONMENT, 3)).astype(np.float32)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(noise)}
+    behind = {"type": "bitmap", "bitmap": mi.Bitmap(noise), "raw": True}
     # An orthographic film is 2 units wide: the camera is scaled to what the others see.
-    wide = mi.ScalarTransform4f().scale([1.4, 1.4, 1])
+    wide = mitsuba_pose(camera) @ mi.ScalarTransform4f().scale([1.4, 1.4, 1])
+    focused = {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2}
+
+    def lens(kind: str, coefficients: dict[str, float]) -> dict[str, object]:
+        return calibrated | {"lens": kind, **coefficients}
+
     return [
         Case("none", "none"),
         *(Case("view dependence", f"SH degree {k}", sh_degree=k) for k in range(3)),
         Case("background", "environment", scene={"sky": sky}),
-        Case(
-            "background",
-            "picture",
-            integrator={"background": {"type": "bitmap", "bitmap": _bitmap(), "raw": True}},
-        ),
-        Case("lens", "distortion: k1 k2 p1 p2", calibrated | {"lens": "opencv", **fox}),
-        Case("lens", "distortion: k1 to k6, p1 p2", calibrated | {"lens": "opencv", **rational}),
-        Case("lens", "fisheye: k1 k2", calibrated | {"lens": "fisheye", **fisheye}),
-        Case(
-            "lens",
-            "fisheye: k1 k2 p1 p2 sx1 sy1",
-            calibrated | {"lens": "thin_prism_fisheye", **prism},
-        ),
-        Case(
-            "lens",
-            "orthographic",
-            {"type": "orthographic", "to_world": mitsuba_pose(camera) @ wide},
-        ),
-        Case(
-            "depth of field",
-            "thin lens",
-            mitsuba_sensor(camera)
-            | {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2},
-        ),
+        Case("background", "picture", integrator={"background": behind}),
+        Case("lens", "distortion: k1 k2 p1 p2", lens("opencv", fox)),
+        Case("lens", "distortion: k1 to k6, p1 p2", lens("opencv", rational)),
+        Case("lens", "fisheye: k1 k2", lens("fisheye", fisheye)),
+        Case("lens", "fisheye: k1 k2 p1 p2 sx1 sy1", lens("thin_prism_fisheye", prism)),
+        Case("lens", "orthographic", {"type": "orthographic", "to_world": wide}),
+        Case("depth of field", "thin lens", mitsuba_sensor(camera) | focused),
         Case("motion", "blur, 8 times", moving | {"shutter_samples": 8}),
         Case("motion", "rolling shutter", moving | {"shutter": "rolling"}),
         Case("antialiasing", "opacity compensation", integrator={"antialiased": True}),
@@ -153,12 +145,21 @@ def rendering_cases() -> list[Case]:
     ]
 
 
-def _bitmap() -> mi.Bitmap:
-    return mi.Bitmap(np.random.default_rng(1).uniform(size=(*ENVIRONMENT, 3)).astype(np.float32))
+def fitting_cases() -> list[FittingCase]:
+    """Return the cases of a fit; the others are compared with the first."""
+    return [
+        FittingCase("none", "none"),
+        FittingCase("background", "random", {"data.random_background": True}, ("alpha",)),
+        FittingCase("exposure and white balance", "", {"colors.lr": 1e-3}),
+        FittingCase("masks", "", view=("mask",)),
+        FittingCase("depth", "supervision", view=("depth",)),
+        FittingCase("camera refinement", "poses", {"cameras.optimise": True}),
+        FittingCase("antialiasing", "3D smoothing filter", {"model.smoothing": True}),
+    ]
 
 
 class Renderer:
-    """Pictures of the bench scene, and their derivatives in all parameters."""
+    """Images of the bench scene, and their derivatives in all parameters."""
 
     def __init__(self, case: Case, gaussians: Gaussians) -> None:
         """gaussians: numpy, SH of degree 3."""
@@ -179,23 +180,22 @@ class Renderer:
             {"type": "scene", "integrator": integrator, "sensor": sensor, **case.scene}
         )
         self.params = mi.traverse(self.scene)
-        names = [f"integrator.{name}" for name in PARAMETER_NAMES]
+        self.differentiated = [f"integrator.{name}" for name in PARAMETER_NAMES]
         if case.of_camera:
-            names += ["sensor.to_world", "sensor.fx", "sensor.fy"]
-        self.differentiated = names
-        for name in names:
+            self.differentiated += ["sensor.to_world", "sensor.fx", "sensor.fy"]
+        for name in self.differentiated:
             dr.enable_grad(self.params[name])
         weights = np.random.default_rng(0).normal(size=(SIZE, SIZE, 3)).astype(np.float32)
         self.weights = mi.TensorXf(weights)
 
     def forward(self) -> None:
-        """Render a picture."""
+        """Render an image."""
         with dr.suspend_grad():
             dr.eval(self._render())
         dr.sync_thread()
 
     def both(self) -> None:
-        """Render a picture and its derivatives."""
+        """Render an image and its derivatives."""
         for name in self.differentiated:
             dr.clear_grad(self.params[name])
         dr.backward(dr.sum(self._render() * self.weights, axis=None))
@@ -203,39 +203,10 @@ class Renderer:
         dr.sync_thread()
 
     def _render(self) -> mi.TensorXf:
-        # Nothing of the last picture may be used again.
+        # Nothing of the last image may be used again.
         self.params.set_dirty("integrator.means")
         self.params.update()
         return mi.render(self.scene, self.params, spp=1)
-
-
-# ----------------------------------------------------------------------------------------------
-# What takes part in a fit
-# ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class FittingCase:
-    """A training iteration with an effect, or without any."""
-
-    effect: str
-    variant: str
-    changes: dict[str, object] = field(default_factory=dict)  # of the configuration
-    view: tuple[str, ...] = ()  # what the data has besides colours
-    against: str = "none"
-
-
-def fitting_cases() -> list[FittingCase]:
-    """The first is what the others are compared with."""
-    return [
-        FittingCase("none", "none"),
-        FittingCase("background", "random", {"data.random_background": True}, ("alpha",)),
-        FittingCase("exposure and white balance", "", {"colors.lr": 1e-3}),
-        FittingCase("masks", "", view=("mask",)),
-        FittingCase("depth", "supervision", view=("depth",)),
-        FittingCase("camera refinement", "poses", {"cameras.optimise": True}),
-        FittingCase("antialiasing", "3D smoothing filter", {"model.smoothing": True}),
-    ]
 
 
 class Fitter:
@@ -244,104 +215,64 @@ class Fitter:
     def __init__(self, case: FittingCase, gaussians: Gaussians) -> None:
         """gaussians: numpy."""
         scene = Scene("bench", gaussians, bench_camera(SIZE))
-        self.trainer = trainer_of(scene, case.changes, {name: _extra(name) for name in case.view})
+        left_out = np.ones((SIZE, SIZE), np.float32)
+        left_out[:, : SIZE // 4] = 0
+        depth = np.full((SIZE, SIZE), 4, np.float32)  # of the box's middle
+        extras = {name: depth if name == "depth" else left_out for name in case.view}
+        self.trainer = trainer_of(scene, case.changes, extras)
 
     def forward(self) -> None:
         """Do nothing: there is no half iteration."""
 
     def both(self) -> None:
-        """One iteration."""
+        """Run one iteration."""
         self.trainer.step()
         dr.sync_thread()
 
 
-def _extra(name: str) -> np.ndarray:
-    """Return a mask, or the depth of the box's middle."""
-    values = np.ones((SIZE, SIZE), np.float32)
-    if name == "depth":
-        return 4 * values
-    values[:, : SIZE // 4] = 0
-    return values
-
-
-# ----------------------------------------------------------------------------------------------
-# Measuring
-# ----------------------------------------------------------------------------------------------
-
-
-class Measured(Protocol):
-    """A case that is ready to run."""
-
-    def forward(self) -> None:
-        """Render a picture."""
-
-    def both(self) -> None:
-        """Render one with its derivatives, or do an iteration."""
-
-
-AnyCase = TypeVar("AnyCase", "Case", "FittingCase")
-
-
-def measure(
-    cases: Sequence[AnyCase], make: Callable[[AnyCase], Measured], rounds: int
-) -> list[Price]:
-    """Time each case and the first one in turns."""
+def measure(cases: Sequence[Any], make: Callable[[Any], Any], rounds: int) -> list[Price]:
+    """Time each case and the first one in turns; make: a :class:`Renderer`, or the like."""
     base, prices = make(cases[0]), []
     base_operations = operations(base)
     for case in cases:
         subject = make(case)
         count = operations(subject)
-        times: dict[str, list[float]] = {k: [] for k in ("f", "b", "base f", "base b")}
-        for _ in range(rounds):
-            for prefix, measured in (("base ", base), ("", subject)):
-                times[f"{prefix}f"].append(seconds(measured.forward))
-                times[f"{prefix}b"].append(seconds(measured.both))
-        forward_ratio, both_ratio = (_ratio(times[k], times[f"base {k}"]) for k in ("f", "b"))
+        calls = base.forward, base.both, subject.forward, subject.both
+        times = np.array([[seconds(call) for call in calls] for _ in range(rounds)])
+        ratios = times[:, 2:] / times[:, :2]  # those of a round were taken one after the other
+        forward, both = (1e3 * statistics.median(column) for column in times[:, 2:].T.tolist())
+        forward_ratio, both_ratio = map(statistics.median, ratios.T.tolist())
         prices.append(
             Price(
-                effect=case.effect,
-                variant=case.variant,
-                against=case.against,
-                forward_ms=1e3 * statistics.median(times["f"]),
-                both_ms=1e3 * statistics.median(times["b"]),
-                forward_ratio=forward_ratio,
-                both_ratio=both_ratio,
-                operations=count,
-                operations_more=count - base_operations,
+                case.effect,
+                case.variant,
+                forward,
+                both,
+                forward_ratio,
+                both_ratio,
+                count,
+                count - base_operations,
             )
         )
         print(f"{case.effect}, {case.variant}: x{both_ratio:.2f}", flush=True)
     return prices
 
 
-def _ratio(times: list[float], base_times: list[float]) -> float:
-    """Median over the rounds: those of a round were taken one after the other."""
-    return statistics.median(t / base for t, base in zip(times, base_times, strict=True))
-
-
-def operations(subject: Measured) -> int:
-    """Count the operations of a picture and its derivatives, or of an iteration; warms up."""
+def operations(subject: Any) -> int:
+    """Count the operations of an image and its derivatives, or of an iteration; warms up."""
     for _ in range(2):
         subject.forward()
         subject.both()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        subject.both()
-        kernels = dr.kernel_history()
-    return sum(k["operation_count"] for k in kernels if k["type"] == dr.KernelType.JIT)
+    return count_operations(subject.both)
 
 
 def table(prices: list[Price], forward: str, both: str) -> str:
-    """Format times and operations; without a name for pictures, they have no column."""
-    header = ["effect", "", *([forward, "ratio"] if forward else []), both, "ratio"]
-    rows = []
-    for p in prices:
-        first = [f"{p.forward_ms:.1f} ms", f"{p.forward_ratio:.2f}"] if forward else []
-        more = f"{p.operations_more:+,}" if p.operations_more else "0"
-        rows.append(
-            [p.effect, p.variant, *first, f"{p.both_ms:.1f} ms", f"{p.both_ratio:.2f}", more]
-        )
-    return markdown_table([*header, "operations"], rows)
+    """Format times and operations; without a name for images, they have no column."""
+    columns = [("effect", "{.effect}"), ("", "{.variant}")]
+    if forward:
+        columns += [(forward, "{.forward_ms:.1f} ms"), ("ratio", "{.forward_ratio:.2f}")]
+    columns += [(both, "{.both_ms:.1f} ms"), ("ratio", "{.both_ratio:.2f}")]
+    return columns_table([*columns, ("operations", "{.operations_more:+,}")], prices)
 
 
 def plot(rendered: list[Price], fitted: list[Price]) -> Figure:

@@ -66,7 +66,13 @@ def write_rows(path: Path, row_type: Any, rows: Iterable[Any]) -> None:
     write_csv(path, names, [[getattr(row, name) for name in names] for row in rows])
 
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Format a table as the page of results has it."""
+def columns_table(columns: Sequence[tuple[str, str]], items: Iterable[Any]) -> str:
+    """Format a row for each item; columns: header, and format such as ``{.seconds:.1f} s``."""
+    headers, formats = zip(*columns, strict=True)
+    return markdown_table(headers, [[each.format(item) for each in formats] for item in items])
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Format a table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)

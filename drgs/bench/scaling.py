@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
-from drgs.bench.output import add_out, machine, markdown_table, write_csv
+from drgs.bench.output import add_out, columns_table, machine, markdown_table, write_csv
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of
 from drgs.bench.timing import (
     STAGES,
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator
 
 STEPS, QUICK_STEPS = 12, 4
 
@@ -58,8 +57,9 @@ class Point:
     threads: int
     scale: float = 1.0  # of the Gaussians
 
-    def x(self) -> int:
-        """Return the number that the sweep varies."""
+    @property
+    def varied(self) -> int:
+        """The number that the sweep varies."""
         return {"pixels": self.size**2, "threads": self.threads}.get(self.sweep, self.count)
 
 
@@ -73,6 +73,35 @@ class Result:
     process_bytes: int  # peak resident, interpreter and libraries included
     work: Work
     stage_ms: dict[str, float] = field(default_factory=dict)  # kernels, medians
+
+    @property
+    def device_mib(self) -> float:
+        """The peak of Dr.Jit's allocations in MiB."""
+        return self.device_bytes / 2**20
+
+    @property
+    def process_mib(self) -> float:
+        """The peak of the process in MiB."""
+        return self.process_bytes / 2**20
+
+    @property
+    def bytes_per_gaussian(self) -> float:
+        """The peak of Dr.Jit's allocations for each Gaussian."""
+        return self.device_bytes / self.point.count
+
+
+COLUMNS = [
+    ("Gaussians", "{.point.count:,}"),
+    ("film", "{0.point.size}x{0.point.size}"),
+    ("threads", "{.point.threads}"),
+    ("iteration", "{.milliseconds:.1f} ms"),
+    ("Dr.Jit's peak", "{.device_mib:.0f} MiB"),
+    ("a Gaussian", "{.bytes_per_gaussian:,.0f} B"),
+    ("process", "{.process_mib:.0f} MiB"),
+    ("entries", "{.work.entries:,}"),
+    ("useful pairs", "{.work.useful:,}"),
+]
+"""Columns of the tables: header and format."""
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -92,11 +121,15 @@ def run(args: argparse.Namespace) -> None:
         results.setdefault(point.sweep, []).append(result)
         print(
             f"{point.sweep}: {point.count:,} Gaussians, {point.size} px, {point.threads} threads: "
-            f"{result.milliseconds:.1f} ms, {result.device_bytes / 2**20:.0f} MiB",
+            f"{result.milliseconds:.1f} ms, {result.device_mib:.0f} MiB",
             flush=True,
         )
     for name, found in results.items():
-        print(f"\n{name}{_exponents(found)}\n{_table(found)}")
+        exponents = ""
+        if len(found) > 1:
+            time, memory = (exponent(found, what) for what in ("milliseconds", "device_bytes"))
+            exponents = f": time ~ x^{time:.2f}, memory ~ x^{memory:.2f}"
+        print(f"\n{name}{exponents}\n{columns_table(COLUMNS, found)}")
     print(f"\n{_stage_table(results['threads'])}", flush=True)
     _write(args.out, results)
 
@@ -119,8 +152,11 @@ def _write(out: Path, results: dict[str, list[Result]]) -> None:
 
 
 def points(quick: bool) -> list[Point]:
-    """The sweeps. With N, the film grows so that each pixel keeps its number of Gaussians, and
-    the Gaussians shrink so that each keeps its number of pixels."""
+    """Return the points of all sweeps.
+
+    In the first, film and Gaussians are scaled so that each pixel keeps its number of Gaussians,
+    and each Gaussian its number of pixels.
+    """
     threads = os.cpu_count() or 1
     counts = (10_000, 30_000) if quick else (10_000, 30_000, 100_000, 300_000, 1_000_000)
     sizes = (100, 200) if quick else (200, 400, 800, 1600)
@@ -137,7 +173,7 @@ def points(quick: bool) -> list[Point]:
 
 
 def measure_in_new_process(point: Point, num_steps: int) -> Result:
-    """Measure where nothing else was ever allocated."""
+    """Measure a point where nothing else was ever allocated."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measure, point, num_steps).result()
 
@@ -165,49 +201,15 @@ def measure(point: Point, num_steps: int) -> Result:
     )
 
 
-# ----------------------------------------------------------------------------------------------
-# Output
-# ----------------------------------------------------------------------------------------------
-
-
 def exponent(results: list[Result], what: str) -> float:
-    """e of the best fit value = c x^e: the slope of a line through the logarithms."""
-    x = np.log([result.point.x() for result in results])
+    """Return e of the best fit value = c x^e: the slope of a line through the logarithms."""
+    x = np.log([result.point.varied for result in results])
     y = np.log([getattr(result, what) for result in results])
     return float(np.polyfit(x, y, 1)[0])
 
 
-def _exponents(results: list[Result]) -> str:
-    return (
-        f": time ~ x^{exponent(results, 'milliseconds'):.2f}, "
-        f"memory ~ x^{exponent(results, 'device_bytes'):.2f}"
-        if len(results) > 1
-        else ""
-    )
-
-
-def _table(results: list[Result]) -> str:
-    header = ["Gaussians", "film", "threads", "iteration", "Dr.Jit's peak", "a Gaussian", "process"]
-    header += ["entries", "useful pairs"]
-    rows = [
-        [
-            f"{r.point.count:,}",
-            f"{r.point.size}x{r.point.size}",
-            r.point.threads,
-            f"{r.milliseconds:.1f} ms",
-            f"{r.device_bytes / 2**20:.0f} MiB",
-            f"{r.device_bytes / r.point.count:,.0f} B",
-            f"{r.process_bytes / 2**20:.0f} MiB",
-            f"{r.work.entries:,}",
-            f"{r.work.useful:,}",
-        ]
-        for r in results
-    ]
-    return markdown_table(header, rows)
-
-
 def _stage_table(results: list[Result]) -> str:
-    """Stages by threads: milliseconds, and how many times faster than with one."""
+    """Format stages by threads: milliseconds, and how many times faster than with one."""
     counts = [result.point.threads for result in results]
     header = ["", *("1 thread" if n == 1 else f"{n} threads" for n in counts)]
     rows = [["a training iteration", *_times_of([r.milliseconds for r in results])]]
@@ -229,23 +231,17 @@ def _short(number: int) -> str:
     return str(number)
 
 
-def _ticks() -> LogLocator:
+def plot(results: dict[str, list[Result]]) -> Figure:
+    """Draw time and memory of each sweep, with the fitted exponents."""
     from matplotlib.ticker import LogLocator
 
-    return LogLocator(subs=(1, 2, 5))
-
-
-def plot(results: dict[str, list[Result]]) -> Figure:
-    """Time and memory of each sweep, with the fitted exponents."""
     figure = new_figure(11, 5.5)
     panels = figure.subplots(2, len(results))
     for column, (name, found) in enumerate(results.items()):
-        x = [result.point.x() for result in found]
-        for row, (what, unit, factor) in enumerate(
-            [("milliseconds", "ms", 1), ("device_bytes", "MiB", 2**-20)]
-        ):
+        x = [result.point.varied for result in found]
+        for row, (what, unit) in enumerate([("milliseconds", "ms"), ("device_mib", "MiB")]):
             panel = panels[row][column]
-            panel.loglog(x, [factor * getattr(result, what) for result in found], "o-")
+            panel.loglog(x, [getattr(result, what) for result in found], "o-")
             if len(found) > 1:
                 panel.set_title(f"{name}: x^{exponent(found, what):.2f}", fontsize=8)
             panel.set_xlabel(name if name in ("pixels", "threads") else "Gaussians")
@@ -253,7 +249,7 @@ def plot(results: dict[str, list[Result]]) -> Figure:
             panel.set_xticks(x, [_short(value) for value in x], fontsize=7)
             panel.tick_params(axis="y", which="both", labelsize=7)
             panel.minorticks_off()
-            panel.yaxis.set_major_locator(_ticks())
+            panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             panel.yaxis.set_major_formatter("{x:g}")
             panel.grid(alpha=0.3)
     return figure

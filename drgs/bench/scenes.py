@@ -1,8 +1,4 @@
-"""Scenes, cameras and trainers that measurements share.
-
-Cameras are :class:`drgs.reference.splatting.Camera`: plain numbers, from which
-:func:`device_camera` makes the kernels' camera in any precision.
-"""
+"""Scenes, cameras and trainers that measurements share; cameras are those of the reference."""
 
 from __future__ import annotations
 
@@ -63,17 +59,10 @@ def bench_gaussians(count: int, seed: int = 0) -> Gaussians:
 
 def bench_camera(size: int) -> reference.Camera:
     """The bench scene's camera with a square film of ``size`` px."""
-    focal = size / (2 * np.tan(BENCH_FIELD_OF_VIEW / 2))
-    return reference.Camera(
-        rotation=(BENCH_TO_WORLD[:, :3] * OPENCV_TO_OPENGL.diagonal()[:3]).T.astype(np.float32),
-        center=BENCH_TO_WORLD[:, 3].astype(np.float32),
-        fx=float(np.float32(focal)),
-        fy=float(np.float32(focal)),
-        cx=size / 2,
-        cy=size / 2,
-        width=size,
-        height=size,
-    )
+    focal = float(np.float32(size / (2 * np.tan(BENCH_FIELD_OF_VIEW / 2))))
+    rotation = (BENCH_TO_WORLD[:, :3] * OPENCV_TO_OPENGL.diagonal()[:3]).T.astype(np.float32)
+    center = BENCH_TO_WORLD[:, 3].astype(np.float32)
+    return reference.Camera(rotation, center, focal, focal, size / 2, size / 2, size, size)
 
 
 def mitsuba_pose(camera: reference.Camera, shift: float = 0.0) -> mi.ScalarTransform4f:
@@ -104,7 +93,7 @@ def mitsuba_sensor(camera: reference.Camera) -> dict[str, object]:
 
 
 def device_camera(camera: reference.Camera, float_type: type) -> Camera:
-    """The same camera as Dr.Jit scalars of ``float_type``."""
+    """Return the camera as Dr.Jit scalars of ``float_type``."""
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     return Camera.create(
         float_type, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
@@ -121,14 +110,14 @@ class Scene:
 
 
 def frame_of(scene: Scene) -> rendering.Frame:
-    """The scene rendered by the kernels in single precision."""
+    """Render the scene by the kernels in single precision."""
     pipeline = rendering.Pipeline(scene.gaussians.sh_degree)
     camera = device_camera(scene.camera, llvm.Float)
     return rendering.render(scene.gaussians.to(llvm.TensorXf), camera, pipeline)
 
 
 def view_of(scene: Scene) -> View:
-    """The scene's own picture, moved by a pixel: derivatives of realistic size."""
+    """Return the scene's own image, moved by a pixel: derivatives of realistic size."""
     camera = scene.camera
     _, *planes = frame_of(scene).planes()
     image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
@@ -144,10 +133,9 @@ def view_of(scene: Scene) -> View:
 def trainer_of(
     scene: Scene, changes: Mapping[str, object] = {}, extras: Mapping[str, np.ndarray] = {}
 ) -> Trainer:
-    """Trains on one view; the population stays, though statistics are gathered as in a fit.
+    """Return a trainer on one view; the population stays, though statistics are gathered.
 
-    changes: of a configuration that renders as 3DGS does, as ``model.smoothing``; extras: of the
-    view, besides colours.
+    changes: of :func:`bench_config`; extras: of the view, besides colours.
     """
     view = replace(view_of(scene), **extras)
     dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
@@ -189,43 +177,23 @@ def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Ca
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     close = rng.normal(size=(near, 3)) * [0.8, 0.8, 0.3] + [0, 0, 1.2]
     close[:, 2] = np.maximum(close[:, 2], 0.4)
-    planes = [crossing(0.7), crossing(-0.7)]
-    means = np.concatenate(
-        [*(m for m, _ in planes), close, directions * rng.uniform(5, 8, (shell, 1))]
-    )
-    quats = np.concatenate(
-        [*(q for _, q in planes), rng.normal(size=(near, 4)), rng.normal(size=(shell, 4))]
-    )
-    scales = np.concatenate(
-        [
-            np.tile([0.15, 0.15, 0.004], (2 * layer, 1)),
-            rng.uniform(0.08, 0.4, (near, 3)),
-            rng.uniform(0.1, 0.6, (shell, 3)),
-        ]
-    )
-    opacities = np.concatenate(
-        [
-            rng.uniform(0.5, 0.98, 2 * layer),
-            rng.uniform(0.05, 0.3, near),
-            rng.uniform(0.3, 0.9, shell),
-        ]
-    )
-    colors = np.concatenate(
-        [
-            np.tile([0.9, 0.35, 0.1], (layer, 1)),
-            np.tile([0.1, 0.45, 0.85], (layer, 1)),
-            rng.uniform(0, 1, (near + shell, 3)),
-        ]
-    )
+    (first, turned), (second, turned_back) = crossing(0.7), crossing(-0.7)
+    means = [first, second, close, directions * rng.uniform(5, 8, (shell, 1))]
+    quats = [turned, turned_back, rng.normal(size=(near, 4)), rng.normal(size=(shell, 4))]
+    scales = [np.tile([0.15, 0.15, 0.004], (2 * layer, 1))]
+    scales += [rng.uniform(0.08, 0.4, (near, 3)), rng.uniform(0.1, 0.6, (shell, 3))]
+    opacities = [rng.uniform(0.5, 0.98, 2 * layer), rng.uniform(0.05, 0.3, near)]
+    opacities = np.concatenate([*opacities, rng.uniform(0.3, 0.9, shell)])
+    colors = [np.tile(color, (layer, 1)) for color in ([0.9, 0.35, 0.1], [0.1, 0.45, 0.85])]
+    colors = np.concatenate([*colors, rng.uniform(0, 1, (near + shell, 3))])
     colors = np.clip(colors + rng.normal(0, 0.08, colors.shape), 0, 1)
-    count = len(means)
     values = {
-        "means": means,
-        "quats": quats,
-        "log_scales": np.log(scales),
+        "means": np.concatenate(means),
+        "quats": np.concatenate(quats),
+        "log_scales": np.log(np.concatenate(scales)),
         "logit_opacities": np.log(opacities / (1 - opacities)),
         "sh0": ((colors - 0.5) / reference.C_00)[:, None],
-        "shN": rng.normal(0, 0.05, (count, 15, 3)),
+        "shN": rng.normal(0, 0.05, (len(colors), 15, 3)),
     }
     gaussians = Gaussians(**{name: value.astype(np.float32) for name, value in values.items()})
     focal = float(np.float32(size / 2 / np.tan(np.radians(110) / 2)))

@@ -12,16 +12,17 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.bench import peers
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of
+from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, mitsuba_sensor
 from drgs.bench.timing import (
     STAGES,
     Work,
@@ -32,16 +33,22 @@ from drgs.bench.timing import (
     warm_trainer,
 )
 from drgs.cli.commands import CommandParser
+from drgs.config.schema import ModelConfig
 from drgs.core.files import atomic_path
 from drgs.core.private import leave_out_avx512
-from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.scene import make_scene
 from drgs.io.figures import new_figure, write_figure
+from drgs.reference import splatting as reference
 from drgs.results.files import GAUSSIANS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 IMAGE_SIZE_PX = 400
+
+SHELL = 3.0
+"""Standard deviations at which Mitsuba's ellipsoids end (its default, and 3DGS's extent)."""
 
 ROUNDS, QUICK_ROUNDS = 15, 5
 
@@ -75,6 +82,11 @@ class IterationReport:
     def kernel_ms(self) -> float:
         """The sum over all stages."""
         return sum(self.stage_ms.values())
+
+    @property
+    def rest_ms(self) -> float:
+        """The time in no kernel."""
+        return self.wall_ms - self.kernel_ms
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -140,31 +152,133 @@ def make_scenes(trained: Path, quick: bool) -> list[Scene]:
     return scenes
 
 
-# ----------------------------------------------------------------------------------------------
-# Measuring
-# ----------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Renderer:
+    """One implementation with a scene loaded.
+
+    ``forward`` renders a frame; ``forward_backward`` also differentiates sum(weights * image) /
+    pixels with respect to all parameters. Both return when the device has finished.
+    """
+
+    name: str
+    forward: Callable[[], None]
+    forward_backward: Callable[[], None]
+    seconds: float  # roughly, for both: how often it can be repeated
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The input of every implementation."""
+
+    gaussians: Gaussians  # numpy
+    camera: reference.Camera
+    weights: np.ndarray  # (H, W, 3): the loss is sum(weights * image) / (H W)
+
+
+def drgs_renderer(problem: Problem) -> Renderer:
+    """Return the ``splats`` integrator through ``mi.render``, as a user of Mitsuba calls it."""
+    scene = make_scene(problem.gaussians, ModelConfig().of_file(), (1.0, 1.0, 1.0))
+    return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
+
+
+def volprim_renderer(problem: Problem, shape: str, seconds: float) -> Renderer:
+    """Return Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
+    scene = mi.load_dict(volprim_scene(problem.gaussians, shape, 256))
+    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
+
+
+def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str, object]:
+    """Return ``ellipsoids`` or ``ellipsoidsmesh`` as a scene without sensor, in display space."""
+    quats_xyzw = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    quats_xyzw = np.roll(quats_xyzw, -1, axis=1)
+    sh = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
+    attributes = {
+        "data": np.concatenate([gaussians.means, gaussians.scales, quats_xyzw], axis=1),
+        "opacities": gaussians.opacities[:, None],
+        "sh_coeffs": sh.reshape(len(sh), -1),
+    }
+    tensors = {name: mi.TensorXf(v.astype(np.float32)) for name, v in attributes.items()}
+    integrator = {"type": "volprim_rf_basic", "srgb_primitives": False, "max_depth": max_depth}
+    return {
+        "type": "scene",
+        "integrator": integrator,
+        "emitter": {"type": "constant"},
+        "shapes": {"type": shape, "extent": SHELL, **tensors},
+    }
+
+
+def _mitsuba_renderer(
+    name: str, scene: mi.Scene, problem: Problem, prefix: str, seconds: float
+) -> Renderer:
+    camera = problem.camera
+    sensor = mi.load_dict(mitsuba_sensor(camera) | {"near_clip": 1e-3})
+    params = mi.traverse(scene)
+    names = [prefix + name for name in (*PARAMETER_NAMES, "data", "opacities", "sh_coeffs")]
+    names = [name for name in names if name in params]
+    weights = mi.TensorXf(problem.weights.astype(np.float32) / (camera.width * camera.height))
+    integrator = scene.integrator()
+
+    def forward() -> None:
+        integrator.parameters_changed([])  # no frame of an earlier call may be used again
+        with dr.suspend_grad():
+            dr.eval(mi.render(scene, sensor=sensor, spp=1))
+        dr.sync_thread()
+
+    def forward_backward() -> None:
+        integrator.parameters_changed([])
+        values = [params[name] for name in names]
+        dr.enable_grad(values)
+        dr.clear_grad(values)
+        image = mi.render(scene, params, sensor=sensor, spp=1)
+        dr.backward(dr.sum(image * weights, axis=None))
+        dr.eval(dr.grad(values))
+        dr.sync_thread()
+        dr.disable_grad(values)
+
+    return Renderer(name, forward, forward_backward, seconds)
+
+
+def reference_renderer(problem: Problem) -> Renderer:
+    """Return the float64 numpy reference."""
+    fields = [getattr(problem.gaussians, name) for name in PARAMETER_NAMES]
+    gaussians, white = reference.Gaussians(*fields), np.ones(3)
+    d_image = problem.weights / problem.weights[..., 0].size
+
+    def forward() -> None:
+        reference.render(gaussians, problem.camera, white)
+
+    def forward_backward() -> None:
+        reference.render(gaussians, problem.camera, white)
+        reference.render_gradients(gaussians, problem.camera, white, d_image)
+
+    seconds = 6e-4 * len(gaussians.means)
+    return Renderer("numpy reference, float64", forward, forward_backward, seconds)
 
 
 def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
     """Time every implementation in turns."""
     rng = np.random.default_rng(0)
     weights = rng.normal(size=(scene.camera.height, scene.camera.width, 3))
-    problem = peers.Problem(scene.gaussians, scene.camera, weights)
+    problem = Problem(scene.gaussians, scene.camera, weights)
     count = scene.gaussians.num_gaussians
     renderers = [
-        peers.drgs_renderer(problem),
-        peers.volprim_renderer(problem, "ellipsoids", 7e-5 * count),
-        peers.volprim_renderer(problem, "ellipsoidsmesh", 1.5e-4 * count),
-        peers.reference_renderer(problem),
+        drgs_renderer(problem),
+        volprim_renderer(problem, "ellipsoids", 7e-5 * count),
+        volprim_renderer(problem, "ellipsoidsmesh", 1.5e-4 * count),
+        reference_renderer(problem),
     ]
     times: dict[str, list[tuple[float, float]]] = {r.name: [] for r in renderers}
     for renderer in renderers:  # compiles the kernels
         if renderer.seconds < VERY_SLOW_S:
             renderer.forward_backward()
             renderer.forward()
+    num_rounds = {
+        r.name: 1 if r.seconds > VERY_SLOW_S else SLOW_ROUNDS if r.seconds > SLOW_S else rounds
+        for r in renderers
+    }
     for turn in range(rounds):
         for renderer in renderers:
-            if turn < _num_rounds(renderer, rounds):
+            if turn < num_rounds[renderer.name]:
                 times[renderer.name].append(
                     (seconds(renderer.forward), seconds(renderer.forward_backward))
                 )
@@ -172,12 +286,6 @@ def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
         Timing(scene.name, name, *map(statistics.median, zip(*pairs, strict=True)), len(pairs))
         for name, pairs in times.items()
     ]
-
-
-def _num_rounds(renderer: peers.Renderer, rounds: int) -> int:
-    if renderer.seconds > VERY_SLOW_S:
-        return 1
-    return SLOW_ROUNDS if renderer.seconds > SLOW_S else rounds
 
 
 def profile_training(scene: Scene, rounds: int) -> IterationReport:
@@ -198,26 +306,16 @@ def profile_training(scene: Scene, rounds: int) -> IterationReport:
     )
 
 
-# ----------------------------------------------------------------------------------------------
-# Output
-# ----------------------------------------------------------------------------------------------
-
-
 def comparison_table(timings: list[Timing]) -> str:
     """Format times of all implementations, and their ratios to the first one's."""
     ours = timings[0]
     header = ["400x400", "forward", "forward + backward", "ratio", "ratio, both", "rounds"]
-    rows = [
-        [
-            timing.renderer,
-            _milliseconds(timing.forward),
-            _milliseconds(timing.forward_backward),
-            f"{timing.forward / ours.forward:.1f}",
-            f"{timing.forward_backward / ours.forward_backward:.1f}",
-            str(timing.rounds),
-        ]
-        for timing in timings
-    ]
+    rows = []
+    for timing in timings:
+        forward, both = timing.forward, timing.forward_backward
+        ratios = f"{forward / ours.forward:.1f}", f"{both / ours.forward_backward:.1f}"
+        times = _milliseconds(forward), _milliseconds(both)
+        rows.append([timing.renderer, *times, *ratios, timing.rounds])
     return markdown_table(header, rows)
 
 
@@ -228,9 +326,9 @@ def _milliseconds(duration: float) -> str:
 def stage_table(report: IterationReport) -> str:
     """Format the stages of a training iteration."""
     rows = [[s, f"{report.stage_ms[s]:.1f} ms", f"{report.num_kernels[s]}"] for s in STAGES]
-    rows.append(["rest of wall time", f"{report.wall_ms - report.kernel_ms:.1f} ms", ""])
+    rows.append(["rest of wall time", f"{report.rest_ms:.1f} ms", ""])
     total = sum(report.num_kernels.values())
-    rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", str(total)])
+    rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", total])
     return markdown_table(["stage", "time", "kernels"], rows)
 
 
@@ -255,7 +353,7 @@ def plot(timings: list[Timing], reports: list[IterationReport]) -> Figure:
         values = np.array([report.stage_ms[stage] for report in reports])
         right.bar(labels, values, bottom=bottoms, label=stage)
         bottoms += values
-    rest = np.array([max(report.wall_ms - report.kernel_ms, 0) for report in reports])
+    rest = [max(report.rest_ms, 0) for report in reports]
     right.bar(labels, rest, bottom=bottoms, label="rest of wall time", color="0.8")
     right.set(ylabel="ms", title="a training iteration")
     right.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1))

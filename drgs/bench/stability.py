@@ -1,11 +1,9 @@
 """``python -m drgs.bench stability``: what single precision costs in accuracy, and why.
 
-Four families of scenes become harder step by step: more layers, longer needles, larger distances,
-coordinates farther from the origin. For each step the float32 kernels are compared with the float64
-reference (``drgs.reference.splatting``), and their error is set beside the *noise*: how much the
-reference's own result changes when every input is moved by one rounding of single precision. The
-noise is the conditioning of the problem; no single-precision program can be expected to do better.
-An error that grows faster than the noise would be the kernels' own fault.
+Four families of scenes become harder step by step. For each step the float32 kernels are compared
+with the float64 reference, and their error is set beside the *noise*: how much the reference's own
+result changes when every input is moved by one rounding of single precision. That is the
+conditioning of the problem; an error that grows faster would be the kernels' own fault.
 
 Pixels at which a decision (cut, clamp, stop) may fall either way in single precision are left out;
 the reference marks them.
@@ -21,7 +19,7 @@ from typing import TYPE_CHECKING
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs.bench.output import add_out, machine, markdown_table, write_csv
+from drgs.bench.output import add_out, columns_table, machine, write_csv
 from drgs.bench.scenes import device_camera
 from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -69,6 +67,16 @@ class Measurement:
     left_out: float  # part of the pixels
 
 
+ERRORS = [
+    ("picture", "{.picture:.1e}"),
+    ("its noise", "{.picture_noise:.1e}"),
+    ("gradients", "{.gradient:.1e}"),
+    ("their noise", "{.gradient_noise:.1e}"),
+    ("stored in float32", "{.storage:.1e}"),
+]
+"""Columns of the tables: header and format."""
+
+
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --quick")
@@ -84,21 +92,16 @@ def run(args: argparse.Namespace) -> None:
     for sweep in sweeps():
         values = sweep.values[:: 3 if args.quick else 1]
         results[sweep.name] = [measure(sweep, value, samples) for value in values]
-        print(f"\n{sweep.name}\n{_table(sweep, results[sweep.name])}", flush=True)
+        columns = [(sweep.axis, "{.value:g}"), *ERRORS]
+        print(f"\n{sweep.name}\n{columns_table(columns, results[sweep.name])}", flush=True)
     columns = list(Measurement.__dataclass_fields__)
     rows = [[name, *vars(m).values()] for name, steps in results.items() for m in steps]
     write_csv(args.out / "stability.csv", ["sweep", *columns], rows)
     write_figure(args.out / "stability.png", plot(results))
-    print(f"\nall of it in short\n{_summary(results)}")
-
-
-# ----------------------------------------------------------------------------------------------
-# Scenes
-# ----------------------------------------------------------------------------------------------
 
 
 def sweeps() -> list[Sweep]:
-    """The four families."""
+    """Return the four families."""
     return [
         Sweep("Stack depth", "layers", (1, 3, 10, 30, 100, 300, 1000), _stack),
         Sweep("Anisotropy", "times longer than wide", (2, *_decades(1, 8)), _needles),
@@ -112,17 +115,10 @@ def _decades(first: int, last: int) -> tuple[float, ...]:
 
 
 def _camera(center: np.ndarray) -> reference.Camera:
-    """Turned about all axes, so that no coordinate is exact by chance."""
-    return reference.Camera(
-        rotation=reference.quat_to_rotation(np.array([[0.9, 0.2, -0.3, 0.1]]))[0],
-        center=center,
-        fx=FOCAL,
-        fy=FOCAL,
-        cx=WIDTH / 2,
-        cy=HEIGHT / 2,
-        width=WIDTH,
-        height=HEIGHT,
-    )
+    """Return a camera turned about all axes, so that no coordinate is exact by chance."""
+    rotation = reference.quat_to_rotation(np.array([[0.9, 0.2, -0.3, 0.1]]))[0]
+    intrinsics = FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT
+    return reference.Camera(rotation, center, *intrinsics)
 
 
 def _gaussians(
@@ -132,7 +128,7 @@ def _gaussians(
     sizes: np.ndarray,
     logit_opacities: np.ndarray,
 ) -> reference.Gaussians:
-    """Means at film positions (N, 2) px and depths z (N,); standard deviations (N, 3) in px."""
+    """Return Gaussians at film positions (N, 2) px and depths z (N,); sizes: (N, 3), px."""
     rng = np.random.default_rng(1)
     count = len(z)
     slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
@@ -174,7 +170,7 @@ def _stack(layers: float) -> Scene:
 
 
 def _needles(ratio: float) -> Scene:
-    """The longest axis has 8 px, the others are ``ratio`` times shorter."""
+    """Needles: the longest axis has 8 px, the others are ``ratio`` times shorter."""
     rng = np.random.default_rng(4)
     camera = _camera(np.zeros(3))
     gaussians = _gaussians(
@@ -199,13 +195,8 @@ def _offset(offset: float) -> Scene:
     return _ordinary(camera, 1, 4), camera
 
 
-# ----------------------------------------------------------------------------------------------
-# Errors
-# ----------------------------------------------------------------------------------------------
-
-
 def measure(sweep: Sweep, value: float, samples: int) -> Measurement:
-    """Errors and noise of one scene; both sides start from the same, rounded numbers."""
+    """Measure errors and noise of one scene; both sides start from the same, rounded numbers."""
     exact = sweep.scene(value)
     gaussians, camera = _stored(*exact)
     picture = reference.render(gaussians, camera, threshold_width=MARKED_WITHIN)
@@ -223,22 +214,20 @@ def measure(sweep: Sweep, value: float, samples: int) -> Measurement:
             for name, exact_one in gradients.items()
         )
 
-    moved = [
-        _by_reference(*_moved(gaussians, camera, sample), cotangent) for sample in range(samples)
-    ]
+    errors = []
+    for sample in range(samples):
+        moved = _by_reference(*_moved(gaussians, camera, sample), cotangent)
+        errors.append([picture_error(moved[0]), gradient_error(moved[1])])
+    picture_noise, gradient_noise = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
     return Measurement(
         value=value,
         picture=picture_error(image32),
-        picture_noise=_root_mean_square([picture_error(one) for one, _ in moved]),
+        picture_noise=picture_noise,
         gradient=gradient_error(gradients32),
-        gradient_noise=_root_mean_square([gradient_error(one) for _, one in moved]),
+        gradient_noise=gradient_noise,
         storage=picture_error(_by_reference(*exact, cotangent)[0]),
         left_out=float(np.mean(~kept)),
     )
-
-
-def _root_mean_square(values: list[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _stored(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
@@ -253,7 +242,7 @@ def _stored(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
 
 
 def _moved(gaussians: reference.Gaussians, camera: reference.Camera, seed: int) -> Scene:
-    """Every number moved by up to one rounding; means and camera relative to each other."""
+    """Move every number by up to one rounding; means and camera relative to each other."""
     rng = np.random.default_rng([6, seed])
 
     def moved(values: np.ndarray) -> np.ndarray:
@@ -284,61 +273,23 @@ def _by_kernels(
     frame = rendering.render(device, device_camera(camera, llvm.Float), pipeline)
     _, *color = frame.planes()
     image = np.stack([np.array(plane).reshape(HEIGHT, WIDTH) for plane in color], axis=-1)
-    planes = [llvm.Float(np.ascontiguousarray(w, np.float32)) for w in _planes(cotangent)]
+    planes = [llvm.Float(np.ascontiguousarray(w, np.float32)) for w in cotangent.reshape(-1, 3).T]
     nothing = llvm.Float(np.zeros(HEIGHT * WIDTH, np.float32))
     gradients = rendering.frames_adjoint(device, [frame], [[nothing, *planes]]).parameters
     return image, {name: np.array(getattr(gradients, name)) for name in PARAMETER_NAMES}
 
 
-def _planes(image: np.ndarray) -> list[np.ndarray]:
-    return [image[..., channel].ravel() for channel in range(3)]
-
-
-# ----------------------------------------------------------------------------------------------
-# Output
-# ----------------------------------------------------------------------------------------------
-
-
-def _table(sweep: Sweep, steps: list[Measurement]) -> str:
-    header = [sweep.axis, "picture", "noise", "gradients", "noise", "stored in float32"]
-    rows = [
-        [f"{m.value:g}"]
-        + [
-            f"{number:.1e}"
-            for number in (
-                m.picture,
-                m.picture_noise,
-                m.gradient,
-                m.gradient_noise,
-                m.storage,
-            )
-        ]
-        for m in steps
-    ]
-    return markdown_table(header, rows)
-
-
-def _summary(results: dict[str, list[Measurement]]) -> str:
-    """The first and the last step of each sweep."""
-    header = ["", "picture", "its noise", "gradients", "their noise"]
-    rows = [
-        [f"{sweep.name}: {m.value:g} {sweep.axis}"]
-        + [f"{v:.1e}" for v in (m.picture, m.picture_noise, m.gradient, m.gradient_noise)]
-        for sweep in sweeps()
-        for m in (results[sweep.name][0], results[sweep.name][-1])
-    ]
-    return markdown_table(header, rows)
-
-
 def plot(results: dict[str, list[Measurement]]) -> Figure:
-    """One panel a sweep: errors as lines, their noise dashed in the same colour."""
+    """Draw a panel for each sweep: errors as lines, their noise dashed in the same colour."""
     figure = new_figure(11, 6)
     axes = figure.subplots(2, 2, sharey=True).ravel()
     for panel, sweep in zip(axes, sweeps(), strict=True):
         steps = results[sweep.name]
         x = [m.value for m in steps]
-        for color, what in (("tab:blue", "picture"), ("tab:orange", "gradient")):
-            label = {"picture": "picture", "gradient": "gradients"}[what]
+        for color, what, label in (
+            ("tab:blue", "picture", "picture"),
+            ("tab:orange", "gradient", "gradients"),
+        ):
             panel.loglog(x, [getattr(m, what) for m in steps], "o-", color=color, label=label)
             noise = [getattr(m, f"{what}_noise") for m in steps]
             panel.loglog(x, noise, "--", color=color, label=f"{label}: one rounding of the inputs")

@@ -50,9 +50,12 @@ def seconds(function: Callable[[], object]) -> float:
     return time.perf_counter() - started
 
 
-# ----------------------------------------------------------------------------------------------
-# Stages
-# ----------------------------------------------------------------------------------------------
+def count_operations(function: Callable[[], object]) -> int:
+    """Count the operations in the kernels that a call launches."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        function()
+        return sum(kernel["operation_count"] for kernel in dr.kernel_history([dr.KernelType.JIT]))
 
 
 @dataclass
@@ -139,11 +142,6 @@ def clocked_step(trainer: Trainer) -> StageClock:
         dr.eval([(view.loss, view.squared_error) for view in report.views])
         clock.end("optimizer and statistics")
     return clock
-
-
-# ----------------------------------------------------------------------------------------------
-# Work
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

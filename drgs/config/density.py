@@ -6,7 +6,7 @@ Each strategy has a section of its own in it; what all of them share stands besi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -16,19 +16,31 @@ from drgs.config.section import Count, Section
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
 """Iterations: the reference's schedule, for 30,000."""
 
-SCHEDULE_SHARES = {"adc": (1 / 2, 5 / 7), "budget": (1 / 20, 1 / 2), "mcmc": (1 / 20, 5 / 7)}
-"""Shares of the iterations by shipped strategy: see ``DensityStrategy.start_share``. Of 7,000
-iterations, adc leaves 2,000 for the last opacities to settle."""
 
-DEFAULT_SCHEDULE_SHARES = (1 / 20, 1 / 2)
+class Schedule(NamedTuple):
+    """Defaults of a strategy: see ``drgs.training.density.strategy.DensityStrategy``."""
+
+    start_share: float  # of the iterations
+    stop_share: float
+    rate_decay: float = 0.1  # of the learning rates, over the fit
 
 
-def schedule_shares(strategy: str) -> tuple[float, float]:
-    """Return ``start_share`` and ``stop_share`` of a strategy; no shipped one is imported."""
-    if strategy in SCHEDULE_SHARES:
-        return SCHEDULE_SHARES[strategy]
+DEFAULT_SCHEDULE = Schedule(1 / 20, 1 / 2)
+
+SCHEDULES = {
+    "adc": Schedule(1 / 2, 5 / 7, rate_decay=1.0),
+    "budget": DEFAULT_SCHEDULE,
+    "mcmc": Schedule(1 / 20, 5 / 7),
+}
+"""By shipped strategy. Of 7,000 iterations, adc leaves 2,000 for the last opacities to settle."""
+
+
+def schedule_of(strategy: str) -> Schedule:
+    """Return the defaults of a strategy; no shipped one is imported."""
+    if strategy in SCHEDULES:
+        return SCHEDULES[strategy]
     extension = STRATEGIES.get(strategy).value
-    return extension.start_share, extension.stop_share
+    return Schedule(extension.start_share, extension.stop_share, extension.rate_decay)
 
 
 class AdcConfig(Section):

@@ -24,8 +24,8 @@ STRATEGIES: Registry[type] = Registry(
         "adc": "drgs.training.density.adc",
         "budget": "drgs.training.density.budget",
         "mcmc": "drgs.training.density.mcmc",
-        "importance": "drgs.training.density.importance",
-        "selection": "drgs.training.density.selection",
+        "importance": "drgs.training.density.pruning",
+        "selection": "drgs.training.density.pruning",
     },
 )
 """Subclasses of :class:`drgs.training.density.strategy.DensityStrategy`."""

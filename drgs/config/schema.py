@@ -32,7 +32,7 @@ from drgs.config.density import (
     REFERENCE_START,
     REFERENCE_STOP,
     DensifyConfig,
-    schedule_shares,
+    schedule_of,
 )
 from drgs.config.extensions import check_loss, check_reader, check_sections
 from drgs.config.section import Count, Rate, Section, Weight
@@ -53,9 +53,6 @@ REFERENCE_NEAR = 0.2
 
 LATEST_DEGREE = 1000
 """Iterations: the reference's schedule, for 30,000."""
-
-LAST_RATE = 0.1
-"""What rates fall to, in parts of what they begin with."""
 
 DEGREE_SHARE = 1 / 40
 """Of the iterations, when the degree of the harmonics rises."""
@@ -511,10 +508,9 @@ class FitConfig(Section):
         if _is_open(model, "sh_increase_every"):
             every = max(1, min(LATEST_DEGREE, round(DEGREE_SHARE * n)))
             self._complete("model", {"sh_increase_every": every})
+        start_share, stop_share, rate_decay = schedule_of(densify.strategy)
         if self.optimizer.decay is None:
-            decay = 1.0 if densify.strategy == "adc" else LAST_RATE
-            self._complete("optimizer", {"decay": decay})
-        start_share, stop_share = schedule_shares(densify.strategy)
+            self._complete("optimizer", {"decay": rate_decay})
         changes, first = {}, densify.start
         if _is_open(densify, "stop"):
             least = 1 if _is_open(densify, "start") else first + 1

@@ -1,14 +1,13 @@
 """A fit for a given time: what to choose, how many iterations, and when to end.
 
-``scenes/studies/training.py`` measures quality over time on the shipped scene: one curve for each
-:class:`Strategy`, some points on it for numbers of iterations. A point's time is counted in
-iterations as they are at the start of a fit, with full pictures and the first Gaussians. A few
-iterations of a fit that is to be planned, timed where it will run, turn these into seconds. What is
-planned is the strategy whose curve is highest where the time is up.
+``scenes/studies/training.py`` measures quality over time on the shipped scene: a curve for each
+:class:`Strategy`. Its time is counted in iterations as they are at the start of a fit, with full
+images and the first Gaussians. A few iterations of the fit that is to be planned turn these into
+seconds. The strategy is planned whose curve is highest where the time is up.
 
-Curves of another scene predict a time to some ten or twenty per cent, and machines vary. So the
-clock has the last word (:class:`Deadline`): it revises the plan, but only what is ahead, and ends
-the fit. A configuration that says what was done gives the same bytes without a clock.
+Curves of another scene predict a time to some ten or twenty per cent. So the clock has the last
+word (:class:`Deadline`): it revises what is ahead of the plan, and ends the fit. The configuration
+that results gives the same bytes without a clock.
 """
 
 from __future__ import annotations
@@ -18,10 +17,13 @@ import math
 import re
 import time
 import warnings
+from argparse import ArgumentTypeError
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
@@ -39,26 +41,19 @@ CURVES = Path(__file__).parent / "training_curves.csv"
 MIN_ITERATIONS = 50
 """Fewer fit nothing."""
 
-MIN_SIDE = 32
-"""px: pictures of coarse stages are not smaller than SSIM's windows need."""
+MIN_SIDE_PX = 32
+"""Images of coarse stages are not smaller than SSIM's windows need."""
 
-REHEARSAL_VIEWS = 8
+WARM_UP, TIMED, REHEARSAL_VIEWS = 6, 20, 8
+"""Iterations of a rehearsal, the first of which compile kernels; and its views."""
 
-REVISED_EVERY = 0.1
-"""Of the time."""
+REVISION_SHARE = 0.1
+"""Share of the time between two revisions of a plan."""
 
-MAX_SECONDS = 7 * 24 * 3600.0
-
-MAX_PICTURES_SHARE = 0.33
+MAX_IMAGES_SHARE = 0.33
 """Share of the time that ``--budget`` leaves: images that take more are left out."""
 
-_NO_PICTURES = (
-    "--budget: the time is needed for iterations: no report, orbit and pictures are written "
-    "(output.report, output.save_renders); python -m drgs.render OUT_DIR --out DIR makes pictures"
-)
-
-WARM_UP, TIMED = 6, 20
-"""Iterations: the first compile kernels and fill the allocator's pools."""
+MAX_SECONDS = 7 * 24 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +79,7 @@ class Strategy:
         return self.share is None or target_of(config) is not None
 
     def applied(self, config: FitConfig, num_points: int) -> FitConfig:
-        """``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
+        """Return ``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
         changes: dict[str, object] = {}
         if self.half_size is not None:
             until = max(1, round(self.half_size * config.iterations))
@@ -97,7 +92,7 @@ class Strategy:
 
 
 def target_of(config: FitConfig) -> int | None:
-    """The number of Gaussians that a fit grows to; None: its strategy knows none."""
+    """Return the number of Gaussians that a fit grows to; None: its strategy knows none."""
     section = getattr(config.densify, config.densify.strategy, None)
     number = getattr(section, "gaussians", None)
     return None if number is None else min(number, config.densify.max_gaussians)
@@ -125,43 +120,34 @@ class Curve:
 
     def iterations_in(self, time: float) -> int:
         """Return the number of iterations that take ``time``."""
-        log_n = _interpolated(math.log(time), _logs(self.time), _logs(self.iterations))
+        log_n = _interpolate(math.log(time), np.log(self.time), np.log(self.iterations))
         return math.floor(math.exp(log_n) + 1e-9)
 
     def time_of(self, iterations: int) -> float:
         """Return the time of a number of iterations."""
-        log_n = math.log(iterations)
-        return math.exp(_interpolated(log_n, _logs(self.iterations), _logs(self.time)))
+        log_time = _interpolate(math.log(iterations), np.log(self.iterations), np.log(self.time))
+        return math.exp(log_time)
 
     def psnr_at(self, iterations: int) -> float:
         """Return the PSNR after a number of iterations."""
-        return _interpolated(math.log(iterations), _logs(self.iterations), self.psnr)
+        return _interpolate(math.log(iterations), np.log(self.iterations), self.psnr)
 
 
-def _logs(values: Sequence[float]) -> list[float]:
-    return [math.log(value) for value in values]
-
-
-def _interpolated(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
-    """Piecewise linear; beyond the ends like the last piece."""
-    pieces = list(pairwise(zip(xs, ys, strict=True)))
-    (x0, y0), (x1, y1) = next((piece for piece in pieces if x <= piece[1][0]), pieces[-1])
-    return y0 + (x - x0) / (x1 - x0) * (y1 - y0)
+def _interpolate(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    """Interpolate linearly; beyond the ends as in the last piece."""
+    i = min(max(int(np.searchsorted(xs, x)), 1), len(xs) - 1)
+    return float(ys[i - 1] + (x - xs[i - 1]) / (xs[i] - xs[i - 1]) * (ys[i] - ys[i - 1]))
 
 
 def load_curves() -> dict[str, Curve]:
     """Read the curves of all strategies, by name."""
     with CURVES.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    curves = {}
-    for name in (strategy.name for strategy in STRATEGIES):
-        points = sorted(
-            (int(r["iterations"]), float(r["wall_s"]) / float(r["start_s"]), float(r["psnr"]))
-            for r in rows
-            if r["choice"] == name
-        )
-        curves[name] = Curve(*zip(*points, strict=True))
-    return curves
+    points: dict[str, list[tuple[int, float, float]]] = {each.name: [] for each in STRATEGIES}
+    for row in (row for row in rows if row["choice"] in points):
+        seconds = float(row["wall_s"]) / float(row["start_s"])
+        points[row["choice"]].append((int(row["iterations"]), seconds, float(row["psnr"])))
+    return {name: Curve(*zip(*sorted(found), strict=True)) for name, found in points.items()}
 
 
 @dataclass(frozen=True)
@@ -223,7 +209,7 @@ def make_plan(
     """
     candidates = []
     for strategy in STRATEGIES:
-        fits = strategy.half_size is None or side / 2 >= MIN_SIDE
+        fits = strategy.half_size is None or side / 2 >= MIN_SIDE_PX
         if strategy.name in curves and fits and strategy.applies_to(config):
             curve = curves[strategy.name]
             iterations = curve.iterations_in(seconds / start_s) if seconds > 0 else 0
@@ -248,7 +234,7 @@ class Rehearsal:
     """The first iterations of a fit, to be thrown away."""
 
     trainer: Trainer
-    iteration_s: float  # of an iteration: full pictures, the first Gaussians
+    iteration_s: float  # of an iteration: full images, the first Gaussians
 
 
 def rehearse(
@@ -256,19 +242,19 @@ def rehearse(
     dataset: Dataset | None,
     gaussians: Gaussians,
     comm: Communicator | None = None,
+    **objects: object,
 ) -> Rehearsal:
     """Time a few iterations on a few of the views.
 
-    comm: the processes that share the fit; others than rank 0 give no configuration and dataset.
+    comm: the processes that share the fit; others than rank 0 give no configuration and dataset;
+    objects: given to :class:`Trainer`, copies of which take part.
     """
     comm = comm or Communicator()
     if comm.is_root:
         config, dataset = _first_iterations(config, dataset)
     config, dataset = share_inputs(comm, config, dataset)
-    trainer, views_per_step = (
-        Trainer(config, dataset, gaussians, comm),
-        config.optimizer.views_per_step,
-    )
+    trainer = Trainer(config, dataset, gaussians, comm, **deepcopy(objects))
+    views_per_step = config.optimizer.views_per_step
     # Steps of several views are fewer.
     warm_up, timed = (max(2, math.ceil(n / views_per_step)) for n in (WARM_UP, TIMED))
     for count in (warm_up, timed):
@@ -301,8 +287,13 @@ def plan_fit(
     results = seconds_of_results(scene, dataset, max(num_points, most), degree)
     pictures = results.renders if config.output.save_renders else 0.0
     pictures += results.report + seconds_of_curves() if config.output.report else 0.0
-    if pictures > MAX_PICTURES_SHARE * (end - time.perf_counter()):
-        warnings.warn(UserNote(_NO_PICTURES), stacklevel=2)
+    if pictures > MAX_IMAGES_SHARE * (end - time.perf_counter()):
+        note = (
+            "--budget: the time is needed for iterations: no report, orbit and pictures are "
+            "written (output.report, output.save_renders); python -m drgs.render OUT_DIR --out DIR "
+            "makes pictures"
+        )
+        warnings.warn(UserNote(note), stacklevel=2)
         config = changed(config, {"output.report": False, "output.save_renders": False})
     else:
         end -= pictures
@@ -319,46 +310,43 @@ def plan_fit(
 
 
 class Deadline:
-    """A fit ends when its time is up.
+    """Ends a fit when its time is up.
 
-    Ten times on the way, the curve is scaled to the time that the fit has taken so far; that says
-    where it will end, and where changes of the population are to end, which keep their share of
-    the whole. The trainer's configuration is kept such that it says what was done.
+    Ten times on the way, the curve is scaled to the time that the fit has taken so far, and the
+    trainer's configuration is revised: where the fit will end, and where changes of the population
+    are to end, which keep their share of the whole.
     """
 
     def __init__(self, trainer: Trainer, end: float, curve: Curve) -> None:
         """end: when the last iteration is to end, by ``time.perf_counter``."""
         self._curve, config = curve, trainer.config
         self._start, self._end = time.perf_counter(), end
-        self._next = self._start + REVISED_EVERY * (end - self._start)
+        self._next = self._start + REVISION_SHARE * (end - self._start)
         self._densify_share = config.densify.stop / config.iterations
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """Whether there is time for another iteration; revises the trainer's configuration."""
+        """Return whether there is time; revises the trainer's configuration."""
         now, done = time.perf_counter(), trainer.iteration
         if now >= self._end and done > 0:
             trainer.reschedule(done, trainer.config.densify.stop)
             return False
         if now >= self._next and done > 0:
-            self._next = now + REVISED_EVERY * (self._end - self._start)
-            total = self.num_iterations(trainer)
-            trainer.reschedule(total, self._densify_stop(trainer, total))
+            self._next = now + REVISION_SHARE * (self._end - self._start)
+            total, densify = self.num_iterations(trainer), trainer.config.densify
+            stop = densify.stop
+            if done < stop:
+                stop = max(round(self._densify_share * total), done + 1, densify.start + 1)
+            trainer.reschedule(total, stop)
         return True
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """Iterations in all: as planned, later as the curve and the time so far say."""
+        """Return the iterations in all: as planned, later by the curve and the time so far."""
         now, done = time.perf_counter(), trainer.iteration
         if done == 0:
             return trainer.config.iterations
         ratio = (self._end - self._start) / max(now - self._start, 1e-9)
         total = self._curve.iterations_in(self._curve.time_of(done) * max(ratio, 1.0))
         return max(total, done + 1) if now < self._end else done
-
-    def _densify_stop(self, trainer: Trainer, total: int) -> int:
-        done, config = trainer.iteration, trainer.config.densify
-        if done >= config.stop:
-            return config.stop
-        return max(round(self._densify_share * total), done + 1, config.start + 1)
 
 
 _NUMBER = r"(\d+(?:\.\d+)?)"
@@ -369,11 +357,13 @@ _DURATION = re.compile(f"(?:{_NUMBER}h)?(?:{_NUMBER}m)?(?:{_NUMBER}s)?|{_NUMBER}
 def parse_duration(text: str) -> float:
     """Return the seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``.
 
-    Raises ValueError for anything else, such as ``1h30``: each of several parts has a unit.
+    Raises ``argparse.ArgumentTypeError`` for anything else, such as ``1h30``.
     """
     match = _DURATION.fullmatch(text.strip())
     parts = match.groups(default="0") if match else ()
     seconds = sum(scale * float(part) for scale, part in zip((3600, 60, 1, 1), parts, strict=False))
     if not 0 < seconds <= MAX_SECONDS:
-        raise ValueError(f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}")
+        raise ArgumentTypeError(
+            f"must be a time such as 90s, 5m or 1h30m, a week at most, got {text!r}"
+        )
     return seconds

@@ -1,16 +1,16 @@
 """Checkpoints: a fit that was stopped continues to the bytes that it would have given.
 
 One file, ``checkpoint.npz``: the trainer's state, the history so far, the seconds spent, the
-configuration that it belongs to, and what the data was. It is written whole or not at all.
+configuration that it belongs to, and a fingerprint of the data. It is written whole or not at all.
 ``config.yml`` follows it: a plan that is revised changes the configuration, and a process may end
-between the two files. So the checkpoint says which configuration stood there before, too.
+between the two files. So the checkpoint contains the configuration that stood there before, too.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,31 +19,34 @@ import numpy as np
 
 from drgs.config.changes import changed, decided_as
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, UserNote, listed, one_line
+from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import atomic_path, read_arrays, why_refused
 from drgs.datasets.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
 from drgs.results.folder import load_run_config, write_run_config
-from drgs.training.state_checks import check_state, check_tables
+from drgs.results.history import DENSITY_COLUMNS, HistoryRow
+from drgs.training.trainer import DENSITY
 
 PLACES = ("data.path", "data.source", "init.point_cloud")
 """Values that say where something is: a project that was moved has others. The start point is
-needed no more; what the data is has a fingerprint."""
+needed no more; the data has a fingerprint."""
 
+MEANS = "means.value"
+"""The array that has a row for each Gaussian."""
 
-EARLIER_NAMES = {"gradient_norms": "density/gradient_norms", "views": "density/views"}
-"""Of the trainer's state, in files of earlier versions."""
+FILTER = "smoothing/filter"
+"""Of an effect, with a number for each Gaussian; a trainer has none at its start."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What a fit has to know of its past."""
+    """The past of a fit."""
 
     trainer: dict[str, np.ndarray]  # Trainer.state()
-    history: np.ndarray  # (rows, columns) float64: the rows of history.csv
+    history: np.ndarray  # (rows, columns) float64: see History.arrays
+    density: np.ndarray  # (changes, columns) int64
     wall_s: float  # seconds spent on iterations
-    data: Fingerprint | None = None  # None: of an earlier version, which kept none
-    density: np.ndarray | None = None  # (changes, columns) int64, of density.csv; None: the same
+    data: Fingerprint
     config: FitConfig | None = None  # of the file that it was read from
 
 
@@ -54,28 +57,25 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
     """
     try:
         before = load_run_config(folder)
-    except UserError:  # there is none, or somebody is just editing it
+    except UserError:  # there is none, or the user is just editing it
         before = config
-    arrays = {f"trainer.{name}": values for name, values in checkpoint.trainer.items()}
-    if checkpoint.data is not None:
-        arrays["data"] = np.frombuffer(checkpoint.data.to_bytes(), np.uint8)
-    if checkpoint.density is not None:
-        arrays["density"] = checkpoint.density
     with atomic_path(folder / CHECKPOINT) as temporary:
         np.savez(
             temporary,
             config=np.array(_as_text(config)),
             config_before=np.array(_as_text(before)),
             history=checkpoint.history,
+            density=checkpoint.density,
             wall_s=np.array(checkpoint.wall_s),
-            **arrays,
+            data=np.frombuffer(checkpoint.data.to_bytes(), np.uint8),
+            **{f"trainer.{name}": values for name, values in checkpoint.trainer.items()},
         )
     if before != config or not (folder / CONFIG).is_file():
         write_run_config(folder, config)
 
 
 def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
-    """The checkpoint of ``folder``, or None if there is none yet.
+    """Return the checkpoint of ``folder``, or None if there is none yet.
 
     config: that of the run; where the plan had just been revised, the checkpoint's is the later.
 
@@ -86,25 +86,25 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
         return None
     try:
         arrays = read_arrays(path, "checkpoint")
-        texts = [arrays.pop("config"), arrays.pop("config_before", None)]
-        own, *before = (
-            _at_the_places_of(config, json.loads(str(t))) for t in texts if t is not None
+        own, before = (
+            _at_the_places_of(config, json.loads(str(arrays.pop(name))))
+            for name in ("config", "config_before")
         )
-        data = arrays.pop("data", None)
         checkpoint = Checkpoint(
             history=arrays.pop("history"),
+            density=arrays.pop("density"),
             wall_s=float(arrays.pop("wall_s")),
-            density=arrays.pop("density", None),
-            data=None if data is None else Fingerprint.from_bytes(data.tobytes()),
+            data=Fingerprint.from_bytes(arrays.pop("data").tobytes()),
             config=own,
-            trainer=_named_as_now(arrays),
+            trainer={name.removeprefix("trainer."): array for name, array in arrays.items()},
         )
-        check_tables(checkpoint.history, checkpoint.density, checkpoint.wall_s)
+        _check_tables(checkpoint)
     except UserError as error:
         raise UserError(f"{error}; {_remedy(path)}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _damaged(path, error) from None
-    if not any(_says_the_same(config, earlier) for earlier in (own, *before)):
+    # What one of them leaves to the dataset, the other has from there.
+    if all(decided_as(config, past) != decided_as(past, config) for past in (own, before)):
         raise UserError(
             f"{path}: belongs to another configuration than {folder / CONFIG}; {_remedy(path)}"
         )
@@ -116,17 +116,34 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
 
     start: ``Trainer.state()`` of that trainer before its first iteration.
     """
-    config = checkpoint.config
     try:
-        check_state(checkpoint.trainer, start, config.iterations, config.densify.max_gaussians)
+        _check_state(checkpoint.trainer, start, checkpoint.config)
     except ValueError as error:
         raise _damaged(folder / CHECKPOINT, error) from None
 
 
-def _named_as_now(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The trainer's state among the arrays of a file."""
-    names = {name: name.removeprefix("trainer.") for name in arrays}
-    return {EARLIER_NAMES.get(names[name], names[name]): array for name, array in arrays.items()}
+def check_same_data(folder: Path, where: Path, before: Fingerprint, now: Fingerprint) -> None:
+    """Raise UserError where the data of the checkpoint in ``folder`` is not what it is ``now``.
+
+    where: the dataset's folder; before: of the checkpoint.
+    """
+    if differences := before.differences(now):
+        raise UserError(
+            f"{folder / CHECKPOINT}: belongs to other data than {where}: {listed(differences)}; "
+            f"give the folder with the data of this fit (--data), or {_remedy(folder / CHECKPOINT)}"
+        )
+
+
+def remove_checkpoint(folder: Path) -> None:
+    """Remove the checkpoint of a finished fit.
+
+    Raises :class:`UserError` where the file system refuses.
+    """
+    path = folder / CHECKPOINT
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be removed: {why_refused(error)}") from None
 
 
 def _damaged(path: Path, error: Exception) -> UserError:
@@ -138,51 +155,79 @@ def _remedy(path: Path) -> str:
     return f"remove {path} to start again from iteration 0"
 
 
-def check_same_data(
-    folder: Path, where: Path, before: Fingerprint | None, now: Fingerprint
-) -> None:
-    """Raise UserError where the data of the checkpoint in ``folder`` is not what it is ``now``.
-
-    where: the dataset's folder. before: of the checkpoint; None: it has none, which is noted.
-    """
-    if before is None:
-        note = f"{folder / CHECKPOINT}: of a version that kept no record of the data: not compared"
-        warnings.warn(UserNote(note), stacklevel=2)
-    elif differences := before.differences(now):
-        raise UserError(
-            f"{folder / CHECKPOINT}: belongs to other data than {where}: {listed(differences)}; "
-            f"give the folder with the data of this fit (--data), or remove {folder / CHECKPOINT} "
-            "to start again from iteration 0"
-        )
-
-
-def remove_checkpoint(folder: Path) -> None:
-    """A finished fit needs none.
-
-    Raises :class:`UserError` where the file system refuses.
-    """
-    path = folder / CHECKPOINT
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be removed: {why_refused(error)}") from None
-
-
-def _says_the_same(config: FitConfig, earlier: FitConfig) -> bool:
-    """What one of them leaves to the dataset, the other has from there."""
-    return decided_as(config, earlier) == decided_as(earlier, config)
-
-
 def _as_text(config: FitConfig) -> str:
-    """Every value but where the output goes and how often it is written."""
+    """Return every value but where the output goes and how often it is written."""
     return json.dumps(config.model_dump(mode="json", exclude={"output"}), sort_keys=True)
 
 
 def _at_the_places_of(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
-    """The configuration of a checkpoint, with the places and the section ``output`` of another."""
-    output = config.output.model_dump()
+    """Return a checkpoint's configuration, with places and the section ``output`` of another."""
     places = {}
     for key in PLACES:
         section, name = key.split(".")
         places[key] = getattr(getattr(config, section), name)
+    output = config.output.model_dump()
     return changed(FitConfig.model_validate({**values, "output": output}), places)
+
+
+# ----------------------------------------------------------------------------------------------
+# Arrays of a file that may be damaged
+# ----------------------------------------------------------------------------------------------
+
+
+def _check_state(
+    state: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray], config: FitConfig
+) -> None:
+    """Raise ValueError unless arrays are those of a trainer's start, but for their values.
+
+    The number of Gaussians may be another.
+    """
+    if missing := [name for name in start if name not in state]:
+        raise ValueError(f"{listed(missing)} missing")
+    num, most = len(np.atleast_1d(state[MEANS])), config.densify.max_gaussians
+    if not 1 <= num <= most:
+        raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")
+    expected = {name: (_shape(name, start, num), array.dtype) for name, array in start.items()}
+    expected[FILTER] = (num,), np.dtype(np.float32)
+    values = [name for name in start if name.endswith(".value")]
+    expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
+    for name in filter(expected.__contains__, state):
+        _check_shape(name, state[name], *expected[name])
+        _check_finite(name, state[name])
+    iteration = int(state["iteration"])
+    if not 0 <= iteration <= config.iterations:
+        raise ValueError(
+            f"iteration must be between 0 and {config.iterations:,}, got {iteration:,}"
+        )
+
+
+def _shape(name: str, start: Mapping[str, np.ndarray], num: int) -> tuple[int, ...]:
+    """Return a shape with ``num`` Gaussians; moments are flat, with several numbers for each."""
+    shape = start[name].shape
+    of_effect = "/" in name and not name.startswith(DENSITY)
+    if not shape or of_effect or name.endswith(".t"):
+        return shape
+    return (shape[0] // len(start[MEANS]) * num, *shape[1:])
+
+
+def _check_tables(checkpoint: Checkpoint) -> None:
+    """Raise ValueError unless these can be the tables of a fit, and the seconds it took."""
+    history, density, wall_s = checkpoint.history, checkpoint.density, checkpoint.wall_s
+    columns = len(HistoryRow.__dataclass_fields__)
+    _check_shape("history", history, (len(history), columns), np.dtype(np.float64))
+    _check_finite("history", history[:, :-1])  # the last, PSNR of test views, may be NaN
+    _check_shape("density", density, (len(density), len(DENSITY_COLUMNS)), np.dtype(np.int64))
+    if (density < 0).any() or not 0 <= wall_s < math.inf:
+        raise ValueError("density and wall_s must hold counts and seconds, got others")
+
+
+def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    if array.shape != shape or array.dtype != dtype:
+        raise ValueError(
+            f"{name} must be of shape {shape} and type {dtype}, got {array.shape} of {array.dtype}"
+        )
+
+
+def _check_finite(name: str, array: np.ndarray) -> None:
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must hold finite numbers")

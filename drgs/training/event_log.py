@@ -1,9 +1,7 @@
 """The history of a fit as TensorBoard reads it, written as the fit goes.
 
-Imported with ``--tensorboard``; tensorboardX, of the extra of that name, writes the format: records
-with checksums, each an event of TensorFlow's ``event.proto``. Its ``SummaryWriter`` names files
-after the time and the host, and writes them from a thread; the file of a fit has one name, which
-the folder's record knows, and is complete after each row.
+Imported with ``--tensorboard``. tensorboardX's ``SummaryWriter`` names files after the time and the
+host, and writes them from a thread; the file of a fit has one name, and is complete after each row.
 """
 
 from __future__ import annotations
@@ -16,12 +14,12 @@ from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
 
-from drgs.training.history import History, HistoryRow
-from drgs.training.loop import Iteration
+from drgs.results.history import HistoryRow
+from drgs.training.loop import History, Iteration
 from drgs.training.trainer import Trainer
 
 VERSION = "brain.Event:2"
-"""Of the format; the first record says it."""
+"""Version of the format, in the first record."""
 
 TAGS = {
     "loss": "loss",
@@ -30,7 +28,7 @@ TAGS = {
     "num_gaussians": "Gaussians",
     "means_lr": "learning_rate/means",
 }
-"""By column of ``history.csv``: the name of its curve."""
+"""Names of curves by column of ``history.csv``."""
 
 
 class EventLog:
@@ -56,11 +54,11 @@ class EventLog:
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Write the last row, if the iteration has one; what the disk takes is no time of a fit."""
+        """Write the last row, if the iteration has one; the history's clock stands still."""
         del trainer, stops
         if done.row is not None:
             start = time.perf_counter()
-            self._write(history.rows[-1], history)
+            self._write(history.rows[-1], history)  # with what was measured since
             self._writer.flush()
             history.leave_out(time.perf_counter() - start)
 

@@ -1,7 +1,4 @@
-"""The output folder of a fit: what is read from it before the fit, and written to it after.
-
-``drgs.results.folder`` decides whose folder it is; ``drgs.results.files`` names the files.
-"""
+"""The output folder of a fit: a checkpoint is read before the fit, results are written after it."""
 
 from __future__ import annotations
 
@@ -51,16 +48,12 @@ from drgs.results.folder import (
     write_run_config,
 )
 from drgs.results.history import write_density, write_history
-from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
+from drgs.results.metrics import FitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
 from drgs.results.report import Fitted, write_pictures, write_results
 from drgs.results.viewer import Shown, shows_as_fitted
-from drgs.training.checkpoint import (
-    Checkpoint,
-    load_checkpoint,
-    remove_checkpoint,
-)
-from drgs.training.history import History
+from drgs.training.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
+from drgs.training.loop import History
 from drgs.training.trainer import Trainer
 
 if TYPE_CHECKING:  # imported where it is needed
@@ -130,7 +123,6 @@ class FitFolder:
     def write_results(
         self,
         trainer: Trainer,
-        dataset: Dataset,
         history: History,
         gaussians: Gaussians,
         for_viewers: ForViewers | None,
@@ -141,7 +133,7 @@ class FitFolder:
         gaussians: what ``trainer.gaussians()`` returned; for_viewers: None where other viewers
         render as the fit does; wall_s: spent on iterations.
         """
-        out, config, render = self.path, trainer.config, trainer.images
+        out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
         saved_gaussians(gaussians, config).save(out / GAUSSIANS)
         for effect in trainer.effects:
             effect.write(out, dataset)
@@ -151,8 +143,16 @@ class FitFolder:
         write_run_config(out, config)
         output, split = config.output, dataset.test_split
         scores = write_pictures(out, dataset, render, output.save_renders, output.report)
-        test = {**vars(mean_of(scores)), "split": split}
-        metrics = fit_metrics(config, gaussians.num_gaussians, wall_s, test, self.command)
+        metrics: FitMetrics = {
+            "iterations": config.iterations,
+            "num_gaussians": gaussians.num_gaussians,
+            "wall_s": round(wall_s, 2),
+            "test": {**vars(mean_of(scores)), "split": split},
+            "seed": config.seed,
+            **_circumstances(),
+            "command": self.command,
+            "config": config.model_dump(mode="json"),
+        }
         other, approximations = None, config.model.approximations
         if for_viewers is not None:
             other = for_viewers.gaussians
@@ -206,9 +206,9 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
 def gaussians_on_page(
     gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
 ) -> Shown:
-    """Return what ``viewer.html`` shows: the fit's own, if it renders their approximations.
+    """Return the Gaussians of ``viewer.html``: the fit's own, if it renders their approximations.
 
-    for_viewers: what it shows otherwise; None: there are none.
+    for_viewers: shown otherwise; None: there are none.
     """
     if for_viewers is not None and not shows_as_fitted(approximations):
         return Shown(for_viewers, Approximations())
@@ -218,21 +218,14 @@ def gaussians_on_page(
 def _without_filter(gaussians: Gaussians) -> Gaussians:
     if gaussians.smoothing is None:
         return gaussians
-    from drgs.effects.smoothing import baked
+    from drgs.effects.smoothing import baked  # imported where there is a filter
 
     return baked(gaussians)
 
 
-def fit_metrics(
-    config: FitConfig, num_gaussians: int, wall_s: float, test: SplitMetrics, command: str
-) -> FitMetrics:
-    """Return the contents of ``metrics.json``."""
+def _circumstances() -> dict[str, object]:
+    """Return the entries of ``metrics.json`` about the machine, the time and the software."""
     return {
-        "iterations": config.iterations,
-        "num_gaussians": num_gaussians,
-        "wall_s": round(wall_s, 2),
-        "test": test,
-        "seed": config.seed,
         "versions": {
             "drgs": drgs.__version__,
             "mitsuba": mi.__version__,
@@ -245,6 +238,4 @@ def fit_metrics(
         "threads": dr.thread_count(),
         "processor": processor(),
         "date": datetime.now().astimezone().isoformat(timespec="minutes"),
-        "command": command,
-        "config": config.model_dump(mode="json"),
     }

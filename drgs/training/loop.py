@@ -1,14 +1,104 @@
-"""The iterations of a fit: what the command and the library run alike."""
+"""The iterations of a fit, and what it writes down as it goes: the same for command and library."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import accumulate
 from typing import Protocol
 
-from drgs.training.history import History, HistoryRow
+import numpy as np
+
+from drgs.datasets.types import View
+from drgs.results.history import (
+    DENSITY_COLUMNS,
+    DensityReport,
+    DensityRow,
+    FitHistory,
+    HistoryRow,
+)
+from drgs.results.metrics import psnr
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
+
+SMOOTHING = 0.9
+"""Weight of the past in the PSNR of training views, each of which is another photograph."""
+
+MAX_MEASURED_VIEWS = 8
+"""Test views that are measured on the way, spread over all of them."""
+
+NUM_MEASUREMENTS, MIN_ITERATIONS_BETWEEN = 10, 100
+"""About how often a fit is measured, and the fewest iterations between two measurements."""
+
+
+class History(FitHistory):
+    """The tables of a fit that runs, and the time spent, also before an interruption."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._before = 0.0
+        self._started = time.perf_counter()
+
+    @staticmethod
+    def from_arrays(rows: np.ndarray, density: np.ndarray, wall_s: float) -> History:
+        """Return the inverse of :meth:`arrays`; the clock goes on from ``wall_s``."""
+        history = History()
+        for i, loss, view_psnr, n, lr, at, test_psnr in rows:
+            measured = None if math.isnan(test_psnr) else float(test_psnr)
+            history.rows.append(HistoryRow(int(i), loss, view_psnr, int(n), lr, at, measured))
+        for row in density.tolist():
+            history.density.append(DensityRow(**dict(zip(DENSITY_COLUMNS, row, strict=True))))
+        history._before = wall_s
+        return history
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows of both tables: float64, NaN where nothing was measured; and int64."""
+        columns = len(HistoryRow.__dataclass_fields__)
+        rows = np.array([tuple(vars(r).values()) for r in self.rows], float).reshape(-1, columns)
+        density = [[getattr(row, name) for name in DENSITY_COLUMNS] for row in self.density]
+        return rows, np.array(density, np.int64).reshape(-1, len(DENSITY_COLUMNS))
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds spent so far."""
+        return self._before + time.perf_counter() - self._started
+
+    def add(self, report: StepReport) -> HistoryRow:
+        """Read the numbers of one iteration; waits for the device."""
+        row = HistoryRow(
+            iteration=report.iteration,
+            loss=report.loss,
+            psnr=report.psnr,
+            num_gaussians=report.num_gaussians,
+            means_lr=report.means_lr,
+            wall_s=self.wall_s,
+        )
+        self.rows.append(row)
+        return row
+
+    def add_density(self, iteration: int, report: DensityReport) -> None:
+        """Write down a change of the population; waits for nothing."""
+        self.density.append(DensityRow(**asdict(report), iteration=iteration))
+
+    def add_test_psnr(self, psnr: float) -> None:
+        """Note what the last row's Gaussians reach on test views, in dB."""
+        self.rows[-1] = replace(self.rows[-1], test_psnr=psnr)
+
+    def leave_out(self, seconds: float) -> None:
+        """Subtract time since the last row that was no part of the fit."""
+        self._started += seconds
+
+
+def smoother(past: float | None, value: float) -> float:
+    """Return the next value of a smooth line, given the one before it (None: there is none)."""
+    return value if past is None else SMOOTHING * past + (1 - SMOOTHING) * value
+
+
+def smoothed(values: Iterable[float]) -> np.ndarray:
+    """Return the exponential mean of the past, (n,) float64."""
+    return np.fromiter(accumulate(values, smoother), np.float64)
 
 
 class StopCriterion(Protocol):
@@ -18,18 +108,18 @@ class StopCriterion(Protocol):
         """Return whether to run another iteration; may revise the trainer's configuration."""
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """The number of iterations of the whole fit, as expected now."""
+        """Return the number of iterations of the whole fit, as expected now."""
 
 
 class AllIterations:
     """Ends a fit after the number of iterations of its configuration."""
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """See :class:`StopCriterion`."""
+        """Return whether iterations are left."""
         return trainer.iteration < trainer.config.iterations
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """See :class:`StopCriterion`."""
+        """Return the number of iterations of the configuration."""
         return trainer.config.iterations
 
 
@@ -41,7 +131,7 @@ class RootDecides:
     comm: Communicator
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """See :class:`StopCriterion`."""
+        """Return the decision of rank 0."""
         before, continues = trainer.config, True
         if self.comm.is_root:
             continues = self.criterion.should_continue(trainer)
@@ -53,7 +143,7 @@ class RootDecides:
         return bool(continues)
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """See :class:`StopCriterion`."""
+        """Return what this rank's criterion expects."""
         return self.criterion.num_iterations(trainer)
 
 
@@ -96,3 +186,45 @@ def iterations(trainer: Trainer, history: History, criterion: StopCriterion) -> 
             row = history.add(report)
             trainer.check_iterations()  # reading the row has waited for the device
         yield Iteration(report, row, is_last=not continues)
+
+
+class HeldOutQuality:
+    """Measures the PSNR of a few test views on the way, for the curve of the report."""
+
+    def __init__(self, views: Sequence[View]) -> None:
+        """views: those of the test split; none on other ranks than 0."""
+        self._views = measured_views(views)
+
+    def after(
+        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
+    ) -> None:
+        """Measure where that is due, if there is to be a report."""
+        del stops
+        config = trainer.config
+        is_row = done.row is not None and config.output.report
+        if is_row and measurement_is_due(history.rows, config.iterations):
+            self.measure(trainer, history)
+
+    def measure(self, trainer: Trainer, history: History) -> None:
+        """Add the mean PSNR to the last row of the history; its clock stands still meanwhile."""
+        start = time.perf_counter()
+        trainer.sync_scene()
+        pairs = zip(trainer.images(self._views), self._views, strict=True)
+        scores = [psnr(image, view.image, view.mask) for image, view in pairs]
+        history.add_test_psnr(float(trainer.comm.of_root(np.mean(scores) if scores else np.nan)))
+        history.leave_out(time.perf_counter() - start)
+
+
+def measured_views(views: Sequence[View]) -> tuple[View, ...]:
+    """Return at most :data:`MAX_MEASURED_VIEWS` of the views, evenly spread."""
+    count = min(MAX_MEASURED_VIEWS, len(views))
+    chosen = np.linspace(0, len(views) - 1, count).round().astype(int)
+    return tuple(views[index] for index in chosen)
+
+
+def measurement_is_due(rows: Sequence[HistoryRow], iterations: int) -> bool:
+    """Return whether the last of ``rows`` is to be measured; iterations: of the whole fit."""
+    last = rows[-1].iteration
+    before = max((row.iteration for row in rows if row.test_psnr is not None), default=0)
+    every = max(MIN_ITERATIONS_BETWEEN, iterations // NUM_MEASUREMENTS)
+    return last >= iterations or last - before >= every

@@ -4,15 +4,14 @@ Between the rendered image and the optimizer: image (H, W, 3) + :class:`Target` 
 Dr.Jit differentiates in reverse and forward mode.
 
 SSIM (Wang et al. 2004, "Image quality assessment: from error visibility to structural
-similarity") is a function of five blurred maps, two of which belong to the target and are
-computed once per view. A blur with a symmetric window and zero padding is its own adjoint, so
-the gradient is three more blurs: no scatter-add anywhere, and the result is bit-reproducible.
+similarity") is a function of five blurred maps, two of which belong to the target. A blur with a
+symmetric window and zero padding is its own adjoint, so the gradient is three more blurs: nothing
+is scattered, and the result is bit-reproducible.
 
-Memory layout: a separable blur wants contiguous inputs in both directions. Each channel is cut
-into 8 x 8 tiles. One lane computes the 8 outputs of one tile row (or column) from the 18 inputs
-that they share, which it loads as three packets of 8. It stores the outputs in the order in which
-the next pass reads them: as one packet, or one by one where rows become columns. Maps are blurred
-one after the other, as the inputs of one alone fit into a core's registers.
+Each channel is cut into 8 x 8 tiles. One lane computes the 8 outputs of one tile row (or column)
+from the 18 inputs that they share, which it loads as three packets of 8. It stores the outputs in
+the order in which the next pass reads them. Maps are blurred one after the other, as the inputs of
+one alone fit into a core's registers.
 """
 
 from __future__ import annotations
@@ -29,11 +28,8 @@ from drgs.config.extensions import LOSS_TERMS, LOSSES, extensions_in_use, sectio
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import is_float64, types_of
 
-C1 = 0.01**2
-"""(K1 L)^2 with K1 = 0.01, dynamic range L = 1 (Wang et al. 2004): stabilises luminance."""
-
-C2 = 0.03**2
-"""(K2 L)^2 with K2 = 0.03 (same source): stabilises contrast and structure."""
+C1, C2 = 0.01**2, 0.03**2
+"""(K L)^2 with K1 = 0.01, K2 = 0.03, dynamic range L = 1 (Wang et al. 2004, section IV)."""
 
 TARGET_BYTES = 36
 """Of a pixel: three numbers for each of three channels in single precision, see :class:`Target`."""
@@ -44,11 +40,7 @@ _CHANNELS = 3
 
 @dataclass(frozen=True)
 class Target:
-    """A photograph y and the two blurs of SSIM that depend on it alone, in tiles.
-
-    Detached flat arrays, ordered as :class:`_Tiling` says: 12 bytes per pixel and channel in
-    single precision, kept on the device.
-    """
+    """A photograph y and the two blurs of SSIM that depend on it alone; detached, in tiles."""
 
     height: int
     width: int
@@ -65,7 +57,7 @@ class Target:
 
 
 def prepare_target(image: Any, window: int = 11, sigma: float = 1.5) -> Target:
-    """Return the :class:`Target` of a photograph, to be kept as long as the view is used.
+    """Return the :class:`Target` of a photograph.
 
     image: (H, W, 3) tensor, display space. window: width of SSIM's Gaussian window, px, odd.
     sigma: its standard deviation, px. The defaults are those of Wang et al. 2004, section III.B,
@@ -162,15 +154,11 @@ class PhotometricLoss(Loss):
             )
 
     def __call__(self, image: Any, target: Target) -> Any:
-        """Return the loss, a ``Float`` of one value; image: (H, W, 3) tensor, display space."""
+        """Return the loss: see :class:`Loss`."""
         return self.with_squared_error(image, target)[0]
 
     def with_squared_error(self, image: Any, target: Target) -> tuple[Any, Any]:
-        """The loss, and the mean over pixels and channels of (x - y)^2, a ``Float`` of one value.
-
-        image: (H, W, 3) tensor, display space. Not differentiated: the squared error, which costs
-        next to nothing beside the loss.
-        """
+        """Return the loss, and the mean of (x - y)^2: see :meth:`Loss.with_squared_error`."""
         height, width = _film_size("PhotometricLoss()", image)
         if (height, width) != (target.height, target.width):
             raise ValueError(
@@ -178,9 +166,8 @@ class PhotometricLoss(Loss):
                 f"{target.width} x {target.height}: render at the photograph's size"
             )
         if self.dssim_weight == 0:
-            photograph = target.image
-            error = dr.mean(dr.square(dr.detach(image).array - photograph.array))
-            return l1_loss(image, photograph), error
+            error = dr.mean(dr.square(dr.detach(image).array - target.image.array))
+            return l1_loss(image, target.image), error
         operands = {"image": image, "target": target, "weight": self.dssim_weight}
         loss, error = dr.custom(_PhotometricOp, **operands)
         return loss, dr.detach(error)
@@ -208,7 +195,7 @@ def l1_loss(image: Any, target: Any) -> Any:
 
 
 class _PhotometricOp(dr.CustomOp):
-    """Two blur passes evaluate the loss and SSIM's partials, two more the gradient."""
+    """Evaluates the loss and SSIM's partials by two blur passes, the gradient by two more."""
 
     def eval(self, image: Any, target: Target, weight: float) -> tuple[Any, Any]:
         self.target, self.weight, self.shape = target, weight, image.shape
@@ -317,7 +304,7 @@ def _assemble_gradient(
 
 
 def _variance(mean: Any, mean_square: Any) -> Any:
-    """E[x^2] - E[x]^2, which only rounding can make negative (it would, for x >> 1)."""
+    """Return E[x^2] - E[x]^2, which only rounding can make negative (it would, for x >> 1)."""
     variance = mean_square - mean * mean
     return dr.select(variance < 0, 0, variance)
 
@@ -328,11 +315,10 @@ def _sign(x: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Tiling:
-    """How an (H, W, 3) image lies in memory as 8 x 8 tiles of one channel.
+    """The layout of an (H, W, 3) image in memory: 8 x 8 tiles of one channel.
 
     Tiles are ordered (channel, tile row, tile column). Within a tile, pixels are in *row order*
-    (the 8 pixels of a row contiguous) or in *column order*. The last tiles are filled with
-    zeros.
+    (the 8 pixels of a row contiguous) or in *column order*. The last tiles are filled with zeros.
     """
 
     height: int
@@ -370,15 +356,11 @@ class _Tiling:
         first = (row * self.width + column) * _CHANNELS
         tiles = dr.empty(type(flat), self.num_lines * _TILE)
         for channel in range(_CHANNELS):
-            values = [
-                dr.gather(
-                    type(flat),
-                    flat,
-                    first + (_CHANNELS * k + channel),
-                    (row < self.height) & (column + k < self.width),
-                )
-                for k in range(_TILE)
-            ]
+            values = []
+            for k in range(_TILE):
+                inside = (row < self.height) & (column + k < self.width)
+                source = first + (_CHANNELS * k + channel)
+                values.append(dr.gather(type(flat), flat, source, inside))
             _store_packets(tiles, values, lane + channel * lines)
         return tiles
 
@@ -421,7 +403,7 @@ class _Lines:
         return dr.arange(self.tiling.index_type, self.tiling.num_lines)
 
     def inside(self, k: int) -> Any:
-        """Whether the line's k-th pixel belongs to the image."""
+        """Return whether the line's k-th pixel belongs to the image."""
         line, (_, *tile) = self.lane % _TILE, self.tiling.split(self.lane // _TILE)
         along = tile[self.axis] * _TILE + k
         across = tile[1 - self.axis] * _TILE + line
@@ -429,11 +411,11 @@ class _Lines:
         return (along < size[self.axis]) & (across < size[1 - self.axis])
 
     def read_own(self, values: Any) -> Any:
-        """The line's own 8 values; ``values`` contiguous along lines."""
+        """Return the line's own 8 values; ``values`` contiguous along lines."""
         return self._read_packet(values, self.lane, True)
 
     def read(self, values: Any) -> dict[int, Any]:
-        """What the line's 8 outputs depend on, over ``tiling.support``; 0 beyond the tiles.
+        """Return the inputs of the line's 8 outputs, over ``tiling.support``; 0 beyond the tiles.
 
         values: contiguous along lines.
         """
@@ -441,13 +423,13 @@ class _Lines:
         return {k: packets[1 + k // _TILE][k % _TILE] for k in self.tiling.support}
 
     def store(self, values: list[Any]) -> Any:
-        """Each line's 8 values, contiguous along lines."""
+        """Store each line's 8 values, contiguous along lines."""
         flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
         _store_packets(flat, values, self.lane)
         return flat
 
     def store_across(self, values: list[Any]) -> Any:
-        """The same, contiguous across lines: rows in column order, columns in row order."""
+        """Store them contiguous across lines: rows in column order, columns in row order."""
         flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
         line = self.lane % _TILE
         first = (self.lane - line) * _TILE + line
@@ -460,7 +442,7 @@ class _Lines:
         return dr.gather(_packet_type(type(values)), values, line, valid, shape=shape)
 
     def _neighbour(self, step: int) -> tuple[Any, Any]:
-        """The same line in the tile ``step`` further along it, and whether there is one."""
+        """Return the same line in the tile ``step`` further along it, and whether there is one."""
         coordinate = self.tiling.split(self.lane // _TILE)[1 + self.axis]
         if step < 0:
             return self.lane - self.stride * _TILE, coordinate > 0
@@ -470,9 +452,9 @@ class _Lines:
 
 
 def _store_packets(flat: Any, values: list[Any], index: Any) -> None:
-    """8 values a lane as packet ``index`` of an array, which no other lane fills.
+    """Store 8 values a lane as packet ``index`` of an array, which no other lane fills.
 
-    Saying so lets several stores into one array share a kernel.
+    ``NoConflicts`` lets several stores into one array share a kernel.
     """
     dr.scatter(flat, _packet_type(type(flat))(values), index, mode=dr.ReduceMode.NoConflicts)
 
@@ -482,7 +464,7 @@ def _product(x: dict[int, Any], y: dict[int, Any]) -> dict[int, Any]:
 
 
 def _blur(values: dict[int, Any], weights: tuple[float, ...]) -> list[Any]:
-    """A blurred map at the line's 8 pixels, from its values at all pixels that they depend on."""
+    """Return a blurred map at the line's 8 pixels, from its values over ``tiling.support``."""
     radius = len(weights) // 2
     blurred = []
     for k in range(_TILE):
@@ -511,7 +493,7 @@ def _gaussian_window(window: int, sigma: float) -> tuple[float, ...]:
 
 
 def _packet_type(float_type: type) -> type:
-    """The array of any number of ``float_type`` components."""
+    """Return the array type of any number of ``float_type`` components."""
     name = "ArrayXf64" if is_float64(float_type) else "ArrayXf"
     return getattr(sys.modules[float_type.__module__], name)
 

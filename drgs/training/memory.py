@@ -1,14 +1,9 @@
 """What memory a fit will take at its peak, estimated before it starts, and what is refused.
 
-The peak is that of an iteration with as many Gaussians as the configuration allows: photographs as
-they are kept, targets that stay on the device, the Gaussians with all that the optimizer has of
-them, what binning and the adjoint store of splats, planes of pixels. How many entries and slots
-(see ``drgs.splatting``) splats have is counted at the start, where they are largest, for some of
-the views and some of the Gaussians; those of fitted Gaussians were counted once.
-
-The numbers of bytes below were fitted to peaks of resident memory that were measured for 10,000 to
-300,000 Gaussians and pictures of 100 x 100 to 1000 x 1000 px. Approximations other than the default
-ones may take more.
+The peak is that of an iteration with as many Gaussians as the configuration allows. Entries and
+slots of splats (see ``drgs.splatting``) are counted at the start, where splats are largest, for
+some of the views and Gaussians. The numbers of bytes below were fitted to measured peaks of
+resident memory, for 10,000 to 300,000 Gaussians and images of 100 x 100 to 1000 x 1000 px.
 """
 
 from __future__ import annotations
@@ -30,30 +25,18 @@ from drgs.splatting.reduction import BAND_SLOTS
 from drgs.training.density.registry import density_strategy
 
 PROCESS_BYTES = 290_000_000
-"""Interpreter, libraries and compiled kernels; and results, as far as they come on top. Compiling
-takes 130 MB for a while where the kernels are not cached: half of that is among them."""
+"""Of interpreter, libraries, compiled kernels, and results."""
 
-NUMBER_BYTES = 28
-"""Of each number of a Gaussian: itself, its gradient, two moments, and one successor at a time."""
+NUMBER_BYTES, GAUSSIAN_BYTES, GROWTH_BYTES = 28, 100, 500
+"""Of each number of a Gaussian: itself, its gradient, two moments, and one successor at a time. Of
+each Gaussian besides: its splat, and derivatives. And more where the population changes: rows are
+copied, and arrays of sizes that will not come again are held a while."""
 
-GAUSSIAN_BYTES = 100
-"""Of each Gaussian besides: as it is seen, and the derivatives of that."""
+ENTRY_BYTES, SLOT_BYTES = 150, 36
+"""Of each (splat, tile) entry; of each composited (entry, micro-tile) pair of a band."""
 
-GROWTH_BYTES = 500
-"""More of each where the population changes: rows are copied, and arrays of sizes that will not
-come again are held a while."""
-
-ENTRY_BYTES = 150
-"""Of each (splat, tile) entry: its record, its sums, and what sorting takes."""
-
-SLOT_BYTES = 36
-"""Of each composited (entry, micro-tile) pair of a band: moments and derivatives of colours."""
-
-PIXEL_BYTES = 155
-"""Of each pixel: planes, the picture, its gradient, and what the loss stores."""
-
-MEASURED_BYTES = 130
-"""Of each pixel of a test view, when it is measured: numbers in double precision."""
+PIXEL_BYTES, MEASURED_BYTES = 155, 130
+"""Of each pixel that is rendered; of each pixel of a test view that is measured."""
 
 FITTED_REACH = 0.55
 """Of fitted Gaussians, in units of the root of (pixels per Gaussian): N Gaussians in P pixels have
@@ -66,14 +49,14 @@ FITTED_SLOTS = 2.7
 COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000
 """Enough to know entries and slots to a few per cent."""
 
-LARGEST = 1e6
-"""px: a radius beyond this covers any film."""
+MAX_RADIUS_PX = 1e6
+"""A larger radius covers any film."""
 
-USABLE = 0.9
+USABLE_SHARE = 0.9
 """Of the memory that is available: estimates are about so exact."""
 
-MIN_WIDTH = 16
-"""px: no smaller pictures are advised."""
+MIN_WIDTH_PX = 16
+"""No smaller images are advised."""
 
 
 @dataclass(frozen=True)
@@ -89,17 +72,13 @@ class FitMemory:
 
     @property
     def needed(self) -> int:
-        """Without targets, which can be made anew."""
+        """The sum without targets, which can be made anew."""
         return self.process + self.photographs + self.gaussians + self.splats + self.pixels
-
-    def room_for_targets(self, usable: int, most: int) -> int:
-        """What targets may take of ``usable`` bytes; some are left, as an estimate may be wrong."""
-        return max(0, min(most, self.targets, usable - round(1.15 * self.needed)))
 
 
 @dataclass(frozen=True)
 class Share:
-    """What one of several processes has of a fit and of its machine."""
+    """The part that one of several processes has of a fit and of its machine."""
 
     processes: int = 1  # that share the Gaussians; each renders pictures of all of them
     on_machine: int = 1  # of these, that share the machine's memory
@@ -116,17 +95,20 @@ def estimate(
     scale: float = 1.0,
     share: Share = ALONE,
 ) -> FitMemory:
-    """The peak, of one process, of a fit that starts with ``gaussians``.
+    """Estimate the peak, in one process, of a fit that starts with ``gaussians``.
 
-    view_bytes: of a pixel, what is made of a view's pictures; scale: of all pictures' width and
-    height, for another ``data.image_size``.
+    view_bytes: of a pixel, what is made of a view's images; scale: of all images' width and height,
+    for another ``data.image_size``.
     """
     train, views = dataset.train, {*dataset.train, *dataset.test}
     start = gaussians.num_gaussians
-    count = most_gaussians(config, start)
+    count = max_num_gaussians(config, start)
     pixels = scale**2 * max(view.width * view.height for view in train)
     measured = scale**2 * max((view.width * view.height for view in dataset.test), default=0)
-    times = max(_times(view) for view in train)
+    times = max(
+        view.motion.samples if view.motion is not None and view.motion.shutter == "global" else 1
+        for view in train
+    )
 
     fitted = count * (1 + FITTED_REACH * math.sqrt(pixels / count)) ** 2
     entries, slots = _at_start(train, gaussians, config.model.near_plane, scale)
@@ -143,29 +125,23 @@ def estimate(
     )
 
 
-def most_gaussians(config: FitConfig, start: int) -> int:
-    """How many a fit can have that starts with ``start``: see its strategy of density."""
-    return density_strategy(config).most_gaussians(start, config.iterations)
+def max_num_gaussians(config: FitConfig, start: int) -> int:
+    """Return the most Gaussians of a fit that starts with ``start``."""
+    return density_strategy(config).max_num_gaussians(start, config.iterations)
 
 
 def _kept_bytes(view: View, scale: float) -> float:
-    """Of a view's pictures: bytes, or the numbers of smaller ones where these take less."""
+    """Return the bytes of a view's images, or of the numbers of smaller ones if these take less."""
     pictures = [p for p in (view.image, view.alpha, view.mask, view.depth) if p is not None]
     numbers = 4 * scale**2 * sum(math.prod(picture.shape) for picture in pictures)
     return min(sum(picture.nbytes for picture in pictures), numbers)
 
 
-def _times(view: View) -> int:
-    """Pictures that are rendered of a view: of a blurred one, several."""
-    is_blurred = view.motion is not None and view.motion.shutter == "global"
-    return view.motion.samples if is_blurred else 1
-
-
-@np.errstate(over="ignore")  # of scales beyond all pictures, which LARGEST ends
+@np.errstate(over="ignore")  # of scales beyond all images
 def _at_start(
     views: Sequence[Viewpoint], gaussians: Gaussians, near: float, scale: float
 ) -> tuple[float, float]:
-    """Entries and slots of the view that has most, of some: splats taken as round."""
+    """Count entries and slots of the view that has most, of some: splats taken as round."""
     g = gaussians.numpy()
     step = -(-g.num_gaussians // COUNTED_GAUSSIANS)
     means, scales = g.means[::step].astype(np.float64), np.exp(g.log_scales[::step].mean(axis=1))
@@ -177,7 +153,7 @@ def _at_start(
         seen = z > near
         z = np.where(seen, z, 1)
         focal, size = scale * math.sqrt(view.fx * view.fy), np.array([view.width, view.height])
-        radius = np.minimum(reach * np.sqrt((focal * scales / z) ** 2 + LOW_PASS), LARGEST)
+        radius = np.minimum(reach * np.sqrt((focal * scales / z) ** 2 + LOW_PASS), MAX_RADIUS_PX)
         tiles, boxes = seen.astype(np.float64), np.ones(len(z))
         centers = scale * (view.fx * x / z + view.cx), scale * (view.fy * y / z + view.cy)
         for center, length in zip(centers, scale * size, strict=True):
@@ -203,16 +179,17 @@ def room_for_targets(
     most: int,
     share: Share = ALONE,
 ) -> int:
-    """Bytes of targets that may stay on the device, at most ``most``.
+    """Return the bytes of targets that may stay on the device, at most ``most``.
 
     view_bytes: see :func:`estimate`. Raises :class:`UserError` where the fit would not fit into
     memory.
     """
     memory = estimate(config, dataset, gaussians, view_bytes, share=share)
-    usable = round(USABLE * (available_memory() / share.on_machine + resident_memory()))
+    usable = round(USABLE_SHARE * (available_memory() / share.on_machine + resident_memory()))
     if memory.needed > usable:
         raise UserError(_refusal(config, dataset, gaussians, memory, usable, share))
-    return memory.room_for_targets(usable, most)
+    # Some are left, as an estimate may be wrong.
+    return max(0, min(most, memory.targets, usable - round(1.15 * memory.needed)))
 
 
 def _refusal(
@@ -224,7 +201,7 @@ def _refusal(
     share: Share,
 ) -> str:
     train, start = dataset.train, gaussians.num_gaussians
-    count, width = most_gaussians(config, start), max(view.width for view in train)
+    count, width = max_num_gaussians(config, start), max(view.width for view in train)
 
     def fits(most: int, scale: float = 1.0) -> bool:
         densify = config.densify.model_copy(update={"max_gaussians": most})
@@ -232,7 +209,7 @@ def _refusal(
         return estimate(smaller, dataset, gaussians, 0, scale, share).needed <= 0.95 * usable
 
     most = next(filter(fits, _smaller(count, start)), None)
-    size = next((s for s in _smaller(width, MIN_WIDTH) if fits(count, s / width)), None)
+    size = next((s for s in _smaller(width, MIN_WIDTH_PX) if fits(count, s / width)), None)
     remedies = [f"densify.max_gaussians={most}"] if most else []
     remedies += [f"data.image_size={size}"] if size else []
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"

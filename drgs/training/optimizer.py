@@ -26,7 +26,7 @@ from drgs.core.arrays import types_of
 from drgs.core.private import new_rate_cache, same_memory
 
 LARGE = 1 << 20
-"""Numbers of an array, from which on memory is worth saving."""
+"""Entries of an array from which on memory is worth saving."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class _Moments:
     former: list[Any]  # of the same memory
 
     @staticmethod
-    def of(arrays: list[Any]) -> _Moments:
-        """Waits for the device."""
+    def from_arrays(arrays: list[Any]) -> _Moments:
+        """Wait for the device, and take other names for the memory of arrays."""
         former = [same_memory(array) for array in arrays]
         return _Moments(arrays, [array.index for array in arrays], former)
 
     def are(self, arrays: list[Any]) -> bool:
-        """Whether these are the moments still."""
+        """Return whether these are the moments still."""
         pairs = zip(self.arrays, self.indices, arrays, strict=True)
         return all(own is array and index == array.index for own, index, array in pairs)
 
@@ -67,18 +67,12 @@ class LeanAdam(Adam):
         super().__init__(*arguments, **settings)
         self._moments: dict[str, _Moments] = {}
 
-    def step(
-        self,
-        *,
-        eval: bool = True,
-        grad_scale: Any = None,
-        active: Any = None,
-    ) -> None:
-        """Take a step; for the arguments see ``drjit.opt.Adam.step``.
+    def step(self, *, eval: bool = True, grad_scale: Any = None, active: Any = None) -> None:
+        """Take a step, and clear the gradients of large arrays.
 
-        Clears the gradients of large arrays. Waits for nothing, but in the first step after large
-        moments were assigned. A step that is scaled, masked or not evaluated, and one with more
-        than two moments, is that of ``drjit.opt.Adam``.
+        Waits for nothing, but in the first step after large moments were assigned. A step that is
+        scaled, masked or not evaluated, and one with more than two moments, is that of
+        ``drjit.opt.Adam``, where the arguments are documented.
         """
         is_plain = eval and grad_scale is None and active is None
         if not is_plain or self.mask_updates or self.amsgrad:
@@ -88,14 +82,19 @@ class LeanAdam(Adam):
         dr.eval([self._replaced(key, rates) for key in self.state])
 
     def forget_moments(self) -> None:
-        """Let memory of moments go that are the parameters' no longer."""
+        """Free memory of moments that are the parameters' no longer."""
         self._moments.clear()
 
     def _replaced(self, key: str, rates: Any) -> list[Any]:
         """Give a parameter its new state, not evaluated, and return what is to be evaluated."""
         value, promoted, rate, (count, *moments, _) = self.state[key]
         is_large = dr.width(value) >= LARGE and dr.backend_v(value) == dr.JitBackend.LLVM
-        former = self._former(key, moments) if is_large else moments
+        former = moments
+        if is_large:
+            known = self._moments.get(key)
+            if known is None or not known.are(moments):
+                self._moments[key] = known = _Moments.from_arrays(moments)
+            former = known.former
         rate_in_use = self.lr if rate is None else rate
         flat, gradient = dr.detach(value).array, value.grad.array
         new, (count, *new_moments, _) = self._step(
@@ -112,12 +111,6 @@ class LeanAdam(Adam):
             dr.scatter(moment, new_moment, element)
         self.state[key] = new_value, promoted, rate, (count, *moments, None)
         return [new]  # and by the same kernel the moments, which it reads
-
-    def _former(self, key: str, moments: list[Any]) -> list[Any]:
-        known = self._moments.get(key)
-        if known is None or not known.are(moments):
-            self._moments[key] = known = _Moments.of(moments)
-        return known.former
 
 
 def make_optimizer(
@@ -150,15 +143,13 @@ def make_optimizer(
 
 def num_rows(optimizer: Adam, prefix: str = "") -> int:
     """Return the number of Gaussians N, the first dimension that all parameters share."""
-    lengths = {
-        name: optimizer.state[prefix + name][0].shape[0] for name in _names(optimizer, prefix)
-    }
-    if len(set(lengths.values())) != 1:
+    counts = {optimizer.state[prefix + name][0].shape[0] for name in _names(optimizer, prefix)}
+    if len(counts) != 1:
         raise ValueError(
             f'num_rows(): the optimizer\'s parameters with prefix "{prefix}" must share one '
-            f"number of rows, got {lengths or 'no parameters'}"
+            f"number of rows, got {sorted(counts) or 'no parameters'}"
         )
-    return next(iter(lengths.values()))
+    return counts.pop()
 
 
 def edit_rows(
@@ -177,7 +168,7 @@ def edit_rows(
     total = num_rows(optimizer, prefix)
     if dr.width(keep) > 0 and dr.max(keep)[0] >= total:
         raise ValueError(f"edit_rows(): keep must hold row numbers below {total}")
-    added = _check_rows(optimizer, append, prefix)
+    added = _num_appended(optimizer, append, prefix)
     if dr.width(keep) + added == 0:
         raise ValueError("edit_rows(): at least one row must remain, but none is kept or appended")
     optimizer.forget_moments()
@@ -237,7 +228,7 @@ def set_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None
 
 
 def optimizer_state(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
-    """Values, moments and step counts as numpy arrays: ``NAME.value``, ``.m``, ``.v``, ``.t``.
+    """Return values, moments and step counts, numpy: ``NAME.value``, ``.m``, ``.v``, ``.t``.
 
     Learning rates are not part of it: they follow from the configuration and the iteration.
     """
@@ -251,16 +242,17 @@ def optimizer_state(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def pending_gradients(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
-    """What has been accumulated for a step that is not taken yet, as numpy: ``NAME.gradient``."""
-    names = _names(optimizer, prefix)
-    values = {name: optimizer.state[prefix + name][0] for name in names}
-    return {f"{name}.gradient": np.array(dr.grad(value)) for name, value in values.items()}
+    """Return the gradients of a step that is not taken yet, numpy: ``NAME.gradient``."""
+    return {
+        f"{name}.gradient": np.array(dr.grad(optimizer.state[prefix + name][0]))
+        for name in _names(optimizer, prefix)
+    }
 
 
 def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: str = "") -> None:
-    """Continue from :func:`optimizer_state`, bit by bit; rates stay as they are.
+    """Continue from :func:`optimizer_state`, and :func:`pending_gradients` if there are any.
 
-    With those of :func:`pending_gradients`, if there are any.
+    Bit by bit; rates stay as they are.
     """
     for name in _names(optimizer, prefix):
         old, promoted, rate, (step, first, second, maximum) = optimizer.state[prefix + name]
@@ -275,7 +267,7 @@ def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: 
 
 
 def _with_value(caller: str, optimizer: Adam, key: str, value: Any) -> tuple[Any, ...]:
-    """The optimizer's entry of a parameter with other values, which are evaluated."""
+    """Return the optimizer's entry of a parameter with other values, which are evaluated."""
     old, *others = optimizer.state[key]
     if tuple(value.shape) != tuple(old.shape):
         raise ValueError(
@@ -293,29 +285,23 @@ def _names(optimizer: Adam, prefix: str) -> list[str]:
     return [key[len(prefix) :] for key in optimizer.state if key.startswith(prefix)]
 
 
-def _check_rows(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) -> int:
-    """The number of ``rows``, which must be given for every parameter in its shape."""
+def _num_appended(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) -> int:
+    """Return the number of ``rows``, which must be given for every parameter in its shape."""
     if rows is None:
         return 0
-    counts = set()
+    count = max((value.shape[0] for value in rows.values()), default=0)
     for name in _names(optimizer, prefix):
-        expected = tuple(optimizer.state[prefix + name][0].shape[1:])
-        got = tuple(rows[name].shape) if name in rows else None
-        if got is None or got[1:] != expected:
+        expected = (count, *optimizer.state[prefix + name][0].shape[1:])
+        got = tuple(rows[name].shape) if name in rows else "none"
+        if got != expected:
             raise ValueError(
-                f"edit_rows(): appended rows of {name} must have the shape "
-                f"({', '.join(map(str, ('M', *expected)))}), got {got or 'none'}"
+                f"edit_rows(): appended rows of {name} must have the shape {expected}, got {got}"
             )
-        counts.add(got[0])
-    if len(counts) != 1:
-        raise ValueError(
-            f"edit_rows(): every parameter must get the same number of rows, got {sorted(counts)}"
-        )
-    return counts.pop()
+    return count
 
 
 def _elements(rows: Any, width: int) -> Any:
-    """Where the elements of ``rows`` lie in a flat row-major array of ``width`` columns."""
+    """Return the places of ``rows`` in a flat row-major array of ``width`` columns."""
     if dr.width(rows) == 0:
         return rows  # Dr.Jit does not compute with empty arrays
     element = dr.arange(type(rows), dr.width(rows) * width)

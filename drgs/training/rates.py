@@ -1,4 +1,4 @@
-"""Learning rates over the iterations."""
+"""Learning rates over the iterations, and plans that are revised on the way."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from drgs.config.changes import changed
 from drgs.config.density import StopAim
 from drgs.config.schema import FitConfig, OptimizerConfig
 
@@ -37,7 +38,7 @@ class ExponentialDecay:
         return math.exp((1 - s) * math.log(self.initial) + s * math.log(self.final))
 
     def progress(self, iteration: int) -> float:
-        """s, from 0 to 1."""
+        """Return s, from 0 to 1."""
         s = 0.0
         for (after, end), until in zip(self.aims, [*self.aims[1:], (math.inf,)], strict=True):
             passed = min(max(iteration, after), until[0]) - after
@@ -47,21 +48,20 @@ class ExponentialDecay:
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Those of all parameters of the Gaussians, over the iterations.
+    """The rates of all parameters of the Gaussians, over the iterations.
 
     The means' rate falls all the time; the others fall to ``decay`` times themselves, by the same
-    factor at every iteration, behind the share ``decay_from`` of the iterations that follow coarse
-    stages. Rates that are high at first find colours and shapes sooner than constant ones, and
-    leave less noise at the end.
+    factor at every iteration, after the share ``decay_from`` of the iterations that follow coarse
+    stages.
     """
 
     means: ExponentialDecay
     others: Mapping[str, float]  # at the start, by parameter
     decay: float
-    decay_from: float  # share of the iterations behind coarse stages
+    decay_from: float  # share of the iterations after coarse stages
 
     def __call__(self, iteration: int) -> dict[str, float]:
-        """The rates of an iteration that are not those of the start; by parameter."""
+        """Return the rates of an iteration that are not those of the start; by parameter."""
         rates = {"means": self.means(iteration)}
         if self.decay < 1:
             late = (self.means.progress(iteration) - self.decay_from) / (1 - self.decay_from)
@@ -71,15 +71,17 @@ class LearningRates:
 
 
 def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
-    """Of all parameters; extent: world units."""
+    """Return the rates of all parameters; extent: world units."""
     optimizer, others = config.optimizer, learning_rates(config.optimizer, extent)
     others.pop("means")
-    means = means_rate(config, extent)
+    longer = math.sqrt(optimizer.views_per_step)
+    ends = (longer * rate * extent for rate in (optimizer.means_lr, optimizer.means_lr_final))
+    means = ExponentialDecay(*ends, tuple(_rate_aims(config)))
     return LearningRates(means, others, optimizer.decay, optimizer.decay_from)
 
 
 def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
-    """Rate per step of each parameter; extent: world units.
+    """Return the rate per step of each parameter at the start; extent: world units.
 
     Steps of B views are sqrt(B) times as long, and moments forget as much in a step as in B steps
     of one view (Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient
@@ -96,38 +98,43 @@ def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
     }
 
 
-def rate_aims(config: FitConfig) -> list[tuple[int, int]]:
-    """(after, end) of the means' rate: see :class:`drgs.training.rates.ExponentialDecay`."""
+def revised_plan(config: FitConfig, now: int, iterations: int, densify_stop: int) -> FitConfig:
+    """Return the configuration of a fit that ends, and whose population does, at other iterations.
+
+    ``now`` iterations are done, as they would be with the result from the start.
+    """
+    begun = [(after, end) for after, end in _rate_aims(config) if after < now]
+    if now < iterations:
+        begun.append(_aim(config, now, iterations))
+    changes = {
+        "iterations": iterations,
+        "densify.stop": densify_stop,
+        **_prune_window(config, now, iterations, densify_stop),
+        "densify.stop_aims": revised_stops(config, now, densify_stop),
+        "optimizer.means_lr_aims": [
+            {"after": after, "end": end} for after, end in begun or _rate_aims(config)
+        ],
+    }
+    return changed(config, changes)
+
+
+def _rate_aims(config: FitConfig) -> list[tuple[int, int]]:
     aims = [(aim.after, aim.end) for aim in config.optimizer.means_lr_aims]
-    return aims or [aim_until(config, 0, config.iterations)]
+    return aims or [_aim(config, 0, config.iterations)]
 
 
-def aim_until(config: FitConfig, after: int, end: int) -> tuple[int, int]:
-    """What a plan heads for that is made, or revised, after an iteration: (after, end).
+def _aim(config: FitConfig, after: int, end: int) -> tuple[int, int]:
+    """Return the aim, (after, end), of a plan that is made, or revised, after an iteration.
 
-    Rates do not fall as long as pictures are coarse, where means have a long way to go
+    Rates do not fall as long as images are coarse, where means have a long way to go
     (DashGaussian, Chen et al. 2025).
     """
     coarse_until = config.coarse[-1].until if config.coarse else 0
     return max(after, min(coarse_until, end - 1)), end
 
 
-def revised_aims(config: FitConfig, now: int, iterations: int) -> list[tuple[int, int]]:
-    """Those of a plan that ends after ``iterations``, where ``now`` of them are done.
-
-    What has begun stays.
-    """
-    begun = [(after, end) for after, end in rate_aims(config) if after < now]
-    if now < iterations:
-        begun.append(aim_until(config, now, iterations))
-    return begun or rate_aims(config)
-
-
 def revised_stops(config: FitConfig, now: int, stop: int) -> list[dict[str, int]]:
-    """``densify.stop_aims`` of a plan whose growth ends at ``stop``, where ``now`` are done.
-
-    What has begun stays.
-    """
+    """Return ``densify.stop_aims`` of a plan whose growth ends at ``stop``; ``now`` are done."""
     densify = config.densify
     if now == 0:
         return []
@@ -138,8 +145,25 @@ def revised_stops(config: FitConfig, now: int, stop: int) -> list[dict[str, int]
     return [aim.model_dump() for aim in begun]
 
 
-def means_rate(config: FitConfig, extent: float) -> ExponentialDecay:
-    """The rate of the means over the iterations; extent: world units."""
-    rates, longer = config.optimizer, math.sqrt(config.optimizer.views_per_step)
-    first, last = (longer * rate * extent for rate in (rates.means_lr, rates.means_lr_final))
-    return ExponentialDecay(first, last, tuple(rate_aims(config)))
+def _prune_window(
+    config: FitConfig, now: int, iterations: int, densify_stop: int
+) -> dict[str, int | None]:
+    """Return the last phase of pruning, which stays if it has begun.
+
+    Else what is given of it keeps its share of the iterations that are ahead.
+    """
+    prune, names = config.densify.prune, ("densify.prune.start", "densify.prune.stop")
+    window = config.densify.prune_window(config.iterations)
+    if prune.to is None:
+        return {}
+    if now > window[0]:
+        return dict(zip(names, window, strict=True))
+    start, stop = (
+        None if given is None else round(given * iterations / config.iterations)
+        for given in (prune.start, prune.stop)
+    )
+    if start is not None:
+        start = max(1, start, now)
+    if stop is not None:
+        stop = max(stop, densify_stop + 1, (start or 0) + 1)
+    return dict(zip(names, (start, stop), strict=True))

@@ -2,19 +2,17 @@
 
     configuration -> dataset -> initial Gaussians -> (plan) -> trainer -> iterations -> results
 
-Two collaborators touch the world outside: :class:`drgs.training.fit_folder.FitFolder` reads and
-writes files, :class:`Console` prints, draws progress and takes Ctrl-C. Without a folder nothing is
-written; the trainer is called alike with and without them.
+:class:`drgs.training.fit_folder.FitFolder` reads and writes files; without one nothing is written.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -35,25 +33,27 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
+from drgs.results.history import HistoryRow
 from drgs.training.budget import Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.fit_folder import FitFolder, saved_gaussians
-from drgs.training.history import History, HistoryRow, smoother
 from drgs.training.loop import (
     AllIterations,
+    HeldOutQuality,
+    History,
     Iteration,
     Observer,
     RootDecides,
     StopCriterion,
     iterations,
+    smoother,
 )
 from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.inputs import share_gaussians, share_inputs
-from drgs.training.quality import HeldOutQuality
 from drgs.training.summary import summary_of_fit
 from drgs.training.trainer import StepReport, Trainer
 
@@ -61,46 +61,10 @@ if TYPE_CHECKING:  # imported where it is needed
     from drgs.training.viewers import ForViewers
 
 
-class Console:
-    """The terminal of a command: printed lines, a progress bar, Ctrl-C as a request to stop."""
-
-    def say(self, text: str) -> None:
-        """Print a line."""
-        print(text)
-
-    def progress(self, what: str, total: int, done: int = 0) -> AbstractContextManager[RunProgress]:
-        """See :class:`drgs.cli.progress.RunProgress`."""
-        return RunProgress(what, total, done)
-
-    def stop_request(self) -> AbstractContextManager[StopRequest]:
-        """See :class:`drgs.cli.interrupts.StopRequest`."""
-        return StopRequest()
-
-
-class Silence:
-    """A console that prints nothing and leaves Ctrl-C to others: of a fit within a program."""
-
-    requested = False
-
-    def say(self, text: str) -> None:
-        """Print nothing."""
-
-    def progress(self, what: str, total: int, done: int = 0) -> AbstractContextManager[Silence]:
-        """Return what draws no progress."""
-        return nullcontext(self)
-
-    def update(self, done: int, total: int, status: str = "") -> None:
-        """Draw nothing."""
-
-    def stop_request(self) -> AbstractContextManager[Silence]:
-        """Return a request that is never made."""
-        return nullcontext(self)
-
-
-class ShownProgress:
+class ProgressLine:
     """Draws the progress of a fit: see :class:`drgs.training.loop.Observer`."""
 
-    def __init__(self, progress: RunProgress | Silence, criterion: StopCriterion) -> None:
+    def __init__(self, progress: RunProgress, criterion: StopCriterion) -> None:
         self._progress, self._criterion = progress, criterion
         self._psnr: float | None = None  # dB, smooth
 
@@ -120,13 +84,13 @@ class ShownProgress:
 class FitSession:
     """One fit, by one process or several, which all run the same session.
 
-    Rank 0 alone is given a configuration, a folder and a console, and decides when to stop.
+    Rank 0 alone has a configuration, a folder and a terminal, and decides when to stop.
     """
 
     config: FitConfig | None
     dataset: Dataset | None = None  # None: that of the configuration
     folder: FitFolder | None = None  # for results and checkpoints
-    console: Console | Silence = field(default_factory=Silence)
+    uses_terminal: bool = False  # prints, draws progress, and takes Ctrl-C as a request to stop
     variant: str | None = None  # of Mitsuba; None: the active one
     budget: Budget | None = None  # the time for which the fit is planned
     check_ranges: Callable[[], None] = lambda: None  # called after each iteration
@@ -140,6 +104,15 @@ class FitSession:
     criterion: StopCriterion = field(init=False, default_factory=AllIterations)
     observers: list[Observer] = field(init=False, default_factory=list)
     _fingerprint: Fingerprint | None = field(init=False, default=None)
+
+    @property
+    def _objects(self) -> dict[str, Any]:
+        """The objects that take part, as arguments of :class:`Trainer`."""
+        return {"density": self.strategy, "effects": self.effects, "loss": self.loss}
+
+    def _print(self, text: str) -> None:
+        if self.uses_terminal:
+            print(text)
 
     def run(self) -> bool:
         """Fit, and write the results; False if Ctrl-C stopped the fit, with its state saved."""
@@ -166,8 +139,7 @@ class FitSession:
         finished = self.folder is not None and self.folder.is_finished(self.config)
         if finished:
             self.folder.finish()  # a process that was killed after its last file has not
-            path = self.folder.path
-            self.console.say(f"{path}: this fit is finished; --overwrite does it again")
+            self._print(f"{self.folder.path}: this fit is finished; --overwrite does it again")
         return bool(self.comm.of_root(finished))
 
     def prepare(self) -> Plan | None:
@@ -186,8 +158,7 @@ class FitSession:
         if self.budget is not None:
             plan = self._plan(gaussians)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
-        objects = self.strategy, self.effects, self.loss
-        self.trainer = Trainer(self.config, self.dataset, gaussians, comm, *objects)
+        self.trainer = Trainer(self.config, self.dataset, gaussians, comm, **self._objects)
         self.history = History()  # whose clock begins
         if comm.of_root(checkpoint is not None):
             self._restore(checkpoint)
@@ -211,13 +182,14 @@ class FitSession:
 
     def _plan(self, gaussians: Gaussians) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
-        rehearsal = rehearse(self.config, self.dataset, gaussians, self.comm)
+        inputs = self.config, self.dataset, gaussians, self.comm
+        rehearsal = rehearse(*inputs, **self._objects)
         rehearsal.trainer.full_scene()  # gathered from all ranks
         if not self.comm.is_root:
             return None
         plan = plan_fit(self.config, self.dataset, gaussians, self.budget.end, rehearsal)
         self.config = plan.config
-        self.console.say(plan.reasons)
+        self._print(plan.reasons)
         return plan
 
     def _follow(self, plan: Plan) -> None:
@@ -231,16 +203,16 @@ class FitSession:
 
         Raises ``UserError`` for lenses that the projection cannot render.
         """
-        config, dataset, say = self.config, self.dataset, self.console.say
-        say(dataset.description)
-        say(
+        config, dataset = self.config, self.dataset
+        self._print(dataset.description)
+        self._print(
             f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
             f"'{dataset.test_split}' to measure on; background {config.data.background}; "
             f"scene extent {dataset.extent:.3g}"
         )
         start = start_of(config, dataset)
-        say(description_of_start(config, start))
-        say(described(summary_of_fit(config, dataset)))
+        self._print(description_of_start(config, start))
+        self._print(described(summary_of_fit(config, dataset)))
         views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
         check_lenses(config.model, views, f"{config.data.path}: ", remedy)
         return gaussians_at(start, config)
@@ -250,10 +222,10 @@ class FitSession:
         start, state = self.trainer.state(), {}
         if checkpoint is not None:
             check_fits(self.folder.path, checkpoint, start)
-            state, past = checkpoint.trainer, (checkpoint.history, checkpoint.wall_s)
-            self.history = History.from_array(*past, checkpoint.density)
+            past = checkpoint.history, checkpoint.density, checkpoint.wall_s
+            state, self.history = checkpoint.trainer, History.from_arrays(*past)
         self.trainer.restore(state)
-        self.console.say(f"continues at iteration {self.trainer.iteration}")
+        self._print(f"continues at iteration {self.trainer.iteration}")
 
     def iterate(self) -> bool:
         """Run the iterations that are left, with checkpoints; False if Ctrl-C stopped them.
@@ -261,13 +233,15 @@ class FitSession:
         The state is saved then, and after the last iteration: from then on the configuration
         specifies what was done, which half-written results belong to.
         """
-        trainer, console, comm = self.trainer, self.console, self.comm
-        criterion = RootDecides(self.criterion, comm)
-        total = criterion.num_iterations(trainer)
-        shown = console.progress("iteration", total, trainer.iteration)
-        with shown as progress, console.stop_request() as stop:
-            observers = [ShownProgress(progress, criterion), HeldOutQuality(self.dataset.test)]
-            observers += self.observers
+        trainer, comm = self.trainer, self.comm
+        criterion, stop = RootDecides(self.criterion, comm), StopRequest()
+        with ExitStack() as blocks:
+            observers: list[Observer] = [HeldOutQuality(self.dataset.test), *self.observers]
+            if self.uses_terminal:
+                total = criterion.num_iterations(trainer)
+                progress = RunProgress("iteration", total, trainer.iteration)
+                observers.insert(0, ProgressLine(blocks.enter_context(progress), criterion))
+                blocks.enter_context(stop)
             for done in iterations(trainer, self.history, criterion):
                 self.check_ranges()
                 for observer in observers:
@@ -286,8 +260,8 @@ class FitSession:
     def _save_checkpoint(self) -> None:
         state, history = self.trainer.state(), self.history
         if self.folder is not None:
-            rows, changes = history.as_array(), history.density_array()
-            checkpoint = Checkpoint(state, rows, history.wall_s, self._fingerprint, changes)
+            past = *history.arrays(), history.wall_s
+            checkpoint = Checkpoint(state, *past, self._fingerprint)
             save_checkpoint(self.folder.path, self.trainer.config, checkpoint)
 
     def _finish(self, wall_s: float, gaussians: Gaussians) -> None:
@@ -301,9 +275,9 @@ class FitSession:
             for_viewers = self._fit_for_viewers(gaussians)
         if self.folder is not None:
             metrics = self.folder.write_results(
-                self.trainer, self.dataset, self.history, gaussians, for_viewers, wall_s
+                self.trainer, self.history, gaussians, for_viewers, wall_s
             )
-            self.console.say(self.folder.describe(metrics))
+            self._print(self.folder.describe(metrics))
 
     def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
         """Return Gaussians for other viewers.
@@ -312,8 +286,10 @@ class FitSession:
         """
         from drgs.training.viewers import for_viewers, num_iterations
 
+        if not self.uses_terminal:
+            return for_viewers(self.trainer, gaussians)
         total = num_iterations(self.trainer.config)
-        with self.console.progress("iteration for viewers", total) as shown:
+        with RunProgress("iteration for viewers", total) as shown:
             return for_viewers(self.trainer, gaussians, lambda done: shown.update(done, total))
 
 

@@ -1,16 +1,107 @@
-"""Steps of a fit: which iterations share a change of the Gaussians, and which views they render."""
+"""Stages and steps of a fit: which views an iteration renders, in which size, and their gradients.
+
+A stage trains on images of one size. A step is what lies between two changes of the Gaussians. One
+of a single view has its gradients in the parameters after ``dr.backward``; those of several views
+use ``drgs.training.parallel.exchange``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from drgs.config.schema import FitConfig
+from drgs.datasets.images import smaller_view
+from drgs.datasets.types import View
+from drgs.integrator.scene import make_sensors
+from drgs.training.effects.base import TrainingEffect, as_tensor
+from drgs.training.losses import TARGET_BYTES, Target, prepare_target
 from drgs.training.rates import LearningRates
-from drgs.training.stages import Stage
 from drgs.training.views import TrainingView
+
+KEPT_BYTES = 1 << 30
+"""Of targets and effects' uploads that stay on the device until their view is drawn again: of 180
+images of 400 x 400 px. Without room, they are made anew, in a tenth of an iteration."""
+
+
+@dataclass(eq=False)
+class Stage:
+    """Iterations that train on images of one size."""
+
+    until: float  # last iteration
+    views: list[TrainingView]
+    view_bytes: int  # of a pixel: what is made of a view's images
+    room: int  # bytes left for what stays on the device
+    kept: set[int] = field(default_factory=set)  # indices of the views that have it
+
+    def keep_or_free(self, view: TrainingView) -> None:
+        """Keep what was made of the images of a rendered view while there is room, else free it.
+
+        The first views that are drawn are kept. Each round draws all views, in another order: those
+        that were drawn last are no more likely to be drawn next than others.
+        """
+        if view.index in self.kept:
+            return
+        size = view.width * view.height * self.view_bytes
+        if size > self.room:
+            view.free()
+        else:
+            self.room -= size
+            self.kept.add(view.index)
+
+    def end(self) -> None:
+        """Free what is kept: the stage will not come again."""
+        for index in self.kept:
+            self.views[index].free()
+        self.kept.clear()
+
+
+def make_stages(
+    views: tuple[View, ...], config: FitConfig, effects: Sequence[TrainingEffect], room: int
+) -> list[Stage]:
+    """Return the configuration's coarse stages, and the last one, of images as they are.
+
+    room: bytes of what is made of images that may stay on the device.
+    """
+    sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
+    view_bytes = bytes_on_device(effects)
+    return [
+        Stage(until, _make_training_views(resized, config, effects), view_bytes, room)
+        for until, resized in [*sizes, (math.inf, views)]
+    ]
+
+
+def bytes_on_device(effects: Sequence[TrainingEffect]) -> int:
+    """Return the bytes of a pixel of a view: its target, and at most what effects upload."""
+    return TARGET_BYTES + sum(effect.upload_bytes for effect in effects)
+
+
+def _make_training_views(
+    views: Sequence[View], config: FitConfig, effects: Sequence[TrainingEffect]
+) -> list[TrainingView]:
+    sensors = make_sensors(views, calibrated=any(e.moves_sensors for e in effects))
+    return [
+        TrainingView(
+            view,
+            index,
+            sensor,
+            partial(_make_target, view, config, effects),
+            {effect.name: partial(effect.upload, view) for effect in effects},
+        )
+        for index, (view, sensor) in enumerate(zip(views, sensors, strict=True))
+    ]
+
+
+def _make_target(view: View, config: FitConfig, effects: Sequence[TrainingEffect]) -> Target:
+    image = np.asarray(view.image)
+    for effect in effects:
+        image = effect.target_image(view, image)
+    return prepare_target(as_tensor(image), config.loss.window, config.loss.sigma)
 
 
 @dataclass(frozen=True)
@@ -47,40 +138,30 @@ def plan_step(
     iterations = step_of(iteration, views_per_step, config.iterations)
     first, last = iterations[0], iterations[-1]
     stage = next(stage for stage in stages if first <= stage.until)
-    late = _late_views(first, config, rates)
+    is_late = rates.means.progress(first) > config.optimizer.views_from
+    is_settled = first >= config.densify.settled_from(config.iterations)
+    late_views = config.optimizer.views if is_late and is_settled else 1
+    order = len(stage.views), config.seed, views_per_step
     return Step(
         iterations=iterations,
         stage=stage,
         begins_stage=any(first - views_per_step <= each.until < first for each in stages),
         views=tuple(
-            StepView(i, i - first, stage.views[_view_of(i, len(stage.views), config)])
-            for i in iterations
-            if i > 0
+            StepView(i, i - first, stage.views[view_of(i, *order)]) for i in iterations if i > 0
         ),
-        num_averaged=max(late, len(iterations)),
-        is_update=late <= views_per_step or last % late == 0,
+        num_averaged=max(late_views, len(iterations)),
+        is_update=late_views <= views_per_step or last % late_views == 0,
     )
 
 
-def _late_views(first: int, config: FitConfig, rates: LearningRates) -> int:
-    """Return ``optimizer.views`` late in the fit, 1 before."""
-    is_late = rates.means.progress(first) > config.optimizer.views_from
-    is_settled = first >= config.densify.settled_from(config.iterations)
-    return config.optimizer.views if is_late and is_settled else 1
-
-
-def _view_of(iteration: int, num_views: int, config: FitConfig) -> int:
-    return view_of(iteration, num_views, config.seed, config.optimizer.views_per_step)
-
-
 def step_of(iteration: int, views_per_step: int, iterations: int) -> range:
-    """The iterations of the step that this one is part of; iterations: of the fit.
+    """Return the iterations of the step that this one is part of; iterations: of the fit.
 
     The last step of a fit may have fewer views than others.
     """
     first = (iteration - 1) // views_per_step * views_per_step + 1
     end = first + views_per_step
-    if iteration > iterations:  # somebody goes on with a fit that is done
+    if iteration > iterations:  # a caller goes on with a fit that is done
         return range(max(first, iterations + 1), end)
     return range(first, min(end, iterations + 1))
 
@@ -99,3 +180,60 @@ def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) 
     key = [seed, which_round, place] if views_per_step > 1 else [seed, which_round]
     order = np.random.default_rng(key).permutation(len(own))
     return own[int(order[position])]
+
+
+@dataclass(frozen=True)
+class ViewGradients:
+    """The backward pass of one view; N are the rows that this process has."""
+
+    means2d_grad: Any  # Array2f or tensor (N, 2): derivative of the step's loss, per px
+    visible: Any  # Bool (N,): the splat's extent touches the film
+    weighted_sums: Mapping[str, Any]  # Float (N,), by name: see DensityStrategy.pixel_weights
+    first_fault: Any  # UInt32 (1,): see drgs.splatting.rendering.decode_fault
+
+
+@dataclass(frozen=True)
+class ViewLoss:
+    """Loss and error of the view of an iteration."""
+
+    loss: Any  # one entry
+    squared_error: Any  # one entry: mean over pixels and channels
+    counted: float  # share of the pixels that count
+
+
+class WholeGradients:
+    """Steps of one view: see :class:`drgs.training.parallel.exchange.ViewExchange`."""
+
+    def __init__(self, integrator: Any) -> None:
+        self.integrator = integrator
+        self._views: Sequence[StepView] = ()
+        self._sums: Mapping[str, Any] = {}
+
+    def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
+        """Begin a step."""
+        del place
+        self._views = views
+
+    def own_views(self) -> Sequence[StepView]:
+        """Return the views that this process renders: all."""
+        return self._views
+
+    def end_view(self, weights: Mapping[str, Any]) -> None:
+        """End the backward pass of a view; weights: planes for weighted sums, by name."""
+        last = self.integrator.last
+        self._sums = {name: last.weighted_sums(plane) for name, plane in weights.items()}
+
+    def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
+        """Return what is known of the view."""
+        del names
+        last = self.integrator.last
+        return [ViewGradients(last.means2d_grad, last.visible, self._sums, last.first_nonfinite)]
+
+    def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
+        """Return the losses of all views, by place in the step."""
+        return list(losses.values())
+
+    def share(self, view: StepView, value: Any) -> Any:
+        """Return an array of the process that renders a view."""
+        del view
+        return value

@@ -1,7 +1,4 @@
-"""The summary of a fit: what it simulates, what asked for that, and what is left out.
-
-The command ``fit`` prints it at its start: see ``drgs.integrator.summary``.
-"""
+"""The summary of a fit, printed at its start: what is simulated, which key is the reason."""
 
 from __future__ import annotations
 
@@ -28,13 +25,15 @@ from drgs.integrator.summary import (
 
 
 def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
-    """The effects of a fit, in the order in which they are listed."""
+    """Return the effects of a fit, in the order in which they are listed."""
     views, model, ignored = dataset.train, config.model, dataset.ignored
     depths = _of_data("depth", [v.depth for v in views], "supervision", "the dataset's depth")
     depths = depths.unless(config.loss.depth_weight == 0)
     return [
         view_dependence_effect(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
-        _background(config),
+        SimulatedEffect("background", "a random colour at each iteration", "data.random_background")
+        if config.data.random_background
+        else SimulatedEffect("background", f"{config.data.background}", "data.background"),
         replace(lens_effect(views), ignored="distortion" in ignored),
         replace(motion_effect(views), ignored="motion" in ignored),
         antialiasing_effect(
@@ -62,7 +61,7 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]
 
 
 def _extensions(config: FitConfig) -> list[SimulatedEffect]:
-    """Return the extensions that take part, with the key that asks for each."""
+    """Return the extensions that take part, with the key of each."""
     used = [
         (extension, f"extensions.{extension.name}")
         for registry in (EFFECTS, LOSS_TERMS)
@@ -81,17 +80,9 @@ def _extensions(config: FitConfig) -> list[SimulatedEffect]:
 def _approximations(config: FitConfig) -> list[SimulatedEffect]:
     """Return the approximations that are chosen by name and not the default, if there are any."""
     chosen = config.model.approximations.others_than_default
-    values = {k: v for k, v in chosen.items() if k in ("projection", "falloff", "order")}
-    words, keys = (", ".join(each) for each in (values.values(), [f"model.{k}" for k in values]))
+    values = {f"model.{k}": chosen[k] for k in chosen if k in ("projection", "falloff", "order")}
+    words, keys = ", ".join(values.values()), ", ".join(values)
     return [SimulatedEffect("approximations", words, keys)] if values else []
-
-
-def _background(config: FitConfig) -> SimulatedEffect:
-    if config.data.random_background:
-        return SimulatedEffect(
-            "background", "a random colour at each iteration", "data.random_background"
-        )
-    return SimulatedEffect("background", f"{config.data.background}", "data.background")
 
 
 def _of_data(name: str, values: Sequence[object], what: str, why: str) -> SimulatedEffect:

@@ -1,23 +1,22 @@
 """The training loop: photographs in, Gaussians out.
 
-Everything between two optimizer steps is visible in :meth:`Trainer.step`, which reads as Mitsuba's
-tutorials do: ``mi.render`` with the ``splats`` integrator, ``dr.backward``, ``drjit.opt.Adam``.
-Changes of the population come from a strategy of ``drgs.training.density``. All processes of a fit
-run the same loop; a communicator tells a process which views and which Gaussians are its own.
+:meth:`Trainer.step` reads as Mitsuba's tutorials do: ``mi.render`` with the ``splats`` integrator,
+``dr.backward``, ``drjit.opt.Adam``. Changes of the population come from a strategy of
+``drgs.training.density``. All processes of a fit run the same loop on their views and Gaussians.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import Dataset, View
@@ -26,11 +25,24 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.registry import density_strategy
-from drgs.training.density.strategy import DensityReport, DensityStrategy, StepInfo
-from drgs.training.effects.base import FitState, TrainingEffect
-from drgs.training.effects.registry import integrator_settings, training_effects
-from drgs.training.finite_checks import GradientWatch, check_values, check_view_values
-from drgs.training.gradients import ViewGradients, ViewLoss, WholeGradients
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PixelWeight,
+    StepInfo,
+)
+from drgs.training.effects.base import (
+    FitState,
+    TrainingEffect,
+    integrator_settings,
+    training_effects,
+)
+from drgs.training.finite_checks import (
+    GradientWatch,
+    WatchedIteration,
+    check_values,
+    check_view_values,
+)
 from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.memory import Share, room_for_targets
 from drgs.training.optimizer import (
@@ -45,17 +57,25 @@ from drgs.training.parallel.population import (
     local_gaussians,
     make_population,
 )
-from drgs.training.rates import learning_rates, rates_over_time, revised_aims, revised_stops
-from drgs.training.stages import KEPT_BYTES, bytes_on_device, make_stages
-from drgs.training.state_checks import DENSITY
-from drgs.training.steps import Step, StepView, plan_step
+from drgs.training.rates import learning_rates, rates_over_time, revised_plan
+from drgs.training.steps import (
+    KEPT_BYTES,
+    Step,
+    StepView,
+    ViewGradients,
+    ViewLoss,
+    WholeGradients,
+    bytes_on_device,
+    make_stages,
+    plan_step,
+)
 from drgs.training.views import TrainingView
-
-if TYPE_CHECKING:  # imported for steps of several views
-    from drgs.training.parallel.exchange import ViewExchange
 
 PREFIX = "integrator."
 """Precedes a parameter's name when the scene is traversed."""
+
+DENSITY = "density/"
+"""Precedes the names of the strategy's state: a row for each Gaussian, or single numbers."""
 
 
 @dataclass(frozen=True)
@@ -97,16 +117,20 @@ class Trainer:
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
     ) -> None:
-        """gaussians: all of them, on each process; comm: the processes; None: this one.
+        """gaussians: all, on each process; comm: the processes; None: this one.
 
         density, loss: None: those of the configuration; effects: besides the configuration's.
         """
         config = resolve_defaults(config, dataset)
+        views_per_step = config.optimizer.views_per_step
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
         check_can_be_shared(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset, effects)
-        room = comm.collective(lambda: self._room_for_targets(gaussians))
+        self._given_density, self._given_effects, self._given_loss = density, effects, loss
+        share = Share(comm.size, comm.num_on_machine)
+        limits = bytes_on_device(self.effects), KEPT_BYTES, share
+        room = comm.collective(lambda: room_for_targets(config, dataset, gaussians, *limits))
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,
@@ -120,41 +144,27 @@ class Trainer:
             {key.removeprefix(PREFIX): value for key, value in self.params.items()},
             learning_rates(config.optimizer, self.extent),
             prefix=PREFIX,
-            beta_1=config.optimizer.beta_1**config.optimizer.views_per_step,
-            beta_2=config.optimizer.beta_2**config.optimizer.views_per_step,
+            beta_1=config.optimizer.beta_1**views_per_step,
+            beta_2=config.optimizer.beta_2**views_per_step,
             epsilon=config.optimizer.epsilon,
         )
         self.rates = rates_over_time(config, self.extent)
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
-        self._given_density = density
         self.stages = make_stages(dataset.train, config, self.effects, room)
-        self.gradients = self._make_gradients()
+        self.gradients: WholeGradients | ViewExchange = WholeGradients(self.integrator)
+        if views_per_step > 1:
+            from drgs.training.parallel.exchange import ViewExchange
+
+            self.gradients = ViewExchange(
+                comm, self.integrator, self.params, PREFIX, views_per_step
+            )
         population = self.optimizer, PREFIX, self.extent, config.seed
         self.population = make_population(*population, comm, gaussians.num_gaussians)
         self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0  # the last one that is done
-        self._gathered: tuple[int, mi.Scene | None] | None = None  # see full_scene
-
-    def _room_for_targets(self, gaussians: Gaussians) -> int:
-        """Return the number of bytes of targets that may stay on the device."""
-        share = Share(self.comm.size, self.comm.num_on_machine)
-        limits = bytes_on_device(self.effects), KEPT_BYTES
-        return room_for_targets(self.config, self.dataset, gaussians, *limits, share)
-
-    def _make_gradients(self) -> WholeGradients | ViewExchange:
-        """Return what collects the gradients of a step's views."""
-        views_per_step = self.config.optimizer.views_per_step
-        if views_per_step == 1:
-            return WholeGradients(self.integrator)
-        from drgs.training.parallel.exchange import ViewExchange
-
-        return ViewExchange(self.comm, self.integrator, self.params, PREFIX, views_per_step)
-
-    # ------------------------------------------------------------------------------------------
-    # A step
-    # ------------------------------------------------------------------------------------------
+        self._full_scene: tuple[int, mi.Scene | None] | None = None  # with its iteration
 
     def step(self) -> StepReport:
         """Render the views of a step, and change the Gaussians along their mean gradient.
@@ -167,7 +177,7 @@ class Trainer:
         losses: dict[int, ViewLoss] = {}
         for view in self.gradients.own_views():
             losses[view.place] = self._differentiate(step, view)
-        found = self.gradients.finish(self._weight_names(step))
+        found = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
         views = self._total_losses(step, found, losses, penalties)
         if step.is_update:
             self._set_learning_rates(step)
@@ -178,7 +188,7 @@ class Trainer:
                 self.density.update_statistics(_step_info(step, view, gradients))
         report = self._control_density(step)
         for place in losses:
-            step.stage.seen(step.views[place].view)
+            step.stage.keep_or_free(step.views[place].view)
         means_lr = self.rates.means(step.last)
         return StepReport(step.last, self.num_gaussians, means_lr, report, tuple(views))
 
@@ -190,7 +200,7 @@ class Trainer:
         image = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
         image, loss, error = self.compare(image, view.view)
         dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
-        self.gradients.end_view(self._pixel_weights(view, dr.detach(image)))
+        self.gradients.end_view(self._weight_planes(view, dr.detach(image)))
         return ViewLoss(dr.detach(loss), error, view.view.counted)
 
     def _begin_step(self) -> Step:
@@ -204,14 +214,14 @@ class Trainer:
         fit = self._fit_state(step, step.iterations[0])
         for effect in self.effects:
             effect.begin(fit)
-        self.gradients.begin(step.views, lambda view: self._place(fit, view))
-        return step
 
-    def _place(self, fit: FitState, view: StepView) -> None:
-        """Put the sensor of a view that another process renders where effects have it."""
-        for effect in self.effects:
-            if effect.moves_sensors:
-                effect.before(fit, view.view)
+        def place(view: StepView) -> None:
+            for effect in self.effects:
+                if effect.moves_sensors:
+                    effect.before(fit, view.view)
+
+        self.gradients.begin(step.views, place)
+        return step
 
     def _differentiate_penalties(self, step: Step) -> list[Any]:
         """Add the derivatives of the strategy's terms of the loss; return the terms."""
@@ -228,7 +238,7 @@ class Trainer:
             total = sum(terms[1:], terms[0])
             flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a term of weight 0 has none
             dr.backward(total / weight if weight > 1 else total, flags=flags)
-        return self.population.terms_of_all(terms, penalties)
+        return self.population.gather_terms(terms, penalties)
 
     def compare(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
         """Return the image as a photograph of the view would be, its loss and squared error."""
@@ -242,17 +252,14 @@ class Trainer:
                 loss = loss + term
         return image, loss, error
 
-    def _pixel_weights(self, view: StepView, image: Any) -> dict[str, Any]:
+    def _weight_planes(self, view: StepView, image: Any) -> dict[str, Any]:
         """Return the planes by which the strategy weighs what it sees of Gaussians; by name."""
-        if not self.density.needs_statistics(view.iteration):
-            return {}
-        weights = self.density.pixel_weights(view.iteration)
+        weights = self._pixel_weights(view.iteration)
         return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
 
-    def _weight_names(self, step: Step) -> list[tuple[str, ...]]:
-        """Return the names of the planes of :meth:`_pixel_weights`, of each view."""
-        needs, weights = self.density.needs_statistics, self.density.pixel_weights
-        return [tuple(weights(i)) if needs(i) else () for i in step.iterations]
+    def _pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        needs_statistics = self.density.needs_statistics(iteration)
+        return self.density.pixel_weights(iteration) if needs_statistics else {}
 
     def _total_losses(
         self,
@@ -263,20 +270,20 @@ class Trainer:
     ) -> list[ViewLoss]:
         """Return the losses of all views with the strategy's terms, and remember to check them."""
         shared, results = self.gradients.share_losses(losses), []
+        first_row = self.population.first_row * len(PARAMETER_NAMES)
         for view, gradients, loss in zip(step.views, found, shared, strict=True):
-            total = sum(penalties, loss.loss)
-            self._watch(view, total, gradients.first_fault)
+            total, fault = sum(penalties, loss.loss), gradients.first_fault
+            if first_row:
+                fault = dr.select(fault == NO_FAULT, fault, fault + dr.opaque(mi.UInt32, first_row))
+            numbers = {
+                f"{effect.name}.{name}": values
+                for effect in self.effects
+                for name, values in effect.numbers_of(view.view).items()
+            }
+            watched = view.iteration, view.view.name, total, fault, numbers
+            self.watch.add(WatchedIteration(*watched))
             results.append(replace(loss, loss=total))
         return results
-
-    def _watch(self, view: StepView, loss: Any, first_fault: Any) -> None:
-        """Remember what may not be finite: see :class:`GradientWatch`."""
-        effects = self.effects
-        numbers = {f"{e.name}.{k}": v for e in effects for k, v in e.numbers_of(view.view).items()}
-        if first := self.population.first_row * len(PARAMETER_NAMES):
-            first = dr.opaque(mi.UInt32, first)
-            first_fault = dr.select(first_fault == NO_FAULT, first_fault, first_fault + first)
-        self.watch.add(view.iteration, view.view.name, loss, first_fault, numbers)
 
     def _set_learning_rates(self, step: Step) -> None:
         """Set the rates of a step, times the factors of the strategy."""
@@ -334,10 +341,6 @@ class Trainer:
             effects=self.effects,
         )
 
-    # ------------------------------------------------------------------------------------------
-    # What it has fitted
-    # ------------------------------------------------------------------------------------------
-
     @property
     def parameters(self) -> dict[str, Any]:
         """Raw values by name, as the optimizer has them: the rows of this process."""
@@ -350,18 +353,13 @@ class Trainer:
 
     @property
     def last_step(self) -> Step:
-        """The step that is done."""
+        """The last step that is done."""
         return self.plan(self.iteration)
 
     @property
     def views(self) -> list[TrainingView]:
         """The training views, at the image size that is in use."""
         return self.last_step.stage.views
-
-    @property
-    def means_lr(self) -> float:
-        """The means' learning rate of the last iteration, world units."""
-        return self.rates.means(self.iteration)
 
     @property
     def sh_degree(self) -> int:
@@ -391,13 +389,13 @@ class Trainer:
         """Return a scene of all Gaussians, as synchronised last; None on other ranks than 0."""
         if self.comm.size == 1:
             return self.scene
-        if self._gathered is None or self._gathered[0] != self.iteration:
+        if self._full_scene is None or self._full_scene[0] != self.iteration:
             gaussians, scene = self.gaussians(), None
             if self.comm.is_root:
                 scene = make_scene(gaussians, self.config.model, self.dataset.background)
                 scene.integrator().sh_degree = self.integrator.sh_degree
-            self._gathered = self.iteration, scene
-        return self._gathered[1]
+            self._full_scene = self.iteration, scene
+        return self._full_scene[1]
 
     def images(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
         """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
@@ -431,13 +429,13 @@ class Trainer:
         of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
         check_view_values(self.iteration, of_views, [view.name for view in self.views])
 
-    # ------------------------------------------------------------------------------------------
-    # Other fits, and other times
-    # ------------------------------------------------------------------------------------------
-
     def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
-        """Return a trainer with the same photographs; config: of another fit."""
-        return Trainer(config, self.dataset, gaussians, self.comm)
+        """Return a trainer with the same photographs, and copies of the given effects and loss.
+
+        config: of another fit, which decides about its population.
+        """
+        effects, loss = deepcopy((self._given_effects, self._given_loss))
+        return Trainer(config, self.dataset, gaussians, self.comm, effects=effects, loss=loss)
 
     def warm_start(self, former: Trainer) -> None:
         """Begin after the iterations of another trainer, with what its effects have found."""
@@ -447,10 +445,7 @@ class Trainer:
         self._restore_effects({f"{name}/{k}": v for name in found for k, v in found[name].items()})
 
     def release(self) -> None:
-        """Free what only further iterations need, of which there will be none: targets, moments.
-
-        Its scene still renders what was fitted last.
-        """
+        """Free what only further iterations need; the scene still renders what was fitted last."""
         self.last_step.stage.end()
         self.optimizer.state.clear()
         release_unused_memory()
@@ -468,15 +463,7 @@ class Trainer:
                 f"Trainer.reschedule(): densify.stop cannot change from {config.densify.stop} to "
                 f"{densify_stop} after iteration {now}"
             )
-        aims = revised_aims(config, now, iterations)
-        changes = {
-            "iterations": iterations,
-            "densify.stop": densify_stop,
-            **_prune_window(config, now, iterations, densify_stop),
-            "densify.stop_aims": revised_stops(config, now, densify_stop),
-            "optimizer.means_lr_aims": [{"after": after, "end": end} for after, end in aims],
-        }
-        self.config = changed(config, changes)
+        self.config = revised_plan(config, now, iterations, densify_stop)
         self.rates = rates_over_time(self.config, self.extent)
         self.density = self._density_from(self.density.state())
 
@@ -541,29 +528,6 @@ def _step_info(step: Step, view: StepView, gradients: ViewGradients) -> StepInfo
     size = view.view.width, view.view.height
     found = means2d_grad, gradients.visible, gradients.weighted_sums
     return StepInfo(view.iteration, *size, *found)
-
-
-def _prune_window(
-    config: FitConfig, now: int, iterations: int, densify_stop: int
-) -> dict[str, int | None]:
-    """Return where the last phase of pruning is in a fit of other iterations.
-
-    It stays if it has begun. Else what is given of it keeps its share of the iterations that are
-    ahead.
-    """
-    prune, names = config.densify.prune, ("densify.prune.start", "densify.prune.stop")
-    window = config.densify.prune_window(config.iterations)
-    if prune.to is None or now > window[0]:
-        return {} if prune.to is None else dict(zip(names, window, strict=True))
-    start, stop = (
-        None if given is None else round(given * iterations / config.iterations)
-        for given in (prune.start, prune.stop)
-    )
-    if start is not None:
-        start = max(1, start, now)
-    if stop is not None:
-        stop = max(stop, densify_stop + 1, (start or 0) + 1)
-    return dict(zip(names, (start, stop), strict=True))
 
 
 def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -1,18 +1,9 @@
 """Gaussians for other viewers: what ``point_cloud_viewers.ply`` holds beside the fit's own.
 
-Viewers of 3DGS files render with the defaults of ``drgs.config.approximations``: 0.3 square pixels
-of low-pass, and opacities as they are. A copy of Gaussians that were fitted
-otherwise is changed in closed form (``drgs.effects.viewers``) and then fitted for a few iterations
-more as viewers render it, with the number of Gaussians fixed and with what the fit has found out
-about cameras and colours. The fit's own Gaussians do not depend on any of it.
-
-Measured on ``scenes/lego_mini.yml`` with ``antialiased`` and a low-pass of 0.1, where the fit has
-35.16 dB: the same numbers as they are give 21.6 dB in viewers, in closed form 30.0 dB, with 160
-iterations behind that 32.7 dB, with 1,000 33.3 dB. A whole fit as viewers render reaches 32.8 dB:
-a filter of 0.3 square pixels lets no more detail through. Gaussians that serve both are not to be
-had: 160 iterations under both rules in turn leave 32.1 dB for the fit and 24.8 dB in viewers.
-With the present recipe, 37.13 dB in 3,400 iterations, further ones of 4, 8 and 10 % give 33.30,
-33.64 and 33.77 dB, and a whole fit as viewers render 34.39 dB.
+Viewers render with the defaults of ``drgs.config.approximations``. A copy of Gaussians that were
+fitted otherwise is changed in closed form (``drgs.effects.viewers``) and then fitted for a few
+iterations more as viewers render it, with the number of Gaussians fixed and with the cameras and
+colours that the fit has found. The fit's own Gaussians do not depend on any of it.
 """
 
 from __future__ import annotations
@@ -41,11 +32,8 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.parallel.inputs import share_gaussians
 from drgs.training.trainer import Trainer
 
-SHARE = 0.08
-"""Of the iterations of the fit, that are added."""
-
-TIME_SHARE = 0.12
-"""Of the time of the fit: late iterations take longer than early ones."""
+SHARE, TIME_SHARE = 0.08, 0.12
+"""Iterations that are added, as a share of the fit's; and their time: late ones take longer."""
 
 RATES = {
     "means_lr": 1.6e-5,
@@ -57,31 +45,30 @@ RATES = {
     "shN_lr": 4e-3,
     "decay": 0.1,
 }
-"""High, as few iterations have to do, and those of colours most of all. With the reference's rates
-the same iterations give 1 dB less."""
+"""High, as few iterations have to do, and those of colours most of all."""
 
-NEXT_TO_NOTHING = 1e-9
-"""A rate for what is to stay, where 0 is not a rate."""
+NEGLIGIBLE_RATE = 1e-9
+"""For values that are to stay, where 0 is not a rate."""
 
 
 @dataclass(frozen=True)
 class ForViewers:
-    """Gaussians for other viewers, and how these show them."""
+    """Gaussians for other viewers, and how viewers render them."""
 
-    gaussians: Gaussians  # numpy; the header of their file says how they are rendered
+    gaussians: Gaussians  # numpy
     model: ModelConfig  # as viewers render
     background: tuple[float, float, float]
     effects: Iterable[TrainingEffect]  # of the fit
 
     def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
-        """Pictures (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
+        """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
         for effect in self.effects:
             views = effect.measured(views)
         return render_views(make_scene(self.gaussians, self.model, self.background), views)
 
 
 def num_iterations(config: FitConfig) -> int:
-    """How many are added to those of a fit."""
+    """Return the number of iterations that are added to those of a fit."""
     return math.ceil(SHARE * config.iterations)
 
 
@@ -96,41 +83,31 @@ def for_viewers(
     gaussians: the result of ``trainer.gaussians()``. watch: is called after each iteration with
     the number of iterations so far.
 
-    Where that cannot be, as where a number is not finite, the closed form is what is given, with a
+    Where that fails, as where a number is not finite, the closed form is returned, with a
     :class:`UserNote`.
     """
-    config = trainer.config
-    start = _started(trainer, gaussians)
-    said = {
-        name: DECLARED[name].default for name in config.model.approximations.others_than_default
-    }
+    others = trainer.config.model.approximations.others_than_default
+    start, further = _closed_form(trainer, gaussians), tuning(trainer.config)
     trainer.release()
-    further = tuning(config)
     try:
-        shared = share_gaussians(trainer.comm, start)
-        tuned = _tuned(trainer.spawn(further, shared), trainer, watch)
+        tuner = trainer.spawn(further, share_gaussians(trainer.comm, start))
+        tuner.warm_start(trainer)
+        while tuner.iteration < further.iterations:
+            if tuner.step().passes(further.output.history_every):
+                tuner.check_iterations()
+            watch(tuner.iteration - trainer.config.iterations)
+        tuned = tuner.gaussians()
     except UserError as error:  # numbers that are not finite, or too little memory by now
         note = f"the Gaussians for viewers are not fitted any further: {error}"
         warnings.warn(UserNote(note), stacklevel=2)
         tuned = start
     release_unused_memory()  # of what those iterations had
-    gaussians = replace(tuned, rendered_with=said)
+    gaussians = replace(tuned, rendered_with={name: DECLARED[name].default for name in others})
     return ForViewers(gaussians, further.model, trainer.dataset.background, trainer.effects)
 
 
-def _tuned(tuner: Trainer, trainer: Trainer, watch: Callable[[int], None]) -> Gaussians:
-    """After the iterations that follow those of ``trainer``."""
-    before = trainer.config.iterations
-    tuner.warm_start(trainer)
-    while tuner.iteration < tuner.config.iterations:
-        if tuner.step().passes(tuner.config.output.history_every):
-            tuner.check_iterations()
-        watch(tuner.iteration - before)
-    return tuner.gaussians()
-
-
-def _started(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
-    """In closed form, by the training cameras as the fit has them."""
+def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians in closed form, by the training cameras as the fit has them."""
     states = (read_sensor(sensor, trainer.integrator.near) for sensor in trainer.sensors())
     on_device = baked(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
@@ -139,13 +116,13 @@ def _started(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
 
 
 def tuning(config: FitConfig) -> FitConfig:
-    """The configuration of the iterations that follow those of ``config``."""
+    """Return the configuration of the iterations that follow those of ``config``."""
     before = config.iterations
     total = before + num_iterations(config)
     kept = {"max_gaussians": config.densify.max_gaussians}
     views_per_step = config.optimizer.views_per_step  # which processes may share
     changes = {
-        **{f"model.{name}": _as_configured(name) for name in DECLARED},
+        **{f"model.{name}": _configured_default(name) for name in DECLARED},
         "model.smoothing": False,
         "iterations": total,
         "coarse": [],
@@ -154,12 +131,11 @@ def tuning(config: FitConfig) -> FitConfig:
         **{f"cameras.{name}_lr": 0.0 for name in ("rotation", "translation", "focal", "principal")},
     }
     if config.colors.lr is not None:
-        changes["colors.lr"] = NEXT_TO_NOTHING
+        changes["colors.lr"] = NEGLIGIBLE_RATE
     return changed(config, changes)
 
 
-def _as_configured(name: str) -> object:
-    """The default of an approximation, as a configuration has it."""
+def _configured_default(name: str) -> object:
     declared = DECLARED[name]
     if declared.unrounded is not None:
         return declared.unrounded

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drgs.datasets.types import Dataset
-from drgs.training.history import History, HistoryRow, smoothed
-from drgs.training.loop import StopCriterion
+from drgs.training.loop import History, HistoryRow, StopCriterion, smoothed
 from drgs.training.trainer import Trainer
 from drgs.viewer.page import Page, StartView
 from drgs.viewer.requests import Wishes

@@ -13,8 +13,7 @@ from typing import Protocol
 import drjit as dr
 
 from drgs.datasets.types import Dataset
-from drgs.training.history import History
-from drgs.training.loop import Iteration, StopCriterion
+from drgs.training.loop import History, Iteration, StopCriterion
 from drgs.training.trainer import Trainer
 from drgs.viewer.frames import LiveScene
 from drgs.viewer.requests import Wishes

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
-import drjit as dr
 import numpy as np
 from fits import SCENES, add_only, make_parser, read_metrics, write_curves
 from scipy.special import expit
@@ -29,10 +28,9 @@ from drgs.bench.output import markdown_table
 from drgs.capture import __main__ as capture
 from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig, FitConfig
-from drgs.core.arrays import from_host
 from drgs.datasets import load_dataset
 from drgs.results.files import HISTORY
-from drgs.training.density import adc
+from drgs.training.density.adc import AdaptiveDensityControl
 from drgs.training.density.strategy import DensityReport, Population
 
 if TYPE_CHECKING:
@@ -53,23 +51,21 @@ def prune_added_rows_at_once() -> Iterator[None]:
     """Let the prune of a step meet the rows that the step has added, as the reference's code."""
 
     def densify_and_prune(
-        rows: Population, statistics: adc.DensityStatistics, config: DensifyConfig, iteration: int
+        strategy: AdaptiveDensityControl, rows: Population, iteration: int
     ) -> DensityReport:
-        report = original(rows, statistics, config, iteration)
+        report, rules = original(strategy, rows, iteration), strategy.config.adc
         opacities = expit(rows.host("logit_opacities"))
         scales = np.exp(rows.host("log_scales")).max(axis=1)
-        limit = (
-            config.adc.prune_scale * rows.extent if adc.prunes_large(config, iteration) else np.inf
-        )
-        keep = np.flatnonzero((opacities >= config.adc.prune_opacity) & (scales <= limit))
+        limit = rules.prune_scale * rows.extent if iteration > rules.reset_every else np.inf
+        keep = np.flatnonzero((opacities >= rules.prune_opacity) & (scales <= limit))
         if len(keep) == report.num_gaussians:
             return report
-        rows.edit(from_host(dr.uint32_array_t(type(statistics.views)), keep))
+        rows.edit(rows.rows(keep))
         pruned = report.pruned + report.num_gaussians - len(keep)
         return replace(report, pruned=pruned, num_gaussians=len(keep))
 
-    original = adc.densify_and_prune
-    with patch.object(adc, "densify_and_prune", densify_and_prune):
+    original = AdaptiveDensityControl.densify_and_prune
+    with patch.object(AdaptiveDensityControl, "densify_and_prune", densify_and_prune):
         yield
 
 
@@ -80,13 +76,13 @@ def reset_until_the_end() -> Iterator[None]:
     A reset in the last iteration would leave nothing to see.
     """
 
-    def should_reset(config: DensifyConfig, iteration: int, white_background: bool) -> bool:
-        if config.stop <= iteration < ITERATIONS:
-            return iteration % config.adc.reset_every == 0
-        return original(config, iteration, white_background)
+    def resets(strategy: AdaptiveDensityControl, iteration: int) -> bool:
+        if strategy.config.stop <= iteration < ITERATIONS:
+            return iteration % strategy.config.adc.reset_every == 0
+        return original(strategy, iteration)
 
-    original = adc.should_reset
-    with patch.object(adc, "should_reset", should_reset):
+    original = AdaptiveDensityControl.resets
+    with patch.object(AdaptiveDensityControl, "resets", resets):
         yield
 
 

@@ -24,8 +24,8 @@ import numpy as np
 import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table
-from drgs.bench.peers import SHELL, volprim_scene
 from drgs.bench.scenes import mitsuba_sensor
+from drgs.bench.speed import SHELL, volprim_scene
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference

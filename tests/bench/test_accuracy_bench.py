@@ -36,7 +36,7 @@ def subject():
 
 
 def image_of(subject, **approximations):
-    return accuracy.Renderer.of(
+    return accuracy.Renderer.from_rung(
         accuracy.Rung("", approximations), subject, subject.cameras[0]
     ).image()
 

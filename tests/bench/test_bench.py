@@ -12,7 +12,7 @@ from support.helpers import FLOAT32 as SINGLE
 from support.helpers import Case, clear, device_camera, device_gaussians
 
 from drgs.bench import __main__ as bench
-from drgs.bench import peers, scaling, scenes, speed, stability, timing
+from drgs.bench import scaling, scenes, speed, stability, timing
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -113,8 +113,8 @@ def test_an_iteration_is_profiled(small_scene):
 
 
 def test_renderers_do_not_reuse_a_frame(small_scene):
-    problem = peers.Problem(small_scene.gaussians, small_scene.camera, np.ones((48, 48, 3)))
-    renderer = peers.drgs_renderer(problem)
+    problem = speed.Problem(small_scene.gaussians, small_scene.camera, np.ones((48, 48, 3)))
+    renderer = speed.drgs_renderer(problem)
     renderer.forward()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()

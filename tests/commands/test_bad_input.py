@@ -26,10 +26,12 @@ from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
+from drgs.datasets.fingerprint import Fingerprint
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.ply import read_points
 from drgs.results.folder import claim_output_folder
 from drgs.training.checkpoint import Checkpoint, save_checkpoint
+from drgs.training.loop import History
 
 
 def some_gaussians(num):
@@ -412,7 +414,9 @@ def small_disk(tmp_path):
 
 
 def save_large_checkpoint(path):
-    state = Checkpoint({"means": np.zeros((9999, 3))}, np.zeros((0, 6)), 0.0)
+    state = Checkpoint(
+        {"means": np.zeros((9999, 3))}, *History().arrays(), 0.0, Fingerprint(train=[], test=[])
+    )
     save_checkpoint(path.parent, FitConfig(data={"path": "x"}), state)
 
 

@@ -17,12 +17,13 @@ from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
+from drgs.datasets.fingerprint import fingerprint_of
 from drgs.datasets.types import Motion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
-from drgs.training import history
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from drgs.training.effects.registry import integrator_settings, training_effects
+from drgs.training.effects.base import integrator_settings, training_effects
+from drgs.training.loop import History
 from drgs.training.summary import summary_of_fit
 
 MODULES = (
@@ -34,7 +35,7 @@ MODULES = (
     "light.grid", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
-    "training.effects.view_parameters", "training.image_ops",
+    "training.effects.view_parameters",
 )  # fmt: skip
 """Of effects, and of nothing else."""
 
@@ -316,7 +317,7 @@ def test_a_checkpoint_file_holds_the_state_of_effects(tmp_path):
     changes = {key: value for key, value in EVERYTHING.items() if key != "model__antialiased"}
     dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
     trainer = fits.steps(fits.make_trainer(dataset, **changes), 3)
-    saved = Checkpoint(trainer.state(), history.History().as_array(), 0.0)
+    saved = Checkpoint(trainer.state(), *History().arrays(), 0.0, fingerprint_of(dataset))
     save_checkpoint(tmp_path, trainer.config, saved)
     resumed = fits.make_trainer(dataset, **changes)
     resumed.restore(load_checkpoint(tmp_path, trainer.config).trainer)
@@ -419,7 +420,7 @@ sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
 from dataclasses import replace
-from drgs.training.effects.registry import training_effects
+from drgs.training.effects.base import training_effects
 from drgs.training.summary import summary_of_fit
 from support import small_capture as capture
 from support.usual_rule import USUAL
@@ -487,7 +488,6 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "colors": [
             "drgs.training.effects.colors",
             "drgs.training.effects.view_parameters",
-            "drgs.training.image_ops",
         ],
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],

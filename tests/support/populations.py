@@ -5,7 +5,6 @@ import numpy as np
 from drjit.llvm.ad import Float, TensorXf
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.density.adc import DensityStatistics
 from drgs.training.density.strategy import Population
 from drgs.training.optimizer import make_optimizer
 
@@ -44,9 +43,10 @@ def make(scales, opacities, sh_rows=3, tensor_type=TensorXf, seed=0):
 
 
 def statistics(gradient_norms, views=None):
+    """Sums of gradient norms and numbers of views, as the strategy adc has them."""
     norms = np.asarray(gradient_norms, dtype=np.float32)
     views = np.full(len(norms), 4) if views is None else np.asarray(views)
-    return DensityStatistics(Float(norms * views), Float(views))
+    return Float(norms * views), Float(views)
 
 
 def rows_of(optimizer, seed=0, prefix=""):

@@ -1,6 +1,7 @@
 """Fits for a given time: what is planned, when they end, and that their plans can be repeated."""
 
 import time
+from argparse import ArgumentTypeError
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,11 +16,13 @@ from drgs.config.changes import changed
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.datasets.fingerprint import Fingerprint
 from drgs.results.folder import load_run_config
 from drgs.training import budget as plan
 from drgs.training import checkpoint
 from drgs.training.budget import Curve, Deadline, Strategy, load_curves, make_plan, parse_duration
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from drgs.training.loop import History
 from drgs.training.rates import rates_over_time
 from drgs.training.trainer import Trainer
 
@@ -42,7 +45,7 @@ def test_durations(text, seconds):
     ["", "0", "m", "5 minutes", "-3s", "nan", "1m2h", "0s", "1h30", "5m5", "\u0665m", "9" * 400],
 )
 def test_what_is_no_duration_is_refused(text):
-    with pytest.raises(ValueError, match="must be a time such as 90s, 5m or 1h30m"):
+    with pytest.raises(ArgumentTypeError, match="must be a time such as 90s, 5m or 1h30m"):
         parse_duration(text)
 
 
@@ -331,7 +334,7 @@ def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
 def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
     """Whatever ends the process while the next one is written: one of both plans goes on."""
     config = FitConfig(data={"path": tmp_path}, iterations=40_000)
-    state = Checkpoint({"iteration": np.array(7)}, np.zeros((0, 6)), 1.0)
+    state = empty_checkpoint()
     save_checkpoint(tmp_path, config, state)
     revised = changed(config, {"iterations": config.iterations + 10})
     for module, name, saved in (
@@ -350,12 +353,17 @@ def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(tmp_
 
 def test_a_checkpoint_of_another_configuration_is_refused(tmp_path):
     config = FitConfig(data={"path": tmp_path}, iterations=40_000)
-    save_checkpoint(tmp_path, config, Checkpoint({}, np.zeros((0, 6)), 1.0))
+    save_checkpoint(tmp_path, config, empty_checkpoint())
     other = changed(config, {"iterations": 50_000})
     with pytest.raises(UserError, match="belongs to another configuration than"):
         load_checkpoint(tmp_path, other)
     moved = changed(config, {"data.path": tmp_path / "moved", "output.history_every": 3})
     assert load_checkpoint(tmp_path, moved).config == moved
+
+
+def empty_checkpoint():
+    data = Fingerprint(train=[], test=[])
+    return Checkpoint({"iteration": np.array(7)}, *History().arrays(), 1.0, data)
 
 
 def interrupt(*arguments, **others):

@@ -24,8 +24,8 @@ from drgs.reference import splatting as reference
 from drgs.results.files import CAMERAS
 from drgs.results.metrics import ssim
 from drgs.results.refined_cameras import refined_dataset
+from drgs.training.effects.base import training_effects
 from drgs.training.effects.cameras import INTRINSICS
-from drgs.training.effects.registry import training_effects
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,18 +1,18 @@
-"""Checkpoints of versions whose configuration had fewer values, or left fewer to the data."""
+"""Checkpoints of configurations with fewer values, or which leave fewer to the data."""
 
 import json
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.trainers import make_trainer
+from support.small_capture import make_dataset
 
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.datasets.fingerprint import fingerprint_of
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from drgs.training.history import History
-from drgs.training.state_checks import check_state
+from drgs.training.loop import History
 
 DECIDED = {"data.background": "white", "model.near": 0.2}
 
@@ -37,15 +37,15 @@ def config(tmp_path):
 
 def saved_as(folder, config, change):
     """The checkpoint of ``config``, whose words about it are changed."""
-    save_checkpoint(
-        folder, config, Checkpoint({"iteration": np.array(3)}, History().as_array(), 0.0)
-    )
+    data = fingerprint_of(make_dataset(1, 1))
+    state = {"iteration": np.array(3)}
+    save_checkpoint(folder, config, Checkpoint(state, *History().arrays(), 0.0, data))
     with np.load(folder / "checkpoint.npz") as file:
         arrays = dict(file)
-    del arrays["config_before"]  # which no earlier version wrote
     values = json.loads(str(arrays["config"]))
     change(values)
-    arrays["config"] = np.array(json.dumps(values, sort_keys=True))
+    for name in ("config", "config_before"):
+        arrays[name] = np.array(json.dumps(values, sort_keys=True))
     np.savez(folder / "checkpoint.npz", **arrays)
 
 
@@ -62,26 +62,6 @@ def without_what_is_new(values):
 def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
     saved_as(folder, config, without_what_is_new)
     assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
-
-
-def test_statistics_of_an_earlier_version_are_those_of_adc(folder):
-    """Whose names stood among those of the optimizer."""
-    densify = {"strategy": "adc", "start": 2, "every": 6, "adc": {"grad_threshold": 1e-6}}
-    trainer = make_trainer(densify=densify)
-    for _ in range(4):
-        trainer.step()
-    state = trainer.state()
-    earlier = {name.removeprefix("density/"): values for name, values in state.items()}
-    assert {"gradient_norms", "views"} < set(earlier)
-    history = History().as_array()
-    save_checkpoint(folder, trainer.config, Checkpoint(earlier, history, 0.0))
-    read = load_checkpoint(folder, trainer.config).trainer
-    assert {k: v.tobytes() for k, v in read.items()} == {k: v.tobytes() for k, v in state.items()}
-    resumed = make_trainer(densify=densify)
-    check_state(read, resumed.state(), 50, 1000)
-    resumed.restore(read)
-    assert resumed.step().loss == trainer.step().loss
-    assert resumed.step().density == trainer.step().density is not None
 
 
 @pytest.mark.parametrize(

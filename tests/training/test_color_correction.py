@@ -12,7 +12,7 @@ from support.helpers import single
 
 from drgs.results.files import COLORS
 from drgs.results.metrics import ssim
-from drgs.training.effects.registry import training_effects
+from drgs.training.effects.base import training_effects
 
 IDENTITY = np.eye(3, 4)
 

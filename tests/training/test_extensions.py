@@ -16,6 +16,7 @@ from drgs.config.changes import changed
 from drgs.config.load import config_from, dump_config, load_config
 from drgs.core import registry
 from drgs.core.errors import UserError
+from drgs.training.effects.base import training_effects
 from drgs.training.losses import prepare_target
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -130,6 +131,15 @@ def test_a_fit_uses_what_its_configuration_names():
     assert trainer.num_gaussians == start - start // 2
     assert [bool(report.density) for report in reports] == [False] * 5 + [True] + [False] * 2
     assert float(effect.state()["strength.value"][0, 0]) != 0
+
+
+def test_an_effect_decides_by_the_dataset_whether_it_takes_part(examples, monkeypatch):
+    """Where its section is there."""
+    needs = lambda config, dataset: any(view.depth is not None for view in dataset.train)  # noqa: E731
+    monkeypatch.setattr(examples["vignetting"].Vignetting, "is_used", needs)
+    for dataset, used in ((fits.plain_dataset(), []), (fits.true_dataset(), ["vignetting"])):
+        effects = training_effects(configured(), dataset)
+        assert [effect.name for effect in effects if effect.name != "depth"] == used
 
 
 def test_objects_give_the_bytes_of_names(examples):

@@ -8,7 +8,7 @@ import pytest
 from support.helpers import FLOAT32, FLOAT64, assert_arrays_agree, bitwise, both_precisions, single
 from support.kernels import float_reductions
 
-from drgs.training import image_ops as pixels
+from drgs.training.effects import colors, depth
 
 HEIGHT, WIDTH = 13, 21
 
@@ -87,7 +87,7 @@ class Operation:
 
 def split_operation(channels=5, count=3):
     return Operation(
-        lambda image: pixels.split(image, count),
+        lambda image: depth.split(image, count),
         lambda image: numpy_split(image, count),
         {"image": random(HEIGHT, WIDTH, channels)},
         lambda first, rest: {"image": np.concatenate([first, rest], axis=-1)},
@@ -105,7 +105,7 @@ def transform_operation():
         }
 
     return Operation(
-        pixels.transform_colors, numpy_transform, {"image": image, "matrix": matrix}, adjoint
+        colors.transform_colors, numpy_transform, {"image": image, "matrix": matrix}, adjoint
     )
 
 
@@ -115,7 +115,7 @@ def depth_operation():
     def apply(depths):
         flat = dr.array_t(depths)
         of_type = FLOAT32 if flat is FLOAT32.Float else FLOAT64
-        return pixels.depth_error(depths, of_type.array(target), of_type.array(weights))
+        return depth.depth_error(depths, of_type.array(target), of_type.array(weights))
 
     def adjoint(g):
         difference = depths[..., 0].ravel() - depths[..., 1].ravel() * target
@@ -273,7 +273,7 @@ def test_the_comparisons_notice_one_percent(monkeypatch):
             value = tuple(scale * v for v in value) if both else scale * value
             original(self, *key, value)
 
-        for kind in (pixels._Split, pixels._TransformColors, pixels._DepthError):
+        for kind in (depth._Split, colors._TransformColors, depth._DepthError):
             monkeypatch.setattr(kind, method, scaled)
     for name in OPERATIONS:
         for check in (
@@ -294,7 +294,7 @@ def test_the_comparisons_notice_one_percent(monkeypatch):
 def test_the_half_of_a_split_that_nothing_depends_on_has_no_derivative(used):
     operation = split_operation()
     image = operation.device(FLOAT32, grad=True)["image"]
-    halves = pixels.split(image, 3)
+    halves = depth.split(image, 3)
     weights = random(*halves[used].shape)
     dr.backward(dr.sum(halves[used] * tensor(weights, FLOAT32), axis=None))
     expected = np.zeros((HEIGHT, WIDTH, 5))
@@ -308,7 +308,7 @@ def test_colors_may_be_transformed_with_one_derivative_alone(attached):
     everything = gradients(operation, FLOAT32, cotangents_of(operation))
     inputs = operation.device(FLOAT32)
     dr.enable_grad(inputs[attached])
-    output = pixels.transform_colors(**inputs)
+    output = colors.transform_colors(**inputs)
     dr.set_grad(output, tensor(cotangents_of(operation)[0], FLOAT32))
     dr.enqueue(dr.ADMode.Backward, output)
     dr.traverse(dr.ADMode.Backward)
@@ -318,7 +318,7 @@ def test_colors_may_be_transformed_with_one_derivative_alone(attached):
     dr.enable_grad(inputs[attached])
     direction = random(*operation.inputs[attached].shape, seed=20)
     dr.set_grad(inputs[attached], tensor(direction, FLOAT32))
-    output = pixels.transform_colors(**inputs)
+    output = colors.transform_colors(**inputs)
     dr.forward_to(output)
     zero = {k: np.zeros_like(v) for k, v in operation.inputs.items()}
     (expected,) = tangents(operation, FLOAT32, zero | {attached: direction})

@@ -142,7 +142,7 @@ def test_each_time_of_a_shutter_counts():
 )
 def test_a_population_grows_to_its_cap_if_there_is_time(changes, expected):
     config = config_of(500, 10**6, **changes)
-    assert memory.most_gaussians(config, 1000) == expected
+    assert memory.max_num_gaussians(config, 1000) == expected
 
 
 # ----------------------------------------------------------------------------------------------
@@ -155,7 +155,8 @@ def available(monkeypatch):
     """Sets how much memory a fit may take."""
 
     def set_to(count):
-        monkeypatch.setattr(memory, "available_memory", lambda: math.ceil(count / memory.USABLE))
+        available = math.ceil(count / memory.USABLE_SHARE)
+        monkeypatch.setattr(memory, "available_memory", lambda: available)
         monkeypatch.setattr(memory, "resident_memory", lambda: 0)
 
     return set_to
@@ -247,7 +248,7 @@ MEASURED = """
 import sys
 from drgs import fit
 from drgs.training import memory
-from drgs.training.stages import KEPT_BYTES
+from drgs.training.steps import KEPT_BYTES
 peaks, estimate = [], memory.estimate
 memory.estimate = lambda *a, **k: peaks.append(estimate(*a, **k)) or peaks[-1]
 fit.main(sys.argv[1:])

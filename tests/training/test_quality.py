@@ -7,8 +7,8 @@ from support.small_capture import decibels
 from support.small_fits import everything_of, make_trainer, steps, true_dataset
 
 from drgs.results.history import DENSITY_COLUMNS, DensityReport, write_density, write_history
-from drgs.training import quality
-from drgs.training.history import History, HistoryRow
+from drgs.training import loop as quality
+from drgs.training.loop import History, HistoryRow
 
 
 def row(iteration, test_psnr=None):
@@ -67,11 +67,12 @@ def test_measuring_changes_nothing_that_comes():
 
 def test_measuring_is_no_part_of_the_fits_time(monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("drgs.training.history.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("drgs.training.loop.time.perf_counter", lambda: now[0])
     history = History()
     history.rows.append(row(10))
     now[0] = 5.0
-    history.add_test_psnr(21.5, 2.0)
+    history.add_test_psnr(21.5)
+    history.leave_out(2.0)
     assert history.wall_s == 3.0
     assert history.rows == [row(10, 21.5)]
 
@@ -79,7 +80,7 @@ def test_measuring_is_no_part_of_the_fits_time(monkeypatch):
 def test_the_history_is_kept_with_and_without_measurements(tmp_path):
     history = History()
     history.rows += [row(10), row(20, 21.5), row(30, float("inf"))]
-    assert History.from_array(history.as_array(), 1.0).rows == history.rows
+    assert History.from_arrays(*history.arrays(), 1.0).rows == history.rows
     write_history(tmp_path / "history.csv", history.rows)
     lines = (tmp_path / "history.csv").read_text().splitlines()
     assert [line.split(",")[-1] for line in lines] == ["test_psnr", "", "21.5", "inf"]
@@ -89,10 +90,10 @@ def test_changes_of_the_population_are_kept(tmp_path):
     history = History()
     write_density(tmp_path / "density.csv", history.density)
     assert not list(tmp_path.iterdir())
-    assert history.density_array().shape == (0, len(DENSITY_COLUMNS))
+    assert history.arrays()[1].shape == (0, len(DENSITY_COLUMNS))
     history.add_density(20, DensityReport(7, num_added=4, split=2, pruned=3, refused=1))
     history.add_density(40, DensityReport(5, relocated=6, pruned=2))
-    again = History.from_array(history.as_array(), 1.0, history.density_array())
+    again = History.from_arrays(*history.arrays(), 1.0)
     assert again.density == history.density
     write_density(tmp_path / "density.csv", again.density)
     assert (tmp_path / "density.csv").read_text().splitlines() == [
@@ -100,8 +101,3 @@ def test_changes_of_the_population_are_kept(tmp_path):
         "20,7,4,0,2,0,3,1",
         "40,5,0,0,0,6,2,0",
     ]
-
-
-def test_the_history_of_an_earlier_version_goes_on():
-    earlier = np.array([[10, 0.5, 10.0, 100, 1e-3, 2.0]])
-    assert History.from_array(earlier, 1.0).rows == [row(10)]

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ from support.trainers import make_trainer
 import drgs
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
-from drgs.training.budget import Budget
+from drgs.training.budget import Budget, rehearse
+from drgs.training.density.strategy import DensityReport, DensityStrategy
+from drgs.training.effects.base import TrainingEffect
 from drgs.training.loop import RootDecides, iterations
+from drgs.training.losses import Loss
 from drgs.training.session import FitSession
 
 
@@ -38,6 +42,51 @@ def test_a_time_that_is_too_short_is_refused_before_the_trainer_is_made(tmp_path
     with pytest.warns(), pytest.raises(UserError, match="--budget: must leave time for 50"):
         session.run()
     assert not hasattr(session, "trainer")
+
+
+class Halves(DensityStrategy):
+    """Keeps half of the rows after the fourth iteration."""
+
+    def is_due(self, iteration):
+        return iteration == 4
+
+    def refine(self, population, iteration):
+        kept = np.arange(population.num_rows // 2)
+        population.edit(population.rows(kept))
+        return DensityReport(num_gaussians=len(kept))
+
+
+class Counted(TrainingEffect):
+    """Counts the views that it sees."""
+
+    name, count = "counted", 0
+
+    def before(self, fit, view):
+        self.count += 1
+
+
+class Squares(Loss):
+    """The mean squared error."""
+
+    def __call__(self, image, target):
+        return dr.mean(dr.square(image.array - target.image.array))
+
+
+def test_other_trainers_of_a_session_get_copies_of_its_objects(tmp_path):
+    """A rehearsal gets all of them; Gaussians for viewers, whose number stays, no strategy."""
+    config, effect = load_config(write_project(tmp_path)), Counted()
+    session = FitSession(config, strategy=Halves(), effects=[effect], loss=Squares())
+    session.prepare()
+    assert session.run() and effect.count == VALUES["iterations"]
+    dataset, start = session.dataset, session.trainer.gaussians()
+    rehearsal = rehearse(session.config, dataset, start, **session._objects).trainer
+    further = session.trainer.spawn(session.config, start)
+    assert type(rehearsal.density) is Halves is not type(further.density)
+    assert rehearsal.num_gaussians == start.num_gaussians // 2
+    for trainer in (rehearsal, further):
+        assert type(trainer.loss) is Squares and type(trainer.effects[0]) is Counted
+        assert trainer.loss is not session.loss and trainer.effects[0] is not effect
+    assert effect.count == VALUES["iterations"] < rehearsal.effects[0].count
 
 
 class Revises:

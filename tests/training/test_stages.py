@@ -6,7 +6,7 @@ import pytest
 from support import small_fits as fits
 from support.trainers import make_trainer
 
-from drgs.training import stages
+from drgs.training import steps as training_steps
 from drgs.training import trainer as trainer_module
 from drgs.training.losses import TARGET_BYTES
 
@@ -21,7 +21,7 @@ def variant():
 def made(trainer):
     """Indices of the views whose targets are on the device, by stage."""
     return [
-        {view.index for view in stage.views if view._photograph is not None}
+        {view.index for view in stage.views if "photograph" in vars(view)}
         for stage in trainer.stages
     ]
 
@@ -69,7 +69,7 @@ def test_what_a_view_takes_is_counted():
     arrays += [view.uploads["colors"].array, view.uploads["background"].array]
     arrays += view.uploads["depth"]
     count = sum(len(array) for array in arrays) * 4
-    assert count == view.width * view.height * stages.bytes_on_device(trainer.effects)
+    assert count == view.width * view.height * training_steps.bytes_on_device(trainer.effects)
 
 
 def test_a_stage_that_ends_leaves_nothing_on_the_device():

@@ -13,7 +13,7 @@ from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.results.metrics import ssim
-from drgs.training.effects.registry import training_effects
+from drgs.training.effects.base import training_effects
 from drgs.training.steps import view_of
 
 # Values of order 1 in single precision: sums of 2304 numbers, SSIM's windows.

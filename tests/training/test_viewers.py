@@ -43,7 +43,7 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
     monkeypatch.setattr(viewers, "SHARE", 1.0)
     trainer, dataset, gaussians = ended_fit()
     before = list(trainer.images(dataset.test))
-    closed = viewers._started(trainer, gaussians)
+    closed = viewers._closed_form(trainer, gaussians)
     counted = []
     found = for_viewers(trainer, gaussians, counted.append)
     assert counted == list(range(1, 21))
@@ -81,12 +81,12 @@ def test_what_a_fit_found_out_of_cameras_and_colours_stays():
         for name, values in effect.values().items():
             np.testing.assert_array_equal(values, before[effect.name][name])
     config = tuning(trainer.config)
-    assert config.colors.lr == viewers.NEXT_TO_NOTHING and config.cameras.rotation_lr == 0
+    assert config.colors.lr == viewers.NEGLIGIBLE_RATE and config.cameras.rotation_lr == 0
 
 
 def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
     trainer, _, gaussians = ended_fit(8)
-    expected = viewers._started(trainer, gaussians)
+    expected = viewers._closed_form(trainer, gaussians)
     monkeypatch.setitem(viewers.RATES, "scales_lr", 10.0)
     monkeypatch.setattr(viewers, "SHARE", 0.5)
     step = Trainer.step

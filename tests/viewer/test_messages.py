@@ -32,8 +32,7 @@ from support.small_fits import everything_of, make_trainer, true_dataset
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from drgs.config.approximations import Approximations
-from drgs.training.history import History
-from drgs.training.loop import AllIterations, iterations
+from drgs.training.loop import AllIterations, History, iterations
 from drgs.viewer.fit_page import FitPage, watch
 from drgs.viewer.messages import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, is_valid, offers
 from drgs.viewer.page import StartView

@@ -17,7 +17,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
-from drgs.training.history import History, HistoryRow
+from drgs.training.loop import History, HistoryRow
 from drgs.viewer.controls import LENSES, SWITCHED
 from drgs.viewer.fit_page import MOST_POINTS, FitPage, curves_of
 from drgs.viewer.frames import SHOWN, Frame

@@ -17,8 +17,7 @@ from support.small_fits import (
 
 from drgs.config.approximations import Approximations
 from drgs.integrator.scene import make_scene, render_views
-from drgs.training.history import History
-from drgs.training.loop import AllIterations, iterations
+from drgs.training.loop import AllIterations, History, iterations
 from drgs.training.trainer import Trainer
 from drgs.viewer.frames import SHOWN, FrameRequest
 from drgs.viewer.optics import Eye, FisheyeLens, ThinLens

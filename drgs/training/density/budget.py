@@ -29,7 +29,7 @@ import drjit as dr
 import numpy as np
 from scipy.special import expit, logit
 
-from drgs.config.density import SCHEDULE_SHARES, DensifyConfig
+from drgs.config.density import SCHEDULES, DensifyConfig
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import CoarseStage, FitConfig
 from drgs.core.arrays import from_host, types_of
@@ -48,14 +48,11 @@ from drgs.training.density.strategy import (
 OFFSET = 1.35
 """Of the halves' means from that of the Gaussian, in standard deviations of its longest axis."""
 
-LONG, OTHERS = 0.55, 0.893
-"""Of the halves' scales: along that axis, and along the two others."""
+LONG_SCALE, SHORT_SCALE = 0.55, 0.893
+"""Factors of the halves' scales: along that axis, and along the two others."""
 
-OPACITY = 0.6
-"""Of the halves: they overlap."""
-
-OPACITY_RANGE = 1e-4, 1 - 1e-4
-"""Of the halves, so that logits stay small."""
+OPACITY, OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
+"""Factor of the halves' opacities, which overlap; and their range, so that logits stay small."""
 
 
 @STRATEGIES.register("budget")
@@ -68,7 +65,7 @@ class GrowthToNumber(DensityStrategy):
     errors: Any = None  # Float (N,): sum over views of s; None until it begins
     first: int = 0  # Gaussians at the start
     by_row = ("errors",)
-    start_share, stop_share = SCHEDULE_SHARES["budget"]
+    start_share, stop_share, rate_decay = SCHEDULES["budget"]
 
     @classmethod
     def from_config(
@@ -82,13 +79,10 @@ class GrowthToNumber(DensityStrategy):
         """Start with the errors of no views."""
         float_type = type(population.value("means").array)
         self.first = self.first or population.num_rows
-        self.errors = dr.zeros(float_type, population.num_own)
+        self.errors = dr.zeros(float_type, population.num_local_rows)
 
     def needs_statistics(self, iteration: int) -> bool:
-        """Every so many views, as long as the errors can still lead to a change.
-
-        Where there was none since the last change, the view of the change itself.
-        """
+        """Return whether errors count: every so many views, at least once before a change."""
         every, stop = self.config.budget.error_every, self.config.stop
         if iteration < stop and iteration % every == 0:
             return True
@@ -106,7 +100,7 @@ class GrowthToNumber(DensityStrategy):
         dr.eval(self.errors)
 
     def is_due(self, iteration: int) -> bool:
-        """Whether the population changes after this iteration."""
+        """Return whether the population changes after this iteration."""
         config = self.config
         turn = iteration % config.every == 0 or iteration == config.stop
         return config.start < iteration <= config.stop and turn
@@ -122,7 +116,7 @@ class GrowthToNumber(DensityStrategy):
             )
         kept = int(np.count_nonzero(keep))
         room = max(0, self.goal(iteration) - kept)
-        errors = np.where(keep, population.of_all(self.errors), 0)
+        errors = np.where(keep, population.gather(self.errors), 0)
         candidates = np.flatnonzero(errors > 0)
         candidates = candidates[np.argsort(-errors[candidates], kind="stable")]
         split = np.sort(candidates[:room])
@@ -140,7 +134,7 @@ class GrowthToNumber(DensityStrategy):
         )
 
     def goal(self, iteration: int) -> int:
-        """How many there are to be after the change of this iteration."""
+        """Return the number of Gaussians after the change of this iteration."""
         return min(self._uncapped_goal(iteration), max(self.config.max_gaussians, self.first))
 
     def _uncapped_goal(self, iteration: int) -> int:
@@ -153,14 +147,11 @@ class GrowthToNumber(DensityStrategy):
         u = min(max((iteration - start) / max(stop - start, 1), 0), 1)
         size = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
         r = size if iteration < stop else 1
-        return self.first + round((self._final - self.first) * math.sqrt(u) / r ** (2 - u))
-
-    @property
-    def _final(self) -> int:
-        return max(self.config.budget.gaussians, self.first)
+        final = max(self.config.budget.gaussians, self.first)
+        return self.first + round((final - self.first) * math.sqrt(u) / r ** (2 - u))
 
     def state(self) -> dict[str, np.ndarray]:
-        """The errors, and the number at the start."""
+        """Return the errors, and the number at the start."""
         return {"errors": np.array(self.errors), "first": np.array(self.first)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -168,14 +159,14 @@ class GrowthToNumber(DensityStrategy):
         self.errors = from_host(type(self.errors), state["errors"])
         self.first = int(state["first"])
 
-    def most_gaussians(self, start: int, iterations: int) -> int:
-        """The number that it grows to."""
+    def max_num_gaussians(self, start: int, iterations: int) -> int:
+        """Return the number that the population grows to."""
         del iterations
         return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
 
 
 def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
-    """Two halves of each of ``rows``: all the first ones, then all the second ones.
+    """Return two halves of each of ``rows``: all the first ones, then all the second ones.
 
     The halves' means lie on both sides of the Gaussian's, on its longest axis.
     """
@@ -184,7 +175,7 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
     longest = population.host("log_scales")[twice].argmax(axis=1)
     offsets = np.zeros((len(twice), 3))
     offsets[np.arange(len(twice)), longest] = np.repeat([OFFSET, -OFFSET], len(rows))
-    factors = np.where(offsets != 0, LONG, OTHERS)
+    factors = np.where(offsets != 0, LONG_SCALE, SHORT_SCALE)
     opacities = np.clip(OPACITY * expit(population.host("logit_opacities")[twice]), *OPACITY_RANGE)
 
     t = types_of(type(new["logit_opacities"]))

@@ -1,7 +1,5 @@
 """The strategy ``mcmc``: relocation, noise and regularisers, up to a number of Gaussians.
 
-Part of ``drgs.training.density``; imported where ``densify.strategy`` is ``mcmc``.
-
 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): the Gaussians are
 samples of a distribution that the photographs define, and Adam's steps with noise are a walk
 through it. Nothing is cloned or split by a threshold. Gaussians that have become transparent are
@@ -19,25 +17,28 @@ import drjit as dr
 import numpy as np
 from scipy.special import comb, expit, logit
 
-from drgs.config.density import SCHEDULE_SHARES, DensifyConfig
+from drgs.config.density import SCHEDULES, DensifyConfig
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.training.density.draws import in_proportion, normals
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, displaced
 
-MOST_COPIES = 51
+MAX_COPIES = 51
 """In one place, of one Gaussian at a time; as in the paper's code. Binomials up to here are exact
 in double precision."""
 
-MOST_OPAQUE = 1 - 2.0**-23
-"""Of copies: float32's largest opacity that has a logit."""
+MAX_OPACITY = 1 - 2.0**-23
+"""Of copies: the largest opacity in float32 that has a logit."""
 
 NOISE_STEEPNESS = 100.0
 """Noise fades out over some 0.05 of opacity: the paper's equation 8."""
+
+
+_UNIT_OF_WORD = 2.0**-24
+"""Scales the upper 24 bits of a random word, which float32 holds exactly, to [0, 1)."""
 
 
 @STRATEGIES.register("mcmc")
@@ -47,7 +48,7 @@ class MarkovChain(DensityStrategy):
 
     config: DensifyConfig
     extent: float = math.nan  # of the scene, world units; known when it begins
-    start_share, stop_share = SCHEDULE_SHARES["mcmc"]
+    start_share, stop_share, rate_decay = SCHEDULES["mcmc"]
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> MarkovChain:
@@ -56,16 +57,16 @@ class MarkovChain(DensityStrategy):
         return cls(config.densify)
 
     def begin(self, population: Population) -> None:
-        """Know the scene's extent, in which noise and scales are measured."""
+        """Note the scene's extent, in which noise and scales are measured."""
         self.extent = population.extent
 
     @property
     def cap(self) -> int:
-        """What the population grows to; one that starts with more stays as it is."""
+        """Gaussians that the population grows to; one that starts with more stays as it is."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
     def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
-        """The paper's equation 10: the mean opacity, and the mean scale in scene extents."""
+        """Yield the paper's equation 10: mean opacity, and mean scale in scene extents."""
         config, logits = self.config.mcmc, parameters["logit_opacities"]
         log_scales = parameters["log_scales"].array
         if config.opacity_weight > 0:
@@ -101,7 +102,7 @@ class MarkovChain(DensityStrategy):
         population.set_values("means", type(means)(dr.ravel(moved), means.shape))
 
     def is_due(self, iteration: int) -> bool:
-        """Every so many iterations between start and stop."""
+        """Return whether an iteration between start and stop is a multiple of ``every``."""
         config = self.config
         return config.start < iteration < config.stop and iteration % config.every == 0
 
@@ -130,7 +131,9 @@ class MarkovChain(DensityStrategy):
         copied = in_proportion(np.where(alive, opacities, 0), aim - num_alive, key)
         if len(copied):
             drawn, rows = _copies(population, copied, opacities, config.min_opacity)
-            _spread(rows, len(drawn), config.spread, [*key, 1])
+            offsets = np.random.default_rng([*key, 1]).standard_normal(rows["means"].shape)
+            offsets[: len(drawn)] = 0
+            rows["means"] = displaced(rows, config.spread * offsets)
             alive[drawn] = False
             population.edit(population.rows(np.flatnonzero(alive)), rows)
         elif num_alive < before:
@@ -143,27 +146,27 @@ class MarkovChain(DensityStrategy):
             pruned=before - num_alive - relocated,
         )
 
-    def most_gaussians(self, start: int, iterations: int) -> int:
-        """The cap, or what is there at the start."""
+    def max_num_gaussians(self, start: int, iterations: int) -> int:
+        """Return the cap, or the number at the start."""
         del iterations
         return max(start, self.cap)
 
 
 def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Opacities of n coincident Gaussians that look like one, and the factor of their scales.
+    """Return opacities of n coincident Gaussians that look like one, and factors of their scales.
 
-    opacities: (M,) of the one; counts: (M,) of what there will be, at most ``MOST_COPIES`` of which
-    count. The paper's equation 9: composited, the copies are as opaque at their centre, and along
-    a line through it:
+    opacities: (M,) of the one; counts: (M,) of n, of which at most ``MAX_COPIES`` count. The
+    paper's equation 9: composited, the copies are as opaque at their centre, and along a line
+    through it:
 
     o' = 1 - (1 - o)^(1/n),   s'/s = o / sum_{j=1..n} C(n, j) (-1)^(j-1) o'^j / sqrt(j)
 
     (with the paper's sum over i of C(i-1, k) summed up: C(n, k+1)).
     """
-    counts = np.minimum(counts, MOST_COPIES)
-    opacities = np.minimum(opacities, MOST_OPAQUE)
+    counts = np.minimum(counts, MAX_COPIES)
+    opacities = np.minimum(opacities, MAX_OPACITY)
     copies = -np.expm1(np.log1p(-opacities) / counts)
-    j = np.arange(1, MOST_COPIES + 1)
+    j = np.arange(1, MAX_COPIES + 1)
     terms = comb(counts[:, None], j) * np.where(j % 2, 1, -1) / np.sqrt(j)
     return copies, opacities / (terms * copies[:, None] ** j).sum(axis=1)
 
@@ -171,13 +174,13 @@ def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np
 def _copies(
     population: Population, copied: np.ndarray, opacities: np.ndarray, min_opacity: float
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Which rows are drawn; and what takes their place: themselves, as corrected, then copies.
+    """Return the rows that are drawn, and their successors: themselves, corrected, then copies.
 
     copied: row numbers, ascending; opacities: (N,), of all rows.
     """
     drawn, counts = np.unique(copied, return_counts=True)
     shared, factors = corrected(opacities[drawn], counts + 1)
-    shared = np.clip(shared, min_opacity, MOST_OPAQUE)
+    shared = np.clip(shared, min_opacity, MAX_OPACITY)
     rows = population.take(population.rows(np.append(drawn, copied)))
     # Of each new row, the place of its source among those that were drawn.
     source = np.append(np.arange(len(drawn)), np.searchsorted(drawn, copied))
@@ -190,16 +193,60 @@ def _copies(
     return drawn, rows
 
 
-def _spread(rows: dict[str, Any], num_drawn: int, spread: float, key: list[int]) -> None:
-    """Move the copies, which stand behind those that were drawn, by so many standard deviations.
-
-    By spread R(q) (s * n), n standard normal; key: what the random numbers depend on.
-    """
-    normals = np.random.default_rng(key).standard_normal(rows["means"].shape)
-    normals[:num_drawn] = 0
-    rows["means"] = displaced(rows, spread * normals)
-
-
 def _mean(values: Any, weight: float, count: int) -> Any:
-    """Their sum, divided by ``count``, times a weight; no literals: their number changes."""
+    """Return the weighted mean; no literals: the number of values changes."""
     return dr.sum(values) * dr.opaque(type(values), weight / count)
+
+
+def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray:
+    """Return ``count`` row numbers, ascending, each as often as its weight requires.
+
+    weights: (N,) of at least 0, not all of them 0; NaN counts as 0. key: of the random numbers.
+
+    Systematic sampling (Madow 1949): the row of share p among the weights is drawn
+    floor(count p) or ceil(count p) times, count p on average; one of weight 0 is never drawn.
+
+    Raises ValueError if no weight is positive and finite.
+    """
+    weights = np.where(weights > 0, weights, 0.0)
+    ends = np.cumsum(weights)
+    if not (len(ends) and 0 < ends[-1] < np.inf):
+        raise ValueError("in_proportion(): the sum of the weights must be positive and finite")
+    offset = np.random.default_rng(key).random()
+    positions = (np.arange(count) + offset) * (ends[-1] / count if count else 0.0)
+    # Rounding may put the last position onto the end, behind the last row of any weight.
+    last = np.flatnonzero(weights)[-1]
+    return np.minimum(np.searchsorted(ends, positions, side="right"), last)
+
+
+def normals(float_type: type, rows: Any, iteration: Any, seed: Any) -> Any:
+    """Return standard normal vectors, Array3f (N,), a function of iteration, seed and row.
+
+    rows: UInt32 (N,); iteration, seed: UInt32 (1,), opaque, so that each value is no new kernel.
+
+    Box and Muller's transform of a hash of the three (``pcg4d``: Jarzynski and Olano 2020, Hash
+    Functions for GPU Rendering).
+    """
+    t = types_of(float_type)
+    words = pcg4d(rows, t.UInt32(iteration), t.UInt32(seed), t.UInt32(0))
+    first, second, third, fourth = (t.Float(word >> 8) * _UNIT_OF_WORD for word in words)
+    # 1 - u is above 0, of which there is a logarithm.
+    radius, other = (dr.sqrt(-2 * dr.log(1 - u)) for u in (first, third))
+    sine, cosine = dr.sincos(dr.two_pi * second)
+    return t.Array3f(radius * cosine, radius * sine, other * dr.cos(dr.two_pi * fourth))
+
+
+def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+    """Return four random words of four numbers, UInt32 each."""
+    x, y, z, w = (1664525 * v + 1013904223 for v in (x, y, z, w))
+    x, y, z, w = _mix(x, y, z, w)
+    x, y, z, w = (v ^ (v >> 16) for v in (x, y, z, w))
+    return _mix(x, y, z, w)
+
+
+def _mix(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+    x = x + y * w
+    y = y + z * x
+    z = z + x * y
+    w = w + y * z
+    return x, y, z, w

@@ -1,17 +1,34 @@
 """The last phase of a fit's population: down to a number of Gaussians, a few at a time.
 
-Part of ``drgs.training.density``: what the methods of ``densify.prune`` have in common. It comes
-after the strategy that lets the population grow, whichever that is.
+It comes after the strategy that lets the population grow. ``densify.prune.method`` chooses between
+the two strategies below.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import drjit as dr
 import numpy as np
 
+from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
-from drgs.training.density.strategy import DensityReport, Population
+from drgs.core.arrays import from_host, types_of
+from drgs.datasets.types import Dataset
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PixelWeight,
+    Population,
+    StepInfo,
+)
+
+MAX_PRESSURE = 1.0
+"""Of logits, at one time: an opacity of 0.5 becomes 0.27. What Adam makes good within some ten
+iterations at four times the usual rate."""
 
 
 @dataclass(frozen=True)
@@ -24,43 +41,176 @@ class PruneSchedule:
     to: int  # Gaussians that are left in the end
 
     @staticmethod
-    def of(config: FitConfig) -> PruneSchedule:
-        """That of a configuration; what is not given follows from the rest of it."""
+    def from_config(config: FitConfig) -> PruneSchedule:
+        """Return the schedule of a configuration, which may follow from the rest of it."""
         prune = config.densify.prune
-        start, stop = config.densify.prune_window(config.iterations)
-        return PruneSchedule(start, stop, prune.every, prune.to)
+        return PruneSchedule(*config.densify.prune_window(config.iterations), prune.every, prune.to)
 
     def contains(self, iteration: int) -> bool:
-        """Whether an iteration belongs to the phase."""
+        """Return whether an iteration belongs to the phase."""
         return self.start < iteration <= self.stop
 
     def is_due(self, iteration: int) -> bool:
-        """Whether something changes after an iteration."""
+        """Return whether something changes after an iteration."""
         due = iteration % self.every == 0 or iteration == self.stop
         return self.contains(iteration) and due
 
-    def wanted(self, iteration: int, begun_with: int) -> int:
-        """How many are to be left after an iteration: each change removes the same share.
+    def num_left(self, iteration: int, before: int) -> int:
+        """Return how many are to be left after an iteration: each change removes the same share.
 
-        ``begun_with`` (to / begun_with)^s, s being the share of the phase that is over; ``to`` at
-        its end.
+        ``before`` (to / before)^s, s being the share of the phase that is over, of ``before``
+        Gaussians at the first change; ``to`` at its end.
         """
-        if iteration >= self.stop or begun_with <= self.to:
+        if iteration >= self.stop or before <= self.to:
             return self.to
         share = (iteration - self.start) / (self.stop - self.start)
-        return round(begun_with * (self.to / begun_with) ** share)
+        return round(before * (self.to / before) ** share)
+
+
+class Pruning(DensityStrategy):
+    """What the methods have in common."""
+
+    @classmethod
+    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Pruning:
+        """Return the phase of the section ``densify.prune``."""
+        del dataset, section
+        return cls(config)
+
+    def __init__(self, config: FitConfig) -> None:
+        self.phase = PruneSchedule.from_config(config)
+        self.prune = config.densify.prune
+        self.num_before = 0  # Gaussians, at the first change
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether Gaussians are removed after this iteration."""
+        return self.phase.is_due(iteration)
+
+
+@STRATEGIES.register("importance")
+class Importance(Pruning):
+    """Removes Gaussians by what they contribute to images.
+
+    A Gaussian's score is the sum of its weights T a (3DGS, equation 3) over the pixels of the
+    images of the phase so far (as in Mini-Splatting, Fang and Wang 2024, section 4.2). Those of the
+    lowest scores are removed, a few at a time, so that the others can take over what they showed.
+    Each image of the phase takes about half as long again.
+    """
+
+    by_row = ("weights",)
+    scores: Any = None  # (N,) Float
+
+    def begin(self, population: Population) -> None:
+        """Start with the scores of no images."""
+        float_type = type(population.value("means").array)
+        self.scores = dr.zeros(float_type, population.num_local_rows)
+
+    def needs_statistics(self, iteration: int) -> bool:
+        """Return whether the iteration is in the phase."""
+        return self.phase.contains(iteration)
+
+    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        """Return ones: all pixels count alike."""
+        del iteration
+        return {"coverage": _ones}
+
+    def update_statistics(self, step: StepInfo) -> None:
+        """Add the weights of an image."""
+        self.scores = self.scores + step.weighted_sums["coverage"]
+        dr.eval(self.scores)
+
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
+        """Remove those of the lowest scores."""
+        before = population.num_rows
+        self.num_before = self.num_before or before
+        scores = population.gather(self.scores)
+        count = min(before, self.phase.num_left(iteration, self.num_before))
+        if count == before:
+            return None
+        report = keep_best(population, scores, count)
+        # Others' scores stay: few of the views were seen since the last change.
+        left = population.local(scores[best_rows(scores, count)])
+        self.scores = from_host(type(self.scores), left)
+        return report
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the scores so far."""
+        return {"pruned_from": np.array(self.num_before), "weights": np.array(self.scores)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+        self.num_before = int(state["pruned_from"])
+        self.scores = from_host(type(self.scores), state["weights"])
+
+
+@STRATEGIES.register("selection")
+class NaturalSelection(Pruning):
+    """Lowers opacities alike, and removes what becomes transparent.
+
+    The derivatives of the loss raise again what is seen, all the faster as the opacities' rate is
+    higher meanwhile; what hardly matters falls below a threshold (GNS, Gaussian natural selection).
+    """
+
+    num_left = 0  # Gaussians after the last change
+
+    def rate_factors(self, iteration: int) -> Mapping[str, float]:
+        """Return a higher rate of opacities from the first change until the last."""
+        phase = self.phase
+        under_pressure = self.num_left > phase.to and phase.contains(iteration)
+        return {"logit_opacities": self.prune.opacity_rate if under_pressure else 1.0}
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether Gaussians are removed: until few enough are left."""
+        is_over = 0 < self.num_left <= self.phase.to
+        return super().is_due(iteration) and not is_over
+
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
+        """Lower all logits, and remove what is then below the threshold.
+
+        By how much follows from how many are to be left now: so many are below, unless others are
+        so opaque that it would take more than ``MAX_PRESSURE``. The last time, the least opaque
+        go until few enough are left.
+        """
+        logits, phase = population.host("logit_opacities"), self.phase
+        threshold = math.log(self.prune.opacity / (1 - self.prune.opacity))
+        self.num_left = before = count = len(logits)
+        self.num_before = self.num_before or before
+        surplus = before - phase.num_left(iteration, self.num_before)
+        if iteration == phase.stop:
+            count = min(before, phase.to)
+        elif surplus > 0:
+            highest_removed = np.sort(logits)[surplus - 1]
+            pressure = min(max(highest_removed - threshold, 0.0), MAX_PRESSURE)
+            values = population.value("logit_opacities")
+            amount = dr.opaque(types_of(type(values)).Float, pressure)
+            population.set_values("logit_opacities", values - amount)
+            count = max(before - surplus, int(np.count_nonzero(logits - pressure > threshold)))
+        if count == before:
+            return None
+        self.num_left = count
+        return keep_best(population, logits, count)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return numbers of Gaussians."""
+        return {"pruned_from": np.array(self.num_before), "pruned_to": np.array(self.num_left)}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+        self.num_before, self.num_left = int(state["pruned_from"]), int(state["pruned_to"])
 
 
 def best_rows(scores: np.ndarray, count: int) -> np.ndarray:
-    """The ``count`` rows of the highest scores (N,), ascending; ties: the first rows."""
+    """Return the ``count`` rows of the highest scores (N,), ascending; ties: the first rows."""
     order = np.argsort(-scores, kind="stable")  # a NaN comes last
     return np.sort(order[:count])
 
 
 def keep_best(population: Population, scores: np.ndarray, count: int) -> DensityReport:
-    """Remove all but the ``count`` rows of the highest scores (N,); ties: the first rows stay.
-
-    The rows that stay keep their order, and their moments.
-    """
+    """Remove all but the ``count`` rows of the highest scores (N,), which keep their moments."""
     population.edit(population.rows(best_rows(scores, count)))
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)
+
+
+def _ones(image: Any, photograph: Any) -> Any:
+    del photograph
+    height, width, _ = image.shape
+    return dr.opaque(type(image.array), 1, height * width)

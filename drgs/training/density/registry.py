@@ -1,11 +1,24 @@
-"""The strategy that a configuration chooses, imported when it is used."""
+"""The strategy of a fit: growth, and a last phase of pruning, imported when it is used."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import chain
+from typing import Any
+
+import numpy as np
 
 from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
 from drgs.datasets.types import Dataset
-from drgs.training.density.strategy import DensityStrategy
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PixelWeight,
+    Population,
+    StepInfo,
+)
 
 
 def density_strategy(
@@ -15,16 +28,102 @@ def density_strategy(
 
     dataset: None for an estimate; growth: a strategy instead of ``densify.strategy``.
     """
-    if growth is None:
-        growth = _make(config.densify.strategy, config, dataset)
+
+    def make(name: str) -> DensityStrategy:
+        strategy = STRATEGIES.get(name, "densify.strategy")
+        section = section_of(strategy, config.extensions)
+        return strategy.value.from_config(config, dataset, section)
+
+    growth = make(config.densify.strategy) if growth is None else growth
     if config.densify.prune.to is None:
         return growth
-    from drgs.training.density.phases import Phases
-
-    return Phases([growth, _make(config.densify.prune.method, config, dataset)])
+    return Phases([growth, make(config.densify.prune.method)])
 
 
-def _make(name: str, config: FitConfig, dataset: Dataset | None) -> DensityStrategy:
-    strategy = STRATEGIES.get(name, "densify.strategy")
-    section = section_of(strategy, config.extensions)
-    return strategy.value.from_config(config, dataset, section)
+@dataclass(frozen=True)
+class Phases(DensityStrategy):
+    """Strategies that follow one another; names in their states differ.
+
+    Where one of them changes rows, the others begin anew, without statistics.
+    """
+
+    phases: Sequence[DensityStrategy]
+
+    @property
+    def by_row(self) -> Sequence[str]:
+        """The names of all phases."""
+        return [name for phase in self.phases for name in phase.by_row]
+
+    def begin(self, population: Population) -> None:
+        """Begin all phases."""
+        for phase in self.phases:
+            phase.begin(population)
+
+    def needs_statistics(self, iteration: int) -> bool:
+        """Return whether any phase does."""
+        return any(phase.needs_statistics(iteration) for phase in self.phases)
+
+    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        """Return the planes of the phases that need statistics."""
+        needed = [phase for phase in self.phases if phase.needs_statistics(iteration)]
+        return {k: v for phase in needed for k, v in phase.pixel_weights(iteration).items()}
+
+    def update_statistics(self, step: StepInfo) -> None:
+        """Update the phases that need statistics."""
+        for phase in self.phases:
+            if phase.needs_statistics(step.iteration):
+                phase.update_statistics(step)
+
+    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
+        """Return the terms of all phases."""
+        return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
+
+    def rate_factors(self, iteration: int) -> Mapping[str, float]:
+        """Return the products of the factors of all phases."""
+        product: dict[str, float] = {}
+        for phase in self.phases:
+            for name, factor in phase.rate_factors(iteration).items():
+                product[name] = product.get(name, 1.0) * factor
+        return product
+
+    def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
+        """Let the phases change values, one after the other."""
+        for phase in self.phases:
+            phase.perturb(population, iteration, means_lr)
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether any phase is."""
+        return any(phase.is_due(iteration) for phase in self.phases)
+
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
+        """Let the phases that are due act, one after the other; return the sum of the reports."""
+        total: DensityReport | None = None
+        for phase in self.phases:
+            report = phase.refine(population, iteration) if phase.is_due(iteration) else None
+            if report is not None:
+                for other in self.phases:
+                    if other is not phase:
+                        other.begin(population)
+                total = report if total is None else _sum(total, report)
+        return total
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the states of all phases."""
+        return {name: v for phase in self.phases for name, v in phase.state().items()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Restore each phase from its entries in ``state``."""
+        for phase in self.phases:
+            phase.restore(state)
+
+    def max_num_gaussians(self, start: int, iterations: int) -> int:
+        """Return the largest number: each phase may begin with that of the one before."""
+        most = start
+        for phase in self.phases:
+            most = max(most, phase.max_num_gaussians(most, iterations))
+        return most
+
+
+def _sum(first: DensityReport, second: DensityReport) -> DensityReport:
+    counts = {name: count + getattr(second, name) for name, count in asdict(first).items()}
+    return DensityReport(**{**counts, "num_gaussians": second.num_gaussians})

@@ -1,11 +1,9 @@
-"""What the trainer asks of a strategy that changes the population, and what it hands to it.
+"""The interface of strategies that change the population, and the rows that they change.
 
-Each iteration, :class:`drgs.training.trainer.Trainer` tells the strategy what it has seen
-(:class:`StepInfo`) and lets it act on the rows of the optimizer (:class:`Population`).
-``drgs.training.density.registry`` makes the strategy that a configuration chooses.
-
-Iterations are counted from 1. A strategy is a function of the configuration and of
-:meth:`DensityStrategy.state`: where a plan is revised, another one is made and given the state.
+Each iteration, :class:`drgs.training.trainer.Trainer` passes statistics (:class:`StepInfo`) to the
+strategy and lets it act on the rows of the optimizer (:class:`Population`). Iterations are counted
+from 1. A strategy is a function of the configuration and of :meth:`DensityStrategy.state`: where a
+plan is revised, another one is made and given the state.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
-from drgs.config.density import DEFAULT_SCHEDULE_SHARES
+from drgs.config.density import DEFAULT_SCHEDULE
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.datasets.types import Dataset
@@ -38,7 +36,7 @@ from drgs.training.optimizer import (
 class StepInfo:
     """Statistics of an iteration, for a strategy; nothing of it is differentiated.
 
-    N are the rows that :meth:`Population.value` has.
+    N is the number of rows of :meth:`Population.value`.
     """
 
     iteration: int
@@ -50,7 +48,7 @@ class StepInfo:
 
 
 PixelWeight = Callable[[Any, Any], Any]
-"""Computes a plane, Float (H W,), from what was rendered and the photograph: tensors (H, W, 3) in
+"""Computes a plane, Float (H W,), from the rendered image and the photograph: tensors (H, W, 3) in
 display space."""
 
 
@@ -64,7 +62,8 @@ class Population:
     """The rows of a fit: what a strategy may read and change.
 
     A row is a Gaussian: its parameters, named as in ``gaussians.PARAMETER_NAMES``, and the moments
-    that Adam keeps of them. Everything is detached.
+    that Adam keeps of them. Everything is detached. Where several processes fit, each has some rows
+    (:class:`drgs.training.parallel.population.ShardedPopulation`).
     """
 
     optimizer: LeanAdam
@@ -74,30 +73,78 @@ class Population:
 
     @property
     def num_rows(self) -> int:
-        """N at the moment."""
+        """The number of Gaussians at the moment."""
         return num_rows(self.optimizer, self.prefix)
 
     @property
-    def num_own(self) -> int:
-        """How many of them :meth:`value` has: all, where no other process has some."""
-        return self.num_rows
+    def num_local_rows(self) -> int:
+        """The number of rows of :meth:`value`."""
+        return num_rows(self.optimizer, self.prefix)
 
     @property
     def first_row(self) -> int:
-        """The number of the first row that this process has."""
+        """The number of the first row of this process."""
         return 0
 
-    def terms_of_all(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
-        """Return terms of the loss that were computed from the rows here, for all rows.
+    def value(self, name: str) -> Any:
+        """Return a parameter as it is at the moment, on the device: the rows of this process."""
+        return dr.detach(self.optimizer[self.prefix + name])
 
-        compute: computes them from parameters by name.
+    def host(self, name: str) -> np.ndarray:
+        """Return a parameter of all rows on the host, float64; waits for the device."""
+        return self.gather(self.value(name))
+
+    def gather(self, values: Any) -> np.ndarray:
+        """Return the values of all rows from those of this process: on the host, float64."""
+        return np.array(values, dtype=np.float64)
+
+    def local(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the rows of this process from those of all rows."""
+        return values
+
+    def rows(self, numbers: np.ndarray) -> Any:
+        """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
+        return from_host(self._index_type, numbers.astype(np.uint32))
+
+    def row_numbers(self) -> Any:
+        """Return the numbers of the rows of this process: UInt32."""
+        return dr.arange(self._index_type, self.num_local_rows)
+
+    @property
+    def _index_type(self) -> type:
+        return dr.uint32_array_t(type(self.value("means").array))
+
+    def take(self, rows: Any) -> dict[str, Any]:
+        """Return copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
+        return take_rows(self.optimizer, rows, self.prefix)
+
+    def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
+        """Keep some rows in the order given and append others.
+
+        keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Kept rows
+        take their moments along, appended ones start with moments of zero.
+        """
+        edit_rows(self.optimizer, keep, append, self.prefix)
+
+    def replace(self, name: str, value: Any) -> None:
+        """Give a parameter new values of the same shape, and moments of zero."""
+        replace_values(self.optimizer, name, value, self.prefix)
+
+    def set_values(self, name: str, value: Any) -> None:
+        """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
+        set_values(self.optimizer, name, value, self.prefix)
+
+    def gather_terms(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
+        """Return terms of the loss over all rows, detached.
+
+        terms: over the rows of this process; compute: computes them from parameters by name.
         """
         del compute
         return [dr.detach(term) for term in terms]
 
-    def gather_gaussians(self, own: Gaussians) -> Gaussians:
+    def gather_gaussians(self, local: Gaussians) -> Gaussians:
         """Return all Gaussians, from those of this process."""
-        return own
+        return local
 
     def gather_state(
         self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
@@ -113,58 +160,9 @@ class Population:
         del is_by_row
         return state
 
-    def value(self, name: str) -> Any:
-        """A parameter as it is at the moment, on the device."""
-        return dr.detach(self.optimizer[self.prefix + name])
-
-    def host(self, name: str) -> np.ndarray:
-        """The same on the host, float64; waits for the device."""
-        return self.of_all(self.value(name))
-
-    def of_all(self, values: Any) -> np.ndarray:
-        """Of values for the rows that :meth:`value` has, those of all rows: on the host, float64.
-
-        Waits for the device.
-        """
-        return np.array(values, dtype=np.float64)
-
-    def own(self, values: np.ndarray) -> np.ndarray:
-        """The inverse: of values for all rows, those for the rows that :meth:`value` has."""
-        return values
-
-    def rows(self, numbers: np.ndarray) -> Any:
-        """Row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
-        index_type = dr.uint32_array_t(type(self.value("means").array))
-        return from_host(index_type, numbers.astype(np.uint32))
-
-    def row_numbers(self) -> Any:
-        """Of the rows that :meth:`value` has: UInt32."""
-        index_type = dr.uint32_array_t(type(self.value("means").array))
-        return dr.arange(index_type, self.num_own)
-
-    def take(self, rows: Any) -> dict[str, Any]:
-        """Copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
-        return take_rows(self.optimizer, rows, self.prefix)
-
-    def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
-        """Keep some rows in the order given and append others: see ``optimizer.edit_rows``.
-
-        keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Kept rows
-        take their moments along, appended ones start with moments of zero.
-        """
-        edit_rows(self.optimizer, keep, append, self.prefix)
-
-    def replace(self, name: str, value: Any) -> None:
-        """Give a parameter new values of the same shape, and moments of zero."""
-        replace_values(self.optimizer, name, value, self.prefix)
-
-    def set_values(self, name: str, value: Any) -> None:
-        """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
-        set_values(self.optimizer, name, value, self.prefix)
-
 
 def displaced(rows: Mapping[str, Any], offsets: np.ndarray) -> Any:
-    """Means of ``rows``, moved along their own axes: mean + R(q) (s * offset), tensor (M, 3).
+    """Return means moved along their own axes: mean + R(q) (s * offset), tensor (M, 3).
 
     rows: of every parameter by name; offsets: (M, 3), in standard deviations.
     """
@@ -178,13 +176,11 @@ def displaced(rows: Mapping[str, Any], offsets: np.ndarray) -> Any:
 
 
 class DensityStrategy(Protocol):
-    """What the trainer asks of a strategy; strategies derive from it and override what they need.
+    """A strategy that leaves the population as it is; others override what they need.
 
-    As it is here, a strategy leaves the population as it is. Equal inputs give equal bytes: what is
-    random is a function of seed, iteration and row.
-
-    Where several processes have some of the rows each, so do their strategies, of which each takes
-    note of its own; whoever acts asks for :meth:`Population.of_all`, and all decide alike.
+    Equal inputs give equal bytes: random numbers are functions of seed, iteration and row. Where
+    several processes fit, each has a strategy with statistics of its own rows; decisions are made
+    from :meth:`Population.gather`, on all of them alike.
     """
 
     @classmethod
@@ -193,17 +189,17 @@ class DensityStrategy(Protocol):
 
         section: the section that the strategy has registered, with the values of the
         configuration, or the model's defaults; by default the only argument of the class. None:
-        the strategy has no section. dataset: None where only :meth:`most_gaussians` is called.
+        the strategy has no section. dataset: None where only :meth:`max_num_gaussians` is called.
         """
         del config, dataset
         return cls() if section is None else cls(section)
 
     by_row: Sequence[str] = ()
-    """Names in :meth:`state` of what has a row for each Gaussian."""
+    """Names in :meth:`state` of arrays with a row for each Gaussian."""
 
-    start_share, stop_share = DEFAULT_SCHEDULE_SHARES
+    start_share, stop_share, rate_decay = DEFAULT_SCHEDULE
     """Shares of the iterations, for schedules that are not given: ``densify.start`` is at most the
-    first (and half of stop), ``densify.stop`` at most the second."""
+    first (and half of stop), ``densify.stop`` at most the second; and ``optimizer.decay``."""
 
     def begin(self, population: Population) -> None:
         """Start with the statistics of no views.
@@ -227,11 +223,11 @@ class DensityStrategy(Protocol):
         return {}
 
     def update_statistics(self, step: StepInfo) -> None:
-        """Take note of an iteration, after its optimizer step."""
+        """Add an iteration to the statistics, after its optimizer step."""
         del step
 
     def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
-        """Terms of the loss, Float of one value each.
+        """Yield terms of the loss, Float of one value each.
 
         parameters: raw values by name, with derivatives, of ``num_rows`` Gaussians or of some.
         """
@@ -239,7 +235,7 @@ class DensityStrategy(Protocol):
         yield from ()
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
-        """What the learning rates of this iteration are multiplied by, by parameter.
+        """Return factors of the learning rates of this iteration, by parameter.
 
         A parameter that is named in one iteration is named in all.
         """
@@ -267,18 +263,15 @@ class DensityStrategy(Protocol):
         del population, iteration
 
     def state(self) -> dict[str, np.ndarray]:
-        """What the coming iterations depend on: by name, a row for each Gaussian here, or a number.
-
-        All of it has to be finite.
-        """
+        """Return finite arrays by name: with a row for each Gaussian here, or a number."""
         return {}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`, where :meth:`begin` was called; unknown names are left."""
+        """Continue from :meth:`state`, where :meth:`begin` was called; other names are ignored."""
         del state
 
-    def most_gaussians(self, start: int, iterations: int) -> int:
-        """How many a fit of so many iterations can have that starts with ``start``.
+    def max_num_gaussians(self, start: int, iterations: int) -> int:
+        """Return the most Gaussians of a fit of so many iterations that starts with ``start``.
 
         Called for an estimate, without :meth:`begin`.
         """

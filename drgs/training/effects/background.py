@@ -29,10 +29,9 @@ def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:
 
 @EFFECTS.register("background")
 class RandomBackground(TrainingEffect):
-    """Another colour behind each picture: nothing but an opaque splat can look like what is there.
+    """Another colour behind each image: nothing but an opaque splat can look like what is there.
 
-    The colours are functions of seed and iteration. Behind what is measured and shown is the
-    dataset's background.
+    The colours are functions of seed and iteration.
     """
 
     name = "background"
@@ -52,14 +51,14 @@ class RandomBackground(TrainingEffect):
     def __init__(
         self, seed: int, background: tuple[float, float, float], window: int, sigma: float
     ) -> None:
-        """background: what the pictures were composited over, display space.
+        """background: behind the photographs, display space.
 
         window, sigma: of SSIM, px: see :func:`drgs.training.losses.prepare_target`.
         """
         self.seed, self.background, self.window = seed, np.array(background), (window, sigma)
 
     def upload(self, view: View) -> Any:
-        """1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
+        """Return 1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
         transparent = 1 - np.asarray(view.alpha)
         if view.mask is not None:
             transparent = transparent * np.asarray(view.mask)

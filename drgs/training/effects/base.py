@@ -1,8 +1,6 @@
-"""What a scene calls for between rendering and the loss: composed into a fit, or not there.
+"""Effects between rendering and the loss, and which of them take part in a fit.
 
-A :class:`TrainingEffect` takes part in each iteration of a fit, of which it knows a
-:class:`FitState`. ``drgs.training.effects.registry`` chooses those that a configuration and a
-dataset use, and imports them.
+A :class:`TrainingEffect` takes part in each iteration, of which it knows a :class:`FitState`.
 """
 
 from __future__ import annotations
@@ -15,8 +13,10 @@ from typing import Any, Protocol
 import mitsuba as mi
 import numpy as np
 
+from drgs.config.extensions import EFFECTS, extensions_in_use, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
+from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset, View
 from drgs.training.views import TrainingView
 
@@ -43,10 +43,19 @@ class FitState:
 
 
 class TrainingEffect(Protocol):
-    """What the trainer asks of an effect; effects derive from it and override what they need.
+    """An effect that does nothing; others override what they need.
 
-    As it is here, an effect does nothing. Images are tensors (H, W, C) in display space.
+    Images are tensors (H, W, C) in display space.
     """
+
+    @classmethod
+    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
+        """Return whether the effect takes part in a fit.
+
+        Called for effects of installed packages whose section the configuration contains.
+        """
+        del config, dataset
+        return True
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: Any) -> Any:
@@ -58,18 +67,18 @@ class TrainingEffect(Protocol):
         del config, dataset
         return cls() if section is None else cls(section)
 
-    name = ""  # of its part of a checkpoint, and of what it uploads
+    name = ""  # of its part of a checkpoint, and of its uploads
     moves_sensors = False  # whether it changes the parameters of sensors
-    aovs = ""  # what the integrator has to put out besides colour
-    upload_bytes = 0  # of a pixel: what it uploads of a view's pictures, at most
+    aovs = ""  # outputs of the integrator besides colour
+    upload_bytes = 0  # of a pixel: its upload of a view, at most
     by_row: frozenset[str] = frozenset()  # names in its state that have a row for each Gaussian
 
     def upload(self, view: View) -> Any:
-        """What the effect needs of a view, on the device: see ``TrainingView.uploads``."""
+        """Return what the effect needs of a view, on the device: see ``TrainingView.uploads``."""
         del view
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
-        """The photograph (H, W, 3) that a rendering is compared with."""
+        """Return the photograph (H, W, 3) that a rendering is compared with."""
         del view
         return image
 
@@ -83,17 +92,17 @@ class TrainingEffect(Protocol):
         """Called before the view is rendered."""
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
-        """What is compared with the photograph, from what was rendered; tensors (H, W, C)."""
+        """Return the image that is compared with the photograph, from the rendered one."""
         del view
         return image
 
     def penalties(self, view: TrainingView) -> Iterator[Any]:
-        """Terms of the loss, Float of one value each; after :meth:`adjust`."""
+        """Yield terms of the loss, Float of one value each; called after :meth:`adjust`."""
         del view
         yield from ()
 
     def leaves(self, view: TrainingView) -> dict[str, Any]:
-        """What it optimises of the view, as :meth:`before` has left it: by name, with derivatives.
+        """Return the optimised numbers of a view, with derivatives, as :meth:`before` has them.
 
         Where several processes fit, each knows the numbers of all views.
         """
@@ -101,10 +110,10 @@ class TrainingEffect(Protocol):
         return {}
 
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
-        """Called when those of all views of a step are known, to take a step of its own.
+        """Take a step, when the derivatives of all views of the fit's step are known.
 
         derivatives: of the step's loss, with respect to the view's :meth:`leaves`. Called in the
-        order of the views, of which this process may have rendered some alone.
+        order of the views, some of which other processes may have rendered.
         """
 
     def repopulated(self, fit: FitState) -> None:
@@ -114,27 +123,68 @@ class TrainingEffect(Protocol):
         """Called before the Gaussians are taken out."""
 
     def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
-        """Views of other photographs, with what the fit found out about their cameras."""
+        """Return views that were not trained on, with what the fit knows of their cameras."""
         return views
 
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write what was found for the training views into the output folder."""
 
     def numbers_of(self, view: TrainingView) -> dict[str, Any]:
-        """What it has optimised that the view depends on: Float by name, without derivatives."""
+        """Return the optimised numbers of a view: Float by name, without derivatives."""
         del view
         return {}
 
     def values(self) -> dict[str, np.ndarray]:
-        """All that it optimises, and its moments: a row for each training view, or for all."""
+        """Return all optimised numbers and moments: a row for each training view, or for all."""
         return {}
 
     def state(self) -> dict[str, np.ndarray]:
-        """What the coming iterations depend on."""
+        """Return what the coming iterations depend on."""
         return {}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from :meth:`state`."""
+
+
+def training_effects(
+    config: FitConfig, dataset: Dataset, given: Sequence[TrainingEffect] = ()
+) -> list[TrainingEffect]:
+    """Return the effects that take part in a fit, in the order in which they act.
+
+    given: effects besides those of the configuration, which act first.
+    """
+    installed = extensions_in_use(config.extensions, EFFECTS)
+    used = [each for each in installed if each.value.is_used(config, dataset)]
+    used += [EFFECTS.get(n) for n in EFFECTS.shipped if _is_shipped_used(n, config, dataset)]
+    effects = [*given]
+    for extension in used:
+        section = section_of(extension, config.extensions)
+        effects.append(extension.value.from_config(config, dataset, section))
+    names = [effect.name for effect in effects]
+    if "" in names or len({*names}) < len(names):
+        raise UserError(f"effects: each needs a name of its own, got {', '.join(names)}")
+    return effects
+
+
+def _is_shipped_used(name: str, config: FitConfig, dataset: Dataset) -> bool:
+    """Return whether a shipped effect takes part, whose module is imported only then."""
+    views = dataset.train
+    if name == "depth":
+        return config.loss.depth_weight > 0 and any(view.depth is not None for view in views)
+    if name == "masks":
+        return any(view.mask is not None for view in views)
+    return {
+        "colors": config.colors.lr is not None,
+        "background": config.data.random_background,
+        "smoothing": config.model.smoothing,
+        "cameras": config.cameras.optimise,
+    }[name]
+
+
+def integrator_settings(effects: Sequence[TrainingEffect]) -> dict[str, str]:
+    """Return the settings of the integrator that effects need."""
+    aovs = ", ".join(effect.aovs for effect in effects if effect.aovs)
+    return {"aovs": aovs} if aovs else {}
 
 
 def as_tensor(values: np.ndarray) -> mi.TensorXf:

@@ -2,8 +2,7 @@
 
 Imported when ``cameras.optimise`` is set. A view's camera is moved, in its own axes, by a rotation
 exp(turn) and a translation; all views share factors of the focal lengths and a shift of the
-principal point. Of a camera that moves while it exposes, both poses are moved alike. The
-derivatives come from the integrator: see ``drgs.cameras.camera.Camera.by_lane``.
+principal point. Both poses of a camera that moves while it exposes are moved alike.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from drgs.core.files import atomic_path
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
-from drgs.training.effects.base import FitState, TrainingEffect
-from drgs.training.effects.view_parameters import ViewParameters
+from drgs.training.effects.base import FitState
+from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
 from drgs.training.views import TrainingView
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -48,7 +47,7 @@ class _Start:
 
 
 @EFFECTS.register("cameras")
-class CameraRefinement(TrainingEffect):
+class CameraRefinement(OptimisedEffect):
     """Poses of all training views, and what their lenses share."""
 
     name = "cameras"
@@ -73,7 +72,7 @@ class CameraRefinement(TrainingEffect):
         self.numbers: dict[int, dict[str, Any]] = {}  # of the step's sensors, by view
 
     def upload(self, view: View) -> _Start:
-        """The view's camera."""
+        """Return the view's camera."""
         motion = None
         if view.motion is not None:
             between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
@@ -89,11 +88,8 @@ class CameraRefinement(TrainingEffect):
 
     def before(self, fit: FitState, view: TrainingView) -> None:
         """Put the sensor where its camera is now."""
-        leaves = self.parameters.leaves(view.index)
         # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
-        self.numbers[view.index] = numbers = dr.detach(
-            self._camera(view.uploads[self.name], leaves)
-        )
+        self.numbers[view.index] = numbers = dr.detach(self._camera_of(view))
         if self._begun(fit):
             dr.enable_grad(numbers)
         _put(view.sensor, numbers)
@@ -103,32 +99,31 @@ class CameraRefinement(TrainingEffect):
 
     def place(self, view: TrainingView) -> None:
         """Put the sensor where its camera is now."""
-        leaves = self.parameters.leaves(view.index)
-        _put(view.sensor, dr.detach(self._camera(view.uploads[self.name], leaves)))
+        _put(view.sensor, dr.detach(self._camera_of(view)))
 
     def leaves(self, view: TrainingView) -> dict[str, Any]:
-        """The numbers of the view's sensor."""
+        """Return the numbers of the view's sensor."""
         return self.numbers[view.index]
 
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
-        """One step of its own."""
+        """Step the view's numbers, at the means' rate: cameras are refined against these."""
         del self.numbers[view.index]
         if not self._begun(fit):
             return
         # Views of a step may share numbers, which the one before has moved.
-        camera = self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
-        for name, value in camera.items():
+        for name, value in self._camera_of(view).items():
             if dr.grad_enabled(value):
                 dr.accum_grad(value, derivatives[name])
                 dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        # As the rate of the means, which are what cameras are refined against.
-        decay = fit.rate_decay
-        self.parameters.step(view.index, decay)
+        self.parameters.step(view.index, fit.rate_decay)
+
+    def _camera_of(self, view: TrainingView) -> dict[str, Any]:
+        return self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
 
     @staticmethod
     def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Any]:
-        """The sensor's parameters, from the numbers that are optimised."""
+        """Return the sensor's parameters, from the numbers that are optimised."""
         turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
         rotation = rotation_matrix(turn)
         rows = [[rotation[i, j] for j in range(3)] + [move[i]] for i in range(3)]
@@ -146,24 +141,8 @@ class CameraRefinement(TrainingEffect):
             poses["to_world_close"] = moved @ start.motion @ signs
         return poses | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
-    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
-        """See :class:`TrainingEffect`."""
-        return self.parameters.numbers(view.index)
-
-    def values(self) -> dict[str, np.ndarray]:
-        """See :class:`TrainingEffect`."""
-        return self.parameters.values()
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Numbers and moments."""
-        return self.parameters.state()
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`."""
-        self.parameters.restore(state)
-
     def refined(self, views: Sequence[View]) -> list[View]:
-        """The training views with their cameras as they are now."""
+        """Return the training views with their cameras as they are now."""
         numbers, result = self.parameters.numpy(), []
         for index, view in enumerate(views):
             row = {name: mi.Float(v[min(index, len(v) - 1)]) for name, v in numbers.items()}
@@ -177,12 +156,13 @@ class CameraRefinement(TrainingEffect):
 
     @property
     def lens_change(self) -> LensChange:
-        """Of all cameras.
+        """The changes that all cameras share.
 
-        Raises :class:`UserError` where it makes no camera of any.
+        Raises :class:`UserError` for focal lengths that no camera has.
         """
-        numbers = {name: values[0].astype(np.float64) for name, values in self._shared.items()}
-        changes = {}
+        shared = self.parameters.optimizers.keys() & {"log_focals", "shifts"}
+        found = self.parameters.numpy()
+        numbers, changes = {name: found[name][0].astype(np.float64) for name in shared}, {}
         if "log_focals" in numbers:
             if np.abs(numbers["log_focals"]).max() > np.log(MAX_FOCAL_FACTOR):
                 raise UserError(
@@ -195,19 +175,12 @@ class CameraRefinement(TrainingEffect):
             changes["principal"] = tuple(numbers["shifts"].tolist())
         return LensChange(**changes)
 
-    @property
-    def _shared(self) -> dict[str, np.ndarray]:
-        return {k: v for k, v in self.parameters.numpy().items() if k in ("log_focals", "shifts")}
-
     def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
-        """With the lens that was found; where the cameras are is not known better than before."""
+        """Return the views with the refined lens; their poses are known no better than before."""
         return tuple(map(self.lens_change.of, views))
 
     def write(self, folder: Path, dataset: Dataset) -> None:
-        """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``.
-
-        ``lens_change`` says what of the intrinsics is not the data's.
-        """
+        """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
         with atomic_path(folder / CAMERAS) as temporary:
             cameras = cameras_json(self.refined(dataset.train), dataset.origin)
             found = {"lens_change": asdict(self.lens_change), **cameras}
@@ -227,10 +200,10 @@ def _put(sensor: mi.Sensor, numbers: dict[str, Any]) -> None:
 
 
 def _pose(to_world: mi.Matrix4f) -> np.ndarray:
-    """(4, 4) float64, OpenCV axes."""
+    """Return a pose (4, 4) float64, OpenCV axes."""
     return np.array(to_world)[..., 0].astype(np.float64) @ OPENCV_TO_MITSUBA
 
 
 def _entries(values: mi.Float) -> list[mi.Float]:
-    """Each number as an array of one."""
+    """Return each number as an array of one."""
     return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(dr.width(values))]

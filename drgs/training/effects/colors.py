@@ -1,12 +1,10 @@
 """Exposure and white balance: an affine colour transform for each training photograph.
 
-Imported when ``colors.lr`` is given. What is rendered is transformed as its photograph seems to
-have been, y = A (r, g, b, 1), before they are compared. A starts as the identity and is drawn to
-it; and since darker splats under brighter transforms would look the same, the mean of all
-photographs' transforms is the identity, always. New views are rendered without a transform: their
-exposure is the mean one. (The 3DGS reference's "exposure compensation" has neither bond.)
-
-Where the photograph is transparent, there is a background which no camera saw: it stays as it is.
+Imported when ``colors.lr`` is given. A rendering is transformed, y = A (r, g, b, 1), before it is
+compared with its photograph. A starts as the identity and is drawn to it; and since darker splats
+under brighter transforms would look the same, the mean of all photographs' transforms is the
+identity. New views are rendered without a transform. (The 3DGS reference's "exposure compensation"
+has neither bond.) The background behind a transparent photograph stays as it is.
 """
 
 from __future__ import annotations
@@ -22,13 +20,12 @@ import numpy as np
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import ColorConfig, FitConfig
-from drgs.core.arrays import from_host
+from drgs.core.arrays import from_host, image_of, planes_of, types_of
 from drgs.core.files import atomic_path
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
-from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
-from drgs.training.effects.view_parameters import ViewParameters
-from drgs.training.image_ops import transform_colors
+from drgs.training.effects.base import FitState, as_tensor
+from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
 from drgs.training.views import TrainingView
 
 IDENTITY = np.eye(3, 4).reshape(1, 12)
@@ -36,7 +33,7 @@ IDENTITY = np.eye(3, 4).reshape(1, 12)
 
 
 @EFFECTS.register("colors")
-class ColorCorrection(TrainingEffect):
+class ColorCorrection(OptimisedEffect):
     """One 3 x 4 transform a view."""
 
     name = "colors"
@@ -59,67 +56,98 @@ class ColorCorrection(TrainingEffect):
         self.matrix: Any = None  # of the view that is rendered
 
     def upload(self, view: View) -> Any:
-        """How opaque the photograph is, (H, W, 3); None where it is opaque everywhere."""
+        """Return the photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
         if view.alpha is None:
             return None
         return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
-        """Get the view's transform."""
+        """Compute the view's transform."""
         del fit
         self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
-        """What was rendered, with the colours of the photograph."""
+        """Return the rendering with the colours of the photograph."""
         seen = transform_colors(image, mi.TensorXf(self.matrix, (3, 4)))
         opaque = view.uploads[self.name]
         return seen if opaque is None else image + opaque * (seen - image)
 
     def penalties(self, view: TrainingView) -> Iterator[Any]:
-        """The mean square by which the transform differs from the identity."""
+        """Yield the mean square by which the transform differs from the identity."""
         del view
         difference = self.matrix - from_host(mi.Float, IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
-    def leaves(self, view: TrainingView) -> dict[str, Any]:
-        """The view's transform."""
-        return self.parameters.leaves(view.index)
-
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
-        """One step of its own, and a little one back for all: their mean stays."""
-        decay = fit.rate_decay
+        """Step the view's transform, and all a little back: their mean stays."""
         dr.set_grad(self.leaves(view), derivatives)
-        before = dr.detach(self.parameters.leaves(view.index)["matrices"])
-        self.parameters.step(view.index, decay)
-        after = dr.detach(self.parameters.leaves(view.index)["matrices"])
+        before = self.numbers_of(view)["matrices"]
+        self.parameters.step(view.index, fit.rate_decay)
+        after = self.numbers_of(view)["matrices"]
         self.common = self.common + (after - before) * self.share
         dr.eval(self.common)
 
     def transforms(self) -> np.ndarray:
-        """(V, 3, 4): of all training views."""
+        """Return the transforms of all training views, (V, 3, 4)."""
         matrices = self.parameters.numpy()["matrices"] - np.array(self.common)
         return matrices.reshape(-1, 3, 4)
 
-    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
-        """See :class:`TrainingEffect`."""
-        return self.parameters.numbers(view.index)
-
-    def values(self) -> dict[str, np.ndarray]:
-        """See :class:`TrainingEffect`."""
-        return self.parameters.values()
-
     def state(self) -> dict[str, np.ndarray]:
-        """Numbers and moments."""
-        return {**self.parameters.state(), "common": np.array(self.common)}
+        """Return numbers and moments."""
+        return {**super().state(), "common": np.array(self.common)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from :meth:`state`."""
-        self.parameters.restore(state)
+        super().restore(state)
         self.common = from_host(mi.Float, state["common"])
 
     def write(self, folder: Path, dataset: Dataset) -> None:
-        """``colors.json``: the transform of each training view, 3 x 4, by name."""
+        """Write ``colors.json``: the transform of each training view, 3 x 4, by name."""
         found = zip(dataset.train, self.transforms(), strict=True)
         by_view = {view.name: matrix.tolist() for view, matrix in found}
         with atomic_path(folder / COLORS) as temporary:
             temporary.write_text(json.dumps(by_view, indent=1) + "\n")
+
+
+def transform_colors(image: Any, matrix: Any) -> Any:
+    """Return A y with y = (red, green, blue, 1) of each pixel.
+
+    image: (H, W, 3); matrix: A, a tensor (3, 4). Differentiable in both.
+    """
+    return dr.custom(_TransformColors, image=image, matrix=matrix)
+
+
+class _TransformColors(dr.CustomOp):
+    def eval(self, image: Any, matrix: Any) -> Any:
+        self.image, self.matrix = dr.detach(image), dr.detach(matrix)
+        return self._transform(planes_of(image), self._rows(self.matrix))
+
+    def forward(self) -> None:
+        d_image, d_matrix = self.grad_in("image"), self.grad_in("matrix")
+        rows = [[*row[:3], 0] for row in self._rows(self.matrix)]
+        moved = self._transform(planes_of(d_image), rows)
+        turned = self._transform(planes_of(self.image), self._rows(d_matrix))
+        self.set_grad_out(moved + turned)
+
+    def backward(self) -> None:
+        g = planes_of(self.grad_out())
+        rows, inputs = self._rows(self.matrix), planes_of(self.image)
+        d_planes = [sum(rows[i][j] * g[i] for i in range(3)) for j in range(3)]
+        self.set_grad_in("image", image_of(d_planes, self.image))
+        products = [d * x for d in g for x in (*inputs, 1)]
+        dr.eval(products)
+        d_matrix = dr.concat([dr.sum(product) for product in products])
+        self.set_grad_in("matrix", type(self.matrix)(d_matrix, (3, 4)))
+
+    def _transform(self, planes: list[Any], rows: list[list[Any]]) -> Any:
+        moved = [sum(a * x for a, x in zip(row, (*planes, 1), strict=True)) for row in rows]
+        return image_of(moved, self.image)
+
+    @staticmethod
+    def _rows(matrix: Any) -> list[list[Any]]:
+        """Return the numbers as arrays of one entry, that are not compiled into the kernel."""
+        flat = matrix.array
+        UInt32 = types_of(type(flat)).UInt32
+        return [
+            [dr.gather(type(flat), flat, UInt32(4 * i + j)) for j in range(4)] for i in range(3)
+        ]

@@ -1,19 +1,23 @@
-"""Supervision by the depth that the data has. Imported where a view has it and it counts."""
+"""Supervision by the depth that the data has. Imported where a view has it and it counts.
+
+Dr.Jit differentiates a gather by adding atomically, in an order that no two runs share: here, as in
+``colors.py``, operations on pixels have adjoints that scatter nothing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import from_host
+from drgs.core.arrays import from_host, image_of, planes_of
 from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import TrainingEffect
-from drgs.training.image_ops import depth_error, split
 from drgs.training.views import TrainingView
 
 
@@ -23,8 +27,7 @@ class DepthSupervision(TrainingEffect):
 
     The term is weight / extent times the mean of |D - A d| over the pixels whose depth d is known
     and that no mask leaves out, D being the alpha-weighted sum of the splats' depths and A the
-    alpha:
-    :func:`drgs.training.image_ops.depth_error`.
+    alpha.
     """
 
     name = "depth"
@@ -42,7 +45,7 @@ class DepthSupervision(TrainingEffect):
         self.weight, self.depths = weight / extent, None
 
     def upload(self, view: View) -> Any:
-        """Depths, and weights of the pixels; None where a view has none that counts."""
+        """Return depths, and weights of the pixels; None where a view has none that counts."""
         if view.depth is None:
             return None
         depth = np.asarray(view.depth)
@@ -55,12 +58,58 @@ class DepthSupervision(TrainingEffect):
         return from_host(mi.Float, depth), from_host(mi.Float, weights)
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
-        """The colours; depth and alpha are kept for the penalty."""
+        """Return the colours; depth and alpha are kept for the penalty."""
         del view
         image, self.depths = split(image, 3)
         return image
 
     def penalties(self, view: TrainingView) -> Iterator[Any]:
-        """The difference in depth."""
+        """Yield the difference in depth."""
         if (known := view.uploads[self.name]) is not None:
             yield depth_error(self.depths, *known)
+
+
+def split(image: Any, count: int) -> tuple[Any, Any]:
+    """Return the first ``count`` channels of an image (H, W, C), and the others."""
+    return dr.custom(_Split, image=image, count=count)
+
+
+class _Split(dr.CustomOp):
+    def eval(self, image: Any, count: int) -> tuple[Any, Any]:
+        self.count = count
+        planes = planes_of(image)
+        return image_of(planes[:count], image), image_of(planes[count:], image)
+
+    def forward(self) -> None:
+        self.set_grad_out(self.eval(self.grad_in("image"), self.count))
+
+    def backward(self) -> None:
+        first, rest = self.grad_out()
+        self.set_grad_in("image", image_of(planes_of(first) + planes_of(rest), first))
+
+
+def depth_error(depths: Any, target: Any, weights: Any) -> Any:
+    """Return sum_i w_i |D_i - A_i d_i| over pixels, a Float of one value.
+
+    depths: (H, W, 2), the composited depth D and alpha A; target: d, Float (H * W,), in the units
+    of D; weights: w, Float (H * W,). The derivative of |x| at 0 is taken as 0. Not differentiated:
+    target and weights.
+    """
+    return dr.custom(_DepthError, depths=depths, target=target, weights=weights)
+
+
+class _DepthError(dr.CustomOp):
+    def eval(self, depths: Any, target: Any, weights: Any) -> Any:
+        self.like, self.target, self.weights = dr.detach(depths), target, weights
+        depth, alpha = planes_of(depths)
+        difference = dr.fma(-alpha, target, depth)
+        self.slope = weights * dr.select(difference == 0, 0, dr.sign(difference))
+        return dr.sum(weights * dr.abs(difference))
+
+    def forward(self) -> None:
+        d_depth, d_alpha = planes_of(self.grad_in("depths"))
+        self.set_grad_out(dr.sum(self.slope * dr.fma(-d_alpha, self.target, d_depth)))
+
+    def backward(self) -> None:
+        g = self.slope * self.grad_out()
+        self.set_grad_in("depths", image_of([g, -g * self.target], self.like))

@@ -14,7 +14,7 @@ from drgs.training.views import TrainingView
 
 @EFFECTS.register("masks")
 class Masks(TrainingEffect):
-    """Pixels that a mask leaves out are black in what is rendered and in what it is compared with.
+    """Pixels that a mask leaves out are black in the rendering and in the photograph.
 
     They have no derivative. SSIM's windows that reach into them see the same black in both.
     """
@@ -23,16 +23,16 @@ class Masks(TrainingEffect):
     upload_bytes = 12
 
     def upload(self, view: View) -> Any:
-        """The mask, (H, W, 3); None where a view has none."""
+        """Return the mask, (H, W, 3); None where a view has none."""
         if view.mask is None:
             return None
         return as_tensor(np.repeat(np.asarray(view.mask)[:, :, None], 3, axis=2))
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
-        """The photograph without what the mask leaves out."""
+        """Return the photograph without what the mask leaves out."""
         return image if view.mask is None else image * np.asarray(view.mask)[:, :, None]
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
-        """The rendering without it."""
+        """Return the rendering without what the mask leaves out."""
         mask = view.uploads[self.name]
         return image if mask is None else image * mask

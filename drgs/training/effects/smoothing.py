@@ -26,29 +26,29 @@ class TrainingSmoothing(TrainingEffect):
         self.filter: mi.Float | None = None
 
     def begin(self, fit: FitState) -> None:
-        """Find the filter anew where the means have moved, or are others."""
+        """Compute the filter anew where the means have moved, or are others."""
         is_due = any(iteration % EVERY == 1 for iteration in fit.iterations_of_step)
         if self.filter is None or fit.begins_stage or is_due:
-            self.filter = self._found(fit)
+            self.filter = _smoothing(fit)
         fit.integrator.smoothing = self.filter
 
     def finish(self, fit: FitState) -> None:
-        """The filter of the means as they are; what the fit goes on with stays."""
-        fit.integrator.smoothing = self._found(fit)
-
-    @staticmethod
-    def _found(fit: FitState) -> mi.Float:
-        states = (read_sensor(sensor, fit.integrator.near) for sensor in fit.sensors())
-        return smoothing_of(fit.means, map(camera_from_sensor, states))
+        """Set the filter of the means as they are; the fit goes on with the former one."""
+        fit.integrator.smoothing = _smoothing(fit)
 
     def repopulated(self, fit: FitState) -> None:
-        """The former filter has other rows."""
+        """Drop the filter, which has other rows."""
         self.filter = fit.integrator.smoothing = None
 
     def state(self) -> dict[str, np.ndarray]:
-        """The filter, if there is one."""
+        """Return the filter, if there is one."""
         return {} if self.filter is None else {"filter": np.array(self.filter)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue with it."""
+        """Continue from :meth:`state`."""
         self.filter = mi.Float(state["filter"]) if "filter" in state else None
+
+
+def _smoothing(fit: FitState) -> mi.Float:
+    states = (read_sensor(sensor, fit.integrator.near) for sensor in fit.sensors())
+    return smoothing_of(fit.means, map(camera_from_sensor, states))

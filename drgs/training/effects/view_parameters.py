@@ -9,7 +9,9 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
+from drgs.training.effects.base import TrainingEffect
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
+from drgs.training.views import TrainingView
 
 
 class ViewParameters:
@@ -23,16 +25,16 @@ class ViewParameters:
         """values: (V, K) each, or (1, K) for all views; rates: per step."""
         self.rates = dict(rates)
         self.optimizers: dict[str, list[Adam]] = {
-            name: [make_optimizer({name: _float(row)}, rates) for row in value]
+            name: [make_optimizer({name: mi.Float(row)}, rates) for row in np.float32(value)]
             for name, value in values.items()
         }
 
     def leaves(self, index: int) -> dict[str, mi.Float]:
-        """The numbers (K,) of a view, with derivatives enabled."""
+        """Return the numbers (K,) of a view, with derivatives enabled."""
         return {name: optimizer[name] for name, optimizer in self._of_view(index).items()}
 
     def numbers(self, index: int) -> dict[str, mi.Float]:
-        """The same without derivatives."""
+        """Return the same without derivatives."""
         return dr.detach(self.leaves(index))
 
     def step(self, index: int, decay: float = 1.0) -> None:
@@ -42,16 +44,16 @@ class ViewParameters:
             optimizer.step()
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """The numbers, (V, K) each."""
+        """Return the numbers, (V, K) each."""
         state = self.state()
         return {name: state[f"{name}.value"] for name in self.optimizers}
 
     def values(self) -> dict[str, np.ndarray]:
-        """The numbers by name, and their moments as ``NAME.m`` and ``NAME.v``; a row each."""
+        """Return numbers by name, and their moments as ``NAME.m`` and ``NAME.v``; a row each."""
         return {key.removesuffix(".value"): value for key, value in self.state().items()}
 
     def state(self) -> dict[str, np.ndarray]:
-        """Numbers, moments and step counts, a row for each view."""
+        """Return numbers, moments and step counts, a row for each view."""
         result = {}
         for optimizers in self.optimizers.values():
             rows = [optimizer_state(optimizer) for optimizer in optimizers]
@@ -69,5 +71,27 @@ class ViewParameters:
         return {name: rows[min(index, len(rows) - 1)] for name, rows in self.optimizers.items()}
 
 
-def _float(row: np.ndarray) -> mi.Float:
-    return mi.Float(row.astype(np.float32))
+class OptimisedEffect(TrainingEffect):
+    """An effect whose ``parameters`` are optimised: they are checked, and part of checkpoints."""
+
+    parameters: ViewParameters
+
+    def leaves(self, view: TrainingView) -> dict[str, mi.Float]:
+        """Return the numbers of a view, with derivatives enabled."""
+        return self.parameters.leaves(view.index)
+
+    def numbers_of(self, view: TrainingView) -> dict[str, mi.Float]:
+        """Return the numbers of a view."""
+        return self.parameters.numbers(view.index)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """Return numbers and moments of all views."""
+        return self.parameters.values()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return numbers, moments and step counts."""
+        return self.parameters.state()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from :meth:`state`."""
+        self.parameters.restore(state)

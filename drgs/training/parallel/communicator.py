@@ -1,17 +1,16 @@
 """The processes that share a fit, and the arrays that they exchange.
 
-Arrays travel by MPI's functions for buffers, through the part of mpi4py's interface that
-:class:`SingleProcess` has, too: with it, the same code runs on one process, without MPI. No call
-blocks in C: a process that waits polls, so that it sees Ctrl-C, and leaves the cores of a crowded
-machine to the others.
+Arrays travel by MPI's functions for buffers. No call blocks in C: a process that waits polls, so
+that it sees Ctrl-C, and leaves the cores of a crowded machine to the others.
 """
+
+# ruff: noqa: N802 (mpi4py's names)
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -20,7 +19,7 @@ import numpy as np
 from drgs.core.errors import UserError
 from drgs.training.finite_checks import NonFiniteError
 
-SPINS, LONGEST_NAP_S = 50, 1e-3
+NUM_SPINS, MAX_PAUSE_S = 50, 1e-3
 """Polls without a pause, for messages that have nearly arrived; the longest pause between polls."""
 
 NEVER = 2**62
@@ -32,37 +31,24 @@ T = TypeVar("T")
 class SingleProcess:
     """The used part of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
 
-    def Get_rank(self) -> int:  # noqa: N802 (mpi4py's names)
+    def Get_rank(self) -> int:
         """Return 0."""
         return 0
 
-    def Get_size(self) -> int:  # noqa: N802
+    def Get_size(self) -> int:
         """Return 1."""
         return 1
 
-    def Iallgather(self, sent: np.ndarray, received: np.ndarray) -> None:  # noqa: N802
-        """Copy the numbers."""
-        received[:] = sent
-
-    def Ibcast(self, array: np.ndarray, root: int) -> None:  # noqa: N802
+    def Ibcast(self, array: np.ndarray, root: int) -> None:
         """Leave the array as it is."""
 
-    def Iallgatherv(self, sent: Any, received: Any, root: int = 0) -> None:  # noqa: N802
-        """Copy the rows: ``sent`` and ``received`` are arrays of bytes or begin with one."""
+    def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
+        """Copy the numbers: ``sent`` and ``received`` are arrays, or lists that begin with one."""
         del root
         sent, received = (b[0] if isinstance(b, list) else b for b in (sent, received))
         received[:] = sent
 
-    Igatherv = Iscatterv = Ialltoallv = Iallgatherv
-
-
-@dataclass
-class Times:
-    """Seconds that a process has spent on communication."""
-
-    waiting: float = 0.0  # for ranks that were not ready
-    exchanging: float = 0.0  # copying, packing and sending
-    sent_bytes: int = 0
+    Iallgatherv = Igatherv = Iscatterv = Ialltoallv = Iallgather
 
 
 @dataclass
@@ -71,15 +57,14 @@ class Communicator:
 
     comm: Any = field(default_factory=SingleProcess)  # mpi4py.MPI.Comm
     num_on_machine: int = 1  # of the processes, those on this machine
-    times: Times = field(default_factory=Times)
 
-    @staticmethod
-    def world() -> Communicator:
+    @classmethod
+    def world(cls) -> Communicator:
         """Return all processes that ``mpiexec`` has started."""
         from mpi4py import MPI
 
         here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED)
-        return Communicator(MPI.COMM_WORLD.Dup(), here.Get_size())
+        return cls(MPI.COMM_WORLD.Dup(), here.Get_size())
 
     @property
     def rank(self) -> int:
@@ -98,30 +83,18 @@ class Communicator:
 
     @property
     def num_own_cores(self) -> int:
-        """Cores for this process, where those of a machine are shared by all processes on it."""
+        """Cores for this process, of those that all processes on its machine share."""
         has_affinity = hasattr(os, "sched_getaffinity")  # Linux
         cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
         return max(1, cores // self.num_on_machine)
 
-    @contextmanager
-    def exchanging(self):
-        """Count the time of a block."""
-        waited, start = self.times.waiting, time.perf_counter()
-        yield
-        waited = self.times.waiting - waited
-        self.times.exchanging += time.perf_counter() - start - waited
-
-    # ------------------------------------------------------------------------------------------
-    # Collective calls: all ranks make them, in the same order
-    # ------------------------------------------------------------------------------------------
+    # All ranks make these collective calls, in the same order.
 
     def all_gather(self, numbers: np.ndarray) -> np.ndarray:
         """Return the numbers of each rank: (size, ...), from arrays of one shape."""
         numbers = np.asarray(numbers, order="C")
         gathered = np.empty((self.size, *numbers.shape), numbers.dtype)
-        start = time.perf_counter()
         wait(self.comm.Iallgather(numbers, gathered))
-        self.times.waiting += time.perf_counter() - start
         return gathered
 
     def all_gather_rows(self, rows: np.ndarray) -> np.ndarray:
@@ -129,10 +102,8 @@ class Communicator:
         rows = np.ascontiguousarray(rows)
         counts = self.all_gather(np.array(len(rows)))
         gathered = np.empty((int(counts.sum()), *rows.shape[1:]), rows.dtype)
-        with self.exchanging():
-            sizes = counts * _row_bytes(rows)
-            wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, sizes)))
-        self.times.sent_bytes += rows.nbytes * (self.size - 1)
+        sizes = counts * _row_bytes(rows)
+        wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, sizes)))
         return gathered
 
     def of_root(self, numbers: Any) -> np.ndarray:
@@ -147,10 +118,7 @@ class Communicator:
         if root == self.rank:
             gathered = np.empty((int(counts.sum()), *rows.shape[1:]), rows.dtype)
             into = _parts(gathered, counts * _row_bytes(rows))
-        else:
-            self.times.sent_bytes += rows.nbytes
-        with self.exchanging():
-            wait(self.comm.Igatherv(_bytes(rows), into, root=root))
+        wait(self.comm.Igatherv(_bytes(rows), into, root=root))
         return gathered
 
     def scatter_rows(self, rows: np.ndarray | None, like: np.ndarray) -> np.ndarray:
@@ -166,10 +134,7 @@ class Communicator:
     def broadcast(self, array: np.ndarray, root: int = 0) -> np.ndarray:
         """Return the array of rank ``root``; other ranks pass one of its shape and type."""
         array = np.ascontiguousarray(array)
-        with self.exchanging():
-            wait(self.comm.Ibcast(_bytes(array), root=root))
-        if root == self.rank:
-            self.times.sent_bytes += array.nbytes * (self.size - 1)
+        wait(self.comm.Ibcast(_bytes(array), root=root))
         return array
 
     def broadcast_text(self, text: str, root: int = 0) -> str:
@@ -180,14 +145,14 @@ class Communicator:
             words[:] = np.frombuffer(text.encode(), np.uint8)
         return self.broadcast(words, root).tobytes().decode()
 
-    def exchange_rows(self, parts: Sequence[np.ndarray], dtype: Any, width: int) -> list:
-        """Send rows (M_k, width) to each rank k, and return those from each rank."""
+    def exchange_rows(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Send rows to each rank, and return those from each rank."""
         counts = self.all_gather(np.array([len(part) for part in parts]))[:, self.rank]
-        own = np.concatenate([part.reshape(-1, width).astype(dtype, copy=False) for part in parts])
-        received = np.empty((int(counts.sum()), width), dtype)
-        row = width * own.itemsize
-        sizes = [len(part) * row for part in parts]
-        wait(self.comm.Ialltoallv(_parts(own, sizes), _parts(received, counts * row)))
+        sent = np.concatenate(parts)
+        received = np.empty((int(counts.sum()), *sent.shape[1:]), sent.dtype)
+        sizes = [part.nbytes for part in parts]
+        received_sizes = counts * _row_bytes(sent)
+        wait(self.comm.Ialltoallv(_parts(sent, sizes), _parts(received, received_sizes)))
         return np.split(received, np.cumsum(counts)[:-1])
 
     def collective(self, call: Callable[[], T]) -> T:
@@ -195,15 +160,13 @@ class Communicator:
 
         If several ranks raise one, it is that of the earliest iteration, on the lowest rank.
         """
+        if self.size == 1:
+            return call()
         result, error = None, None
         try:
             result = call()
         except UserError as caught:
-            if self.size == 1:
-                raise
             error = caught
-        if self.size == 1:
-            return result
         iteration = NEVER if error is None else getattr(error, "iteration", 0)
         errors = self.all_gather(np.array([iteration, isinstance(error, NonFiniteError)]))
         first = int(errors[:, 0].argmin())
@@ -213,13 +176,8 @@ class Communicator:
         text = self.broadcast_text("" if error is None else str(error), first)
         raise NonFiniteError(text, int(iteration)) if is_non_finite else UserError(text)
 
-    # ------------------------------------------------------------------------------------------
-    # From one rank to another
-    # ------------------------------------------------------------------------------------------
-
     def send(self, array: np.ndarray, to: int, tag: int) -> Any:
         """Begin to send an array, which must not change until the returned request is done."""
-        self.times.sent_bytes += array.nbytes
         return self.comm.Isend(_bytes(array), dest=to, tag=tag)
 
     def receive(self, into: np.ndarray, source: int, tag: int) -> Any:
@@ -232,17 +190,17 @@ def wait(*requests: Any) -> None:
     pending, polls = [request for request in requests if request is not None], 0
     while not all([request.Test() for request in pending]):
         polls += 1
-        if polls > SPINS:
-            time.sleep(min(LONGEST_NAP_S, 1e-6 * polls))
+        if polls > NUM_SPINS:
+            time.sleep(min(MAX_PAUSE_S, 1e-6 * polls))
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:
-    """The memory of an array, for MPI; more than 2^31 bytes take MPI 4."""
+    """Return the memory of an array, for MPI; more than 2^31 bytes take MPI 4."""
     return array.reshape(-1).view(np.uint8)
 
 
 def _parts(array: np.ndarray, sizes: Sequence[int]) -> list[Any]:
-    """The memory of an array, divided among ranks; sizes: bytes."""
+    """Return the memory of an array, divided among ranks; sizes: bytes."""
     return [_bytes(array), [int(size) for size in sizes], None, "B"]
 
 

@@ -2,14 +2,10 @@
 
 Every rank has some rows of the Gaussians, and renders some views of a step. It projects its rows
 for the cameras of all views; the splats that are on a view's film go to the rank that renders it,
-which bins and composites them behind one another, as if they were its own. The derivatives with
-respect to these splats go back, and every rank takes those of its rows through the projection. So
-14 numbers of a splat travel, and 9 come back, where a Gaussian has 59; and since rows are ordered
-by rank, and each rank adds up the views in their order, the bytes do not depend on the number of
-ranks. A rank that is alone sends nothing: its splats stay on the device.
-
-Going back from splats to Gaussians reads and writes all of their numbers. For views that see the
-same Gaussians, one kernel does it for :data:`VIEWS_AT_ONCE` of them.
+which bins and composites them behind one another. The derivatives with respect to these splats go
+back, and every rank takes those of its rows through the projection. Since rows are ordered by rank,
+and each rank adds up the views in their order, the bytes do not depend on the number of ranks. A
+rank that is alone sends nothing: its splats stay on the device.
 """
 
 from __future__ import annotations
@@ -46,10 +42,9 @@ from drgs.splatting.rendering import (
     weighted_sums,
 )
 from drgs.splatting.tiles import Footprints
-from drgs.training.gradients import ViewGradients, ViewLoss
 from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.population import renderer_of
-from drgs.training.steps import StepView
+from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
 VIEWS_AT_ONCE = 4
 """Views whose derivatives one kernel adds up; it is longer, and takes longer to compile, with each.
@@ -62,44 +57,22 @@ BOX_NUMBERS = 4
 """Numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.Footprints`."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Splats that travel
-# ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class SplatLayout:
-    """The numbers of a splat that travel."""
-
-    num_stored: int  # geometry, features, keys
-    num_features: int
-    num_keys: int
-
-    @property
-    def num_gradients(self) -> int:
-        """Numbers of the derivatives with respect to geometry and features."""
-        return self.num_stored - self.num_keys
-
-    @property
-    def widths(self) -> tuple[int, ...]:
-        """Columns of the blocks of a splat: its box, what is stored, its depth."""
-        return (BOX_NUMBERS, *block_widths(self.num_stored), 1)
-
-
 @dataclass(frozen=True, eq=False)
 class LocalProjection:
-    """This rank's rows as one camera sees them at one time."""
+    """This rank's rows as one camera sees them at one time, without what is stored of them."""
 
     camera: Camera
     pipeline: Pipeline  # composed for the camera
-    layout: SplatLayout
     boxes: Rows  # of tiles, of all rows of this rank
+    num_stored: int  # numbers of a splat: geometry, features, keys
+    num_features: int
+    num_keys: int
 
     @staticmethod
     def from_footprints(camera: Camera, pipeline: Pipeline, found: Footprints) -> LocalProjection:
-        """Remember what derivatives need of projected splats."""
-        layout = SplatLayout(found.rows.width, found.num_features, found.num_keys)
-        return LocalProjection(camera, pipeline, layout, found.boxes)
+        """Keep what derivatives need of projected splats."""
+        counts = found.rows.width, found.num_features, found.num_keys
+        return LocalProjection(camera, pipeline, found.boxes, *counts)
 
     @property
     def num_rows(self) -> int:
@@ -112,9 +85,26 @@ class LocalProjection:
         t = types_of(self.boxes.Float)
         return self.boxes.load(dr.arange(t.UInt32, self.num_rows))[-1] > 0
 
-    def view_splats(self, gradients: SplatGradients) -> SeenSplats:
-        """Return the derivatives with what they depend on."""
-        return SeenSplats(self.camera, self.pipeline, gradients)
+    @property
+    def num_gradients(self) -> int:
+        """Numbers of the derivatives with respect to geometry and features."""
+        return self.num_stored - self.num_keys
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Columns of the blocks of a splat: its box, what is stored, its depth."""
+        return (BOX_NUMBERS, *block_widths(self.num_stored), 1)
+
+    def footprints(self, blocks: Blocks) -> Footprints:
+        """Return received splats without copying them."""
+        box, *stored, depths = (wrapped(self.boxes.Float, block) for block in blocks)
+        rows, boxes = Rows(tuple(stored), self.num_stored), Rows((box,), BOX_NUMBERS)
+        return Footprints(boxes, rows, depths, self.num_features, self.num_keys)
+
+    def gradients(self, columns: list[Any]) -> SplatGradients:
+        """Divide columns of derivatives into those of geometry and of features."""
+        num_geometry = len(columns) - self.num_features
+        return SplatGradients(columns[:num_geometry], columns[num_geometry:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +121,7 @@ class PackedProjection:
         """Pack what is on the film. The host reads the number of splats."""
         rows = dr.compress(local.visible)
         count, float_type = dr.width(rows), found.rows.Float
-        blocks = _empty_blocks(0, local.layout.widths, float_type)
+        blocks = _empty_blocks(0, local.widths, float_type)
         if count > 0:
             boxes, stored = (Rows.of(each.load(rows)) for each in (found.boxes, found.rows))
             depths = dr.gather(float_type, found.depths, rows)
@@ -163,23 +153,14 @@ def _concatenate(parts: Sequence[Footprints]) -> Footprints:
     """Return the splats of several ranks behind one another."""
     if len(parts) == 1:
         return parts[0]
-    boxes, rows = (
-        Rows(
-            tuple(dr.concat(list(blocks)) for blocks in zip(*(e.blocks for e in each))),  # noqa: B905
-            each[0].width,
-        )
-        for each in ([part.boxes for part in parts], [part.rows for part in parts])
-    )
+
+    def concatenate(each: Sequence[Rows]) -> Rows:
+        columns = zip(*(rows.blocks for rows in each), strict=True)
+        return Rows(tuple(dr.concat(list(blocks)) for blocks in columns), each[0].width)
+
+    boxes, rows = (concatenate([getattr(p, name) for p in parts]) for name in ("boxes", "rows"))
     depths = dr.concat([part.depths for part in parts])
     return Footprints(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)
-
-
-def _footprints_of_blocks(blocks: Blocks, layout: SplatLayout, float_type: type) -> Footprints:
-    """Return received splats without copying them."""
-    box, *stored, depths = (wrapped(float_type, block) for block in blocks)
-    rows = Rows(tuple(stored), layout.num_stored)
-    box = Rows((box,), BOX_NUMBERS)
-    return Footprints(box, rows, depths, layout.num_features, layout.num_keys)
 
 
 class ViewMessages:
@@ -200,19 +181,12 @@ class ViewMessages:
     def receive(self, into: Blocks, source: int, place: int, time: int) -> None:
         """Wait for the next rows that a rank sends."""
         tag = place * MAX_SHUTTER_SAMPLES + time
-        with self.comm.exchanging():
-            wait(*(self.comm.receive(block, source, tag) for block in into))
+        wait(*(self.comm.receive(block, source, tag) for block in into))
 
     def finish(self) -> None:
         """Wait until all has been sent."""
-        with self.comm.exchanging():
-            wait(*(request for requests, _ in self._sending for request in requests))
+        wait(*(request for requests, _ in self._sending for request in requests))
         self._sending.clear()
-
-
-# ----------------------------------------------------------------------------------------------
-# A step
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(eq=False)
@@ -259,8 +233,6 @@ class ViewExchange:
         self._current: _View | None = None  # is rendered now; None: between two steps
         self._num_added = 0  # views whose derivatives are in the parameters
         integrator.use_projection(self)
-
-    # What the trainer calls ---------------------------------------------------------------------
 
     def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
         """Project the rows of this rank for the views that others render.
@@ -320,7 +292,15 @@ class ViewExchange:
                 self._receive(each, weights)
         self._add_ready_views(is_end=True)
         self.messages.finish()
-        return [self._result(each) for each in self._views]
+        return [
+            ViewGradients(
+                each.means2d,
+                reduce(or_, (local.visible for local in each.local)),
+                each.sums,
+                each.first_fault,
+            )
+            for each in self._views
+        ]
 
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
         """Return the losses of all views, by place in the step; losses: of views rendered here."""
@@ -341,8 +321,6 @@ class ViewExchange:
         renderer = self._views[view.place].renderer
         return type(value)(self.comm.broadcast(np.array(value, np.float32), renderer))
 
-    # What the integrator calls ------------------------------------------------------------------
-
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
         """Return the splats of all ranks, behind one another, as ``camera`` sees them.
 
@@ -359,9 +337,9 @@ class ViewExchange:
             if rank == self.comm.rank:
                 parts.append(own)
             elif (count := int(each.counts[rank, time])) > 0:
-                blocks = _empty_blocks(count, local.layout.widths, own.rows.Float)
+                blocks = _empty_blocks(count, local.widths, own.rows.Float)
                 self.messages.receive(blocks, rank, each.view.place, time)
-                parts.append(_footprints_of_blocks(blocks, local.layout, own.rows.Float))
+                parts.append(local.footprints(blocks))
         return _concatenate(parts)
 
     def gradients(
@@ -372,13 +350,11 @@ class ViewExchange:
             return Projected().gradients(gaussians, frame, of_splats, of_camera)
         time = len(each.gradients)
         columns = self._divide(each, time, [*of_splats.geometry, *of_splats.features])
-        each.gradients.append(_splat_gradients(columns, each.local[time].layout))
+        each.gradients.append(each.local[time].gradients(columns))
         each.frames.append(frame)
         each.needs_camera = of_camera
         t = types_of(type(of_splats.opacities))
         return GaussianGradients(None, dr.zeros(t.Array2f), t.Bool(False), t.UInt32(NO_FAULT))
-
-    # Splats ---------------------------------------------------------------------------------------
 
     def _cameras(self, view: StepView) -> list[Camera]:
         """Return what is simulated of the view's camera, by time, detached."""
@@ -420,9 +396,9 @@ class ViewExchange:
         """Receive what another rank has found out about the rows of this one."""
         place, source = each.view.place, each.renderer
         for time, packed in enumerate(each.packed):
-            layout = packed.local.layout
-            columns = self._receive_columns(packed, source, place, time, layout.num_gradients)
-            each.gradients.append(_splat_gradients(columns, layout))
+            width = packed.local.num_gradients
+            columns = self._receive_columns(packed, source, place, time, width)
+            each.gradients.append(packed.local.gradients(columns))
         for name in weights:
             sums = [
                 self._receive_columns(packed, source, place, time, 1)[0]
@@ -437,8 +413,6 @@ class ViewExchange:
         if packed.count > 0:
             self.messages.receive(blocks, source, place, time)
         return packed.unpack(blocks, width)
-
-    # Gaussians ------------------------------------------------------------------------------------
 
     def _add_ready_views(self, is_end: bool) -> None:
         """Add the derivatives of the next groups of views whose derivatives are all here.
@@ -467,7 +441,10 @@ class ViewExchange:
         """Add the derivatives of some views to those of the step."""
         with dr.suspend_grad():
             gaussians = dr.detach(self.integrator.gaussians)
-            seen = [[*map(LocalProjection.view_splats, v.local, v.gradients)] for v in group]
+            seen = [
+                [SeenSplats(p.camera, p.pipeline, g) for p, g in zip(*pairs, strict=True)]
+                for pairs in ((each.local, each.gradients) for each in group)
+            ]
             total, faults = sum_of_views(gaussians, seen)
         self._accumulate(total)
         for each, fault in zip(group, faults, strict=True):
@@ -500,14 +477,3 @@ class ViewExchange:
     def _accumulate(self, gradients: Gaussians) -> None:
         for key, parameter in self.params.items():
             dr.accum_grad(parameter, getattr(gradients, key.removeprefix(self.prefix)))
-
-    @staticmethod
-    def _result(each: _View) -> ViewGradients:
-        """Return what is known of a view, of the rows of this rank."""
-        visible = reduce(or_, (local.visible for local in each.local))
-        return ViewGradients(each.means2d, visible, each.sums, each.first_fault)
-
-
-def _splat_gradients(columns: list[Any], layout: SplatLayout) -> SplatGradients:
-    num_geometry = len(columns) - layout.num_features
-    return SplatGradients(columns[:num_geometry], columns[num_geometry:])

@@ -1,27 +1,34 @@
-"""Inputs of a fit by several processes: configuration and Gaussians of rank 0, photographs.
+"""Inputs of processes that work together: what rank 0 sends, and what the others read themselves.
 
-Rank 0 reads the whole dataset. Each other rank reads the photographs of the views that it renders
-by itself, and of other views the cameras and sizes, from files' headers.
+Rank 0 reads the whole dataset of a fit. Each other rank reads the photographs of the views that it
+renders by itself, and of other views the cameras and sizes, from files' headers. What a rank reads
+is compared with rank 0: a stale copy on one machine would mix two datasets, and another version of
+a library would make the result depend on the number of processes.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+import platform
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
+import PIL
 
+import drgs
 from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError, listed
+from drgs.core.private import llvm_vector_width, llvm_version
 from drgs.datasets import load_dataset
+from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
 from drgs.datasets.images import without_images
-from drgs.datasets.types import Dataset
+from drgs.datasets.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.training.parallel.agreement import (
-    check_versions,
-    check_views,
-    send_fingerprint,
-    versions,
-)
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import own_views
 
@@ -41,23 +48,14 @@ def share_inputs(
     if comm.is_root:
         names = [view.name for view in dataset.train]
         comm.broadcast_text(json.dumps([config.model_dump_json(), names, versions()]))
-        send_fingerprint(comm, dataset)  # made while the others read
-        return config, _with_own_photographs(dataset, config.optimizer.views_per_step, comm)
+        # Made while the others read.
+        comm.broadcast_text(fingerprint_of(replace(dataset, test=())).to_bytes().decode())
+        own = own_views(len(names), config.optimizer.views_per_step, comm.rank, comm.size)
+        train = (v if i in own else without_images(v) for i, v in enumerate(dataset.train))
+        return config, replace(dataset, train=tuple(train))
     text, names, versions_of_root = json.loads(comm.broadcast_text(""))
     check_versions(versions_of_root)
     config = FitConfig.model_validate_json(text)
-    return config, _read_own_photographs(config, names, comm)
-
-
-def _with_own_photographs(dataset: Dataset, views_per_step: int, comm: Communicator) -> Dataset:
-    """Return the dataset without the photographs of views that other ranks render."""
-    own = own_views(len(dataset.train), views_per_step, comm.rank, comm.size)
-    train = (v if i in own else without_images(v) for i, v in enumerate(dataset.train))
-    return replace(dataset, train=tuple(train))
-
-
-def _read_own_photographs(config: FitConfig, names: list[str], comm: Communicator) -> Dataset:
-    """Return the dataset with the training views of these names, and no views to measure on."""
     own = own_views(len(names), config.optimizer.views_per_step, comm.rank, comm.size)
     rendered = {names[index] for index in own}
     dataset = load_dataset(config.data_for_training, rendered.__contains__, config.extensions)
@@ -65,7 +63,7 @@ def _read_own_photographs(config: FitConfig, names: list[str], comm: Communicato
     dataset = replace(dataset, train=tuple(view for view in dataset.train if view.name in chosen))
     check_views(comm, dataset, rendered, config.data.path)
     by_name = {view.name: view for view in dataset.train}
-    return replace(dataset, train=tuple(by_name[name] for name in names), test=())
+    return config, replace(dataset, train=tuple(by_name[name] for name in names), test=())
 
 
 def share_gaussians(comm: Communicator, gaussians: Gaussians | None) -> Gaussians:
@@ -77,3 +75,83 @@ def share_gaussians(comm: Communicator, gaussians: Gaussians | None) -> Gaussian
     arrays = given or [np.empty(shape, dtype) for dtype, shape in described]
     arrays = [comm.broadcast(a).reshape(a.shape) for a in arrays]
     return Gaussians(**dict(zip(PARAMETER_NAMES, arrays, strict=True)))
+
+
+def versions() -> dict[str, str]:
+    """Return versions and the vector width that the bytes of a result depend on, by name."""
+    return {
+        "drgs": drgs.__version__,
+        "Mitsuba": mi.__version__,
+        "Dr.Jit": dr.__version__,
+        "numpy": np.__version__,
+        "Pillow": PIL.__version__,
+        "LLVM": ".".join(map(str, llvm_version())),
+        "the vector width": str(llvm_vector_width()),
+        "the variant": mi.variant(),
+    }
+
+
+def check_versions(first: Mapping[str, str]) -> None:
+    """Raise ``UserError`` unless this process has the versions of rank 0."""
+    own = versions()
+    for name, value in first.items():
+        if own.get(name) != value:
+            raise UserError(
+                f"mpiexec: {name} must be the same everywhere, or the result would depend on the "
+                f"number of processes; got {own.get(name)} on {platform.node()}, {value} for "
+                "process 0"
+            )
+
+
+def check_views(comm: Communicator, dataset: Dataset, own: Collection[str], path: Path) -> None:
+    """Raise ``UserError`` unless training views are those that rank 0 has read.
+
+    own: names of the views whose files this process reads; path: the dataset's, for the message.
+    """
+    here = fingerprint_of(replace(dataset, test=()), own.__contains__)
+    first = Fingerprint.from_bytes(comm.broadcast_text("").encode())
+    if found := first.other_files(dataset.train, here) or first.differences(here):
+        raise _not_the_same(path, found)
+
+
+def check_scene(
+    comm: Communicator, scene: mi.Scene, views: Sequence[Viewpoint], files: Mapping[str, object]
+) -> None:
+    """Raise ``UserError`` unless the scene and its views are those of rank 0.
+
+    files: for the message, the origin of ``cameras`` and ``background``, and of the ``model``.
+    Called by all processes; returns when all have agreed.
+    """
+    integrator = scene.integrator()
+    own = versions()
+    parameters = {**mi.traverse(integrator), "smoothing": integrator.smoothing}
+    for name, value in parameters.items():
+        array = np.asarray(value)  # an object, where it is no array
+        own[name] = str(value) if array.dtype == object else _digest(array)
+    own |= {"settings": str(integrator), "cameras": _digest_of_cameras(views)}
+    first = json.loads(comm.broadcast_text(json.dumps(own)))
+    check_versions({name: first[name] for name in versions()})
+    if other := [name for name in {**first, **own} if first.get(name) != own.get(name)]:
+        raise _not_the_same(files.get(other[0].partition(".")[0]) or files["model"], other)
+    comm.all_gather(np.array(True))
+
+
+def _not_the_same(file: object, differences: Sequence[object]) -> UserError:
+    return UserError(
+        f"{file}: not the same on {platform.node()} as for process 0: {listed(differences)}; all "
+        "processes must see the same files and options"
+    )
+
+
+def _digest_of_cameras(views: Sequence[Viewpoint]) -> str:
+    cameras = [
+        [view.name, view.width, view.height, view.K.tolist(), view.camera_to_world.tolist()]
+        + ([] if view.lens is None else [view.lens.kind, str(view.lens.coefficients())])
+        + ([] if view.motion is None else [view.motion.close_to_world.tolist()])
+        for view in views
+    ]
+    return _digest(json.dumps(cameras).encode())
+
+
+def _digest(content: bytes | np.ndarray) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,16 +1,14 @@
-"""``mpiexec -n K drgs render``: processes share the pictures; the first one writes them.
+"""``mpiexec -n K drgs render``: processes share the images; rank 0 writes them.
 
-Every process reads what the command line names and finds the same cameras. The pictures go round:
-the first process renders the first one, the second the second, and so on.
+Every process reads what the command line names and finds the same cameras. Image k is rendered by
+rank k modulo K.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
-from typing import NoReturn
+from collections.abc import Callable, Iterator, Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -18,21 +16,15 @@ import numpy as np
 from drgs.core.errors import UserError
 from drgs.datasets.types import Viewpoint
 from drgs.integrator.scene import render_views
-from drgs.training.parallel.agreement import check_pictures
 from drgs.training.parallel.communicator import Communicator, wait
-
-END = "end"
-"""Message of the first process when all images are written."""
+from drgs.training.parallel.inputs import check_scene
 
 Render = Callable[..., Iterator[np.ndarray]]
-"""Of a scene and views, pictures (H, W, 3)."""
-
-Files = Mapping[str, object]
-"""Files of models, cameras and backgrounds, for messages."""
+"""Renders images (H, W, 3) of a scene and views."""
 
 
 def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:
-    """Run the command on all processes; work: the command, given what renders views."""
+    """Run the command on all processes; work: the command, given a function that renders views."""
     comm = Communicator.world()
     if args.threads is None:
         args.threads = comm.num_own_cores
@@ -40,35 +32,28 @@ def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> No
         raise UserError("mpiexec: a scene of Mitsuba is rendered by one process; leave mpiexec out")
     background = " ".join(args.background or ())
     files = {"cameras": args.camera, "background": background, "model": args.what}
+
+    def render_all(scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
+        """Yield all images in order, of which rank 0 renders its own."""
+        check_scene(comm, scene, views, files)
+        own = render_views(scene, views[:: comm.size])
+        for index, view in enumerate(views):
+            source = index % comm.size
+            if source == 0:
+                yield next(own)
+                continue
+            image = np.empty((view.height, view.width, 3), np.float32)
+            wait(comm.receive(image, source, 0))
+            yield image
+
+    def render_own(scene: mi.Scene, views: Sequence[Viewpoint]) -> Iterator[np.ndarray]:
+        """Render the images of this rank, and end the process when rank 0 has written all."""
+        check_scene(comm, scene, views, files)
+        for image in render_views(scene, views[comm.rank :: comm.size]):
+            wait(comm.send(np.ascontiguousarray(image, np.float32), 0, 0))
+        comm.broadcast_text("")
+        sys.exit()
+
+    work(render_all if comm.is_root else render_own)
     if comm.is_root:
-        work(partial(_gathered, comm, files))
-        comm.broadcast_text(END)
-    else:
-        work(partial(_contributed, comm, files))
-
-
-def _gathered(
-    comm: Communicator, files: Files, scene: mi.Scene, views: Sequence[Viewpoint]
-) -> Iterator[np.ndarray]:
-    """All pictures in order, of which this process renders its own."""
-    check_pictures(comm, scene, views, files)
-    own = render_views(scene, views[:: comm.size])
-    for index, view in enumerate(views):
-        source = index % comm.size
-        if source == 0:
-            yield next(own)
-            continue
-        picture = np.empty((view.height, view.width, 3), np.float32)
-        wait(comm.receive(picture, source, 0))
-        yield picture
-
-
-def _contributed(
-    comm: Communicator, files: Files, scene: mi.Scene, views: Sequence[Viewpoint]
-) -> NoReturn:
-    """Render what falls to this process, and end when the first process has."""
-    check_pictures(comm, scene, views, files)
-    for picture in render_views(scene, views[comm.rank :: comm.size]):
-        wait(comm.send(np.ascontiguousarray(picture, np.float32), 0, 0))
-    comm.broadcast_text("")
-    sys.exit()
+        comm.broadcast_text("all images are written")

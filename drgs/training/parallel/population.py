@@ -1,9 +1,8 @@
 """The rows of a fit that several processes share: which ones each has, and how they change.
 
 All rows together are in the order in which a single process would have them, and each process has
-an interval of them, all of the same length but for one. Decisions about rows are made from what is
-known of all of them (:meth:`ShardedPopulation.host`), on every process alike; only the numbers of
-the rows themselves, with their moments, are in one place each.
+an interval of them, all of the same length but for one. Decisions about rows are made on every
+process alike, from values of all rows (:meth:`ShardedPopulation.host`).
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ import drjit as dr
 import numpy as np
 
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import from_host, types_of
+from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.training.density.strategy import Population
-from drgs.training.optimizer import LeanAdam, num_rows, take_rows
+from drgs.training.optimizer import LeanAdam, take_rows
 from drgs.training.parallel.communicator import Communicator
 
 
@@ -40,7 +39,7 @@ def local_gaussians(gaussians: Gaussians, comm: Communicator) -> Gaussians:
     """Return the rows of this process; gaussians: numpy arrays, of all."""
     if comm.size == 1:
         return gaussians
-    own = Shard(gaussians.num_gaussians, comm.rank, comm.size).own
+    own = Shard(gaussians.num_gaussians, comm.rank, comm.size).local
     rows = {name: getattr(gaussians, name)[own] for name in PARAMETER_NAMES}
     smoothing = None if gaussians.smoothing is None else gaussians.smoothing[own]
     return replace(gaussians, **rows, smoothing=smoothing)
@@ -90,7 +89,7 @@ class Shard:
         return np.arange(self.size + 1) * self.total // self.size
 
     @property
-    def own(self) -> slice:
+    def local(self) -> slice:
         """The interval of this process."""
         first, end = self.bounds[self.rank : self.rank + 2]
         return slice(int(first), int(end))
@@ -104,9 +103,8 @@ class Shard:
 class ShardedPopulation(Population):
     """The rows of a fit, an interval of which is in the optimizer here.
 
-    Every process calls the same methods in the same order. What they are given, and row numbers,
-    concern all rows; what :meth:`value` returns and what :meth:`replace` and :meth:`set_values`
-    take are the rows of this process.
+    Every process calls the same methods in the same order. Arguments and row numbers concern all
+    rows; :meth:`value`, :meth:`replace` and :meth:`set_values` those of this process.
     """
 
     comm: Communicator
@@ -114,58 +112,86 @@ class ShardedPopulation(Population):
 
     @property
     def num_rows(self) -> int:
-        """N at the moment, of all processes."""
+        """The number of Gaussians of all processes."""
         return self.shard.total
 
     @property
     def first_row(self) -> int:
         """The number of the first row of this process."""
-        return self.shard.own.start
+        return self.shard.local.start
 
-    @property
-    def num_own(self) -> int:
-        """How many of them this process has."""
-        return num_rows(self.optimizer, self.prefix)
-
-    def of_all(self, values: Any) -> np.ndarray:
-        """Values for the rows of all processes: see ``Population.of_all``."""
+    def gather(self, values: Any) -> np.ndarray:
+        """Return the values of all rows: see :class:`Population`."""
         return self.comm.all_gather_rows(np.array(values)).astype(np.float64)
 
-    def own(self, values: np.ndarray) -> np.ndarray:
-        """Of values for all rows, those of this process."""
-        return values[self.shard.own]
+    def local(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the rows of this process."""
+        return values[self.shard.local]
 
     def row_numbers(self) -> Any:
-        """Of the rows that :meth:`value` has: UInt32."""
-        index_type = dr.uint32_array_t(type(self.value("means").array))
-        first = dr.opaque(index_type, self.shard.own.start)
-        return dr.arange(index_type, self.num_own) + first
+        """Return the numbers of the rows of this process: UInt32."""
+        return super().row_numbers() + dr.opaque(self._index_type, self.first_row)
 
     def take(self, rows: Any) -> dict[str, Any]:
-        """Copies of some of all rows, of every parameter by name."""
-        shard, wanted = self.shard, np.array(rows)
-        owners = shard.owners(wanted)
-        own = self.rows(wanted[owners == shard.rank] - shard.own.start)
-        packed = self._packed(take_rows(self.optimizer, own, self.prefix), dr.width(own))
-        found = np.empty((len(wanted), packed.shape[1]), packed.dtype)
-        found[np.argsort(owners, kind="stable")] = self.comm.all_gather_rows(packed)
-        return self._unpacked(found)
+        """Return copies of some of all rows, of every parameter by name."""
+        wanted = np.array(rows)
+        owners = self.shard.owners(wanted)
+        place = np.argsort(owners, kind="stable")
+        local = self.rows(wanted[owners == self.shard.rank] - self.first_row)
+        taken = {}
+        for name, values in take_rows(self.optimizer, local, self.prefix).items():
+            gathered = self.comm.all_gather_rows(np.array(values).reshape(values.shape))
+            result = np.empty_like(gathered)
+            result[place] = gathered
+            taken[name] = _on_device(values, result)
+        return taken
 
     def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
-        """Keep some of all rows in the order given and append others: see ``Population.edit``."""
-        before, kept = replace(self.shard), np.array(keep)
-        appended = np.empty((0, 0))
-        if append is not None:
-            appended = self._packed(append, append["means"].shape[0])
-        after = Shard(len(kept) + len(appended), before.rank, before.size)
+        """Keep some of all rows in the order given and append others: see :class:`Population`."""
+        kept, optimizer = np.array(keep), self.optimizer
+        num_appended = 0 if append is None else append["means"].shape[0]
+        after = replace(self.shard, total=len(kept) + num_appended)
         _check_count(after.total, after.size)
-        moved = self._moved(before, after, kept)
-        own = appended[max(after.own.start - len(kept), 0) : max(after.own.stop - len(kept), 0)]
-        self._replace(moved, own)
+        move = self._row_moves(after, kept)
+        first, end = (max(row - len(kept), 0) for row in (after.local.start, after.local.stop))
+        optimizer.forget_moments()
+        for key in (key for key in optimizer.state if key.startswith(self.prefix)):
+            value, promoted, rate, (step, *moments, maximum) = optimizer.state[key]
+            appended = np.empty((0, *value.shape[1:]), np.float32)
+            if append is not None:
+                appended = np.array(append[key.removeprefix(self.prefix)])[first:end]
+            rows = np.concatenate([move(np.array(dr.detach(value))), appended])
+            none = np.zeros_like(appended)
+            moved = [np.array(moment).reshape(value.shape) for moment in moments]
+            moments = [
+                from_host(type(moment), np.concatenate([move(former), none]))
+                for moment, former in zip(moments, moved, strict=True)
+            ]
+            new_value = _on_device(value, rows)
+            dr.make_opaque(new_value, moments)
+            dr.enable_grad(new_value)
+            optimizer.state[key] = new_value, promoted, rate, (step, *moments, maximum)
         self.shard.total = after.total
 
-    def terms_of_all(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
-        """Return terms of the loss over all rows: see ``Population.terms_of_all``.
+    def _row_moves(self, after: Shard, kept: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """Return what turns rows of this process into the kept ones of its next interval."""
+        before = self.shard
+        sources, goals = before.owners(kept), after.owners(np.arange(len(kept)))
+        from_here = sources == before.rank
+        local, to = kept[from_here] - self.first_row, goals[from_here]
+        wanted = sources[goals == after.rank]
+
+        def move(rows: np.ndarray) -> np.ndarray:
+            parts = self.comm.exchange_rows([rows[local[to == r]] for r in range(after.size)])
+            result = np.empty((len(wanted), *rows.shape[1:]), rows.dtype)
+            for rank, part in enumerate(parts):
+                result[wanted == rank] = part
+            return result
+
+        return move
+
+    def gather_terms(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
+        """Return terms of the loss over all rows.
 
         They are computed again: the sum of what the ranks have would be rounded otherwise.
         """
@@ -173,12 +199,12 @@ class ShardedPopulation(Population):
             return []
         return [np.array(term, np.float32) for term in compute(_AllRows(self))]
 
-    def gather_gaussians(self, own: Gaussians) -> Gaussians:
-        """Return the Gaussians of all ranks on rank 0, and ``own`` on others."""
-        columns = {name: getattr(own, name) for name in (*PARAMETER_NAMES, "smoothing")}
+    def gather_gaussians(self, local: Gaussians) -> Gaussians:
+        """Return the Gaussians of all ranks on rank 0, and ``local`` on others."""
+        columns = {name: getattr(local, name) for name in (*PARAMETER_NAMES, "smoothing")}
         columns = {name: rows for name, rows in columns.items() if rows is not None}
         gathered = {name: self.comm.gather_rows(rows) for name, rows in columns.items()}
-        return replace(own, **gathered) if self.comm.is_root else own
+        return replace(local, **gathered) if self.comm.is_root else local
 
     def gather_state(
         self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
@@ -186,7 +212,7 @@ class ShardedPopulation(Population):
         """Return a trainer's state with the rows of all ranks on rank 0."""
         for name in filter(is_by_row, state):
             array = state[name]
-            rows = self.comm.gather_rows(array.reshape(self.num_own, -1))
+            rows = self.comm.gather_rows(array.reshape(self.num_local_rows, -1))
             if rows is not None:
                 shape = (-1,) if array.ndim == 1 else (self.num_rows, *array.shape[1:])
                 state[name] = rows.reshape(shape)
@@ -201,7 +227,7 @@ class ShardedPopulation(Population):
         (total,) = (shape[0] for name, _, shape in described if name == "means.value")
         _check_count(total, self.comm.size)
         self.shard.total = total
-        own, count = {}, self.shard.own.stop - self.shard.own.start
+        own, count = {}, self.shard.local.stop - self.shard.local.start
         for name, dtype, shape in described:
             array = state.get(name)
             if is_by_row(name):
@@ -214,88 +240,11 @@ class ShardedPopulation(Population):
                 own[name] = self.comm.broadcast(array).reshape(shape)
         return own
 
-    def _moved(self, before: Shard, after: Shard, kept: np.ndarray) -> np.ndarray:
-        """Values and moments of the kept rows that are this process's from now on, in order."""
-        sources, goals = before.owners(kept), after.owners(np.arange(len(kept)))
-        from_here = sources == before.rank
-        local, to = kept[from_here] - before.own.start, goals[from_here]
-        everything = np.concatenate(self._everything(), axis=1)
-        parts = [everything[local[to == rank]] for rank in range(after.size)]
-        del everything
-        with self.comm.exchanging():
-            found = self.comm.exchange_rows(parts, parts[0].dtype, parts[0].shape[1])
-        wanted = sources[goals == after.rank]
-        result = np.empty((len(wanted), parts[0].shape[1]), parts[0].dtype)
-        for rank, part in enumerate(found):
-            result[wanted == rank] = part
-        return result
 
-    def _everything(self) -> list[np.ndarray]:
-        """Of the rows of this process: values, first and second moments, (n, columns) each."""
-        found: list[list[np.ndarray]] = [[], [], []]
-        for key in self._keys:
-            value, _, _, (_, first, second, _) = self.optimizer.state[key]
-            for arrays, flat in zip(found, (dr.detach(value), first, second), strict=True):
-                arrays.append(np.array(flat).reshape(self.num_own, self._width(key)))
-        return [np.concatenate(arrays, axis=1) for arrays in found]
-
-    def _replace(self, kept: np.ndarray, appended: np.ndarray) -> None:
-        """Give the optimizer other rows: kept ones with their moments, then new ones."""
-        optimizer, start = self.optimizer, 0
-        optimizer.forget_moments()
-        columns = kept.shape[1] // 3
-        for key in self._keys:
-            value, promoted, rate, (step, first, *_, maximum) = optimizer.state[key]
-            shape = tuple(value.shape[1:])
-            width = math.prod(shape)
-
-            def rows_of(which: int, begin: int = start, width: int = width) -> np.ndarray:
-                at = columns * which + begin
-                new = np.zeros((len(appended), width), kept.dtype)
-                if which == 0 and len(appended):
-                    new = appended[:, begin : begin + width]
-                return np.concatenate([kept[:, at : at + width], new])
-
-            flat_type, rows = type(first), rows_of(0)
-            flat = from_host(flat_type, rows)
-            new_value = type(value)(flat, (len(rows), *shape)) if dr.is_tensor_v(value) else flat
-            moments = [from_host(flat_type, rows_of(which)) for which in (1, 2)]
-            dr.make_opaque(new_value, moments)
-            dr.enable_grad(new_value)
-            optimizer.state[key] = new_value, promoted, rate, (step, *moments, maximum)
-            start += width
-
-    @property
-    def _keys(self) -> list[str]:
-        return [key for key in self.optimizer.state if key.startswith(self.prefix)]
-
-    def _width(self, key: str) -> int:
-        """Numbers of a row."""
-        return math.prod(self.optimizer.state[key][0].shape[1:])
-
-    def _packed(self, rows: Mapping[str, Any], count: int) -> np.ndarray:
-        """(count, columns): rows of every parameter, side by side."""
-        columns = [
-            np.array(rows[key[len(self.prefix) :]]).reshape(count, self._width(key))
-            for key in self._keys
-        ]
-        return np.concatenate(columns, axis=1)
-
-    def _unpacked(self, packed: np.ndarray) -> dict[str, Any]:
-        """The inverse, on the device."""
-        result, start = {}, 0
-        for key in self._keys:
-            value = self.optimizer.state[key][0]
-            shape = tuple(value.shape[1:])
-            width = math.prod(shape)
-            t = types_of(type(dr.detach(value).array))
-            flat = from_host(t.Float, packed[:, start : start + width])
-            is_tensor = dr.is_tensor_v(value)
-            result[key[len(self.prefix) :]] = (
-                type(value)(flat, (len(packed), *shape)) if is_tensor else flat
-            )
-            start += width
-        return result
+def _on_device(like: Any, rows: np.ndarray) -> Any:
+    """Return rows as the tensor, or array, that other rows of a parameter are in."""
+    flat = from_host(type(dr.detach(like).array), rows)
+    return type(like)(flat, rows.shape) if dr.is_tensor_v(like) else flat
 
 
 class _AllRows(dict[str, Any]):

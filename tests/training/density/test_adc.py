@@ -11,17 +11,8 @@ from drgs.config.schema import DensifyConfig
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.training.density.adc import (
-    DensityStatistics,
-    accumulate,
-    densify_and_prune,
-    needs_statistics,
-    prunes_large,
-    reset_opacities,
-    should_densify,
-    should_reset,
-)
-from drgs.training.density.strategy import DensityReport
+from drgs.training.density.adc import AdaptiveDensityControl
+from drgs.training.density.strategy import DensityReport, StepInfo
 from drgs.training.optimizer import make_optimizer, num_rows
 
 EARLY, LATE = 600, 3100  # before and after the first opacity reset of the default schedule
@@ -34,8 +25,12 @@ HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
 
 
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
-    rows = rows_of(optimizer, seed)
-    return densify_and_prune(rows, statistics(gradient_norms), DensifyConfig(**config), iteration)
+    strategy = AdaptiveDensityControl(DensifyConfig(**config), False, *statistics(gradient_norms))
+    return strategy.densify_and_prune(rows_of(optimizer, seed), iteration)
+
+
+def seen(strategy, gradient, visible, width, height):
+    strategy.update_statistics(StepInfo(1, width, height, gradient, visible, {}))
 
 
 # ---- statistics
@@ -47,24 +42,22 @@ def test_statistics_are_gradient_norms_in_ndc_over_visible_views(as_tensor):
     visible = random.random((3, num)) < 0.6
     visible[:, 2] = False
 
-    result = DensityStatistics.zeros(Float, num)
-    for gradient, seen in zip(gradients, visible, strict=True):
+    result = AdaptiveDensityControl(DensifyConfig())
+    result.begin(rows_of(make([SMALL] * num, 0.5)))
+    for gradient, is_seen in zip(gradients, visible, strict=True):
         pixel = TensorXf(gradient) if as_tensor else Array2f(gradient.T)
-        result = accumulate(result, pixel, Bool(seen), width, height)
+        seen(result, pixel, Bool(is_seen), width, height)
 
     # d/dx_ndc = d/dx_px * W / 2, because x_ndc spans 2 over W pixels.
     norms = np.linalg.norm(gradients * [width / 2, height / 2], axis=2)
     np.testing.assert_array_equal(result.views, visible.sum(0))
     np.testing.assert_allclose(result.gradient_norms, (norms * visible).sum(0), rtol=1e-6)
-    means = result.mean_gradient_norms()
-    assert means[2] == 0
-    expected = (norms * visible).sum(0) / np.maximum(visible.sum(0), 1)
-    np.testing.assert_allclose(means, expected, rtol=1e-6)
 
 
 def test_invisible_gradients_are_ignored_even_if_they_are_nan():
     gradient, visible = Array2f([np.nan, 1], [0, 0]), Bool(False, True)
-    result = accumulate(DensityStatistics.zeros(Float, 2), gradient, visible, 2, 2)
+    result = AdaptiveDensityControl(DensifyConfig(), False, Float(0, 0), Float(0, 0))
+    seen(result, gradient, visible, 2, 2)
     np.testing.assert_array_equal(result.gradient_norms, [0, 1])
 
 
@@ -72,20 +65,21 @@ def test_invisible_gradients_are_ignored_even_if_they_are_nan():
 @pytest.mark.parametrize("white", [False, True])
 def test_schedule_is_that_of_the_reference_training_loop(white):
     config = DensifyConfig(start=20, stop=200, every=10, reset_every=60, white_background_reset=20)
+    strategy = AdaptiveDensityControl(config, white)
     for i in range(1, 300):
         densify = reset = False
         if i < 200:
             densify = i > 20 and i % 10 == 0
             reset = i % 60 == 0 or (white and i == 20)
-        assert should_densify(config, i) == densify, i
-        assert should_reset(config, i, white) == reset, i
-        assert needs_statistics(config, i) == (i < 200), i
-        assert prunes_large(config, i) == (i > 60), i
+        assert strategy.densifies(i) == densify, i
+        assert strategy.resets(i) == reset, i
+        assert strategy.is_due(i) == (densify or reset), i
+        assert strategy.needs_statistics(i) == (i < 200), i
 
 
 def test_extra_reset_can_be_off():
     config = DensifyConfig(white_background_reset=None)
-    assert not any(should_reset(config, i, True) for i in range(1, 3000))
+    assert not any(AdaptiveDensityControl(config, True).resets(i) for i in range(1, 3000))
 
 
 # ---- single decisions
@@ -218,16 +212,11 @@ def test_prefixed_parameters_are_found():
     rates = dict.fromkeys(PARAMETER_NAMES, 0.0)
     optimizer = make_optimizer(dict(bare.items()), rates, "integrator.")
     config, rows = DensifyConfig(), rows_of(optimizer, prefix="integrator.")
-    report = densify_and_prune(rows, statistics([HIGH] * 3), config, EARLY)
+    strategy = AdaptiveDensityControl(config, False, *statistics([HIGH] * 3))
+    report = strategy.densify_and_prune(rows, EARLY)
     assert (report.cloned, report.split, report.pruned) == (1, 1, 1)
-    reset_opacities(rows, config)
+    strategy.reset_opacities(rows)
     assert num_rows(optimizer, "integrator.") == report.num_gaussians
-
-
-def test_statistics_of_another_population_are_refused():
-    optimizer = make([SMALL, SMALL], 0.5)
-    with pytest.raises(ValueError, match="statistics of 3 Gaussians for 2"):
-        run(optimizer, [0, 0, 0])
 
 
 # ---- cap
@@ -339,7 +328,7 @@ def test_reset_lowers_opacities_and_forgets_their_moments_only():
     config = DensifyConfig()
     optimizer = make([SMALL] * 3, [0.9, 0.01001, 0.007])
     before, (means_m, _) = values(optimizer), moments(optimizer, "means")
-    reset_opacities(rows_of(optimizer), config)
+    AdaptiveDensityControl(config).reset_opacities(rows_of(optimizer))
     after = values(optimizer)
     opacities = reference.sigmoid(after["logit_opacities"].astype(float))
     # 1e-6: single precision of a logit of -4.6.

@@ -6,7 +6,7 @@ import pytest
 from drjit.llvm.ad import Float, Float64, UInt32
 from scipy import stats
 
-from drgs.training.density.draws import in_proportion, normals, pcg4d
+from drgs.training.density.mcmc import in_proportion, normals, pcg4d
 
 
 def test_rows_are_drawn_as_often_as_their_weights_call_for():

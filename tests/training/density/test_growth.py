@@ -132,7 +132,7 @@ def test_neither_the_curve_nor_the_cap_is_exceeded(seed, num, target, cap, itera
     assert report.num_gaussians == num_rows(optimizer)
     assert report.num_gaussians <= max(num, min(on_curve + 1, cap))
     assert report.num_gaussians == num + report.num_added - report.pruned
-    assert growth.most_gaussians(num, 1000) >= report.num_gaussians
+    assert growth.max_num_gaussians(num, 1000) >= report.num_gaussians
 
 
 def test_the_last_change_is_at_the_end_of_growth_and_reaches_the_number():

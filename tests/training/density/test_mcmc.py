@@ -14,7 +14,7 @@ from drgs.config.density import DensifyConfig
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.training.density.mcmc import MOST_COPIES, MarkovChain, corrected
+from drgs.training.density.mcmc import MAX_COPIES, MarkovChain, corrected
 
 SIZE, DEAD = 0.05, 0.001
 
@@ -34,7 +34,7 @@ def act(optimizer, iteration=600, seed=0, **config):
 
 # ---- what copies look like
 @pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 0.9999])
-@pytest.mark.parametrize("count", [1, 2, 3, 10, MOST_COPIES])
+@pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
 def test_copies_composite_to_what_they_are_copies_of(opacity, count):
     (copies,), (factor,) = corrected(np.array([opacity]), np.array([count]))
     assert 1 - (1 - copies) ** count == pytest.approx(opacity, rel=1e-12)
@@ -46,7 +46,7 @@ def test_copies_composite_to_what_they_are_copies_of(opacity, count):
 
 
 def test_more_copies_count_as_many_as_are_exact():
-    for numbers in corrected(np.array([0.7] * 2), np.array([1000, MOST_COPIES])):
+    for numbers in corrected(np.array([0.7] * 2), np.array([1000, MAX_COPIES])):
         assert numbers[0] == numbers[1]
 
 
@@ -187,7 +187,7 @@ def test_random_populations_keep_to_both_caps(seed):
     assert report.num_gaussians == num + report.num_added - report.pruned
     assert report.num_added <= config["growth"] * num
     assert all(np.isfinite(value).all() for value in after.values())
-    assert strategy(**config).most_gaussians(num, 30_000) >= report.num_gaussians
+    assert strategy(**config).max_num_gaussians(num, 30_000) >= report.num_gaussians
 
 
 def test_equal_seeds_give_equal_bytes():

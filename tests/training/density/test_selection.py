@@ -9,9 +9,13 @@ from support.populations import make, moments, rows_of, values
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.density.importance import Importance
-from drgs.training.density.pruning import PruneSchedule, keep_best
-from drgs.training.density.selection import LARGEST_PRESSURE, NaturalSelection
+from drgs.training.density.pruning import (
+    MAX_PRESSURE,
+    Importance,
+    NaturalSelection,
+    PruneSchedule,
+    keep_best,
+)
 
 SIZE = 0.05
 
@@ -31,9 +35,10 @@ class Step:
 
 # ---- schedule
 def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
-    schedule = PruneSchedule.of(config_of(to=100))
+    schedule = PruneSchedule.from_config(config_of(to=100))
     assert (schedule.start, schedule.stop) == (2000, 3000)
-    reference = PruneSchedule.of(FitConfig(data={"path": "."}, densify={"prune": {"to": 9}}))
+    config = FitConfig(data={"path": "."}, densify={"prune": {"to": 9}})
+    reference = PruneSchedule.from_config(config)
     assert (reference.start, reference.stop) == (15_000, 22_500)
     acting = [i for i in range(5000) if schedule.is_due(i)]
     assert acting == list(range(2050, 3001, 50))
@@ -41,18 +46,18 @@ def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
 
 def test_the_phase_can_be_named_and_comes_after_growth_wherever_that_ends():
     config = config_of(to=100, start=2500, stop=2730, every=100)
-    schedule = PruneSchedule.of(config)
+    schedule = PruneSchedule.from_config(config)
     assert [i for i in range(5000) if schedule.is_due(i)] == [2600, 2700, 2730]
-    later = PruneSchedule.of(changed(config, {"densify.stop": 2600}))
+    later = PruneSchedule.from_config(changed(config, {"densify.stop": 2600}))
     assert (later.start, later.stop) == (2600, 2730)
 
 
 def test_each_change_leaves_the_same_share_and_the_last_one_the_number():
     schedule = PruneSchedule(start=1000, stop=1400, every=100, to=100)
-    wanted = [schedule.wanted(i, 1600) for i in (1100, 1200, 1300, 1400)]
+    wanted = [schedule.num_left(i, 1600) for i in (1100, 1200, 1300, 1400)]
     assert wanted == [800, 400, 200, 100]
-    assert schedule.wanted(1100, 100) == 100
-    assert schedule.wanted(1100, 50) == 100
+    assert schedule.num_left(1100, 100) == 100
+    assert schedule.num_left(1100, 50) == 100
 
 
 def test_the_best_stay_in_their_order_with_their_moments():
@@ -95,7 +100,7 @@ def test_pressure_has_a_limit_and_then_nobody_goes():
     phase = NaturalSelection(config_of(to=5))
     assert phase.refine(rows_of(optimizer), 2050) is None
     logits = values(optimizer)["logit_opacities"]
-    np.testing.assert_allclose(logits, -LARGEST_PRESSURE, rtol=1e-6)
+    np.testing.assert_allclose(logits, -MAX_PRESSURE, rtol=1e-6)
 
 
 def test_in_the_end_exactly_so_many_are_left():

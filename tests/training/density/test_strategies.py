@@ -13,8 +13,7 @@ from drgs.config.density import DensifyConfig
 from drgs.config.extensions import GROWTH
 from drgs.config.schema import FitConfig
 from drgs.training import trainer as trainer_module
-from drgs.training.density.phases import Phases
-from drgs.training.density.registry import density_strategy
+from drgs.training.density.registry import Phases, density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy
 from drgs.training.optimizer import set_values
 from drgs.training.rates import revised_stops
@@ -194,7 +193,7 @@ class Phase(DensityStrategy):
     def restore(self, state):
         self.seen = int(state[f"{self.name}_seen"])
 
-    def most_gaussians(self, start, iterations):
+    def max_num_gaussians(self, start, iterations):
         return start + self.num
 
 
@@ -210,7 +209,7 @@ def test_phases_are_one_strategy_and_begin_anew_where_others_change_rows():
     assert [i for i in range(1, 9) if phases.needs_statistics(i)] == [1, 2, 3, 4, 5, 6]
     assert phases.rate_factors(1) == {"means": 4.0, "first": 3.0, "last": 3.0}
     assert list(phases.penalties({}, 5)) == ["first", "last"]
-    assert phases.most_gaussians(100, 8) == 117
+    assert phases.max_num_gaussians(100, 8) == 117
     for iteration in range(1, 6):
         phases.update_statistics(Seen(iteration))
     assert (first.seen, last.seen) == (4, 5)

@@ -31,7 +31,7 @@ SETTINGS = (
 @pytest.fixture
 def agreement():
     pytest.importorskip("mpi4py", reason="the extra mpi is not installed")
-    from drgs.training.parallel import agreement
+    from drgs.training.parallel import inputs as agreement
 
     return agreement
 

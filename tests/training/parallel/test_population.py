@@ -12,12 +12,12 @@ from drgs.training.steps import view_of
 def test_every_row_has_one_owner_and_intervals_are_alike(total, size):
     shards = [population.Shard(total, rank, size) for rank in range(size)]
     rows = np.arange(total)
-    owned = np.concatenate([rows[shard.own] for shard in shards])
+    owned = np.concatenate([rows[shard.local] for shard in shards])
     np.testing.assert_array_equal(owned, rows)
-    lengths = [len(rows[shard.own]) for shard in shards]
+    lengths = [len(rows[shard.local]) for shard in shards]
     assert max(lengths) - min(lengths) <= 1
     for shard in shards:
-        assert (shard.owners(rows)[shard.own] == shard.rank).all()
+        assert (shard.owners(rows)[shard.local] == shard.rank).all()
 
 
 @pytest.mark.parametrize(("count", "views_per_step", "size"), [(10, 4, 3), (3, 4, 2), (25, 6, 6)])
