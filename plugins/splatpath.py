@@ -16,14 +16,17 @@ from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_
 from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.path_segment import PathSegment
-from drgs.integrator.properties import boolean, integer, refuse_unknown
+from drgs.integrator.properties import flag, integer, read, refuse_unknown
 from drgs.integrator.transparency import StraightRays, has_transparent_parts
 
 if TYPE_CHECKING:
     from drgs.integrator.path_segment import SplatTransport
 
-KNOWN = ("max_depth", "rr_depth", "hide_emitters")
-"""Names of its properties."""
+PROPERTIES = {
+    "max_depth": integer(-1, least=-1),
+    "rr_depth": integer(5, least=1),
+    "hide_emitters": flag(False),
+}
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's integrators take a ``max_depth`` of -1 for."""
@@ -33,69 +36,25 @@ MOST_LIKELY = 0.95
 
 
 class SplatPathIntegrator(RBIntegrator):
-    r"""
-    .. _integrator-splatpath:
+    """Path tracer whose paths pass splats: to be nested in ``splats`` that set ``light``.
 
-    Path tracer among splats (:monosp:`splatpath`)
-    ----------------------------------------------
+    - ``max_depth``: longest path; 1 shows emitters only. (Default: -1, no limit)
+    - ``rr_depth``: depth from which on Russian roulette ends paths. (Default: 5)
+    - ``hide_emitters``: hide directly visible emitters. (Default: false)
 
-    .. pluginparameters::
+    The first segment of a path passes no splats: ``splats`` renders those. What lets light pass
+    straight on (``null``, ``mask``, ``thindielectric``) is no vertex. Derivatives by path replay
+    with detached sampling, with respect to materials, emitters and poses of objects.
 
-     * - max_depth
-       - |int|
-       - Longest path depth: 1 shows emitters only, 2 adds direct illumination, and so on. -1: no
-         limit. (Default: -1)
-
-     * - rr_depth
-       - |int|
-       - Path depth from which on Russian roulette ends paths. (Default: 5)
-
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: |false|)
-
-    To be nested in ``splats`` whose ``light`` is ``rays``: it renders the scene's surfaces as
-    ``path`` does, and as splats light and shade them. What a path meets between two vertices adds
-    its radiance and weakens all that comes behind; so do splats between a vertex and the emitter
-    that it samples. The first segment, which starts at the camera, meets no splats: those the
-    integrator ``splats`` puts into the picture. Without it, this is a path tracer.
-
-    What lets light pass straight on (``null``, ``mask``, ``thindielectric``) is no vertex for a
-    path that passes: it does not count as a bounce, splats before and behind it are composited
-    together, and emitters are sampled through it, also those that ``path`` cannot see there.
-
-    Derivatives are found as by ``prb`` (path replay, detached sampling), with respect to materials,
-    emitters and poses of objects. Unlike there, those of perfect mirrors and glass are, and those
-    of lamps without a surface that move.
-
-    .. note:: Not differentiated: the splats, and what a path meets of them: that includes how it
-        changes with the ray; where perfect mirrors and glass send light; silhouettes.
-
-    .. tabs::
-
-        .. code-tab:: xml
-
-            <integrator type="splats">
-                <string name="filename" value="point_cloud.ply"/>
-                <string name="light" value="rays"/>
-                <integrator type="splatpath">
-                    <integer name="max_depth" value="8"/>
-                </integrator>
-            </integrator>
-
-        .. code-tab:: python
-
-            'type': 'splatpath',
-            'max_depth': 8
+    Not differentiated: the splats and what a path meets of them, where perfect mirrors and glass
+    send light, silhouettes.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         check_variant("splatpath", mi.variant())
-        integer(props, "max_depth", -1, least=-1)  # before the base class, which names no plugin
-        integer(props, "rr_depth", 5, least=1)
-        boolean(props, "hide_emitters", False)
+        read(props, PROPERTIES)  # before the base class, which names no plugin
         super().__init__(props)
-        refuse_unknown(props, KNOWN)
+        refuse_unknown(props, list(PROPERTIES))
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED
         self.sees_through = False  # whether anything in the scene lets light pass straight on

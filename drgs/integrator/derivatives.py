@@ -113,7 +113,7 @@ def check_derivatives(
 
 def _has_attached_gaussians(splats: SplatsState, scene: mi.Scene) -> bool:
     parts = splats.parts(ellipsoids_in(scene))
-    values = [value for part in parts for value in part.values.parameters().values()]
+    values = [value for part in parts for value in part.values.values()]
     return any(dr.grad_enabled(value) for value in values)
 
 

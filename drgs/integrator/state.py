@@ -121,9 +121,14 @@ class SplatObject:
     file: str = ""
     header: dict[str, Value] = field(default_factory=dict)  # approximations of the file's header
 
+    @property
+    def has_gaussians(self) -> bool:
+        """False for an integrator that renders those of objects and shapes alone."""
+        return self.gaussians.num_gaussians > 0
+
     def check_to_world(self) -> None:
         """Raise PluginError for a ``to_world`` that is no similarity; find whether it moves."""
-        from drgs.integrator.placement import similarity_of
+        from drgs.integrator.gathering import similarity_of
 
         place = similarity_of(self.to_world.matrix, "splats: to_world")
         self.is_moved = not place.is_identity
@@ -135,7 +140,6 @@ class SplatsState:
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
-    has_own: bool  # whether ``own`` has Gaussians
     turns: dict[str, Any]  # drgs.integrator.gathering.Turn by shapes' ids; "": of all others
     background: Any  # Color3f, display space; or mi.Texture, linear
     nested: Any  # mi.Integrator of surfaces, or None
@@ -161,7 +165,7 @@ class SplatsState:
     @property
     def objects(self) -> dict[str, SplatObject]:
         """All objects that have Gaussians, by the prefix of their parameters' names."""
-        own = {"": self.own} if self.has_own else {}
+        own = {"": self.own} if self.own.has_gaussians else {}
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
     @property
@@ -198,6 +202,31 @@ class SplatsState:
         """Return the names of the channels besides colour and alpha."""
         return [f"{name}.{c}" for name, kind in self.aovs.items() for c in self.channels_of(kind)]
 
+    def settings(self) -> dict[str, object]:
+        """Return settings by name, without those that are off or at their default."""
+        gathered = self.cache.gathered
+        parts = [one.gaussians for one in self.objects.values()]
+        parts = parts if gathered is None else [gathered.gaussians]
+        lit = {} if self.light == "none" else {"light": self.light, "exposure": self.exposure}
+        others = {
+            "objects": ", ".join(self.nested_objects),
+            "hide_emitters": self.hide_emitters,
+            "aovs": ", ".join(f"{name}:{kind}" for name, kind in self.aovs.items()),
+            "nested": self.nested and self.nested.class_name(),
+            "nested_spp": self.nested_spp,
+            **lit,
+            "ignore": ", ".join(self.ignore),
+        }
+        return {
+            "gaussians": sum(p.num_gaussians for p in parts) or "those of the scene's shapes",
+            "sh_degree": self.sh_degree,
+            "background": self.background,
+            "near": self.near,
+            "srgb_primitives": self.srgb_primitives,
+            **self.approximations.others_than_default,
+            **{name: value for name, value in others.items() if value},
+        }
+
     def channels_of(self, kind: str) -> Sequence[int | str]:
         """Return the suffixes of an AOV's channels."""
         return AOVS[kind] if kind in AOVS else range(self.feature_widths[kind])
@@ -218,7 +247,7 @@ class SplatsState:
         if keys != ["background"]:
             self.cache.frames.clear()
             self.cache.gathered = None
-        if not self.has_own:
+        if not self.own.has_gaussians:
             return
         own = self.own
         if dr.width(own.gaussians.shN) == 0:  # not exposed, so that its rows could not be set
@@ -296,14 +325,11 @@ class SplatsState:
         return parts
 
     def _placements(self) -> list[Part]:
-        from drgs.integrator.placement import PlacedGaussians, Placement
+        from drgs.integrator.gathering import Placement
 
         return [
-            Placement(
-                PlacedGaussians(self.rendered_part_of(one), one.to_world.matrix),
-                f"splats: {prefix}to_world",
-            )
-            for prefix, one in self.objects.items()
+            Placement.of(self.rendered_part_of(one), one.to_world.matrix, f"splats: {k}to_world")
+            for k, one in self.objects.items()
         ]
 
     def accumulate(self, scene: mi.Scene, gradients: Gaussians) -> None:
@@ -321,11 +347,16 @@ class SplatsState:
         """Return derivatives of :attr:`gaussians` along those set on the parameters."""
         if self.cache.gathered is not None:
             return self.cache.gathered.tangents(self.parts(ellipsoids_in(scene)))
-        own = self.rendered_part_of(self.own)
-        return Gaussians(
-            **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
-            features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
-        )
+        return tangents_of(self.rendered_part_of(self.own))
+
+
+def tangents_of(gaussians: Gaussians) -> Gaussians:
+    """Return the gradients set on Gaussians, or propagated to them."""
+    return Gaussians(
+        **{name: tangent_of(getattr(gaussians, name)) for name in PARAMETER_NAMES},
+        smoothing=None if gaussians.smoothing is None else tangent_of(gaussians.smoothing),
+        features=gaussians.features and {k: tangent_of(v) for k, v in gaussians.features.items()},
+    )
 
 
 def is_splats(node: object) -> bool:

@@ -201,12 +201,12 @@ def counted(monkeypatch):
     return frames, conversions
 
 
-def test_a_backward_pass_reuses_the_frame_and_converts_nothing(counted):
+def test_a_backward_pass_reuses_the_frame_and_converts_once_more(counted):
     scene = Held()
     loaded = scene.load()
     gradients_held(loaded, scene.weights())
     image_of(loaded)
-    assert [len(calls) for calls in counted] == [1, 1]
+    assert [len(calls) for calls in counted] == [1, 2]
 
 
 @pytest.mark.parametrize("name", HELD)
@@ -291,7 +291,7 @@ print(json.dumps([kernels, [] if blocked else loaded_modules]))
 
 
 MODULES = (
-    *("integrator.ellipsoids", "integrator.gathering", "integrator.placement"),
+    *("integrator.ellipsoids", "integrator.gathering"),
     *("gaussians.similarity", "gaussians.rotation"),
 )
 
