@@ -105,7 +105,6 @@ class CalibratedSensor(mi.Sensor):
     # ------------------------------------------------------------------------------------------
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose the pose and the calibration."""
         super().traverse(callback)
         callback.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
         for name in ("fx", "fy", "cx", "cy"):
@@ -116,21 +115,17 @@ class CalibratedSensor(mi.Sensor):
             callback.put("to_world_close", self.to_world_close, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Where the lens model ends depends on its coefficients, which are read back."""
         if not keys or set(keys) & set(self.coefficients):
             values = {name: float(value[0]) for name, value in self.coefficients.items()}
             self.lens = _with_coefficients(type(self.lens), values) if values else self.lens
 
     def near_clip(self) -> float:
-        """Nearer means and surfaces are not seen."""
         return self.near
 
     def far_clip(self) -> float:
-        """Nor are surfaces farther than this."""
         return self.far
 
     def to_string(self) -> str:
-        """One line a setting."""
         lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
         return (
             f"CalibratedSensor[\n  fx = {self.fx}, fy = {self.fy},\n  cx = {self.cx}, "
@@ -143,17 +138,14 @@ class CalibratedSensor(mi.Sensor):
     # ------------------------------------------------------------------------------------------
 
     def camera_parameters(self) -> list[str]:
-        """Names of the parameters that the camera depends on."""
         moves = ["to_world_close"] if self.to_world_close is not None else []
         return ["to_world", *moves, "fx", "fy", "cx", "cy", *self.coefficients]
 
     def camera_from_state(self, state: SensorState) -> Camera:
-        """The camera with these parameters."""
         camera = self._pinhole(state)
         return camera.with_lens(self.lens.with_coefficients(state.device))
 
     def num_poses(self) -> int:
-        """Poses whose pictures are averaged: 1 unless motion blurs them."""
         moves = self.to_world_close is not None and self.shutter == "global"
         return self.shutter_samples if moves else 1
 
@@ -177,7 +169,6 @@ class CalibratedSensor(mi.Sensor):
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """A ray through the point ``sample2`` of the crop window; sample1: for the wavelength."""
         del sample3
         place = sample2 * mi.Vector2f(self.film().crop_size())
         state = read_sensor(self, 0.0)
@@ -214,7 +205,6 @@ class CalibratedSensor(mi.Sensor):
     def sample_ray_differential(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """The same, with the rays of the neighbouring pixels."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()
         beside = []
@@ -228,12 +218,10 @@ class CalibratedSensor(mi.Sensor):
         return result, weight
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        """Of the centre: nothing of the camera is in the scene."""
         return mi.ScalarBoundingBox3f()
 
 
 def _lens(props: mi.Properties) -> Lens:
-    """Return the lens with those of its coefficients that are given."""
     kind = str(props.get("lens", "pinhole"))
     try:
         model = LENSES.get(kind, "calibrated: lens").value

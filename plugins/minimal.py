@@ -56,7 +56,6 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         self.pipeline = Pipeline(gaussians.sh_degree)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose the Gaussians."""
         for name in PARAMETER_NAMES:
             callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
@@ -64,7 +63,6 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
-        """Return the linear image (H, W, 3 or 4); ``seed`` and ``spp`` make no difference."""
         with dr.suspend_grad():
             film, _, _, _, layers = self._composited(scene, sensor)
             return develop_pixels(film, _channels(film, layers.planes()), [])
@@ -73,7 +71,6 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
         sensor: Any = 0, seed: Any = 0, spp: int = 0,
     ) -> None:  # fmt: skip
-        """Add the derivatives of a loss to those of the Gaussians; grad_in: by the image."""
         with dr.suspend_grad():
             film, camera, bins, records, layers = self._composited(scene, sensor)
             planes = layers.planes()

@@ -115,7 +115,6 @@ class SplatPathIntegrator(RBIntegrator):
         return (L if primal else δL), is_seen, [], L
 
     def _begin(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> _Path:
-        """A path at the camera, whose first hit is known."""
         ray, active = mi.Ray3f(dr.detach(ray)), mi.Bool(active)
         hit = scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
         if self.hide_emitters:
@@ -145,7 +144,6 @@ class SplatPathIntegrator(RBIntegrator):
         arrives: mi.Spectrum,
         primal: bool,
     ) -> mi.Spectrum:
-        """Return the radiance of the emitter that a path has met."""
         shows = path.active & ~((path.depth == 0) & ~si.is_valid() & self.hide_emitters)
         ds = mi.DirectionSample3f(scene, si=si, ref=path.last_si)
         pdf = scene.pdf_emitter_direction(path.last_si, ds, ~path.last_is_delta)
@@ -163,7 +161,6 @@ class SplatPathIntegrator(RBIntegrator):
         active: mi.Bool,
         primal: bool,
     ) -> mi.Spectrum:
-        """Return the radiance of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         rays, numbers = StraightRays(scene, False, self.sees_through), sampler.next_2d()
@@ -190,7 +187,6 @@ class SplatPathIntegrator(RBIntegrator):
         si: mi.SurfaceInteraction3f,
         arrives: mi.Spectrum,
     ) -> _Step:
-        """Sample the step to the next vertex, if the path goes on."""
         has_bounces = path.depth + 1 < self.max_depth
         may_pass = mi.Bool(self.sees_through)
         active = path.active & si.is_valid() & (has_bounces | may_pass)
@@ -238,7 +234,6 @@ class SplatPathIntegrator(RBIntegrator):
         return path.throughput * radiance, path.throughput * let_through
 
     def _let_through(self, segment: PathSegment, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        """Return the transmittance of splats to an emitter."""
         if self._transport is None:
             return mi.Float(1)
         return self._transport.transmittance(segment, sampler.next_1d(), active)
@@ -250,7 +245,6 @@ class SplatPathIntegrator(RBIntegrator):
     def _past_emitters(
         self, scene: mi.Scene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
     ) -> mi.PreliminaryIntersection3f:
-        """The first hit that is no emitter."""
         skips = hit.is_valid() & (hit.shape.emitter() != None) & active  # noqa: E711
         si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, skips)
         behind = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skips)

@@ -295,7 +295,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return summary_of_scene(self.state, scene, sensors)
 
     def _gather(self, scene: mi.Scene) -> None:
-        """Find the scene's Gaussians, and shade them."""
         self.state.gather(scene)
         if self.state.shadows:
             from drgs.integrator.shadows import shade
@@ -303,7 +302,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
             shade(self.state, scene)
 
     def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:
-        """Refuse those that would be wrong."""
         if surfaces_in(scene):
             from drgs.integrator.derivatives import check_derivatives
 

@@ -107,17 +107,14 @@ class RayDepths(AffineDepths):
     camera: Camera | None = None  # whose film has the anchors
 
     def for_camera(self, camera: Camera) -> RayDepths:
-        """For one camera."""
         return replace(self, camera=camera)
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """The depth of the mean, divided by |a_c|."""
         return [splats.depths * splats.ray.scale]
 
     def at(
         self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
-        """a and D of a splat at a point of the film, px."""
         del keys
         u, v = falloff.coordinates(geometry, x, y)
         anchor = closest_on_film(self.camera, *geometry[:2])
@@ -125,7 +122,6 @@ class RayDepths(AffineDepths):
         return a, denominator
 
     def along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
-        """Depths at the 16 pixels, divided by the key; not positive where there is none."""
         del keys
         return footprint.along
 
@@ -140,21 +136,17 @@ class BoundedDepths(AffineDepths):
     bounds: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane
 
     def for_camera(self, camera: Camera) -> BoundedDepths:
-        """For one camera."""
         return replace(self, depths=self.depths.for_camera(camera))
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns that the depths are computed from."""
         return self.depths.keys(splats)
 
     def at(
         self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
     ) -> tuple[Any, Any]:
-        """a and D of a splat at a point of the film, px, wherever its peak is."""
         return self.depths.at(falloff, geometry, keys, x, y)
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> BoundedDepths:
-        """For the lanes of one kernel: loads the bounds."""
         near, far = (load_pixels(bound, lanes, grid) for bound in (self.nearest, self.farthest))
         return replace(
             self,
@@ -163,7 +155,6 @@ class BoundedDepths(AffineDepths):
         )
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
-        """Depths in the unit at the 16 pixels; not positive where there is none."""
         unit = keys[-1]
         return [
             dr.select((unit * along > near) & (unit * along < far), along, -1)

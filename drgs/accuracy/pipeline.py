@@ -62,7 +62,6 @@ def pipeline_of(
 def _own_falloff(
     approximations: Approximations, projection: type[ProjectionModel]
 ) -> type[GaussianFalloff]:
-    """Return the falloff of a projection that has one of its own."""
     if approximations.falloff != FALLOFFS.words()[0]:
         raise UnsupportedError(
             f"splats: projection '{approximations.projection}' has a falloff of its own, got "

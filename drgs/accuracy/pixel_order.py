@@ -76,7 +76,6 @@ class PixelOrder(CenterOrder):
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
     ) -> tuple[Projection, PixelOrder]:
-        """Return the projection with what depths at a pixel depend on, and the order."""
         shape, depths = projection.shape_with_depth, AffineDepths()
         if projection.falloff is RayFalloff:
             depths = RayDepths()
@@ -85,15 +84,12 @@ class PixelOrder(CenterOrder):
         return shape or WithAffineDepth(projection.shape), cls(approximations.order_window, depths)
 
     def for_camera(self, camera: Camera) -> PixelOrder:
-        """For one camera."""
         return replace(self, depths=self.depths.for_camera(camera))
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns that the depth at a pixel depends on."""
         return self.depths.keys(splats)
 
     def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
-        """See :func:`drgs.splatting.rasterize.composite`."""
         return _composite(bins, records, self)
 
     def adjoint(
@@ -106,14 +102,12 @@ class PixelOrder(CenterOrder):
         samples: range = ONE_SAMPLE,
         before: SplatGradients | None = None,
     ) -> SplatGradients:
-        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
         inputs = _WalkInputs.of(bins, records, layers.lists, self, samples)
         return _adjoint(inputs, layers, d_features, d_transmittance, before)
 
     def tangent(
         self, bins: TileBins, records: Records, layers: _OrderedLayers, tangents: SplatGradients
     ) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
         return _tangent(bins, records, layers, tangents, self)
 
 
@@ -438,7 +432,6 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Ro
 def _sum_items(
     inputs: _WalkInputs, partials: Rows, before: SplatGradients | None
 ) -> SplatGradients:
-    """Add up the items of each splat."""
     lists, places = inputs.lists, inputs.lists.places()
     UInt32 = type(places)
 

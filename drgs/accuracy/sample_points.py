@@ -31,12 +31,10 @@ class SamplePoints(Positions):
     bound: tuple[list[Any], list[Any]] | None = None  # the 16 of each lane
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> SamplePoints:
-        """For the lanes of one kernel."""
         bound = tuple(load_pixels(plane, lanes, grid) for plane in (self.x, self.y))
         return SamplePoints(bound=bound)
 
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
-        """x and y (px) of the 16 pixels."""
         x, y = Float(lanes.x), Float(lanes.y)
         return [
             (x + (pixel % MICRO) + px, y + (pixel // MICRO) + py)
@@ -44,7 +42,6 @@ class SamplePoints(Positions):
         ]
 
     def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
-        """Grids of x and y, from a point of the film to the points, px."""
         Float = types_of(type(x)).Float
         first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
         dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.bound[0])]
@@ -52,19 +49,15 @@ class SamplePoints(Positions):
         return _grid(dx), _grid(dy)
 
     def sum(self, values: list[Any]) -> Any:
-        """Sum 16 values."""
         return total(values)
 
     def sum_dx(self, values: list[Any], dx: list) -> Any:
-        """Sum values times dx."""
         return total(_products(values, dx))
 
     def sum_dy(self, values: list[Any], dy: list) -> Any:
-        """Sum values times dy."""
         return total(_products(values, dy))
 
     def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
-        """Sum values times dy^2."""
         return total(_products(_products(values, dy), dy))
 
 

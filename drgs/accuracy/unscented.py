@@ -112,7 +112,6 @@ def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Any) -> _Sigm
 
 
 def _same(slopes: list[Any] | None, clamped: list[Any] | None) -> Any:
-    """Whether slopes are not clamped; a lens that has none does not clamp."""
     if slopes is None:
         return True
     return (slopes[0] == clamped[0]) & (slopes[1] == clamped[1])

@@ -47,6 +47,5 @@ class NamedFeature:
     name: str
 
     def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
-        """Select them."""
         del splats, camera
         return list(rows.features[self.name])

@@ -58,7 +58,6 @@ def smoothing_of(means: Any, cameras: Iterable[Camera]) -> Any:
 
 
 def _rates(points: Any, camera: Camera) -> Any:
-    """Return the rates of one camera, px per scene unit; 0 where it does not see a point."""
     lens = camera.lens
     seen, position, depth = lens.visibility(camera, camera.rotation @ (points - camera.center))
     film = lens.project_point(camera, position)

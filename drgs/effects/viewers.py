@@ -85,7 +85,6 @@ def _integrals(
 
 
 def _integral(rows: GaussianRows, camera: Camera, rule: OpacityRule, low_pass: float) -> Any:
-    """Of one camera; 0 where it does not see a mean."""
     splats = project(rows, camera, 0, rule, low_pass=low_pass, least_alpha=0.0)
     beside = (splats.means2d < camera.film_start) | (splats.means2d > camera.film_end)
     p, _, s = splats.whitening

@@ -119,7 +119,6 @@ class ImageRays:
         return channels
 
     def _gathered(self, passes: Sequence[Channels]) -> Channels:
-        """Channels by ray, from those by pixel of each pass."""
         samples = by_sample(self.positions, passes[: len(self.positions)])
         planes = zip(*samples, strict=True)
         return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
@@ -140,7 +139,6 @@ class ImageRays:
 
 
 def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
-    """Return where on the film rays start, px; whether they belong to this camera."""
     offset = camera.rotation @ mi.Vector3f(ray.o - mi.Point3f(camera.center))
     direction = camera.rotation @ mi.Vector3f(ray.d)
     place, radius = camera.place_of_ray(offset, direction)

@@ -160,7 +160,6 @@ def _is_padded(parameter: Parameter) -> bool:
 
 
 def _why_not(parameter: Parameter, splats: SplatsState) -> str | None:
-    """Why a derivative would be wrong, and what to do; None: it is right."""
     nested, owner = splats.nested, parameter.owners[0]
     kind = SPLATPATH if nested is None else type_of(nested)
     is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)

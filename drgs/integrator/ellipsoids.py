@@ -86,7 +86,6 @@ class Conversion:
     fixed: Turn | None  # of the harmonics, which is not differentiated
 
     def gaussians(self) -> Gaussians:
-        """Return all parameters, differentiable with respect to ``values``."""
         num = dr.width(self.values["opacities"])
         data = columns(self.values["data"], DATA)
         sh = columns(self.values["sh_coeffs"], dr.width(self.values["sh_coeffs"]) // num)

@@ -45,7 +45,6 @@ from drgs.gaussians.rotation import (
 )
 from drgs.gaussians.sh import num_coefficients
 from drgs.gaussians.similarity import Similarity
-from drgs.integrator.state import tangents_of
 
 TO_WORLD = "to_world"
 
@@ -109,7 +108,7 @@ class Gathered:
                 dr.set_grad(copy.values[name], tangent_of(values))
             moved = copy.gaussians()
             dr.forward_to(moved)
-            found.append(tangents_of(moved))
+            found.append(_gaussians({k: tangent_of(v) for k, v in _arrays(moved).items()}))
         return _joined(found, self.gaussians.sh_degree)
 
 
@@ -129,42 +128,34 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     return Gathered(parts, sizes, gaussians)
 
 
-_ROWS = {
-    **{"means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3)},
-    **{"logit_opacities": (), "smoothing": ()},
-}
-"""Shapes of the rows that do not depend on the degree."""
-
-
 def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
-    """Concatenate the rows of all parts."""
-    parts = [part for part in parts if part.num_gaussians > 0]
-    found, rows = [_arrays(part) for part in parts], _row_shapes(degree)
-    rows |= {k: v.shape[1:] for arrays in found for k, v in arrays.items() if k not in rows}
+    found = [(part.num_gaussians, _arrays(part)) for part in parts if part.num_gaussians > 0]
+    shapes = {k: v.shape[1:] for _, arrays in found for k, v in arrays.items()}
+    shapes["shN"] = _sh_shape(degree)
     whole = {}
-    for name in dict.fromkeys(name for arrays in found for name in arrays):
-        blocks = [
-            _block(arrays.get(name), 0, part.num_gaussians, part.num_gaussians, rows[name])
-            for arrays, part in zip(found, parts, strict=True)
-        ]
+    for name, row in shapes.items():
+        blocks = [_block(arrays.get(name), 0, num, num, row) for num, arrays in found]
         filled = [block for block in blocks if dr.width(block) > 0]  # dr.concat takes no others
-        whole[name] = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
-    return _gaussians(whole, rows, sum(part.num_gaussians for part in parts))
+        flat = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
+        whole[name] = _shaped(flat, sum(num for num, _ in found), row)
+    return _gaussians(whole)
 
 
 def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
     """Return ``num`` rows from row ``start`` on, with the coefficients that ``degree`` has."""
-    arrays, rows = _arrays(gaussians), _row_shapes(degree)
-    rows |= {k: v.shape[1:] for k, v in arrays.items() if k not in rows}
-    blocks = {
-        name: _block(values, start, num, gaussians.num_gaussians, rows[name])
-        for name, values in arrays.items()
-    }
-    return _gaussians(blocks, rows, num)
+    arrays = _arrays(gaussians)
+    shapes = {k: v.shape[1:] for k, v in arrays.items()} | {"shN": _sh_shape(degree)}
+    total = gaussians.num_gaussians
+    blocks = {k: _block(v, start, num, total, shapes[k]) for k, v in arrays.items()}
+    return _gaussians({k: _shaped(v, num, shapes[k]) for k, v in blocks.items()})
 
 
-def _row_shapes(degree: int) -> dict[str, tuple[int, ...]]:
-    return {**_ROWS, "shN": (num_coefficients(degree) - 1, 3)}
+def _sh_shape(degree: int) -> tuple[int, int]:
+    return num_coefficients(degree) - 1, 3
+
+
+def _shaped(flat: Any, num: int, row: tuple[int, ...]) -> Any:
+    return mi.TensorXf(flat, (num, *row)) if row else flat
 
 
 def _arrays(part: Gaussians) -> dict[str, Any]:
@@ -172,12 +163,10 @@ def _arrays(part: Gaussians) -> dict[str, Any]:
     return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
 
 
-def _gaussians(arrays: dict[str, Any], rows: dict[str, tuple[int, ...]], num: int) -> Gaussians:
-    """Return Gaussians of flat arrays; rows: shapes of their rows."""
-    shaped = {k: mi.TensorXf(v, (num, *rows[k])) if rows[k] else v for k, v in arrays.items()}
-    names = [name for name in shaped if name not in (*_ROWS, "shN")]
-    features = {name: shaped.pop(name) for name in names}
-    return Gaussians(**shaped, features=features or None)
+def _gaussians(arrays: dict[str, Any]) -> Gaussians:
+    features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
+    own = {k: v for k, v in arrays.items() if k not in features}
+    return Gaussians(**own, features=features or None)
 
 
 def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) -> Any:
@@ -284,10 +273,7 @@ class Placement:
         arrays = {name: values for name, values in self.values.items() if name != TO_WORLD}
         if dr.grad_enabled(self.values[TO_WORLD]) or not self._place.is_identity:
             arrays |= self._moved(arrays)
-        features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
-        return Gaussians(
-            **{k: v for k, v in arrays.items() if k not in features}, features=features or None
-        )
+        return _gaussians(arrays)
 
     @cached_property
     def _place(self) -> Similarity:

@@ -95,7 +95,6 @@ class ImageRender:
         return ImageRender(views, samples, hybrid, batch)._with_surfaces()
 
     def _with_surfaces(self) -> ImageRender:
-        """Return the same with channels for all surfaces that are seen one through the other."""
         if self.hybrid is None:
             return self
         hybrid = self.hybrid.with_surfaces(max(view.num_surfaces() for view in self.views))
@@ -154,12 +153,10 @@ class ImageRender:
         return self.hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
 
     def _image_of_splats(self) -> mi.TensorXf:
-        """Return the image of the splats, with the channels that surfaces need."""
         constant = constant_background(self.views[0].splats)
         return self._developed([view.planes() for view in self.views], constant)
 
     def _developed(self, planes: list[Planes], constant: mi.Color3f | None) -> mi.TensorXf:
-        """planes: by view."""
         pictures = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
         passes = pictures[0] if self.batch is None else self.batch.put_together(pictures)
         return self.samples.develop(passes)

@@ -291,7 +291,6 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
 
 
 def _enlarged(camera: Camera, scale: float) -> Camera:
-    """Scale a camera's film, and add a border."""
     factor = dr.opaque(mi.Float, scale)
     changes = {
         name: factor * getattr(camera, name) + BORDER

@@ -43,11 +43,9 @@ class NoSplats:
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        """See :meth:`SplatTransport.composite_segment`."""
         return mi.Color3f(0), mi.Float(1)
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """See :meth:`SplatTransport.transmittance`."""
         return mi.Float(1)
 
 

@@ -90,7 +90,6 @@ class ProbeTransport:
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        """See :meth:`drgs.integrator.path_segment.SplatTransport.composite_segment`."""
         seen, is_asked, is_reversed = self._look(segment, active)
         is_known = is_asked & seen.is_known
         radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
@@ -102,7 +101,6 @@ class ProbeTransport:
         return radiance, dr.select(is_known, 1 - seen.coverage, T)
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """Return the transmittance along segments; 1 where it is not known."""
         seen, is_asked, _ = self._look(segment, active)
         return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)
 
@@ -190,7 +188,6 @@ def _warn_of_close(
 
 
 def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, Any]:
-    """Find the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
     from drgs.integrator.mirrors import FlatMirror
 
     settings, last = (splats.cache.surfaces,), splats.cache.flat_mirrors
@@ -204,7 +201,6 @@ def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int,
 def _mirror_images(
     splats: SplatsState, scene: mi.Scene, mirrors: list[Any], states: list[SensorState]
 ) -> Any:
-    """Render what sensors see in flat mirrors, or reuse it; None where there are no mirrors."""
     from drgs.integrator.mirrors import Mirrors
 
     gaussians, cache = dr.detach(splats.gaussians), splats.cache
@@ -244,7 +240,6 @@ def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:
 
 
 def _center(node: mi.Object) -> list[float]:
-    """World."""
     box = node.bbox()
     if not box.valid():
         raise PluginError(
@@ -261,5 +256,4 @@ def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
 
 
 def _decoded(color: list[mi.Float]) -> list[mi.Float]:
-    """Linear radiance."""
     return [mi.math.srgb_to_linear(channel) for channel in color]

@@ -214,7 +214,6 @@ def _check_settings(state: SplatsState) -> None:
 
 
 def _words(props: mi.Properties, name: str) -> tuple[str, ...]:
-    """Split a text at its commas."""
     return tuple(part.strip() for part in str(props.get(name, "")).split(",") if part.strip())
 
 
@@ -283,7 +282,6 @@ def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
 
 
 def _column(name: str, tensor: mi.TensorXf) -> mi.Float:
-    """Flatten a tensor of shape (N,) or (N, 1)."""
     if math.prod(tensor.shape[1:]) != 1:
         raise PluginError(f"splats: {name} must have the shape (N), got {tuple(tensor.shape)}")
     return mi.Float(tensor.array)
@@ -330,7 +328,6 @@ def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:
 
 
 def _aovs(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
-    """Return types of AOVs by name, each of ``kinds``."""
     aovs = {}
     for item in _words(props, "aovs"):
         name, _, kind = (part.strip() for part in item.partition(":"))

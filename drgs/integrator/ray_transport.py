@@ -74,7 +74,6 @@ class RayTransport:
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        """See :meth:`drgs.integrator.path_segment.SplatTransport.composite_segment`."""
         look = self._sampled if self.num_samples else self._composited
         color, coverage = look(_segment(segment.ray, active), segment.is_open, sample)
         return dr.select(active, self.exposure * color, 0), dr.select(active, 1 - coverage, 1)
@@ -82,7 +81,6 @@ class RayTransport:
     def _composited(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
-        """Linear colour, times coverage, and coverage."""
         del sample
         found = self.splats.composite_segment(segment)
         coverage = 1 - found.transmittance
@@ -91,7 +89,6 @@ class RayTransport:
     def _sampled(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
-        """Estimates of the same."""
         seed, n = dr.reinterpret_array(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
         drawn = self.splats.sampled(segment, seed, n)
         colors = [

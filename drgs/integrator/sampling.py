@@ -105,7 +105,6 @@ class DrawnSamples(CenterSamples):
         self.key = (HeldSeed(seed) if dr.is_jit_v(seed) else seed, spp, str(sensor.sampler()))
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
-        """Return the image, from the channels of each pass."""
         film = self.film
         if film.rfilter().is_box_filter():
             count = sum(point.samples for point in self.positions)
@@ -126,7 +125,6 @@ class DrawnSamples(CenterSamples):
         return film.develop()
 
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
-        """Return derivatives with respect to the channels, given those of the image."""
         if self.film.rfilter().is_box_filter():
             count = sum(point.samples for point in self.positions)
             averaged = pixels_adjoint(self.film, self.maps, grad_in, self.aovs)

@@ -184,7 +184,6 @@ class SensorRender:
         return channels
 
     def _behind(self, constant: mi.Color3f | None) -> _Behind:
-        """Evaluate the background, in the space of the channels."""
         splats = self.splats
         environment = None if splats.hide_emitters else self.scene.environment()
         if environment is None and constant is not None:
@@ -227,7 +226,6 @@ class SensorRender:
         return last.value
 
     def _traced_surfaces(self, state: SensorState) -> Cached:
-        """Trace the scene's surfaces, or reuse the last ones: Layers by time and by pass."""
         from drgs.integrator.visible_surfaces import trace_surfaces
 
         kept, sensor, hides = self.splats.cache.traced, self.sensor, self.splats.hide_emitters
@@ -256,7 +254,6 @@ class SensorRender:
         return read_sensor(self.sensor, self.splats.near)
 
     def _cameras(self, state: SensorState) -> list[Camera]:
-        """Return the camera at each time, detached, without what is ignored."""
         return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
     def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
@@ -270,7 +267,6 @@ class SensorRender:
 
 
 def _mean(passes: Sequence[Passes]) -> Passes:
-    """Return the mean over several times, summed in their order."""
     total: list[Passes] = []
     for first in range(0, len(passes), PASSES_PER_KERNEL):
         dr.eval(total)
@@ -351,13 +347,11 @@ def accumulate_in_sensor(
 
 
 def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
-    """Return the camera at each time, attached to the sensor's parameters."""
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
     return cameras_in_time(without_effects(state.make(state), ignored))
 
 
 def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:
-    """Accumulate into what the values were computed from."""
     pairs = zip(chain(*values), chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
     for value, gradient in attached:

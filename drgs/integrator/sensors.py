@@ -111,7 +111,6 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
 
 def _perspective(state: SensorState) -> Camera:
-    """Return the camera of a ``perspective``; a thin lens has no offsets of the principal point."""
     width, height, *_ = host = opaque_host(state)
     device = state.device
     # x_fov is the horizontal field of view of the whole film, whatever 'fov_axis' was given.
@@ -123,7 +122,6 @@ def _perspective(state: SensorState) -> Camera:
 
 
 def _thin_lens(state: SensorState) -> Camera:
-    """Return the camera of a ``thinlens``, which blurs points out of focus."""
     from drgs.cameras.thin_lens import RoundAperture
 
     device = state.device
@@ -135,7 +133,6 @@ def _thin_lens(state: SensorState) -> Camera:
 
 
 def _orthographic(state: SensorState) -> Camera:
-    """Return the camera of an ``orthographic``, whose film is 2 of its units wide."""
     from drgs.cameras.orthographic import Orthographic
 
     width, height, *_ = host = opaque_host(state)

@@ -111,7 +111,6 @@ class _Estimate:
         normals: mi.Vector3f,
         let_through: Callable[[mi.Ray3f, mi.Float], mi.Float],
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        """Return the irradiance, and that which the objects block; let_through: by the splats."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, dr.width(points))
         place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
@@ -149,7 +148,6 @@ class _Estimate:
 
 
 def _unhindered(ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
-    """Return full transmittance."""
     del ray, sample
     return mi.Float(1)
 

@@ -311,7 +311,6 @@ class SplatsState:
 
     @property
     def _is_placed(self) -> bool:
-        """True if Gaussians are moved, or are to be differentiated along a move."""
         is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
         return bool(self.nested_objects) or is_moved
 
@@ -347,16 +346,11 @@ class SplatsState:
         """Return derivatives of :attr:`gaussians` along those set on the parameters."""
         if self.cache.gathered is not None:
             return self.cache.gathered.tangents(self.parts(ellipsoids_in(scene)))
-        return tangents_of(self.rendered_part_of(self.own))
-
-
-def tangents_of(gaussians: Gaussians) -> Gaussians:
-    """Return the gradients set on Gaussians, or propagated to them."""
-    return Gaussians(
-        **{name: tangent_of(getattr(gaussians, name)) for name in PARAMETER_NAMES},
-        smoothing=None if gaussians.smoothing is None else tangent_of(gaussians.smoothing),
-        features=gaussians.features and {k: tangent_of(v) for k, v in gaussians.features.items()},
-    )
+        own = self.rendered_part_of(self.own)
+        return Gaussians(
+            **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
+            features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
+        )
 
 
 def is_splats(node: object) -> bool:

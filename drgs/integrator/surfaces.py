@@ -214,7 +214,6 @@ class Insertion:
         return develop_pixels(self.film, tangents, self.aovs)
 
     def _inserted(self, planes: list[mi.Float], nested: list[list[mi.Float]]) -> Channels:
-        """Return the channels for the film."""
         to_developed, to_rgb = self._color_maps()
         count = len(to_developed)
         rest, own = planes[count : -len(self.channels)], planes[-len(self.channels) :]

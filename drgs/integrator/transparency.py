@@ -89,7 +89,6 @@ class StraightRays:
     def _meet(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.PreliminaryIntersection3f, mi.Float]:
-        """Return what rays hit, and its opacity."""
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         return hit, self._opacity(ray, hit)
 
@@ -146,7 +145,6 @@ def sensor_behind(sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysB
 
 @cache
 def _sensor_type(variant: str) -> type:
-    """Return the type of such sensors, which derives from the variant's own."""
     del variant
 
     class SensorBehind(mi.Sensor):
@@ -167,14 +165,12 @@ def _sensor_type(variant: str) -> type:
         def sample_ray(
             self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
         ) -> tuple[mi.Ray3f, mi.Spectrum]:
-            """See ``mi.Sensor.sample_ray``."""
             ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
             return mi.Ray3f(ray), weight
 
         def sample_ray_differential(
             self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
         ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-            """See ``mi.Sensor.sample_ray_differential``."""
             # Not by the batch, whose calls reach all sensors that there are, this one included.
             place, found = sample2.x * len(self.sensors), None
             for k, sensor in enumerate(self.sensors):
@@ -185,7 +181,6 @@ def _sensor_type(variant: str) -> type:
             return ray, found[1] * passes
 
         def to_string(self) -> str:
-            """Return the text that Mitsuba prints."""
             return f"SensorBehind[{self.sensors}]"
 
     return SensorBehind

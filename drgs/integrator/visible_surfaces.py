@@ -43,17 +43,15 @@ class VisibleSurface(Surface):
     normal: Any  # Normal3f, world, times the coverage; None where no AOV needs it
 
     def at(self, pixel: mi.UInt32) -> VisibleSurface:
-        """Return the surface at some of the pixels."""
         planes = (dr.gather(mi.Float, plane, pixel) for plane in (self.depth, self.coverage))
         normal = None if self.normal is None else dr.gather(mi.Normal3f, self.normal, pixel)
         return VisibleSurface(*planes, normal)
 
     def share(self, front: mi.Float) -> mi.Float:
-        """Return the weight of the surface; front: sum of the splats' weights in front of it."""
+        """Return the weight of the surface; front: sum of the weights of splats in front of it."""
         return self.coverage * (1 - front)
 
     def aov_values(self, kind: str, front: mi.Float) -> list[mi.Float] | None:
-        """Return what the surface contributes to the channels of an AOV; None: nothing."""
         if kind == "depth":
             return [self.share(front) * self.depth]
         if kind == "normal":
@@ -99,7 +97,6 @@ def trace_surfaces(
 
 
 def _padded(layers: Layers, count: int) -> Layers:
-    """Return ``count`` surfaces, the last of which are not there."""
     first = layers[0]
     zero = dr.zeros(mi.Float, dr.width(first.coverage))
     far = zero + FAR_AWAY
@@ -160,7 +157,6 @@ class _Tracer:
         hit: mi.PreliminaryIntersection3f,
         coverage: mi.Float,
     ) -> VisibleSurface:
-        """Return what has been hit."""
         valid = coverage > 0
         point = ray.o + dr.select(valid, hit.t, 1) * ray.d
         _, _, depth = camera.lens.visibility(camera, camera.rotation @ (point - camera.center))

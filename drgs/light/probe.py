@@ -320,7 +320,6 @@ class _Face:
 
 
 def _joined(parts: list[list[Any]]) -> list[Any]:
-    """Texels behind each other."""
     columns = [dr.concat(columns) for columns in zip(*parts, strict=True)]
     dr.eval(columns)
     return columns

@@ -205,7 +205,6 @@ class RaySplats:
         return Sampled([t.Array3f(color) for color in found], exist, T)
 
     def _color(self, row: Any, basis: list[Any], active: Any) -> list[Any]:
-        """Display space, seen along rays."""
         t = types_of(self.shapes.Float)
         numbers = self.colors.load(row, active)[: 3 * num_coefficients(self.sh_degree)]
         color = []
