@@ -15,12 +15,11 @@ from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_
 
 from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.path_segment import PathSegment
 from drgs.integrator.properties import flag, integer, read, refuse_unknown
-from drgs.integrator.transparency import StraightRays, has_transparent_parts
+from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
 
 if TYPE_CHECKING:
-    from drgs.integrator.path_segment import SplatTransport
+    from drgs.integrator.rays import SplatTransport
 
 PROPERTIES = {
     "max_depth": integer(-1, least=-1),

@@ -30,8 +30,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.accuracy.exact import RayFalloff, ewa_with_depth
-from drgs.accuracy.peak_depths import AffineDepths, RayDepths, WithAffineDepth
-from drgs.accuracy.pixel_lists import PixelLists
+from drgs.accuracy.pixel_lists import AffineDepths, PixelLists, RayDepths, WithAffineDepth
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of

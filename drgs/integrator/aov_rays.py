@@ -20,13 +20,11 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
-from drgs.accuracy.sample_points import SamplePoints
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import interleave
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.film import Channels, pixel_corners
+from drgs.integrator.film import Channels, SamplePoints, by_sample, in_passes, pixel_corners
 from drgs.integrator.image_render import hybrid_of
-from drgs.integrator.sampling import by_sample, in_passes
 from drgs.integrator.sensor_render import SensorRender, constant_background
 from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
 from drgs.integrator.state import SplatsState

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, listed
 from drgs.integrator.checks import ellipsoids_in
-from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.rays import passes_splats
 from drgs.integrator.state import SplatsState
 
 ATTACHED = ("PathIntegrator", "DirectIntegrator")

@@ -23,14 +23,14 @@ import mitsuba as mi
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_image
 from drgs.integrator.film import CenterSamples
-from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.rays import passes_splats
 from drgs.integrator.sensor_render import Planes, SensorRender, constant_background
 from drgs.integrator.sensors import is_batch, num_poses, sensors_of
 from drgs.integrator.state import SplatsState
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:  # imported where a scene calls for them
-    from drgs.integrator.batch import SideBySide
+    from drgs.integrator.sensors import SideBySide
     from drgs.integrator.surfaces import Hybrid
 
 
@@ -65,7 +65,7 @@ class ImageRender:
         if spp == 1 and film.rfilter().is_box_filter():
             samples = CenterSamples(film, maps, names)
         else:
-            from drgs.integrator.sampling import DrawnSamples
+            from drgs.integrator.film import DrawnSamples
 
             samples = DrawnSamples(sensor, seed, spp, maps, names)
         whole = SensorRender(
@@ -80,7 +80,7 @@ class ImageRender:
         )
         if not is_batch(sensor):
             return ImageRender([whole], samples, hybrid)._with_surfaces()
-        from drgs.integrator.batch import SideBySide
+        from drgs.integrator.sensors import SideBySide
 
         batch = SideBySide.of(sensor)
         views = [
@@ -172,8 +172,8 @@ def hybrid_of(
     """Return the surfaces' part of an image; None where there are none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
+    from drgs.integrator.rays import StraightRays
     from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces
-    from drgs.integrator.transparency import StraightRays
 
     cache, hide_emitters = splats.cache, splats.hide_emitters
     surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
@@ -189,7 +189,7 @@ def hybrid_of(
         if passes_splats(nested):
             nested.use_transport(None)  # another integrator may have given it one
     else:
-        from drgs.integrator.ray_transport import nested_with_transport
+        from drgs.integrator.splat_transport import nested_with_transport
 
         num_paths = splats.nested_spp or spp or sensor.sampler().sample_count()
         nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))

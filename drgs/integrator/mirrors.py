@@ -23,16 +23,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.accuracy.peak_depths import BoundedDepths
 from drgs.accuracy.pipeline import pipeline_of
+from drgs.accuracy.pixel_lists import BoundedDepths
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.path_segment import PathSegment
+from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
-from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.probe import LOW_PASS, Seen
 from drgs.splatting import rendering
 

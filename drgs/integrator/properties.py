@@ -24,7 +24,7 @@ from drgs.core.origin import WORLD, shown_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.checks import check_shapes
-from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.rays import passes_splats
 from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given

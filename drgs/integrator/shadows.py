@@ -26,10 +26,10 @@ from drgs.core.constants import SH_C0
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.checks import check_ids
-from drgs.integrator.ray_transport import ray_splats_of
+from drgs.integrator.rays import StraightRays, has_transparent_parts
+from drgs.integrator.splat_transport import ray_splats_of
 from drgs.integrator.state import Cached, SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
-from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 

@@ -318,7 +318,7 @@ class SplatsState:
         """Return Gaussians of objects and shapes, attached, in the order of rendering."""
         parts = self._placements()
         if shapes or self.turns:
-            from drgs.integrator.ellipsoids import conversions_of
+            from drgs.integrator.gathering import conversions_of
 
             parts += conversions_of(shapes, self.turns)
         return parts
@@ -375,7 +375,7 @@ def feature_of(kind: str) -> rendering.Feature:
     """Return the composited feature of an AOV of this kind, other than alpha."""
     if kind == "depth":
         return rendering.depth_feature
-    from drgs.effects.features import NamedFeature, normal_features
+    from drgs.effects.compose import NamedFeature, normal_features
 
     return normal_features if kind == "normal" else NamedFeature(kind)
 

@@ -10,7 +10,7 @@ far as surfaces let them through (``drgs.effects.occlusion``),
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
 With N_k the nested picture of what is behind the first k surfaces, times what these let through
-(``drgs.integrator.transparency``), L_k = N_(k - 1) - N_k. Behind the last surface there is only the
+(``drgs.integrator.rays``), L_k = N_(k - 1) - N_k. Behind the last surface there is only the
 background: where the nested integrator shows it, N_k is there (1 - sum_k p_k) B, and else 0. Light
 does not pass from one to the other: splats neither light surfaces nor are lit by them, and cast no
 shadows (``light`` and ``shadows`` do that).
@@ -42,14 +42,14 @@ from drgs.integrator.derivatives import (
 )
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
 from drgs.integrator.film import pixels_adjoint as film_adjoint
-from drgs.integrator.path_segment import passes_splats
-from drgs.integrator.sensors import sensors_of
-from drgs.integrator.transparency import (
+from drgs.integrator.rays import (
     RaysBehind,
     StraightRays,
     has_transparent_parts,
+    passes_splats,
     sensor_behind,
 )
+from drgs.integrator.sensors import sensors_of
 from drgs.integrator.visible_surfaces import Layers, rest_behind
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")

@@ -22,7 +22,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.effects.occlusion import Surface
 from drgs.integrator.film import pixel_corners, samples_in
-from drgs.integrator.transparency import INVISIBLE, StraightRays
+from drgs.integrator.rays import INVISIBLE, StraightRays
 
 EDGE_GRID = 4
 

@@ -1,10 +1,10 @@
 """Gaussians for other viewers: what ``point_cloud_viewers.ply`` holds beside the fit's own.
 
 Viewers of 3DGS files render with the defaults of ``drgs.config.approximations``: 0.3 square pixels
-of low-pass, and opacities as they are. A copy of Gaussians that were fitted
-otherwise is changed in closed form (``drgs.effects.viewers``) and then fitted for a few iterations
-more as viewers render it, with the number of Gaussians fixed and with what the fit has found out
-about cameras and colours. The fit's own Gaussians do not depend on any of it.
+of low-pass, and opacities as they are. A copy of Gaussians that were fitted otherwise is changed in
+closed form (``drgs.effects.smoothing``) and then fitted for a few iterations more as viewers render
+it, with the number of Gaussians fixed and with what the fit has found out about cameras and
+colours. The fit's own Gaussians do not depend on any of it.
 
 Measured on ``scenes/lego_mini.yml`` with ``antialiased`` and a low-pass of 0.1, where the fit has
 35.16 dB: the same numbers as they are give 21.6 dB in viewers, in closed form 30.0 dB, with 160
@@ -32,8 +32,7 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
-from drgs.effects.smoothing import baked
-from drgs.effects.viewers import baked_for_viewers
+from drgs.effects.smoothing import baked, baked_for_viewers
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor

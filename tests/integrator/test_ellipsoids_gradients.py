@@ -29,7 +29,7 @@ from support.kernels import float_reductions
 from support.views import gradient, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.integrator import ellipsoids as shapes_module
+from drgs.integrator import gathering as shapes_module
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 

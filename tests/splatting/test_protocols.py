@@ -5,7 +5,6 @@ import inspect
 import pytest
 
 from drgs.accuracy import exact, peak_depths, pixel_order, ray_colors
-from drgs.accuracy.sample_points import SamplePoints
 from drgs.cameras import (
     distortion,
     fisheye,
@@ -16,6 +15,7 @@ from drgs.cameras import (
     thin_prism_fisheye,
 )
 from drgs.effects import defocus, occlusion
+from drgs.integrator.film import SamplePoints
 from drgs.splatting import footprint, rendering
 
 CLASSES = {

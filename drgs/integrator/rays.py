@@ -1,9 +1,9 @@
-"""Surfaces that let light pass straight on (``null``, ``mask``, ``thindielectric``).
+"""Rays between surfaces: segments of paths, and rays that pass straight on.
 
-Imported when a scene has surfaces. The opacity of a surface at a point is what it does not let pass
-straight on, averaged over red, green and blue. What is less opaque than :data:`INVISIBLE` is not
-there: rays go on as if it were not. A sensor whose rays start behind the first k visible surfaces
-has any nested integrator render what these let through.
+The opacity of a surface at a point is what it does not let pass straight on (``null``, ``mask``,
+``thindielectric``), averaged over red, green and blue. What is less opaque than :data:`INVISIBLE`
+is not there: rays go on as if it were not. A sensor whose rays start behind the first k visible
+surfaces has any nested integrator render what these let through.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -184,3 +184,49 @@ def _sensor_type(variant: str) -> type:
             return f"SensorBehind[{self.sensors}]"
 
     return SensorBehind
+
+
+@dataclass(frozen=True)
+class PathSegment:
+    """A part of a path: from one vertex to the next, or to an emitter."""
+
+    ray: mi.Ray3f  # maxt: where it ends
+    start: mi.ShapePtr  # that it leaves
+    end: mi.EmitterPtr  # that it reaches, if it is one
+    pdf: mi.Float  # of the direction, by solid angle; inf: there was no other
+    is_open: mi.Bool  # whether it leaves a scene without an environment: black is the last splat
+
+
+class SplatTransport(Protocol):
+    """Radiance and transmittance of the splats along segments of paths."""
+
+    def composite_segment(
+        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """Return the linear radiance and the transmittance of the splats along segments.
+
+        sample: in 0..1, of each segment.
+        """
+        ...
+
+    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return the transmittance of the splats along segments, or an estimate of it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class NoSplats:
+    """Transport without splats: zero radiance, full transmittance."""
+
+    def composite_segment(
+        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        return mi.Color3f(0), mi.Float(1)
+
+    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        return mi.Float(1)
+
+
+def passes_splats(integrator: mi.Integrator) -> bool:
+    """Return whether an integrator's paths can pass splats, as those of ``splatpath`` do."""
+    return hasattr(integrator, "use_transport")
