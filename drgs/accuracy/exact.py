@@ -56,13 +56,7 @@ from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.footprint import (
-    Footprint,
-    GaussianFalloff,
-    Offsets,
-    Positions,
-    flat_columns,
-)
+from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions, flat_columns
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,

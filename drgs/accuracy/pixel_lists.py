@@ -29,9 +29,7 @@ from drgs.splatting.projection import (
     Splats2D,
     film_axes,
 )
-from drgs.splatting.rasterize import (
-    Records,
-)
+from drgs.splatting.rasterize import Records
 from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 
 
@@ -156,9 +154,7 @@ class BoundedDepths(AffineDepths):
     def bind(self, lanes: Lanes, grid: TileGrid) -> BoundedDepths:
         near, far = (load_pixels(bound, lanes, grid) for bound in (self.nearest, self.farthest))
         return replace(
-            self,
-            depths=self.depths.bind(lanes, grid),
-            bounds=list(zip(near, far, strict=True)),
+            self, depths=self.depths.bind(lanes, grid), bounds=list(zip(near, far, strict=True))
         )
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
@@ -298,9 +294,7 @@ class _Items:
             return masks & (masks - 1), item + 1
 
         loop = dr.while_loop(
-            state=(t.UInt32(masks), t.UInt32(item)),
-            cond=lambda masks, item: masks != 0,
-            body=body,
+            state=(t.UInt32(masks), t.UInt32(item)), cond=lambda masks, item: masks != 0, body=body
         )
         dr.eval(loop, items)
         return items

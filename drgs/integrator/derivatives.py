@@ -74,10 +74,7 @@ class Parameter:
 
 
 def check_derivatives(
-    splats: SplatsState,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    mode: dr.ADMode,
+    splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong.
 

@@ -45,11 +45,7 @@ class ImageRender:
 
     @staticmethod
     def of(
-        splats: SplatsState,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        seed: int | mi.UInt32,
-        spp: int,
+        splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
     ) -> ImageRender:
         """Choose where the sensor's pixels are evaluated, and how its film develops them.
 
@@ -85,10 +81,7 @@ class ImageRender:
         batch = SideBySide.of(sensor)
         views = [
             replace(
-                whole,
-                index=index,
-                sensor=one,
-                positions=batch.positions(whole.positions, index),
+                whole, index=index, sensor=one, positions=batch.positions(whole.positions, index)
             )
             for index, one in enumerate(batch.sensors)
         ]
@@ -163,11 +156,7 @@ class ImageRender:
 
 
 def hybrid_of(
-    splats: SplatsState,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    seed: int | mi.UInt32,
-    spp: int,
+    splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
 ) -> Hybrid | None:
     """Return the surfaces' part of an image; None where there are none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):

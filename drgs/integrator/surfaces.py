@@ -34,12 +34,7 @@ import numpy as np
 from drgs.core.arrays import image_of, planes_of
 from drgs.core.errors import PluginError, UnsupportedError, listed, one_line, root_cause
 from drgs.core.private import same_variables
-from drgs.integrator.derivatives import (
-    Parameter,
-    attached_parameters,
-    parameter_value,
-    type_of,
-)
+from drgs.integrator.derivatives import Parameter, attached_parameters, parameter_value, type_of
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
 from drgs.integrator.film import pixels_adjoint as film_adjoint
 from drgs.integrator.rays import (

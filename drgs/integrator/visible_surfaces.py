@@ -151,11 +151,7 @@ class _Tracer:
         return ray, dr.full(mi.Bool, True, dr.width(ray)) & mi.Bool(seen)
 
     def _surface(
-        self,
-        camera: Camera,
-        ray: mi.Ray3f,
-        hit: mi.PreliminaryIntersection3f,
-        coverage: mi.Float,
+        self, camera: Camera, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, coverage: mi.Float
     ) -> VisibleSurface:
         valid = coverage > 0
         point = ray.o + dr.select(valid, hit.t, 1) * ray.d

@@ -302,9 +302,7 @@ class _Walk:
             return (_Place(at.end, cell.exit, cell.first, cell.first, cell.last, at.turn),)
 
         (at,) = dr.while_loop(
-            state=(at,),
-            cond=lambda at: (at.entry == at.last) & (at.end < self.stop),
-            body=body,
+            state=(at,), cond=lambda at: (at.entry == at.last) & (at.end < self.stop), body=body
         )
         return replace(at, turn=type(at.turn)(0))
 
