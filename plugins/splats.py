@@ -113,7 +113,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def forget_frames(self) -> None:
         """Render the next image anew, also if no parameter has changed."""
-        self.state.cache.frames.clear()
+        self.state.cache.forget("frames")
         if self.last is not None:
             self.last = replace(self.last, frames=[])
 
@@ -231,7 +231,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             self._gather(scene)
             render = ImageRender.of(self.state, scene, sensor, seed, spp)
             gradients = render.backward(params, grad_in)
-            means2d, frames = gradients.means2d, self.state.cache.frames[0].value
+            means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
             self.last = BackwardResult(
                 mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
                 gradients.visible,

@@ -111,7 +111,8 @@ class ImageRays:
             hybrid = hybrid.with_surfaces(view.num_surfaces())
             view = replace(view, hybrid=hybrid)
         channels = self._gathered(view.channels(view.planes(), constant_background(splats)))
-        splats.cache.forget_view(NESTED)
+        for kind in ("frames", "surfaces"):
+            splats.cache.forget(f"{kind} {NESTED}")
         if hybrid is not None:
             channels = self._with_surfaces(channels, hybrid, sampler, active)
         return channels

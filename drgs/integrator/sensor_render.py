@@ -118,7 +118,7 @@ class SensorRender:
         behind = self._behind(constant)
         seen = repeat(repeat(None))
         if self.hybrid is not None:
-            seen = self.splats.cache.traced[self.index].value
+            seen = self._traced_surfaces(self._state().detached()).value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -215,35 +215,36 @@ class SensorRender:
         One list for each time at which the shutter is open, of a frame for each pass.
         """
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
-        state, kept = self._state().detached(), self.splats.cache.frames
+        state = self._state().detached()
         traced = None if self.hybrid is None else self._traced_surfaces(state)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
-        last = kept.get(self.index)
-        if last is None or not last.matches(*key):
+
+        def render() -> list[list[rendering.Frame]]:
             seen = repeat(None) if traced is None else traced.value
-            frames = [
+            return [
                 _render(gaussians, camera, pipeline, self.positions, of_time)
                 for camera, of_time in zip(self._cameras(state), seen, strict=False)
             ]
-            last = kept[self.index] = Cached(frames, *key)
-        return last.value
+
+        return self.splats.cache.find(f"frames {self.index}", *key, render).value
 
     def _traced_surfaces(self, state: SensorState) -> Cached:
         from drgs.integrator.visible_surfaces import trace_surfaces
 
-        kept, sensor, hides = self.splats.cache.traced, self.sensor, self.splats.hide_emitters
+        sensor, hides = self.sensor, self.splats.hide_emitters
         settings = self.hybrid.surfaces, self.key, hides, sensor.far_clip(), *state.settings
-        last = kept.get(self.index)
-        if last is None or not last.matches(settings, state.device):
-            seen = trace_surfaces(
+        return self.splats.cache.find(
+            f"surfaces {self.index}",
+            settings,
+            state.device,
+            lambda: trace_surfaces(
                 self.hybrid.rays,
                 sensor,
                 self._cameras(state),
                 self._offsets,
                 with_normals="normal" in self.splats.aovs.values(),
-            )
-            last = kept[self.index] = Cached(seen, settings, state.device)
-        return last
+            ),
+        )
 
     def num_surfaces(self) -> int:
         """Number of surfaces that are seen one through the other."""

@@ -28,7 +28,7 @@ from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.checks import check_ids
 from drgs.integrator.rays import StraightRays, has_transparent_parts
 from drgs.integrator.splat_transport import ray_splats_of
-from drgs.integrator.state import Cached, SplatsState
+from drgs.integrator.state import SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
@@ -56,16 +56,15 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
     """
     gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
     surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
-    last, cache.shaded = cache.shaded, None
-    if last is None or not last.matches((surfaces,), gaussians):
-        estimate = _Estimate(
-            scene=_rays_through(surfaces.objects),
-            without=_rays_through(_without(surfaces.objects, splats.shadows)),
-            splats=ray_splats_of(gaussians, splats.approximations, degree=0),
-        )
-        darkened = _darkened(gaussians, estimate.ratios(gaussians))
-        last = Cached(darkened, (surfaces,), gaussians)
-    cache.shaded = last
+
+    def estimate() -> Gaussians:
+        rays = _rays_through(surfaces.objects)
+        without = _rays_through(_without(surfaces.objects, splats.shadows))
+        blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
+        return _darkened(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
+
+    cache.shaded = None
+    cache.shaded = cache.find("shaded", (surfaces,), gaussians, estimate).value
 
 
 def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:

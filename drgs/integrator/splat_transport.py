@@ -46,7 +46,7 @@ from drgs.integrator.checks import check_ids
 from drgs.integrator.rays import NoSplats, PathSegment, SplatTransport
 from drgs.integrator.sensor_render import decode
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
-from drgs.integrator.state import Cached, SplatsState
+from drgs.integrator.state import SplatsState
 from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
@@ -79,12 +79,12 @@ class RayTransport:
     def of(splats: SplatsState) -> RayTransport:
         """Return the transport of an integrator's Gaussians."""
         gaussians = dr.detach(splats.gaussians)
-        settings, last = (splats.approximations, splats.sh_degree), splats.cache.ray_splats
-        if last is None or not last.matches(settings, gaussians):
-            last = Cached(ray_splats_of(gaussians, *settings), settings, gaussians)
-            splats.cache.ray_splats = last
+        settings = splats.approximations, splats.sh_degree
+        found = splats.cache.find(
+            "ray splats", settings, gaussians, lambda: ray_splats_of(gaussians, *settings)
+        )
         exposure = dr.opaque(mi.Float, splats.exposure)
-        return RayTransport(last.value, exposure, splats.light_samples)
+        return RayTransport(found.value, exposure, splats.light_samples)
 
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
@@ -290,11 +290,9 @@ def _probes(
 
     flat: mirrors by the probe's number; sensor: that sees them.
     """
-    gaussians, last = dr.detach(splats.gaussians), splats.cache.probes
-    centers, planes = _places(objects, flat, sensor)
-    places = centers.tolist(), planes.tolist()
-    settings = splats.approximations, splats.sh_degree, splats.near, places
-    if last is None or not last.matches(settings, gaussians):
+    gaussians, (centers, planes) = dr.detach(splats.gaussians), _places(objects, flat, sensor)
+
+    def render() -> Probes:
         approximations = replace(splats.approximations, projection="exact", low_pass=LOW_PASS)
         pipeline = pipeline_of(approximations, splats.sh_degree, (color_features, depth_feature))
         if gaussians.smoothing is not None:
@@ -302,9 +300,12 @@ def _probes(
 
             pipeline = replace(pipeline, rows=smoothed)
         probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
-        last = splats.cache.probes = Cached(probes, settings, gaussians)
         _warn_of_close(splats, objects, flat, probes)
-    return last.value
+        return probes
+
+    places = centers.tolist(), planes.tolist()
+    settings = splats.approximations, splats.sh_degree, splats.near, places
+    return splats.cache.find("probes", settings, gaussians, render).value
 
 
 def _warn_of_close(
@@ -324,14 +325,14 @@ def _warn_of_close(
 
 
 def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, Any]:
+    """Return the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
     from drgs.integrator.mirrors import FlatMirror
 
-    settings, last = (splats.cache.surfaces,), splats.cache.flat_mirrors
-    if last is None or not last.matches(settings, ()):
+    def recognise() -> dict[int, Any]:
         every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
-        flat = {k: mirror for k, mirror in every.items() if mirror is not None}
-        last = splats.cache.flat_mirrors = Cached(flat, settings, ())
-    return last.value
+        return {k: mirror for k, mirror in every.items() if mirror is not None}
+
+    return splats.cache.find("flat mirrors", (splats.cache.surfaces,), (), recognise).value
 
 
 def _mirror_images(
@@ -339,16 +340,18 @@ def _mirror_images(
 ) -> Any:
     from drgs.integrator.mirrors import Mirrors
 
-    gaussians, cache = dr.detach(splats.gaussians), splats.cache
+    if not mirrors:
+        return None
+    gaussians, surfaces = dr.detach(splats.gaussians), splats.cache.surfaces
     how = splats.approximations, splats.sh_degree
-    settings = (cache.surfaces, *how, *(state.settings for state in states))
-    arrays, last = (gaussians, [state.device for state in states]), cache.mirrors
-    if last is None or not last.matches(settings, arrays):
-        images = None
-        if mirrors:
-            images = Mirrors.of(mirrors, states, cache.surfaces.traced(scene), gaussians, *how)
-        last = cache.mirrors = Cached(images, settings, arrays)
-    return last.value
+    settings = (surfaces, *how, *(state.settings for state in states))
+    arrays = gaussians, [state.device for state in states]
+    return splats.cache.find(
+        "mirrors",
+        settings,
+        arrays,
+        lambda: Mirrors.of(mirrors, states, surfaces.traced(scene), gaussians, *how),
+    ).value
 
 
 def _places(

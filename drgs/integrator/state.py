@@ -8,7 +8,7 @@ here and named beside it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -56,8 +56,7 @@ class BackwardResult:
         """Return the sum over pixels of each Gaussian's weight times ``plane``: Float (N,).
 
         plane: Float (H * W,). The weight is alpha times transmittance, as composited; its mean over
-        samples, and over the times at which the shutter was open. To be called before a parameter
-        changes.
+        samples and times. To be called before a parameter changes.
         """
         sums = [rendering.weighted_sums(frame, plane) for frame in self.frames]
         return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
@@ -75,35 +74,35 @@ class Cached:
     settings: tuple[object, ...]  # compared by ==
     arrays: Any  # a PyTree, detached: compared by variables
 
-    def matches(self, settings: tuple[object, ...], arrays: Any) -> bool:
-        """Return whether the value is that of these settings and arrays."""
-        return self.settings == settings and same_variables(self.arrays, arrays)
-
 
 @dataclass
 class RenderCache:
-    """Intermediate results of the last renderings; sensors are known by their places in a batch."""
+    """Intermediate results of the last renderings."""
 
-    frames: dict[int, Cached] = field(default_factory=dict)  # by time, one for each pass
-    traced: dict[int, Cached] = field(default_factory=dict)  # visible_surfaces.Layers, likewise
+    kept: dict[str, Cached] = field(default_factory=dict)  # by what they are
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
     gathered: Any = None  # drgs.integrator.gathering.Gathered; None: the own Gaussians, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[Any] = field(default_factory=list)  # mi.Shape: of the last scene, checked
     sensor: Any = None  # mi.Sensor that was rendered last
     surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
-    ray_splats: Cached | None = None  # drgs.light.walk.RaySplats
-    probes: Cached | None = None  # drgs.light.probe.Probes
     too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
-    flat_mirrors: Cached | None = None  # by probe: drgs.integrator.mirrors.FlatMirror
-    mirrors: Cached | None = None  # drgs.integrator.mirrors.Mirrors
-    shaded: Cached | None = None  # Gaussians in the shadow of surfaces
+    shaded: Any = None  # Gaussians in the shadow of surfaces; None: there are no such shadows
     summary: str = ""  # that was logged last
 
-    def forget_view(self, index: int) -> None:
-        """Drop a sensor that will not be rendered again."""
-        self.frames.pop(index, None)
-        self.traced.pop(index, None)
+    def find(
+        self, name: str, settings: tuple[object, ...], arrays: Any, make: Callable[[], Any]
+    ) -> Cached:
+        """Return what was kept under a name, made anew unless settings and arrays are the same."""
+        last = self.kept.get(name)
+        is_same = last is not None and last.settings == settings
+        if not is_same or not same_variables(last.arrays, arrays):
+            last = self.kept[name] = Cached(make(), settings, arrays)
+        return last
+
+    def forget(self, prefix: str) -> None:
+        """Drop what was kept under names that begin with ``prefix``."""
+        self.kept = {k: v for k, v in self.kept.items() if not k.startswith(prefix)}
 
 
 # ----------------------------------------------------------------------------------------------
@@ -130,8 +129,7 @@ class SplatObject:
         """Raise PluginError for a ``to_world`` that is no similarity; find whether it moves."""
         from drgs.integrator.gathering import similarity_of
 
-        place = similarity_of(self.to_world.matrix, "splats: to_world")
-        self.is_moved = not place.is_identity
+        self.is_moved = not similarity_of(self.to_world.matrix, "splats: to_world").is_identity
 
 
 @dataclass
@@ -245,7 +243,7 @@ class SplatsState:
         is_object: whether another integrator renders them.
         """
         if keys != ["background"]:
-            self.cache.frames.clear()
+            self.cache.forget("frames")
             self.cache.gathered = None
         if not self.own.has_gaussians:
             return
@@ -278,7 +276,7 @@ class SplatsState:
         once it was rendered.
         """
         shaded = self.cache.shaded
-        return self.unshaded_gaussians if shaded is None else shaded.value
+        return self.unshaded_gaussians if shaded is None else shaded
 
     @property
     def unshaded_gaussians(self) -> Gaussians:
