@@ -25,10 +25,7 @@ PLUGINS = ("splats", "splatpath", "calibrated", "minimal")
 
 
 def register(variant: str) -> None:
-    """Register all plugins for ``variant``, which must be the active one; once is enough.
-
-    Raises ``LLVMVersionError`` for a variant that needs a libLLVM which is not there.
-    """
+    """Register all plugins for the active variant; LLVMVersionError without a usable libLLVM."""
     if variant.startswith("llvm_"):
         ensure_usable_llvm()
     for name in PLUGINS:

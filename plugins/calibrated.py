@@ -100,10 +100,6 @@ class CalibratedSensor(mi.Sensor):
         self.shutter, self.shutter_samples = values["shutter"], values["shutter_samples"]
         refuse_unknown(props, (*KNOWN, *self.lens.coefficient_names()))
 
-    # ------------------------------------------------------------------------------------------
-    # Parameters
-    # ------------------------------------------------------------------------------------------
-
     def traverse(self, callback: mi.TraversalCallback) -> None:
         super().traverse(callback)
         callback.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
@@ -124,18 +120,6 @@ class CalibratedSensor(mi.Sensor):
 
     def far_clip(self) -> float:
         return self.far
-
-    def to_string(self) -> str:
-        lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
-        return (
-            f"CalibratedSensor[\n  fx = {self.fx}, fy = {self.fy},\n  cx = {self.cx}, "
-            f"cy = {self.cy},\n  lens = {lens},\n  to_world = {self.m_to_world},\n"
-            f"  film = {self.film()}\n]"
-        )
-
-    # ------------------------------------------------------------------------------------------
-    # For the splats integrator: see ``drgs.integrator.sensors.CameraSensor``
-    # ------------------------------------------------------------------------------------------
 
     def camera_parameters(self) -> list[str]:
         moves = ["to_world_close"] if self.to_world_close is not None else []
@@ -161,10 +145,6 @@ class CalibratedSensor(mi.Sensor):
         if self.shutter == "rolling":
             return replace(camera, shutter=RollingShutter(*motion))
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
-
-    # ------------------------------------------------------------------------------------------
-    # For integrators that trace rays
-    # ------------------------------------------------------------------------------------------
 
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True

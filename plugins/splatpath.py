@@ -361,10 +361,7 @@ def _attached(
     numbers: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """An emitter's sample and its weight, attached to the emitter and to the vertex.
-
-    numbers: in 0..1, that it was sampled with.
-    """
+    """Attach an emitter's sample, drawn with ``numbers``, and its weight to emitter and vertex."""
     flags = ds.emitter.flags()
     is_surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
     is_infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)

@@ -9,8 +9,8 @@ same without options, on one page.
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import drjit as dr
@@ -19,12 +19,12 @@ import mitsuba as mi
 from drgs.core.arrays import interleave
 from drgs.core.environment import check_variant
 from drgs.core.errors import PluginError, UnsupportedError
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
 from drgs.integrator.properties import check_object, nested_integrators, only_one, read_state
 from drgs.integrator.state import BackwardResult
-from drgs.splatting.rendering import Pipeline, ProjectionStage
+from drgs.splatting.rendering import ProjectionStage
 
 
 class SplatsIntegrator(mi.CppADIntegrator):
@@ -119,10 +119,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def sh_degree(self) -> int:
-        """Highest spherical harmonics degree that is evaluated; 0 to 3. May be set.
-
-        A scene is refused whose Gaussians, those of its shapes included, do not have it.
-        """
+        """Highest spherical harmonics degree that is evaluated, 0 to 3. May be set."""
         return self.state.sh_degree
 
     @sh_degree.setter
@@ -150,30 +147,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
         own = self.state.own
         own.gaussians = replace(own.gaussians, smoothing=filter_)
 
-    @property
-    def gaussians(self) -> Gaussians:
-        """All rendered Gaussians: see :attr:`drgs.integrator.state.SplatsState.gaussians`."""
-        return self.state.gaussians
-
-    @property
-    def pipeline(self) -> Pipeline:
-        """Stages that the settings select."""
-        return self.state.pipeline
-
-    @property
-    def srgb_primitives(self) -> bool:
-        """True if the image is linear radiance; ``volprim_rf_basic`` has the same attribute."""
-        return self.state.srgb_primitives
-
-    @property
-    def near(self) -> float:
-        """Near plane, scene units."""
-        return self.state.near
-
-    @property
-    def ignore(self) -> Sequence[str]:
-        """Effects that are not simulated."""
-        return self.state.ignore
+    gaussians = property(attrgetter("state.gaussians"), doc="All rendered Gaussians, world space.")
+    pipeline = property(attrgetter("state.pipeline"), doc="Stages that the settings select.")
+    srgb_primitives = property(attrgetter("state.srgb_primitives"), doc="If images are linear.")
+    near = property(attrgetter("state.near"), doc="Near plane, scene units.")
+    ignore = property(attrgetter("state.ignore"), doc="Effects that are not simulated.")
 
     def use_projection(self, stage: ProjectionStage) -> None:
         """Project the Gaussians by another stage, such as one that several processes share."""
@@ -205,7 +183,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with self._lock, dr.suspend_grad():
             self.state.cache.sensor = sensor
             self._gather(scene)
-            self._log_summary(scene, sensor)
             image = ImageRender.of(self.state, scene, sensor, seed, spp).image()
             if evaluate:
                 dr.eval(image)
@@ -220,11 +197,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         seed: int | mi.UInt32 = 0,
         spp: int = 0,
     ) -> None:
-        """Accumulate the derivatives of the loss into the attached parameters.
-
-        grad_in: derivative of the loss with respect to the developed image. Leaves
-        :class:`drgs.integrator.state.BackwardResult` in ``self.last``.
-        """
+        """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
         sensor = _resolve_sensor(scene, sensor)
         self._check_derivatives(scene, sensor, dr.ADMode.Backward)
         with self._lock, dr.suspend_grad():
@@ -265,10 +238,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def sample(
         self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any
     ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
-        """Render along the rays of a whole image, for ``aov``; all others are refused.
-
-        See ``drgs.integrator.aov_rays``. Not differentiated: ``aov`` needs it for AOVs alone.
-        """
+        """Render along the rays of a whole image, for ``aov``: see ``drgs.integrator.aov_rays``."""
         from drgs.integrator.aov_rays import ImageRays
 
         del others
@@ -307,21 +277,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
             check_derivatives(self.state, scene, sensor, mode)
 
-    def _log_summary(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
-        """Log each summary once, if the logger shows it."""
-        if mi.logger() is None or mi.logger().log_level() > mi.LogLevel.Info:
-            return
-        summary = self.summary(scene, sensor)
-        if summary != self.state.cache.summary:
-            mi.Log(mi.LogLevel.Info, f"splats: {summary}")
-            self.state.cache.summary = summary
-
 
 def _resolve_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """Return the sensor itself.
-
-    Raises UnsupportedError while Dr.Jit records: what is launched depends on what is seen.
-    """
+    """Return the sensor; UnsupportedError while Dr.Jit records."""
     if dr.flag(dr.JitFlag.FreezingScope):
         raise UnsupportedError(
             "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from the "

@@ -164,11 +164,7 @@ class RayFalloff(GaussianFalloff):
     camera: Camera | None = None
 
     def for_camera(self, camera: Camera) -> RayFalloff:
-        """For one camera, whose film has the anchors.
-
-        Raises UnsupportedError for lenses that are no pinholes: their rays are not straight on
-        the film.
-        """
+        """Bind to a camera, whose film has the anchors; UnsupportedError unless it is a pinhole."""
         if not isinstance(camera.lens, Pinhole):
             raise UnsupportedError(
                 f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "

@@ -35,20 +35,14 @@ from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 
 @dataclass(frozen=True)
 class AffineDepths:
-    """Depths at a pixel for a falloff that does not know them: stores what they depend on.
-
-    The base of all classes of depths.
-    """
+    """Base of depths at a pixel, for a falloff that does not know them: stores kappa and h."""
 
     def for_camera(self, camera: Camera) -> AffineDepths:
         """For one camera, whose rays may be parallel."""
         return ParallelDepths() if camera.lens.parallel else self
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """Return columns from which depths are computed; last, their unit.
-
-        Here kappa, h (scaled to base 2), and the depth of the mean.
-        """
+        """Return columns from which depths are computed: kappa, h (to base 2); last, their unit."""
         ray, scale = splats.ray, WHITENING_SCALE
         return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
 

@@ -63,10 +63,7 @@ uncut, a fitted scene is 52.4 dB from the true order with 16 places, and 51.3 dB
 @ORDERS.register("pixel")
 @dataclass(frozen=True)
 class PixelOrder(CenterOrder):
-    """Composites by the depth of the peak along each pixel's ray.
-
-    window: K, how many splats a pixel keeps waiting.
-    """
+    """Compositing by the depth of the peak along each pixel's ray."""
 
     window: int
     depths: AffineDepths
@@ -247,10 +244,7 @@ def _walk(
 
 
 def _insert(places: list[list[Any]], item: list[Any]) -> tuple[list[list[Any]], list[Any]]:
-    """Insert into places sorted by their first number; returns all but the first, and that.
-
-    Of equals, the one that came first stays before.
-    """
+    """Insert into places sorted by their first number, stably; also return the first of all."""
     places = list(places)
     for k in reversed(range(len(places))):
         before = item[0] < places[k][0]
@@ -398,10 +392,7 @@ def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]
 
 
 def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Rows:
-    """Third walk: the sums over the 16 pixels of each item, rows by place.
-
-    pairs: weights and d loss / d ln(alpha), 16 for each place.
-    """
+    """Third walk: the sums of ``pairs`` over the 16 pixels of each item, rows by place."""
     bins, records, lists = inputs.bins, inputs.records, inputs.lists
     lanes, model = inputs.lanes, inputs.model
     t = types_of(bins.rows.Float)

@@ -31,10 +31,7 @@ def stored_coefficients(rows: GaussianRows, direction: Any, sh_degree: int) -> l
 
 @dataclass(frozen=True)
 class RayColors(SplatFeatures):
-    """Of what is stored, the first are SH coefficients; the others are composited as they are.
-
-    Not differentiated: the direction, in the camera.
-    """
+    """Colours by SH coefficients, stored first. Not differentiated: the direction."""
 
     sh_degree: int
     camera: Camera | None = None

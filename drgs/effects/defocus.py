@@ -31,10 +31,7 @@ class Defocused:
     def __call__(
         self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
     ) -> FilmShape:
-        """The blurred shape, whose ``dimming`` keeps the integral.
-
-        Its determinants are those of the low-pass alone.
-        """
+        """Return the blurred shape, whose ``dimming`` keeps the integral."""
         film = self.shape(rows, camera, position, low_pass)
         spread = camera.aperture.variance(camera, position.z)
         blurred = self.shape(rows, camera, position, low_pass + spread)

@@ -42,11 +42,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class OccludedFeatures(SplatFeatures):
-    """SplatFeatures of splats that surfaces may hide.
-
-    The last stored number is the splat's depth; the last planes are the sums of the weights in
-    front of each surface.
-    """
+    """Features of splats that surfaces may hide; last planes: the weights in front of each."""
 
     features: SplatFeatures
     surfaces: tuple[Surface, ...]  # nearest first

@@ -45,10 +45,7 @@ FILM_MARGIN = 0.15
 
 
 def smoothed(rows: GaussianRows) -> GaussianRows:
-    """Gaussians whose covariance is widened by ``rows.smoothing``^2, and dimmed in proportion.
-
-    The filter is differentiated where an object is scaled with it, and is no parameter itself.
-    """
+    """Widen the covariance of Gaussians by ``rows.smoothing``^2, and dim them in proportion."""
     variance = dr.square(rows.smoothing)
     log_scales = dr.log(dr.exp(2 * rows.log_scales) + variance) / 2
     dimming = dr.exp(dr.sum(rows.log_scales - log_scales))
@@ -84,10 +81,7 @@ def _rates(points: Any, camera: Camera) -> Any:
 
 
 def baked(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians (numpy) with the filter in their scales and opacities.
-
-    For viewers that know nothing of it. Opacities are rounded to below 1.
-    """
+    """Return the Gaussians (numpy) with the filter in their scales, and opacities below 1."""
     g = gaussians.numpy()
     if g.smoothing is None:
         return g

@@ -57,13 +57,7 @@ class ImageRays:
 
     @staticmethod
     def of(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> ImageRays:
-        """Find where in their pixels the rays start.
-
-        sensor: of which a picture was rendered last, None if there was none; near: near plane of
-        the integrator, scene units.
-
-        Raises UnsupportedError for rays that are not those of a picture of this sensor.
-        """
+        """Find where in pixels the rays start; UnsupportedError unless they are of an image."""
         if sensor is None:
             raise UnsupportedError(REFUSAL)
         film = sensor.film()
@@ -125,10 +119,7 @@ class ImageRays:
     def _with_surfaces(
         self, channels: Channels, hybrid: Hybrid, sampler: mi.Sampler, active: mi.Bool
     ) -> Channels:
-        """The channels with what the nested integrator sees along the rays.
-
-        hybrid: see ``drgs.integrator.surfaces.Hybrid``, whose own channels are at the end.
-        """
+        """Add what the nested integrator sees along the rays."""
         insertion = hybrid.insertion
         aovs, own = channels[3 : -len(insertion.channels)], channels[-len(insertion.channels) :]
         behind = own[2 * insertion.num_surfaces :] or [mi.Float(0)] * 3

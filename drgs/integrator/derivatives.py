@@ -76,10 +76,7 @@ class Parameter:
 def check_derivatives(
     splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
 ) -> None:
-    """Raise UnsupportedError for a parameter whose derivative would be wrong.
-
-    scene: with surfaces.
-    """
+    """Raise UnsupportedError for a parameter whose derivative would be wrong."""
     if (splats.light != "none" or splats.shadows) and _has_attached_gaussians(splats, scene):
         raise UnsupportedError(
             f"splats: with light '{splats.light}' and shadows "

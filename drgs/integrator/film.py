@@ -20,7 +20,6 @@ import numpy as np
 
 from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
 from drgs.core.errors import UnsupportedError
-from drgs.core.private import same_variables
 from drgs.splatting.footprint import PixelCenters, Positions, flat_columns, total
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
@@ -119,10 +118,7 @@ def pixels_adjoint(
 
 
 def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) -> np.ndarray:
-    """(developed channels, channels): the linear map that a film applies to each pixel.
-
-    maps: remembers those of films, by their description.
-    """
+    """Return the linear map that a film applies to each pixel: (developed channels, channels)."""
     key = f"{film} {', '.join(aovs)}"
     if key not in maps:
         maps[key] = _found_map(film, aovs)
@@ -184,22 +180,6 @@ def by_sample(positions: Sequence[SamplePoints], passes: Sequence[Channels]) -> 
             yield [dr.gather(mi.Float, p, pixel, mode=dr.ReduceMode.Permute) for p in channels]
 
 
-class HeldSeed:
-    """A seed that is an array, as it is now: its owner may change it in place.
-
-    Equal to another of the same variable: no value is read back. That it is held keeps the
-    variable's index from being reused.
-    """
-
-    def __init__(self, seed: mi.UInt32) -> None:
-        self.seed = type(seed)(seed)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, HeldSeed) and same_variables(self.seed, other.seed)
-
-    __hash__ = None
-
-
 class DrawnSamples(CenterSamples):
     """``spp`` samples per pixel, drawn by a copy of the sensor's sampler."""
 
@@ -212,6 +192,7 @@ class DrawnSamples(CenterSamples):
         aovs: Sequence[str] = (),
     ) -> None:
         super().__init__(sensor.film(), maps, aovs)
+        seed = int(seed[0]) if dr.is_jit_v(seed) else seed  # its owner may change it in place
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # some round it up
@@ -222,7 +203,7 @@ class DrawnSamples(CenterSamples):
         points = sampler.next_2d()
         self.positions = in_passes(points, spp, num_pixels)
         dr.eval([(p.x, p.y) for p in self.positions])
-        self.key = (HeldSeed(seed) if dr.is_jit_v(seed) else seed, spp, str(sensor.sampler()))
+        self.key = (seed, spp, str(sensor.sampler()))
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
         film = self.film
@@ -271,10 +252,7 @@ class DrawnSamples(CenterSamples):
 
 @dataclass(frozen=True)
 class SamplePoints(Positions):
-    """One point in each pixel, for each of some samples.
-
-    Equality is identity of the arrays: those of another pass are another model.
-    """
+    """Points in each pixel, one for each of some samples; equal if the arrays are the same."""
 
     margin: ClassVar[float] = 0.5
 

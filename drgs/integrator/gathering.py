@@ -278,10 +278,7 @@ class Placement:
         return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
 
     def gaussians(self) -> Gaussians:
-        """Return all parameters; where nothing is moved, the object's own.
-
-        Raises PluginError where they leave float32.
-        """
+        """Return all parameters; PluginError where they leave float32."""
         arrays = {name: values for name, values in self.values.items() if name != TO_WORLD}
         if dr.grad_enabled(self.values[TO_WORLD]) or not self._place.is_identity:
             arrays |= self._moved(arrays)
@@ -350,10 +347,7 @@ class Placement:
         }
 
     def _motion(self, num: int) -> tuple[mi.Float, mi.Vector3f, mi.Vector3f]:
-        """Return l, w and the translation of a change of the matrix, which are 0: only attached.
-
-        Each has a lane for each Gaussian, so that derivatives are summed once.
-        """
+        """Return l, w and the translation of a change of the matrix: attached zeros (N,)."""
         matrix, place = self.values[TO_WORLD], self._place
         change = matrix - dr.detach(matrix)
         inverse = _device(place.rotation.T / place.scale)
@@ -368,10 +362,7 @@ class Placement:
 
 
 def similarity_of(to_world: Any, name: str) -> Similarity:
-    """Return the similarity that is nearest to a Matrix4f, which is read back from the device.
-
-    Raises PluginError that begins with ``name`` unless it is close to one.
-    """
+    """Return the similarity nearest to a Matrix4f; PluginError unless it is close to one."""
     matrix = np.array(dr.detach(to_world), np.float64)
     if matrix.size != 16:
         raise PluginError(f"{name} must be one transform, got {matrix.shape[2]}")
@@ -461,10 +452,7 @@ class Conversion:
         )
 
     def _opacity(self, is_visible: mi.Bool) -> mi.Float:
-        """Return opacities between bounds, attached where they were within 0..1.
-
-        A NaN stays: projection then drops the Gaussian.
-        """
+        """Return opacities between bounds, attached where they were within 0..1; a NaN stays."""
         (lowest, highest), value = OPACITIES, self.values["opacities"]
         clamped = dr.detach(dr.select(value < lowest, lowest, value))
         clamped = dr.select(clamped > highest, highest, clamped)
@@ -473,13 +461,7 @@ class Conversion:
 
 
 def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, Turn]) -> list[Conversion]:
-    """Read the current values of shapes, attached.
-
-    turns: by the ids of shapes, and under "" of all others.
-
-    Raises PluginError for shapes that cannot be rendered, and for turns of shapes that there are
-    not.
-    """
+    """Read the values of shapes, attached; turns: by their ids, "": of all others."""
     unknown = set(turns) - {shape.id() for shape in shapes} - {""}
     if unknown:
         found = ", ".join(f"'{shape.id()}'" for shape in shapes if shape.id()) or "none"

@@ -47,10 +47,7 @@ class ImageRender:
     def of(
         splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
     ) -> ImageRender:
-        """Choose where the sensor's pixels are evaluated, and how its film develops them.
-
-        seed, spp: as ``mi.render`` has them; 0 samples per pixel: those of the sensor's sampler.
-        """
+        """Choose where pixels are evaluated; spp: 0 for that of the sensor's sampler."""
         hybrid = hybrid_of(splats, scene, sensor, seed, spp)
         names = splats.aov_names()
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
@@ -102,11 +99,7 @@ class ImageRender:
         return self.hybrid.insertion.develop(image, self.hybrid.pictures())
 
     def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
-        """Return derivatives with respect to the Gaussians; accumulate all others.
-
-        params: as ``mi.render`` has them; grad_in: derivative of the loss with respect to the
-        image.
-        """
+        """Return derivatives with respect to the Gaussians; accumulate all others."""
         if self.hybrid is not None:
             own, nested = self._image_of_splats(), self.hybrid.pictures()
             grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
@@ -120,10 +113,7 @@ class ImageRender:
         return reduce(rendering.sum_of_gradients, gradients)
 
     def tangent(self, params: object, tangents: Gaussians) -> mi.TensorXf:
-        """Return the directional derivative of the image.
-
-        tangents: of the Gaussians; those of all other parameters are set on them.
-        """
+        """Return the directional derivative; tangents: of the Gaussians."""
         splats = self.views[0].splats
         d_planes = [view.plane_tangents(tangents) for view in self.views]
         planes = [view.planes() for view in self.views]

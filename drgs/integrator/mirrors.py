@@ -65,11 +65,6 @@ SAME_END = (0.1, 0.01)
 from the mirror on, and to that from the camera to the mirror: both are allowed."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Planes
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Plane:
     """Points x with normal . x = offset, world; arrays of them, by mirror, in :class:`Mirrors`."""
@@ -87,10 +82,7 @@ class Plane:
         return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
 
     def mirror(self, camera: Camera) -> Camera:
-        """Mirror a camera: each pixel sees what the mirror shows there.
-
-        Its axes have the other handedness, which the projection does not notice.
-        """
+        """Mirror a camera, whose axes then have the other handedness."""
         n = self.normal
         turned = [
             list(axis - 2 * dr.dot(axis, n) * n) for axis in map(mi.Vector3f, camera.rotation)
@@ -161,11 +153,6 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
     return axes[:, 0].tolist(), float(axes[:, 0] @ middle)
 
 
-# ----------------------------------------------------------------------------------------------
-# Pictures
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Mirrors:
     """Pictures of the splats that cameras see in mirrors."""
@@ -182,10 +169,7 @@ class Mirrors:
         approximations: Approximations,
         sh_degree: int,
     ) -> Mirrors:
-        """Render the pictures. Cameras that move have none.
-
-        scene: of the surfaces.
-        """
+        """Render the images, of cameras that do not move; scene: of the surfaces."""
         normals = np.array([mirror.normal for mirror in mirrors], np.float32)
         every = Plane(mi.Vector3f(normals.T), mi.Float([mirror.offset for mirror in mirrors]))
         cameras = [c for c in map(camera_from_sensor, states) if c.shutter is None]
@@ -237,10 +221,7 @@ class _View:
         far: mi.Float,
         active: mi.Bool,
     ) -> Seen:
-        """Look up what rays meet, as far as they go on along those of the camera.
-
-        origin, direction: those of the mirrored rays, as if they had gone through the mirror.
-        """
+        """Look up what mirrored rays meet, as far as they go on along those of the camera."""
         camera, rounding = self.camera, OFF_SURFACE * (1 + dr.max(dr.abs(origin)))
         origin = camera.rotation @ (mi.Vector3f(origin) - camera.center)
         direction = camera.rotation @ mi.Vector3f(direction)

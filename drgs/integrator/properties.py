@@ -110,10 +110,7 @@ def matrix(props: mi.Properties, name: str) -> np.ndarray:
 
 
 def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:
-    """Raise PluginError for a property that nobody has read: a mistyped name.
-
-    Mitsuba would refuse it as well, without the name that was meant.
-    """
+    """Raise PluginError for a property that nobody has read: a mistyped name."""
     for name in props.unqueried():
         hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
         raise PluginError(f"{props.plugin_name()}: there is no parameter {name}{hint}")
@@ -341,10 +338,7 @@ def _aovs(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
 
 
 def _agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> dict[str, Value]:
-    """Return the approximations that headers set and no property gives; files: by name.
-
-    Raises PluginError where files differ, of which some may be made with the defaults.
-    """
+    """Return what headers set and no property gives; PluginError where files differ."""
     made_with = {file: Approximations.of(said) for file, said in files.items()}
     names = [name for name in DECLARED if name not in props]
     for name in names:

@@ -30,10 +30,7 @@ def has_transparent_parts(scene: mi.Scene) -> bool:
 
 @dataclass(frozen=True)
 class StraightRays:
-    """Rays through a scene that go straight on until something is visible.
-
-    Loops name their state: a scene in it would carry its attached parameters into them.
-    """
+    """Rays that go straight on until something is visible. In no loop's state: it would attach."""
 
     scene: mi.Scene
     hide_emitters: bool  # whether surfaces that are emitters are invisible
@@ -42,10 +39,7 @@ class StraightRays:
     def next_visible(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
-        """Return a ray that starts behind all that is invisible, its hit, and the hit's opacity.
-
-        The opacity is 0 where nothing is hit.
-        """
+        """Return a ray behind all that is invisible, its hit, and the hit's opacity, 0 for none."""
         hit, opacity = self._meet(ray, active)
         if not self.sees_through:
             return ray, hit, opacity
@@ -103,17 +97,9 @@ class StraightRays:
         return dr.select(hit.is_valid(), opacity, 0)
 
 
-# ----------------------------------------------------------------------------------------------
-# Sensors behind windows
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class RaysBehind:
-    """Rays behind the first ``count`` visible surfaces, and all that is invisible before the next.
-
-    Rays that end at one of these surfaces have the weight 0, others what the surfaces let through.
-    """
+    """Rays behind the first ``count`` visible surfaces; the weight is what these let through."""
 
     rays: StraightRays
     count: int
@@ -136,10 +122,7 @@ class RaysBehind:
 
 
 def sensor_behind(sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind) -> mi.Sensor:
-    """Return a sensor with the same film, sampler and rays, which start behind surfaces.
-
-    sensors: those of a ``batch``, side by side; else the sensor itself.
-    """
+    """Return a sensor whose rays start behind surfaces; sensors: those of a ``batch``."""
     return _sensor_type(mi.variant())(sensor, sensors, behind)
 
 
@@ -203,28 +186,12 @@ class SplatTransport(Protocol):
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        """Return the linear radiance and the transmittance of the splats along segments.
-
-        sample: in 0..1, of each segment.
-        """
+        """Return linear radiance and transmittance of segments; sample: in 0..1."""
         ...
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """Return the transmittance of the splats along segments, or an estimate of it."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class NoSplats:
-    """Transport without splats: zero radiance, full transmittance."""
-
-    def composite_segment(
-        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Color3f, mi.Float]:
-        return mi.Color3f(0), mi.Float(1)
-
-    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        return mi.Float(1)
 
 
 def passes_splats(integrator: mi.Integrator) -> bool:

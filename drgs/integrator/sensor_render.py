@@ -111,10 +111,7 @@ class SensorRender:
         return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
-        """Return the channels of each pass for the film: the mean over the times.
-
-        constant: the background, where it is a colour; display space.
-        """
+        """Return the mean over times of each pass's channels; constant: the background."""
         behind = self._behind(constant)
         seen = repeat(repeat(None))
         if self.hybrid is not None:
@@ -205,15 +202,8 @@ class SensorRender:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, environment is not None, radiance)
 
-    # ------------------------------------------------------------------------------------------
-    # Frames
-    # ------------------------------------------------------------------------------------------
-
     def _frames(self) -> list[list[rendering.Frame]]:
-        """Render, or reuse the last frames if nothing that they depend on has changed.
-
-        One list for each time at which the shutter is open, of a frame for each pass.
-        """
+        """Return frames by time and by pass, those of the last image where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
         state = self._state().detached()
         traced = None if self.hybrid is None else self._traced_surfaces(state)
@@ -327,10 +317,7 @@ def _render(
 
 
 def constant_background(splats: SplatsState) -> mi.Color3f | None:
-    """The background without gradients, if it is a colour; display space.
-
-    No literal, or every colour would be a new kernel.
-    """
+    """Return the background, detached and in no kernel, if it is a colour."""
     if isinstance(splats.background, mi.Texture):
         return None
     constant = mi.Color3f(dr.detach(splats.background))
@@ -341,11 +328,7 @@ def constant_background(splats: SplatsState) -> mi.Color3f | None:
 def accumulate_in_sensor(
     ignored: Collection[str], state: SensorState, gradients: list[list[Any]]
 ) -> None:
-    """Accumulate derivatives of a sensor's cameras into what its parameters were computed from.
-
-    ignored: effects that are not simulated; state: attached; gradients: by time, of
-    ``Camera.numbers()``.
-    """
+    """Accumulate derivatives by ``Camera.numbers()``, by time, into a sensor."""
     numbers = [camera.numbers() for camera in _attached_cameras(ignored, state)]
     _accumulate_through(numbers, gradients)
 
@@ -371,10 +354,7 @@ as so many pictures of itself."""
 
 
 def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f) -> mi.Color3f:
-    """Return an emitter's radiance along the camera's rays; black where the lens model ends.
-
-    place: on the crop window, px.
-    """
+    """Return an emitter's radiance at a place of the crop window, px; black where the lens ends."""
     ray, seen, count = camera.view_directions(place.x, place.y, LENS_POINTS)
     interaction = dr.zeros(mi.SurfaceInteraction3f, count * dr.width(place))
     # As the environment is infinitely far, only directions count.

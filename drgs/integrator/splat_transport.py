@@ -43,7 +43,7 @@ from drgs.config.approximations import Approximations
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import NoSplats, PathSegment, SplatTransport
+from drgs.integrator.rays import PathSegment, SplatTransport
 from drgs.integrator.sensor_render import decode
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
@@ -144,10 +144,7 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
 def nested_with_transport(
     splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
 ) -> mi.Integrator:
-    """The nested integrator, with the splats of the one that it is nested in.
-
-    num_paths: of a pixel; sensors: whose picture is rendered.
-    """
+    """Return the nested integrator, given the splats; num_paths: of a pixel; sensors: rendered."""
     nested = splats.nested
     if nested is None:
         settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
@@ -156,7 +153,7 @@ def nested_with_transport(
         nested.use_transport(RayTransport.of(splats))
     else:
         traces = splats.unseen == "rays"
-        unseen = RayTransport.of(splats) if traces else NoSplats()
+        unseen = RayTransport.of(splats) if traces else None
         nested.use_transport(ProbeTransport.of(splats, scene, num_paths, sensors, unseen))
     return nested
 
@@ -189,7 +186,7 @@ class ProbeTransport:
     emitters: dict[int, mi.EmitterPtr]  # likewise
     flat: dict[int, int]  # numbers of the mirrors, by that of the probe
     num_paths: mi.Float  # (1,): of a pixel
-    unseen: SplatTransport  # for rays of which probes do not know what they meet
+    unseen: SplatTransport | None  # for rays of which probes do not know what they meet
 
     @staticmethod
     def of(
@@ -197,15 +194,9 @@ class ProbeTransport:
         scene: mi.Scene,
         num_paths: int,
         sensors: Sequence[mi.Sensor],
-        unseen: SplatTransport,
+        unseen: SplatTransport | None,
     ) -> ProbeTransport:
-        """Return the transport by the probes of an integrator's objects.
-
-        sensors: those that flat mirrors are seen by.
-
-        Raises PluginError for the name of an object that the scene does not have, and for an
-        emitter that is nowhere.
-        """
+        """Return the transport by probes; sensors: of flat mirrors. PluginError for ids."""
         objects = _objects(scene, splats.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
@@ -228,7 +219,9 @@ class ProbeTransport:
     ) -> tuple[mi.Color3f, mi.Float]:
         seen, is_asked, is_reversed = self._look(segment, active)
         is_known = is_asked & seen.is_known
-        radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
+        radiance, T = mi.Color3f(0), mi.Float(1)
+        if self.unseen is not None:
+            radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
         color = mi.Color3f(seen.color)
         color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
         radiance = dr.select(is_known, self.exposure * color, radiance)
@@ -286,10 +279,7 @@ class ProbeTransport:
 def _probes(
     splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
 ) -> Probes:
-    """Render the probes of objects, or return the last ones if all is the same.
-
-    flat: mirrors by the probe's number; sensor: that sees them.
-    """
+    """Render the probes of objects; flat: mirrors by the probe's number; sensor: that sees them."""
     gaussians, (centers, planes) = dr.detach(splats.gaussians), _places(objects, flat, sensor)
 
     def render() -> Probes:

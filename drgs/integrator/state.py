@@ -38,11 +38,6 @@ AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """Outputs besides colour, and the names of their channels as in Mitsuba's ``aov``."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Results and cache
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class BackwardResult:
     """Results of a backward pass that ``mi.render`` cannot return; N Gaussians."""
@@ -88,7 +83,6 @@ class RenderCache:
     surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
     too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
     shaded: Any = None  # Gaussians in the shadow of surfaces; None: there are no such shadows
-    summary: str = ""  # that was logged last
 
     def find(
         self, name: str, settings: tuple[object, ...], arrays: Any, make: Callable[[], Any]
@@ -103,11 +97,6 @@ class RenderCache:
     def forget(self, prefix: str) -> None:
         """Drop what was kept under names that begin with ``prefix``."""
         self.kept = {k: v for k, v in self.kept.items() if not k.startswith(prefix)}
-
-
-# ----------------------------------------------------------------------------------------------
-# State
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -233,15 +222,8 @@ class SplatsState:
         """Raise PluginError for AOVs of too many channels."""
         check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
 
-    # ------------------------------------------------------------------------------------------
-    # Parameters
-    # ------------------------------------------------------------------------------------------
-
     def parameters_changed(self, keys: list[str], is_object: bool) -> None:
-        """Check that the own parameters fit together; keys: names, none for all.
-
-        is_object: whether another integrator renders them.
-        """
+        """Check that own parameters fit together; keys: none for all."""
         if keys != ["background"]:
             self.cache.forget("frames")
             self.cache.gathered = None
@@ -270,11 +252,7 @@ class SplatsState:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All rendered Gaussians, world space: the parameters, whose arrays may be attached.
-
-        Detached where they are moved, or of several parts. Those of a scene's shapes are among them
-        once it was rendered.
-        """
+        """All rendered Gaussians, world space; attached where they are the parameters."""
         shaded = self.cache.shaded
         return self.unshaded_gaussians if shaded is None else shaded
 

@@ -105,10 +105,7 @@ def summary_of_sensors(
 def summary_of_views(
     splats: SplatsState, views: Sequence[Viewpoint], said: Collection[str] = ()
 ) -> list[SimulatedEffect]:
-    """Return the effects for views or viewpoints before the integrator's background.
-
-    said: names of the approximations that the Gaussians' file has decided.
-    """
+    """Return the effects for views; said: approximations that the Gaussians' file decided."""
     count = f"{len(views)} cameras"
     of_cameras = [
         effect_of(views, count).unless(word in splats.ignore)

@@ -154,10 +154,7 @@ class Insertion:
     def values(
         self, layers: Layers, fronts: Sequence[mi.Float], radiance: mi.Color3f | None
     ) -> Channels:
-        """Return those channels of a pass.
-
-        fronts: for each surface, see :class:`VisibleSurface`; radiance: B, linear.
-        """
+        """Return those channels of a pass; fronts: sums of weights; radiance: B, linear."""
         values = []
         for surface, front in zip(layers, fronts, strict=True):
             values += [surface.share(front), surface.coverage]
@@ -242,10 +239,7 @@ class Insertion:
         return list(weight * mi.math.linear_to_srgb(mean))
 
     def _color_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the maps from linear RGB to the film's colours (RGB, XYZ, luminance), and back.
-
-        Of luminance there is no way back but to some colour that has it.
-        """
+        """Return the maps from linear RGB to the film's colours (RGB, XYZ, luminance), and back."""
         matrix = film_map(self.film, self.maps, ())
         has_alpha = num_colors(self.film) == 4
         to_developed = matrix[: len(matrix) - has_alpha, :3]
@@ -339,10 +333,7 @@ class Hybrid:
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 
     def _where_they_matter(self, differentiate: Callable[[mi.Sensor], Any]) -> list[Any]:
-        """Differentiate each nested picture; None for those that do not depend on parameters.
-
-        What is behind a window may not show the window. Raises the error if no picture depends.
-        """
+        """Differentiate nested images; None for those that do not depend on parameters."""
         found, errors = [], []
         for sensor in self._sensors():
             try:
@@ -378,10 +369,7 @@ class Hybrid:
 
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
-        """Yield the parameters that the nested integrator is to differentiate.
-
-        Its errors, which are about variables, are raised again with the parameters' names.
-        """
+        """Yield the nested integrator's parameters, with whose names its errors are raised."""
         with dr.resume_grad(), _sample_count_kept(self.sensor):
             parameters = list(attached_parameters(self.rays.scene))
             try:

@@ -113,10 +113,7 @@ class _Tracer:
     with_normals: bool
 
     def trace(self, camera: Camera, corner: mi.Point2f, x: Any, y: Any) -> Layers:
-        """Return what rays meet at places of pixels.
-
-        corner: upper left corners of the pixels, px; x, y: from there.
-        """
+        """Return what rays meet at x, y from the corners of pixels, px."""
         place = corner + mi.Point2f(x, y)
         camera = camera.at_row(place.y)
         ray, active = self._camera_rays(camera, place)

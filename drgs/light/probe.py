@@ -124,10 +124,7 @@ class Probes:
     def look(
         self, probe: Any, origin: Any, direction: Any, far: Any, level: Any, active: Any
     ) -> Seen:
-        """Look along rays up to ``far``.
-
-        probe, level: UInt32, of each ray; direction: unit vectors.
-        """
+        """Look along unit directions up to ``far``; probe, level: UInt32, of each ray."""
         t = types_of(type(far))
         start = origin - dr.gather(t.Array3f, self.centers, probe, active)
         reach = LEAST_REACH * dr.gather(t.Float, self.nearest, probe, active)
@@ -203,11 +200,6 @@ def _beyond(t: Any, plane: np.ndarray, pipeline: rendering.Pipeline) -> renderin
         return replace(rows, logit_opacities=dr.select(is_beyond, rows.logit_opacities, -dr.inf))
 
     return replace(pipeline, rows=rows)
-
-
-# ----------------------------------------------------------------------------------------------
-# Cubes
-# ----------------------------------------------------------------------------------------------
 
 
 def _num_texels(level: int) -> int:

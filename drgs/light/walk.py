@@ -216,10 +216,7 @@ class RaySplats:
         return color
 
     def transmittance(self, segment: Segment, least: Any) -> Any:
-        """Float: what all Gaussians of a segment let through, whichever comes first.
-
-        least: Float; where it is less, it is anything that is less.
-        """
+        """Return what segments let through; where that is less than ``least``, anything less."""
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
 

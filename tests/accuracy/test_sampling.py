@@ -212,9 +212,9 @@ def test_a_seed_that_was_changed_in_place_gives_other_points():
         return np.array(integrator.render(loaded, sensor, seed=seed))
 
     before = picture(seed)
-    frames = integrator.state.cache.frames[0]
+    frames = integrator.state.cache.kept["frames 0"]
     np.testing.assert_array_equal(picture(seed), before)
-    assert integrator.state.cache.frames[0] is frames
+    assert integrator.state.cache.kept["frames 0"] is frames
     seed += 1
     np.testing.assert_array_equal(picture(seed), picture(1))
     assert np.abs(picture(1) - before).max() > 1e-3
@@ -436,7 +436,7 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
     integrator.render_backward(loaded, params, weights, sensor, 5, samples)
     gradients = {key: np.array(dr.grad(value)) for key, value in values.items()}
     assert all(np.abs(gradient).max() > 0 for gradient in gradients.values())
-    (frames, *_) = integrator.state.cache.frames[0].value
+    (frames, *_) = integrator.state.cache.kept["frames 0"].value
     return {"image": np.array(image), "tangent": np.array(tangent), **gradients}, len(frames)
 
 
