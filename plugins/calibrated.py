@@ -1,8 +1,4 @@
-"""The ``calibrated`` sensor: a camera as calibration tools describe it.
-
-Executed once per Mitsuba variant (see ``drgs.plugins``). The lenses are in ``drgs.cameras``; this
-file is where they meet Mitsuba's rays, films and parameters.
-"""
+"""The ``calibrated`` sensor: lenses of ``drgs.cameras`` for Mitsuba's rays and parameters."""
 
 from __future__ import annotations
 

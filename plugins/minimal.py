@@ -1,8 +1,4 @@
-"""The ``splats_minimal`` integrator: 3D Gaussian splatting on one page, to be read first.
-
-Executed once per Mitsuba variant (see ``drgs.plugins``). The stages are those of ``splats``, which
-gives the same bytes at its defaults; that plugin adds what a scene may ask for besides.
-"""
+"""The ``splats_minimal`` integrator: ``splats`` without options on one page, to be read first."""
 
 from __future__ import annotations
 
@@ -26,25 +22,13 @@ from drgs.splatting.tiles import TileBins, bin_footprints, footprints_of
 
 
 class MinimalSplatsIntegrator(mi.CppADIntegrator):
-    r"""
-    .. _integrator-splats_minimal:
+    """3D Gaussian splatting alone over black, for a ``perspective`` sensor and a box filter.
 
-    3D Gaussian splatting, minimal (:monosp:`splats_minimal`)
-    ---------------------------------------------------------
+    - ``filename``: file of Gaussians, such as a PLY file of the 3DGS reference implementation.
+    - ``means``, ``quats``, ``log_scales``, ``logit_opacities``, ``sh0``, ``shN``: exposed.
 
-    .. pluginparameters::
-
-     * - filename
-       - |string|
-       - A file of Gaussians, such as the PLY files of the 3DGS reference implementation.
-
-     * - means, quats, log_scales, logit_opacities, sh0, shN
-       - |tensor|
-       - The Gaussians, as ``splats`` documents them.
-       - |exposed|, |differentiable|
-
-    Renders splats alone over black, for a ``perspective`` sensor and a box filter: one sample at
-    the centre of each pixel. Not differentiated: the sensor, visibility, the order of the splats.
+    Each pixel has one sample, at its centre; ``seed`` and ``spp`` make no difference. Not
+    differentiated: the sensor, visibility, the order of the splats.
     """
 
     def __init__(self, props: mi.Properties) -> None:

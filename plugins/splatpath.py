@@ -1,8 +1,4 @@
-"""The ``splatpath`` integrator: a path tracer whose rays pass splats on their way.
-
-Executed once per Mitsuba variant (see ``drgs.plugins``). How rays pass splats is in
-``drgs.light``; this file is where it meets emitters, BSDFs and derivatives.
-"""
+"""The ``splatpath`` integrator: a path tracer whose rays pass splats (``drgs.light``)."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
 """The ``splats`` integrator: 3D Gaussian splatting as a Mitsuba plugin.
 
-Executed once per Mitsuba variant (see ``drgs.plugins``). The rasterizer is in
-``drgs.splatting.rendering``, an image of all that a scene has in ``drgs.integrator.image_render``;
-this file is where both meet Mitsuba's parameters and derivatives. Read ``minimal.py`` first: the
-same without options, on one page.
+This file is where images (``drgs.integrator.image_render``) meet Mitsuba's parameters and
+derivatives. Read ``minimal.py`` first: the same without options, on one page.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""From approximations to the pipeline that renders with them.
-
-Everything but the defaults is in modules of its own, imported when it is chosen: what is not chosen
-costs nothing.
-"""
+"""From approximations to the pipeline that renders with them, importing what is chosen."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Colour in the direction of each pixel's ray: ``sh_direction: pixel``.
 
-Imported when it is chosen. By default a splat has one colour, seen in the direction of its mean
-(3DGS). Here its spherical harmonics are stored, and evaluated in the direction of each pixel. The
-basis functions depend on the pixel alone and are computed once per lane.
+A splat's spherical harmonics are stored, and evaluated in the direction of each pixel. The basis
+functions depend on the pixel alone and are computed once per lane.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Depth of field: what is out of focus is blurred, as a thin lens blurs it.
 
-Imported when a camera has an aperture. A point is spread over a disc; here the disc's variance is
-added to the splat's covariance on the film, and its opacity falls such that its integral stays. The
-alpha at which it ends falls with it: a surface of many small splats, each of them hardly there when
-it is far out of focus, is as opaque as in focus. What a picture by many rays shows beyond that,
-such as what is seen past the blurred edge of something near, needs the rays.
+A point is spread over a disc, whose variance is added to the splat's covariance on the film; the
+opacity falls such that its integral stays, and the alpha at which it ends with it: many small
+splats far out of focus are as opaque as in focus. What is seen past a blurred edge needs rays.
 """
 
 from __future__ import annotations

@@ -1,17 +1,15 @@
 """The 3D smoothing filter: Gaussians no smaller than what the training cameras can tell apart.
 
-Imported when Gaussians come with it. A scene that was photographed with a sampling rate nu (pixels
-per scene unit, focal length over depth) says nothing about detail below its Nyquist limit; a
-rendering that is nearer, or larger, shows what the fit has made up there. Mip-Splatting (Yu et al.
-2024, section 4.1) therefore convolves each Gaussian with one of variance 0.2 / nu^2, nu being the
-largest rate of all cameras that see it, and keeps its integral.
+A scene that was photographed with a sampling rate nu (pixels per scene unit, focal length over
+depth) holds no detail below its Nyquist limit. Mip-Splatting (Yu et al. 2024, section 4.1)
+therefore convolves each Gaussian with one of variance 0.2 / nu^2, nu being the largest rate of all
+cameras that see it, and keeps its integral.
 
-:func:`baked` and :func:`baked_for_viewers` change Gaussians in closed form so that other viewers
-show them about as they were fitted. Viewers of 3DGS files add 0.3 square pixels to each splat's
-covariance and leave its opacity as it is. Gaussians that were fitted with another low-pass, or with
-opacities that compensate for it (section 5), are blurred and too opaque there. What is added on the
-film is taken from the Gaussians beforehand, as far as there is something to take from, and
-opacities make up for the rest, such that a splat keeps its integral over the film.
+:func:`baked` and :func:`baked_for_viewers` change Gaussians in closed form so that other viewers,
+which add 0.3 square pixels to each splat's covariance and leave its opacity as it is, show them
+about as they were fitted. What is added on the film is taken from the Gaussians beforehand, as far
+as there is something to take from, and opacities make up for the rest, such that a splat keeps its
+integral over the film (section 5).
 """
 
 from __future__ import annotations

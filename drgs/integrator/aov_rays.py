@@ -1,14 +1,8 @@
-"""Inside Mitsuba's ``aov``: what the single rays of a whole picture see.
+"""Inside Mitsuba's ``aov``: splats along the single rays of a whole image.
 
-Imported when ``aov`` asks. That integrator takes the picture of a nested one, and its derivatives,
-from ``render``, ``render_backward`` and ``render_forward``. It then calls ``sample`` with the rays
-of a picture of its own, all pixels at once, and takes from that the AOVs of the nested integrator
-and what the film holds besides its picture.
-
-Splats are composited over whole images, so rays are only answered if they are those of one: ray k
-starts in pixel k // n of the sensor that was rendered last, n of them a pixel. Where in its pixel
-each of them starts is found by looking at it through the camera; the splats are then evaluated at
-these very points.
+Imported when ``aov`` calls ``sample``, with the rays of all pixels at once. Splats are composited
+over whole images, so that ray k must start in pixel k // n of the sensor that was rendered last, n
+rays a pixel. Each is found by looking at it through the camera, and the splats are evaluated there.
 """
 
 from __future__ import annotations

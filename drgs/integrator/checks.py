@@ -1,7 +1,4 @@
-"""Checks of scenes: their Gaussians, their shapes, and the size of an image.
-
-What cannot be rendered is refused in words before anything is allocated or compiled.
-"""
+"""Checks of scenes, before anything is allocated or compiled."""
 
 from __future__ import annotations
 

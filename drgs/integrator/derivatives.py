@@ -1,8 +1,4 @@
-"""Refusals of derivatives that a picture with surfaces does not have.
-
-Imported when a picture with surfaces is differentiated. What is refused would be wrong: the terms
-that are missing are no noise. Each message begins with the parameter's name.
-"""
+"""Refusals of derivatives that would be wrong in an image with surfaces."""
 
 from __future__ import annotations
 

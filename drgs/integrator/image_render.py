@@ -1,14 +1,9 @@
 """An image of the integrator ``splats``: its sensors, and the channels of the film.
 
-An :class:`ImageRender` has a :class:`SensorRender` for each sensor; they are several only for a
-``batch``. That renders frames (``drgs.splatting.rendering``), one for each time at which its
-shutter is open and each pass of samples, composites them over the background, and returns channels
-of the film. The film develops these (``drgs.integrator.film``), and a nested integrator's image of
-surfaces is inserted (``drgs.integrator.surfaces``). :meth:`ImageRender.backward` and
+An :class:`ImageRender` has a :class:`SensorRender` for each sensor of a ``batch``, or one. The film
+develops their channels (``drgs.integrator.film``), and a nested integrator's image of surfaces is
+inserted (``drgs.integrator.surfaces``). :meth:`ImageRender.backward` and
 :meth:`ImageRender.tangent` run the same way back and along.
-
-Frames are reused while nothing that they depend on has changed: ``mi.render`` calls ``render`` and,
-later, ``render_backward`` on the same integrator, with other pictures possibly in between.
 """
 
 from __future__ import annotations

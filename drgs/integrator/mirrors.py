@@ -1,14 +1,10 @@
 """Flat mirrors among probes: the splats as cameras see them that are mirrored in their planes.
 
-Imported where a scene has probes. A ray of a camera that a plane mirrors goes on along a ray
-of the camera that is mirrored in it: what it meets of splats is a pixel of the latter's picture.
-That is rendered by the kernels that make all others, with a few texels for each pixel. Splats on
-the other side of the plane are left out, and so are those behind the surface that the mirrored ray
-meets: a ray that ends elsewhere, as at the edge of such a surface, looks at those of the texels
-around it that end where it does.
-
-A ray that leaves the plane on none of the mirrored camera's rays, after other bounces or scattered,
-is not known.
+A ray of a camera that a plane mirrors goes on along a ray of the mirrored camera: what it meets of
+splats is a pixel of that one's image, which has a few texels for each pixel. Splats on the other
+side of the plane are left out, and so are those behind the surface that the mirrored ray meets: a
+ray looks at those of the texels around it that end where it does. A ray that leaves the plane on
+none of the mirrored camera's rays, after other bounces or scattered, is not known.
 
 Nothing here is differentiated.
 """

@@ -1,8 +1,4 @@
-"""Mitsuba objects from a dataset: sensors for the views, a scene with the integrator.
-
-The trainer and the commands reach the integrator through these dictionaries, as any Mitsuba scene
-would.
-"""
+"""Mitsuba objects from a dataset: sensors for the views, a scene with the integrator."""
 
 from __future__ import annotations
 

@@ -1,12 +1,9 @@
 """An image of one sensor: frames, their planes, and the channels of its film.
 
-A :class:`SensorRender` renders the frames of its camera (``drgs.splatting.rendering``), or reuses
-those of the last image where nothing has changed. It composites them over the background, and adds
-the surfaces.
-
-An environment or a texture behind them is linear radiance, evaluated where the pixels are, and
-differentiated by Dr.Jit. Derivatives of an image's texels are added atomically: they, and no
-others, are the same in every run only up to rounding.
+A :class:`SensorRender` renders frames (``drgs.splatting.rendering``), one for each time at which
+the shutter is open and each pass of samples, or reuses those of the last image where nothing has
+changed. It composites them over the background, and adds the surfaces. Derivatives of a
+background's texels are added atomically: they are the same in every run only up to rounding.
 """
 
 from __future__ import annotations

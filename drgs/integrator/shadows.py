@@ -1,17 +1,15 @@
 """Shadows of surfaces on splats.
 
-Imported where a scene asks for it. A splat's colour is that of photographs, in which an object that
-was put among the splats is not. The shadow of such objects is estimated once for each splat, and
-not for each view: with E the irradiance at its mean from the scene's lamps and environment, which
-stand for those of the photographs, and E' that without the objects, its colour is multiplied by
+A splat's colour is that of photographs, in which an object that was put among the splats is not.
+The shadow of such objects is estimated once for each splat, and not for each view: with E the
+irradiance at its mean from the scene's lamps and environment, which stand for those of the
+photographs, and E' that without the objects, its colour is multiplied by
 
     f = (E / E')^(1 / 2.2),
 
 in each channel: display-encoded colours are about the 2.2nd root of radiance, and f multiplies the
 harmonics. A splat faces along its shortest axis, to both sides. Light that splats weaken counts as
-little as they let through, and at least :data:`HIDDEN`, so that splats below others have a shadow.
-
-Not simulated: light that the objects reflect onto splats.
+little as they let through, and at least :data:`HIDDEN`. Light that objects reflect is left out.
 """
 
 from __future__ import annotations

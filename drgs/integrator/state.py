@@ -1,9 +1,7 @@
 """The state of the integrator ``splats``: what it was given, and what it keeps between renderings.
 
-The plugin owns one :class:`SplatsState`; the functions of this package take it as an argument.
-``mi.render`` has Dr.Jit traverse the integrator with its state, which resolves annotations in
-whatever variant is active: types that are imported on demand, or belong to one variant, are ``Any``
-here and named beside it.
+``mi.render`` has Dr.Jit traverse it, which resolves annotations in whatever variant is active:
+types that are imported on demand, or belong to one variant, are ``Any`` here and named beside it.
 """
 
 from __future__ import annotations

@@ -1,23 +1,19 @@
 """Meshes and other surfaces that a scene holds besides its splats.
 
-Imported when a scene has surfaces. A nested integrator, such as Mitsuba's ``path``, makes a picture
-of them. What that shows at a pixel lies at the depths of the surfaces there, between the splats
-(``drgs.integrator.visible_surfaces``): with p_k the part of the light that the k-th surface stops,
-T_k the transmittance of the splats in front of it, T that of all splats, L_k what the surface sends
-to the camera, B the background, and C and A the sums of the colours and weights of the splats as
-far as surfaces let them through (``drgs.effects.occlusion``),
+Imported when a scene has surfaces. A nested integrator, such as Mitsuba's ``path``, renders them at
+the depths of the surfaces in each pixel, between the splats (``drgs.integrator.visible_surfaces``).
+With p_k the part of the light that the k-th surface stops, T_k the transmittance of the splats in
+front of it, T that of all splats, L_k what the surface sends to the camera, B the background, and C
+and A the sums of the colours and weights of the splats as far as surfaces let them through
+(``drgs.effects.occlusion``), a pixel is
 
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
-With N_k the nested picture of what is behind the first k surfaces, times what these let through
-(``drgs.integrator.rays``), L_k = N_(k - 1) - N_k. Behind the last surface there is only the
-background: where the nested integrator shows it, N_k is there (1 - sum_k p_k) B, and else 0. Light
-does not pass from one to the other: splats neither light surfaces nor are lit by them, and cast no
-shadows (``light`` and ``shadows`` do that).
+With N_k the nested image of what is behind the first k surfaces, times what these let through
+(``drgs.integrator.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is (1 - sum_k p_k) B
+where the nested integrator shows the background, and else 0.
 
-Derivatives flow to the splats and, through the nested integrator, to the parameters of surfaces and
-emitters. Not differentiated: the depth of a surface and the part of a pixel that it covers, and
-with that its silhouette.
+Not differentiated: the depth of a surface, the part of a pixel that it covers, its silhouette.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
 """The surfaces that a camera sees at each pixel: depths, and what they stop of the light behind.
 
-Imported when a scene has surfaces. Rays go from the camera to the first visible surface, and past
-what lets light pass straight on (``null``, ``mask``, ``thindielectric``) to the next one: each is
-seen by the part of the light that it stops of what arrives there.
-
-Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, rays are
-traced through :data:`EDGE_SAMPLES` places of each pixel next to where surfaces end and the
-background begins; with several samples, each has its own depth. A ``thinlens`` sees depths and
-coverage from the middle of its aperture.
+Rays go from the camera to the first visible surface, and past what lets light pass straight on to
+the next one. Where a surface ends within a pixel, it covers a part of it: with one sample per
+pixel, rays are traced through :data:`EDGE_SAMPLES` places of such pixels; with several samples,
+each has its own depth. A ``thinlens`` sees depths and coverage from the middle of its aperture.
 """
 
 from __future__ import annotations

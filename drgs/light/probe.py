@@ -1,16 +1,14 @@
 """Probes: the splats as they look from one place, in all directions.
 
-A probe is a cube of six pictures around a centre, made by the kernels that make all others: colour,
-coverage, and distance of the splats in each direction. A ray that starts near the centre sees about
-the same points, but not in its own direction. Where it meets the splats is searched on it: it goes
-on, in steps that look the same size from the centre, until it is behind what the probe sees in the
-direction of where it is. What it meets there is what the probe sees. Where it gets behind something
-that it has not met, as what is seen there was nearer all the time, the probe cannot tell what it
-meets: that lies in the shadow of the centre. Such rays are not known.
+A probe is a cube of six images around a centre: colour, coverage, and distance of the splats in
+each direction. A ray that starts near the centre sees about the same points, but not in its own
+direction: where it meets the splats is searched on it, in steps that look the same size from the
+centre, until it is behind what the probe sees in the direction of where it is. Where it gets behind
+something that it has not met, as what is seen there was nearer all the time, it is in the shadow of
+the centre, and what it meets is not known.
 
-Rays that stand for others around them look at smaller pictures, of which each texel is the mean
-over a larger angle (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance
-Sampling").
+Rays that stand for others around them look at smaller images, of which each texel is the mean over
+a larger angle (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance Sampling").
 
 Nothing here is differentiated.
 """
