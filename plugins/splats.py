@@ -169,14 +169,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
     # ------------------------------------------------------------------------------------------
 
     def render(
-        self,
-        scene: mi.Scene,
-        sensor: int | mi.Sensor = 0,
-        seed: int | mi.UInt32 = 0,
-        spp: int = 0,
-        develop: bool = True,
-        evaluate: bool = True,
-    ) -> mi.TensorXf:
+        self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        develop: bool = True, evaluate: bool = True,
+    ) -> mi.TensorXf:  # fmt: skip
         sensor = _resolve_sensor(scene, sensor)
         with self._lock, dr.suspend_grad():
             self.state.cache.sensor = sensor
@@ -187,14 +182,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return image if develop else mi.TensorXf()
 
     def render_backward(
-        self,
-        scene: mi.Scene,
-        params: object,
-        grad_in: mi.TensorXf,
-        sensor: int | mi.Sensor = 0,
-        seed: int | mi.UInt32 = 0,
-        spp: int = 0,
-    ) -> None:
+        self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
+        sensor: Any = 0, seed: Any = 0, spp: int = 0,
+    ) -> None:  # fmt: skip
         """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
         sensor = _resolve_sensor(scene, sensor)
         self._check_derivatives(scene, sensor, dr.ADMode.Backward)
@@ -215,12 +205,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it may hold an attached block
 
     def render_forward(
-        self,
-        scene: mi.Scene,
-        params: object,
-        sensor: int | mi.Sensor = 0,
-        seed: int | mi.UInt32 = 0,
-        spp: int = 0,
+        self, scene: mi.Scene, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> mi.TensorXf:
         """Return the directional derivative of the image along gradients set on parameters."""
         sensor = _resolve_sensor(scene, sensor)

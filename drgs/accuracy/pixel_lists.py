@@ -2,8 +2,8 @@
 
 What the order of each pixel (``drgs.accuracy.pixel_order``) compares: :class:`RayDepths` where the
 falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are),
-:class:`AffineDepths` where it does not, :class:`ParallelDepths` where rays do not meet,
-:class:`BoundedDepths` where each pixel sees a part of its ray. And what it starts from:
+:class:`AffineDepths` where it does not, :class:`ParallelDepths` where rays do not meet. Each pixel may see
+a part of its ray alone. And what it starts from:
 :class:`PixelLists`, what each micro-tile composites, sorted by the depths of peaks at its middle.
 """
 
@@ -37,9 +37,12 @@ from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 class AffineDepths:
     """Base of depths at a pixel, for a falloff that does not know them: stores kappa and h."""
 
+    bounds: tuple[Any, Any] | None = None  # nearest and farthest, Float (H * W,), scene units
+    bound: list[tuple[Any, Any]] = field(default_factory=list)  # the same, at the 16 of a lane
+
     def for_camera(self, camera: Camera) -> AffineDepths:
-        """For one camera, whose rays may be parallel."""
-        return ParallelDepths() if camera.lens.parallel else self
+        """Bind to a camera, whose rays may be parallel."""
+        return ParallelDepths(self.bounds) if camera.lens.parallel else self
 
     def keys(self, splats: Splats2D) -> list[Any]:
         """Return columns from which depths are computed: kappa, h (to base 2); last, their unit."""
@@ -53,12 +56,23 @@ class AffineDepths:
         return self._at(keys, *falloff.coordinates(geometry, x, y))
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
-        """For the lanes of one kernel: nothing has to be loaded."""
-        del lanes, grid
-        return self
+        """Load the bounds, if there are any, for the lanes of one kernel."""
+        if self.bounds is None:
+            return self
+        near, far = (load_pixels(bound, lanes, grid) for bound in self.bounds)
+        return replace(self, bound=list(zip(near, far, strict=True)))
 
     def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
         """Return depths in the unit at the 16 pixels; not positive where there is none."""
+        found, unit = self._along(footprint, keys), keys[-1]
+        if not self.bound:
+            return found
+        return [
+            dr.select((unit * along > near) & (unit * along < far), along, -1)
+            for along, (near, far) in zip(found, self.bound, strict=True)
+        ]
+
+    def _along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
         coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
         return [a / denominator for a, denominator in (self._at(keys, *e) for e in coordinates)]
 
@@ -120,45 +134,9 @@ class RayDepths(AffineDepths):
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
-    def along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
+    def _along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
         del keys
         return footprint.along
-
-
-@dataclass(frozen=True)
-class BoundedDepths(AffineDepths):
-    """Depths of peaks between two bounds of each pixel: there are no others."""
-
-    depths: AffineDepths
-    nearest: Any  # Float (H * W,), scene units
-    farthest: Any  # the same
-    bounds: list[tuple[Any, Any]] = field(default_factory=list)  # the 16 of each lane
-
-    def for_camera(self, camera: Camera) -> BoundedDepths:
-        return replace(self, depths=self.depths.for_camera(camera))
-
-    def keys(self, splats: Splats2D) -> list[Any]:
-        return self.depths.keys(splats)
-
-    def at(
-        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
-    ) -> tuple[Any, Any]:
-        return self.depths.at(falloff, geometry, keys, x, y)
-
-    def bind(self, lanes: Lanes, grid: TileGrid) -> BoundedDepths:
-        near, far = (load_pixels(bound, lanes, grid) for bound in (self.nearest, self.farthest))
-        return replace(
-            self, depths=self.depths.bind(lanes, grid), bounds=list(zip(near, far, strict=True))
-        )
-
-    def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
-        unit = keys[-1]
-        return [
-            dr.select((unit * along > near) & (unit * along < far), along, -1)
-            for along, (near, far) in zip(
-                self.depths.along(footprint, keys), self.bounds, strict=True
-            )
-        ]
 
 
 FARTHEST = 4.0
@@ -205,14 +183,12 @@ class PixelLists:
         first = dr.prefix_sum(dr.popcnt(masks))
         count = int(first[bins.num_entries])
 
-        items = _Items.of(bins, records, depths, entry, masks, first, max(count, 1))
-        by_depth = stable_order(_levels(items.depths), _LEVELS)
-        lists = dr.gather(t.UInt32, items.micro_tiles, by_depth)
+        at, micro_tiles, entries = _items(bins, records, depths, entry, masks, first, max(count, 1))
+        by_depth = stable_order(_levels(at), _LEVELS)
+        lists = dr.gather(t.UInt32, micro_tiles, by_depth)
         num_lists = bins.grid.num_tiles * MICROS
         order = dr.gather(t.UInt32, by_depth, stable_order(lists, num_lists))
-        entries, lists = (
-            dr.gather(t.UInt32, column, order) for column in (items.entries, items.micro_tiles)
-        )
+        entries, lists = (dr.gather(t.UInt32, c, order) for c in (entries, micro_tiles))
         dr.eval(entries, lists, order)
         return PixelLists(
             entries=entries,
@@ -239,56 +215,48 @@ def _levels(depths: Any) -> Any:
     return dr.select(level < _LEVELS, level, _LEVELS - 1)
 
 
-@dataclass(frozen=True)
-class _Items:
-    """Columns of the items as made."""
+def _items(
+    bins: TileBins,
+    records: Records,
+    depths: AffineDepths,
+    entry: Any,
+    masks: Any,
+    item: Any,
+    count: int,
+) -> tuple[Any, Any, Any]:
+    """Make items: the depths of peaks at the middle of micro-tiles, micro-tiles, and entries.
 
-    depths: Any  # Float: of the peak along the ray through the middle of the micro-tile
-    micro_tiles: Any  # UInt32: tile * 16 + micro-tile within the tile
-    entries: Any  # UInt32: sorted entry
+    entry: sorted entries; masks: their micro-tiles; item: the first of each one's items.
+    """
+    t = types_of(bins.rows.Float)
+    # A single item that is not made, if there are none.
+    items = dr.ones(t.Float, count), dr.zeros(t.UInt32, count), dr.zeros(t.UInt32, count)
+    dr.eval(items)
+    exists = masks != 0
+    geometry, _ = records.load(entry, exists)
+    keys = records.load_keys(entry, exists)
+    tile = dr.gather(t.UInt32, bins.tiles, entry, exists)
+    columns = dr.opaque(t.UInt32, bins.grid.columns)
+    row = tile // columns
+    # Middle of the first micro-tile.
+    x = t.Float((tile - row * columns) * TILE) + MICRO / 2
+    y = t.Float(row * TILE) + MICRO / 2
 
-    @staticmethod
-    def of(
-        bins: TileBins,
-        records: Records,
-        depths: AffineDepths,
-        entry: Any,
-        masks: Any,
-        item: Any,
-        count: int,
-    ) -> _Items:
-        """entry: sorted entries; masks: their micro-tiles; item: the first of each one's items."""
-        t = types_of(bins.rows.Float)
-        # A single item that is not made, if there are none.
-        items = _Items(
-            dr.ones(t.Float, count), dr.zeros(t.UInt32, count), dr.zeros(t.UInt32, count)
-        )
-        dr.eval(items)
-        exists = masks != 0
-        geometry, _ = records.load(entry, exists)
-        keys = records.load_keys(entry, exists)
-        tile = dr.gather(t.UInt32, bins.tiles, entry, exists)
-        columns = dr.opaque(t.UInt32, bins.grid.columns)
-        row = tile // columns
-        # Middle of the first micro-tile.
-        x = t.Float((tile - row * columns) * TILE) + MICRO / 2
-        y = t.Float(row * TILE) + MICRO / 2
+    def body(masks: Any, item: Any) -> tuple:
+        micro = dr.tzcnt(masks)
+        middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
+        a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)
+        # Where there is no peak, there may be one at a neighbour.
+        along = dr.select(a > 0, a / denominator, 1)
+        along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)
+        along = dr.select(along > FARTHEST, FARTHEST, along)
+        values = keys[-1] * along, tile * MICROS + micro, entry
+        for column, value in zip(items, values, strict=True):
+            dr.scatter(column, value, item)
+        return masks & (masks - 1), item + 1
 
-        def body(masks: Any, item: Any) -> tuple:
-            micro = dr.tzcnt(masks)
-            middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
-            a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)
-            # Where there is no peak, there may be one at a neighbour.
-            along = dr.select(a > 0, a / denominator, 1)
-            along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)
-            along = dr.select(along > FARTHEST, FARTHEST, along)
-            dr.scatter(items.depths, keys[-1] * along, item)
-            dr.scatter(items.micro_tiles, tile * MICROS + micro, item)
-            dr.scatter(items.entries, entry, item)
-            return masks & (masks - 1), item + 1
-
-        loop = dr.while_loop(
-            state=(t.UInt32(masks), t.UInt32(item)), cond=lambda masks, item: masks != 0, body=body
-        )
-        dr.eval(loop, items)
-        return items
+    loop = dr.while_loop(
+        state=(t.UInt32(masks), t.UInt32(item)), cond=lambda masks, item: masks != 0, body=body
+    )
+    dr.eval(loop, items)
+    return items

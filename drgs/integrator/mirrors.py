@@ -20,7 +20,6 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.accuracy.pixel_lists import BoundedDepths
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
@@ -297,7 +296,7 @@ def _picture(
     dr.make_opaque(plane, camera)
     nearest, farthest, ends = _trace(camera, plane, scene)
     pipeline = with_effects(pipeline, gaussians, camera)
-    depths = BoundedDepths(pipeline.order.depths, nearest, farthest)
+    depths = replace(pipeline.order.depths, bounds=(nearest, farthest))
     order = replace(pipeline.order, depths=depths)
     frame = rendering.render(gaussians, camera, replace(pipeline, order=order))
     T, *color = frame.planes()

@@ -98,7 +98,7 @@ class Probes:
         texels, nearest = [], []
         for center, plane in zip(centers, planes, strict=True):
             beyond = _beyond(t, plane, pipeline)
-            faces = [_Face(center, k).render(gaussians, beyond, near, decode) for k in range(6)]
+            faces = [_face(center, k, gaussians, beyond, near, decode) for k in range(6)]
             levels = [_joined(faces)]
             for level in range(1, LEVELS):
                 levels.append(_halved(levels[-1], SIZE >> level))
@@ -272,41 +272,38 @@ def _place_on_cube(v: Any) -> tuple[Any, Any, Any]:
     return face, dr.select(is_negative, down, right), dr.select(is_negative, right, down)
 
 
-@dataclass(frozen=True)
-class _Face:
-    """One of the cube's images."""
+def _face(
+    center: np.ndarray,
+    number: int,
+    gaussians: Gaussians,
+    pipeline: rendering.Pipeline,
+    near: float,
+    decode: Callable[[list[Any]], list[Any]],
+) -> list[Any]:
+    """Render a side of a cube (+x, -x, +y, ...), borders included.
 
-    center: np.ndarray
-    number: int  # +x, -x, +y, ...
-
-    def render(
-        self,
-        gaussians: Gaussians,
-        pipeline: rendering.Pipeline,
-        near: float,
-        decode: Callable[[list[Any]], list[Any]],
-    ) -> list[Any]:
-        """Red, green, blue, coverage, nearness of its texels, borders included."""
-        Float = type(gaussians.means.array)
-        UInt32, edge = types_of(Float).UInt32, SIZE + 2 * BORDER
-        axis, is_negative = divmod(self.number, 2)
-        forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
-        if is_negative:
-            forward, right, down = -forward, down, right
-        K = np.array([[SIZE / 2, 0, edge / 2], [0, SIZE / 2, edge / 2], [0, 0, 1]])
-        rotation = np.stack([right, down, forward])
-        camera = Camera.create(Float, rotation, self.center, K, edge, edge, near)
-        T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
-        coverage = 1 - T
-        shows = coverage > 0
-        color = decode([c / dr.select(shows, coverage, 1) for c in color])
-        texel = dr.arange(UInt32, edge * edge)
-        x, y = ((Float(p) + (0.5 - edge / 2)) * (2 / SIZE) for p in (texel % edge, texel // edge))
-        distance = depth * dr.sqrt(1 + x * x + y * y)  # times coverage
-        nearness = dr.select(shows & (distance > 0), coverage * coverage / distance, 0)
-        columns = [*(c * coverage for c in color), coverage, nearness]
-        dr.eval(columns)
-        return columns
+    Red, green, blue, coverage, nearness of its texels.
+    """
+    Float = type(gaussians.means.array)
+    UInt32, edge = types_of(Float).UInt32, SIZE + 2 * BORDER
+    axis, is_negative = divmod(number, 2)
+    forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
+    if is_negative:
+        forward, right, down = -forward, down, right
+    K = np.array([[SIZE / 2, 0, edge / 2], [0, SIZE / 2, edge / 2], [0, 0, 1]])
+    rotation = np.stack([right, down, forward])
+    camera = Camera.create(Float, rotation, center, K, edge, edge, near)
+    T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
+    coverage = 1 - T
+    shows = coverage > 0
+    color = decode([c / dr.select(shows, coverage, 1) for c in color])
+    texel = dr.arange(UInt32, edge * edge)
+    x, y = ((Float(p) + (0.5 - edge / 2)) * (2 / SIZE) for p in (texel % edge, texel // edge))
+    distance = depth * dr.sqrt(1 + x * x + y * y)  # times coverage
+    nearness = dr.select(shows & (distance > 0), coverage * coverage / distance, 0)
+    columns = [*(c * coverage for c in color), coverage, nearness]
+    dr.eval(columns)
+    return columns
 
 
 def _joined(parts: list[list[Any]]) -> list[Any]:

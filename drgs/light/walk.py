@@ -295,8 +295,8 @@ class _Walk:
         grid = self.splats.grid
 
         def body(at: _Place) -> tuple[_Place]:
-            cell = grid.cell(self.origin, self.direction, at.end)
-            return (_Place(at.end, cell.exit, cell.first, cell.first, cell.last, at.turn),)
+            first, last, leaves = grid.cell(self.origin, self.direction, at.end)
+            return (_Place(at.end, leaves, first, first, last, at.turn),)
 
         (at,) = dr.while_loop(
             state=(at,), cond=lambda at: (at.entry == at.last) & (at.end < self.stop), body=body
