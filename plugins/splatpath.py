@@ -112,8 +112,10 @@ class SplatPathIntegrator(RBIntegrator):
     def _begin(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> _Path:
         ray, active = mi.Ray3f(dr.detach(ray)), mi.Bool(active)
         hit = scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
-        if self.hide_emitters:
-            hit = self._past_emitters(scene, ray, hit, active)
+        if self.hide_emitters:  # begin at the first hit that is none
+            skips = hit.is_valid() & (hit.shape.emitter() != None) & active  # noqa: E711
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, skips)
+            hit[skips] = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skips)
         return _Path(
             ray=ray,
             hit=hit,
@@ -163,7 +165,9 @@ class SplatPathIntegrator(RBIntegrator):
         active &= ds.pdf != 0
         ray = si.spawn_ray_to(ds.p)
         segment = PathSegment(ray, si.shape, ds.emitter, ds.pdf, is_open=mi.Bool(False))
-        let_through = self._let_through(segment, sampler, active)
+        let_through = mi.Float(1)
+        if self._transport is not None:
+            let_through = self._transport.transmittance(segment, sampler.next_1d(), active)
         if dr.hint(rays.sees_through, mode="scalar"):
             let_through *= rays.transmittance(ray, active)
         with dr.resume_grad(when=not primal):
@@ -210,10 +214,6 @@ class SplatPathIntegrator(RBIntegrator):
             numbers=numbers,
         )
 
-    # ------------------------------------------------------------------------------------------
-    # Splats
-    # ------------------------------------------------------------------------------------------
-
     def _pass_splats(
         self, scene: mi.Scene, path: _Path, sampler: mi.Sampler
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
@@ -227,24 +227,6 @@ class SplatPathIntegrator(RBIntegrator):
         # or they would be darker there.
         radiance *= dr.square(path.eta)
         return path.throughput * radiance, path.throughput * let_through
-
-    def _let_through(self, segment: PathSegment, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        if self._transport is None:
-            return mi.Float(1)
-        return self._transport.transmittance(segment, sampler.next_1d(), active)
-
-    # ------------------------------------------------------------------------------------------
-    # Surfaces
-    # ------------------------------------------------------------------------------------------
-
-    def _past_emitters(
-        self, scene: mi.Scene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
-    ) -> mi.PreliminaryIntersection3f:
-        skips = hit.is_valid() & (hit.shape.emitter() != None) & active  # noqa: E711
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, skips)
-        behind = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skips)
-        hit[skips] = behind
-        return hit
 
 
 @dataclass  # not frozen: ``dr.syntax`` carries it through a loop

@@ -1,10 +1,9 @@
 """Depths of splats' peaks along the ray of each pixel, and lists that are sorted by them.
 
-What the order of each pixel (``drgs.accuracy.pixel_order``) compares: :class:`RayDepths` where the
-falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are),
-:class:`AffineDepths` where it does not, :class:`ParallelDepths` where rays do not meet. Each pixel may see
-a part of its ray alone. And what it starts from:
-:class:`PixelLists`, what each micro-tile composites, sorted by the depths of peaks at its middle.
+The order of each pixel (``drgs.accuracy.pixel_order``) compares :class:`RayDepths` where the falloff
+finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are), :class:`AffineDepths`
+where it does not, :class:`ParallelDepths` where rays do not meet. It starts from
+:class:`PixelLists`: what each micro-tile composites, sorted by the depths of peaks at its middle.
 """
 
 from __future__ import annotations
