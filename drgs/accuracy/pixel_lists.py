@@ -1,8 +1,8 @@
 """Depths of splats' peaks along the ray of each pixel, and lists that are sorted by them.
 
-The order of each pixel (``drgs.accuracy.pixel_order``) compares :class:`RayDepths` where the falloff
-finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are), :class:`AffineDepths`
-where it does not, :class:`ParallelDepths` where rays do not meet. It starts from
+What the order of each pixel (``drgs.accuracy.pixel_order``) compares: :class:`RayDepths` where the
+falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are),
+:class:`AffineDepths` where it does not, :class:`ParallelDepths` of parallel rays. It starts from
 :class:`PixelLists`: what each micro-tile composites, sorted by the depths of peaks at its middle.
 """
 
