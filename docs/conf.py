@@ -7,12 +7,7 @@ from contextlib import suppress
 from dataclasses import is_dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import ClassVar
 
-from docutils import nodes
-from docutils.parsers.rst import Directive
-from docutils.parsers.rst.directives.tables import ListTable
-from docutils.statemachine import StringList
 from pydantic import BaseModel
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,25 +44,14 @@ html_theme = "furo"
 html_title = "drgs"
 
 
-# Docstrings are written to be read in the code: equations are indented, |x| is a norm. Those of
-# the plugins are in the format of Mitsuba's own documentation.
+# Docstrings are written to be read in the code: equations are indented, |x| is a norm.
 
-MITSUBA_NAMES = (
-    "bool|differentiable|exposed|false|float|int|rgb|string|tensor|texture|transform|true"
-)
 LITERAL = re.compile(r"(``.+?``|:\w+(?::\w+)?:`.+?`)")
 
 
 def as_restructured_text(app, what, name, obj, options, lines):
     """Escape what reStructuredText would read as markup, and set indented blocks as they are."""
-    del app, options
-    if name.startswith("drgs.plugins"):
-        text = re.sub(rf"\|({MITSUBA_NAMES})\|", r"``\1``", "\n".join(lines))
-        text = re.sub(r":monosp:`(.*?)`", r"\1", text)
-        text = re.sub(r"(.+)\n-{4,}", r"**\1**", text)  # no section of a page within a class
-        text = re.sub(r"^( *\* - .*?\w)_\.\.\.", r"\1\\_...", text, flags=re.MULTILINE)
-        lines[:] = text.split("\n")
-        return
+    del app, name, options
     lines, original = list(_with_argument_lists(obj, lines)), lines
     result, literal = [], False
     for k, line in enumerate(lines):
@@ -138,54 +122,6 @@ def _escaped(line):
     return "".join(parts)
 
 
-class PluginParameters(ListTable):
-    """Mitsuba's table of parameters: name, type, description and, for some, flags."""
-
-    def run(self):
-        """Fill up rows without flags, and set the table with a header."""
-        rows, count = ["* - Parameter", "  - Type", "  - Description", "  - Flags"], 4
-        for line in self.content:
-            starts = line.startswith("* - ")
-            if starts and count < 4:
-                rows += ["  -"] * (4 - count)
-            count = 1 if starts else count + line.startswith("  - ")
-            rows.append(line)
-        rows = [row for row in rows if row.strip()] + ["  -"] * (4 - count)
-        self.content = StringList(rows, self.content.source(0))
-        self.options |= {"header-rows": 1, "widths": [20, 12, 53, 15]}
-        return super().run()
-
-
-class Tabs(Directive):
-    """Tabs one below the other."""
-
-    has_content = True
-
-    def run(self):
-        """What the tabs hold."""
-        node = nodes.container()
-        self.state.nested_parse(self.content, self.content_offset, node)
-        return node.children
-
-
-class CodeTab(Directive):
-    """A tab with a program."""
-
-    has_content = True
-    required_arguments = 1
-    optional_arguments = 1
-    option_spec: ClassVar = {"name": str}
-
-    def run(self):
-        """The program, highlighted."""
-        text = "\n".join(self.content)
-        return [nodes.literal_block(text, text, language=self.arguments[0])]
-
-
 def setup(app):
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", as_restructured_text)
-    app.add_directive("pluginparameters", PluginParameters)
-    app.add_directive("tabs", Tabs)
-    app.add_directive("code-tab", CodeTab)
-    app.add_generic_role("paramtype", nodes.literal)

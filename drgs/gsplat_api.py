@@ -22,7 +22,7 @@ from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
 from drgs.core.memory import why_too_large
-from drgs.effects.features import NamedFeature
+from drgs.effects.compose import NamedFeature
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import GaussianRows, load_rows
 from drgs.splatting.rendering import (

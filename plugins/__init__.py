@@ -1,14 +1,8 @@
 """Mitsuba plugins of drgs, one file each; importable as ``drgs.plugins``.
 
-May import ``integrator`` and what that may import.
-
-A plugin file reads like one of Mitsuba's own: a class that derives from a class of the active
-variant, and a registration that closes the file. Such a class belongs to one variant, so the files
-are executed once for each variant that becomes active, and the results are kept.
-
-Mitsuba 3.10 imports this package by its entry point (group ``mitsuba``) when the first variant
-becomes active and reloads it after each change. To it, as to everybody else, the registration that
-closes this file is one that happens once for each variant, however often it is executed.
+A plugin file is a class that derives from a class of the active variant, and a registration that
+closes the file. The files are executed once for each variant that becomes active. Mitsuba 3.10
+imports this package by its entry point (group ``mitsuba``), and reloads it after each change.
 """
 
 from __future__ import annotations
@@ -25,10 +19,7 @@ PLUGINS = ("splats", "splatpath", "calibrated", "minimal")
 
 
 def register(variant: str) -> None:
-    """Register all plugins for ``variant``, which must be the active one; once is enough.
-
-    Raises ``LLVMVersionError`` for a variant that needs a libLLVM which is not there.
-    """
+    """Register all plugins for the active variant; LLVMVersionError without a usable libLLVM."""
     if variant.startswith("llvm_"):
         ensure_usable_llvm()
     for name in PLUGINS:

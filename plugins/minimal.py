@@ -1,8 +1,4 @@
-"""The ``splats_minimal`` integrator: 3D Gaussian splatting on one page, to be read first.
-
-Executed once per Mitsuba variant (see ``drgs.plugins``). The stages are those of ``splats``, which
-gives the same bytes at its defaults; that plugin adds what a scene may ask for besides.
-"""
+"""The ``splats_minimal`` integrator: ``splats`` without options on one page, to be read first."""
 
 from __future__ import annotations
 
@@ -26,25 +22,13 @@ from drgs.splatting.tiles import TileBins, bin_footprints, footprints_of
 
 
 class MinimalSplatsIntegrator(mi.CppADIntegrator):
-    r"""
-    .. _integrator-splats_minimal:
+    """3D Gaussian splatting alone over black, for a ``perspective`` sensor and a box filter.
 
-    3D Gaussian splatting, minimal (:monosp:`splats_minimal`)
-    ---------------------------------------------------------
+    - ``filename``: file of Gaussians, such as a PLY file of the 3DGS reference implementation.
+    - ``means``, ``quats``, ``log_scales``, ``logit_opacities``, ``sh0``, ``shN``: exposed.
 
-    .. pluginparameters::
-
-     * - filename
-       - |string|
-       - A file of Gaussians, such as the PLY files of the 3DGS reference implementation.
-
-     * - means, quats, log_scales, logit_opacities, sh0, shN
-       - |tensor|
-       - The Gaussians, as ``splats`` documents them.
-       - |exposed|, |differentiable|
-
-    Renders splats alone over black, for a ``perspective`` sensor and a box filter: one sample at
-    the centre of each pixel. Not differentiated: the sensor, visibility, the order of the splats.
+    Each pixel has one sample, at its centre; ``seed`` and ``spp`` make no difference. Not
+    differentiated: the sensor, visibility, the order of the splats.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -56,7 +40,6 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         self.pipeline = Pipeline(gaussians.sh_degree)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose the Gaussians."""
         for name in PARAMETER_NAMES:
             callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
@@ -64,7 +47,6 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
-        """Return the linear image (H, W, 3 or 4); ``seed`` and ``spp`` make no difference."""
         with dr.suspend_grad():
             film, _, _, _, layers = self._composited(scene, sensor)
             return develop_pixels(film, _channels(film, layers.planes()), [])
@@ -73,7 +55,6 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
         sensor: Any = 0, seed: Any = 0, spp: int = 0,
     ) -> None:  # fmt: skip
-        """Add the derivatives of a loss to those of the Gaussians; grad_in: by the image."""
         with dr.suspend_grad():
             film, camera, bins, records, layers = self._composited(scene, sensor)
             planes = layers.planes()

@@ -1,8 +1,4 @@
-"""The ``splatpath`` integrator: a path tracer whose rays pass splats on their way.
-
-Executed once per Mitsuba variant (see ``drgs.plugins``). How rays pass splats is in
-``drgs.light``; this file is where it meets emitters, BSDFs and derivatives.
-"""
+"""The ``splatpath`` integrator: a path tracer whose rays pass splats (``drgs.light``)."""
 
 from __future__ import annotations
 
@@ -15,15 +11,17 @@ from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_
 
 from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.path_segment import PathSegment
-from drgs.integrator.properties import boolean, integer, refuse_unknown
-from drgs.integrator.transparency import StraightRays, has_transparent_parts
+from drgs.integrator.properties import flag, integer, read, refuse_unknown
+from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
 
 if TYPE_CHECKING:
-    from drgs.integrator.path_segment import SplatTransport
+    from drgs.integrator.rays import SplatTransport
 
-KNOWN = ("max_depth", "rr_depth", "hide_emitters")
-"""Names of its properties."""
+PROPERTIES = {
+    "max_depth": integer(-1, least=-1),
+    "rr_depth": integer(5, least=1),
+    "hide_emitters": flag(False),
+}
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's integrators take a ``max_depth`` of -1 for."""
@@ -33,69 +31,25 @@ MOST_LIKELY = 0.95
 
 
 class SplatPathIntegrator(RBIntegrator):
-    r"""
-    .. _integrator-splatpath:
+    """Path tracer whose paths pass splats: to be nested in ``splats`` that set ``light``.
 
-    Path tracer among splats (:monosp:`splatpath`)
-    ----------------------------------------------
+    - ``max_depth``: longest path; 1 shows emitters only. (Default: -1, no limit)
+    - ``rr_depth``: depth from which on Russian roulette ends paths. (Default: 5)
+    - ``hide_emitters``: hide directly visible emitters. (Default: false)
 
-    .. pluginparameters::
+    The first segment of a path passes no splats: ``splats`` renders those. What lets light pass
+    straight on (``null``, ``mask``, ``thindielectric``) is no vertex. Derivatives by path replay
+    with detached sampling, with respect to materials, emitters and poses of objects.
 
-     * - max_depth
-       - |int|
-       - Longest path depth: 1 shows emitters only, 2 adds direct illumination, and so on. -1: no
-         limit. (Default: -1)
-
-     * - rr_depth
-       - |int|
-       - Path depth from which on Russian roulette ends paths. (Default: 5)
-
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: |false|)
-
-    To be nested in ``splats`` whose ``light`` is ``rays``: it renders the scene's surfaces as
-    ``path`` does, and as splats light and shade them. What a path meets between two vertices adds
-    its radiance and weakens all that comes behind; so do splats between a vertex and the emitter
-    that it samples. The first segment, which starts at the camera, meets no splats: those the
-    integrator ``splats`` puts into the picture. Without it, this is a path tracer.
-
-    What lets light pass straight on (``null``, ``mask``, ``thindielectric``) is no vertex for a
-    path that passes: it does not count as a bounce, splats before and behind it are composited
-    together, and emitters are sampled through it, also those that ``path`` cannot see there.
-
-    Derivatives are found as by ``prb`` (path replay, detached sampling), with respect to materials,
-    emitters and poses of objects. Unlike there, those of perfect mirrors and glass are, and those
-    of lamps without a surface that move.
-
-    .. note:: Not differentiated: the splats, and what a path meets of them: that includes how it
-        changes with the ray; where perfect mirrors and glass send light; silhouettes.
-
-    .. tabs::
-
-        .. code-tab:: xml
-
-            <integrator type="splats">
-                <string name="filename" value="point_cloud.ply"/>
-                <string name="light" value="rays"/>
-                <integrator type="splatpath">
-                    <integer name="max_depth" value="8"/>
-                </integrator>
-            </integrator>
-
-        .. code-tab:: python
-
-            'type': 'splatpath',
-            'max_depth': 8
+    Not differentiated: the splats and what a path meets of them, where perfect mirrors and glass
+    send light, silhouettes.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         check_variant("splatpath", mi.variant())
-        integer(props, "max_depth", -1, least=-1)  # before the base class, which names no plugin
-        integer(props, "rr_depth", 5, least=1)
-        boolean(props, "hide_emitters", False)
+        read(props, PROPERTIES)  # before the base class, which names no plugin
         super().__init__(props)
-        refuse_unknown(props, KNOWN)
+        refuse_unknown(props, list(PROPERTIES))
         if "max_depth" not in props:
             self.max_depth = UNBOUNDED
         self.sees_through = False  # whether anything in the scene lets light pass straight on
@@ -156,11 +110,12 @@ class SplatPathIntegrator(RBIntegrator):
         return (L if primal else δL), is_seen, [], L
 
     def _begin(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> _Path:
-        """A path at the camera, whose first hit is known."""
         ray, active = mi.Ray3f(dr.detach(ray)), mi.Bool(active)
         hit = scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
-        if self.hide_emitters:
-            hit = self._past_emitters(scene, ray, hit, active)
+        if self.hide_emitters:  # begin at the first hit that is none
+            skips = hit.is_valid() & (hit.shape.emitter() != None) & active  # noqa: E711
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, skips)
+            hit[skips] = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skips)
         return _Path(
             ray=ray,
             hit=hit,
@@ -186,7 +141,6 @@ class SplatPathIntegrator(RBIntegrator):
         arrives: mi.Spectrum,
         primal: bool,
     ) -> mi.Spectrum:
-        """Return the radiance of the emitter that a path has met."""
         shows = path.active & ~((path.depth == 0) & ~si.is_valid() & self.hide_emitters)
         ds = mi.DirectionSample3f(scene, si=si, ref=path.last_si)
         pdf = scene.pdf_emitter_direction(path.last_si, ds, ~path.last_is_delta)
@@ -204,7 +158,6 @@ class SplatPathIntegrator(RBIntegrator):
         active: mi.Bool,
         primal: bool,
     ) -> mi.Spectrum:
-        """Return the radiance of an emitter that the vertex samples."""
         bsdf = si.bsdf(path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         rays, numbers = StraightRays(scene, False, self.sees_through), sampler.next_2d()
@@ -212,7 +165,9 @@ class SplatPathIntegrator(RBIntegrator):
         active &= ds.pdf != 0
         ray = si.spawn_ray_to(ds.p)
         segment = PathSegment(ray, si.shape, ds.emitter, ds.pdf, is_open=mi.Bool(False))
-        let_through = self._let_through(segment, sampler, active)
+        let_through = mi.Float(1)
+        if self._transport is not None:
+            let_through = self._transport.transmittance(segment, sampler.next_1d(), active)
         if dr.hint(rays.sees_through, mode="scalar"):
             let_through *= rays.transmittance(ray, active)
         with dr.resume_grad(when=not primal):
@@ -231,7 +186,6 @@ class SplatPathIntegrator(RBIntegrator):
         si: mi.SurfaceInteraction3f,
         arrives: mi.Spectrum,
     ) -> _Step:
-        """Sample the step to the next vertex, if the path goes on."""
         has_bounces = path.depth + 1 < self.max_depth
         may_pass = mi.Bool(self.sees_through)
         active = path.active & si.is_valid() & (has_bounces | may_pass)
@@ -260,10 +214,6 @@ class SplatPathIntegrator(RBIntegrator):
             numbers=numbers,
         )
 
-    # ------------------------------------------------------------------------------------------
-    # Splats
-    # ------------------------------------------------------------------------------------------
-
     def _pass_splats(
         self, scene: mi.Scene, path: _Path, sampler: mi.Sampler
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
@@ -277,26 +227,6 @@ class SplatPathIntegrator(RBIntegrator):
         # or they would be darker there.
         radiance *= dr.square(path.eta)
         return path.throughput * radiance, path.throughput * let_through
-
-    def _let_through(self, segment: PathSegment, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        """Return the transmittance of splats to an emitter."""
-        if self._transport is None:
-            return mi.Float(1)
-        return self._transport.transmittance(segment, sampler.next_1d(), active)
-
-    # ------------------------------------------------------------------------------------------
-    # Surfaces
-    # ------------------------------------------------------------------------------------------
-
-    def _past_emitters(
-        self, scene: mi.Scene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
-    ) -> mi.PreliminaryIntersection3f:
-        """The first hit that is no emitter."""
-        skips = hit.is_valid() & (hit.shape.emitter() != None) & active  # noqa: E711
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, skips)
-        behind = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skips)
-        hit[skips] = behind
-        return hit
 
 
 @dataclass  # not frozen: ``dr.syntax`` carries it through a loop
@@ -409,10 +339,7 @@ def _attached(
     numbers: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """An emitter's sample and its weight, attached to the emitter and to the vertex.
-
-    numbers: in 0..1, that it was sampled with.
-    """
+    """Attach an emitter's sample, drawn with ``numbers``, and its weight to emitter and vertex."""
     flags = ds.emitter.flags()
     is_surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
     is_infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)

@@ -56,13 +56,7 @@ from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.footprint import (
-    Footprint,
-    GaussianFalloff,
-    Offsets,
-    Positions,
-    flat_columns,
-)
+from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions, flat_columns
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
@@ -170,11 +164,7 @@ class RayFalloff(GaussianFalloff):
     camera: Camera | None = None
 
     def for_camera(self, camera: Camera) -> RayFalloff:
-        """For one camera, whose film has the anchors.
-
-        Raises UnsupportedError for lenses that are no pinholes: their rays are not straight on
-        the film.
-        """
+        """Bind to a camera, whose film has the anchors; UnsupportedError unless it is a pinhole."""
         if not isinstance(camera.lens, Pinhole):
             raise UnsupportedError(
                 f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "
@@ -183,18 +173,15 @@ class RayFalloff(GaussianFalloff):
         return RayFalloff(camera)
 
     def geometry(self, splats: Splats2D) -> list[Any]:
-        """Columns, one value per Gaussian."""
         ray = splats.ray
         own = [ray.tilt_x, ray.tilt_y, ray.spread / WHITENING_SCALE**2]
         return [*super().geometry(splats), *own]
 
     def differentiable(self, splats: Splats2D) -> list[Any]:
-        """What :meth:`derivatives` are with respect to."""
         ray = splats.ray
         return [*super().differentiable(splats), ray.tilt_x, ray.tilt_y, ray.spread]
 
     def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
-        """Centre and half sizes (Array2f, px) of the box around the outline."""
         x, y, p, r, s = self.outline(geometry, reach)
         Array2f = types_of(type(p)).Array2f
         half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
@@ -238,7 +225,6 @@ class RayFalloff(GaussianFalloff):
         return [dr.select(bounded, a, b) for a, b in zip(ellipse, everywhere, strict=True)]
 
     def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> RayFootprint:
-        """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
         affine = super().footprint(geometry[: super().num_geometry], offsets_from, active)
         log2_opacity = dr.select(active, self.log2_opacity(geometry), -dr.inf)
         from_anchor = offsets_from(*closest_on_film(self.camera, *geometry[:2]))
@@ -316,14 +302,12 @@ class RayFalloff(GaussianFalloff):
         ]
 
     def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
-        """Tangents of the geometry, that of the opacity as d ln(opacity)."""
         count = super().num_geometry
         return super().pack_tangents(geometry, tangents[:count]) + list(tangents[count:])
 
     def tangent(
         self, geometry: list[Any], footprint: RayFootprint, d_geometry: list[Any]
     ) -> list[Any]:
-        """Tangent of ln(alpha) at the 16 pixels; see :meth:`moments`."""
         _, _, p, r, s = geometry[:5]
         d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_h = d_geometry
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE

@@ -1,8 +1,4 @@
-"""From approximations to the pipeline that renders with them.
-
-Everything but the defaults is in modules of its own, imported when it is chosen: what is not chosen
-costs nothing.
-"""
+"""From approximations to the pipeline that renders with them, importing what is chosen."""
 
 from __future__ import annotations
 
@@ -62,7 +58,6 @@ def pipeline_of(
 def _own_falloff(
     approximations: Approximations, projection: type[ProjectionModel]
 ) -> type[GaussianFalloff]:
-    """Return the falloff of a projection that has one of its own."""
     if approximations.falloff != FALLOFFS.words()[0]:
         raise UnsupportedError(
             f"splats: projection '{approximations.projection}' has a falloff of its own, got "

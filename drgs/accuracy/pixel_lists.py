@@ -1,23 +1,142 @@
-"""Lists of what each micro-tile composites, sorted by the depths of peaks at its middle.
+"""Depths of splats' peaks along the ray of each pixel, and lists that are sorted by them.
 
-What the order of each pixel starts from (``drgs.accuracy.pixel_order``). The splats of a tile are
-in the order of their means; those of a list are nearly in that of its pixels.
+What the order of each pixel (``drgs.accuracy.pixel_order``) compares: :class:`RayDepths` where the
+falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are),
+:class:`AffineDepths` where it does not, :class:`ParallelDepths` of parallel rays. It starts from
+:class:`PixelLists`: what each micro-tile composites, sorted by the depths of peaks at its middle.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 
-from drgs.accuracy.peak_depths import AffineDepths
+from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
+from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
-from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes
-from drgs.splatting.rasterize import (
-    Records,
+from drgs.core.constants import WHITENING_SCALE
+from drgs.splatting.footprint import Footprint, GaussianFalloff, flat_columns
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
+from drgs.splatting.lanes import load_pixels
+from drgs.splatting.projection import (
+    FilmShape,
+    GaussianRows,
+    Projection,
+    RayTerms,
+    Splats2D,
+    film_axes,
 )
+from drgs.splatting.rasterize import Records
 from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
+
+
+@dataclass(frozen=True)
+class AffineDepths:
+    """Base of depths at a pixel, for a falloff that does not know them: stores kappa and h."""
+
+    bounds: tuple[Any, Any] | None = None  # nearest and farthest, Float (H * W,), scene units
+    bound: list[tuple[Any, Any]] = field(default_factory=list)  # the same, at the 16 of a lane
+
+    def for_camera(self, camera: Camera) -> AffineDepths:
+        """Bind to a camera, whose rays may be parallel."""
+        return ParallelDepths(self.bounds) if camera.lens.parallel else self
+
+    def keys(self, splats: Splats2D) -> list[Any]:
+        """Return columns from which depths are computed: kappa, h (to base 2); last, their unit."""
+        ray, scale = splats.ray, WHITENING_SCALE
+        return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
+
+    def at(
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
+    ) -> tuple[Any, Any]:
+        """Return a and D at a point of the film, px: the depth is a / D in the unit, if a > 0."""
+        return self._at(keys, *falloff.coordinates(geometry, x, y))
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
+        """Load the bounds, if there are any, for the lanes of one kernel."""
+        if self.bounds is None:
+            return self
+        near, far = (load_pixels(bound, lanes, grid) for bound in self.bounds)
+        return replace(self, bound=list(zip(near, far, strict=True)))
+
+    def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
+        """Return depths in the unit at the 16 pixels; not positive where there is none."""
+        found, unit = self._along(footprint, keys), keys[-1]
+        if not self.bound:
+            return found
+        return [
+            dr.select((unit * along > near) & (unit * along < far), along, -1)
+            for along, (near, far) in zip(found, self.bound, strict=True)
+        ]
+
+    def _along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
+        coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
+        return [a / denominator for a, denominator in (self._at(keys, *e) for e in coordinates)]
+
+    @staticmethod
+    def _at(keys: list[Any], u: Any, v: Any) -> tuple[Any, Any]:
+        kx, ky, h = keys[:3]
+        a = dr.fma(-kx, u, dr.fma(-ky, v, 1))
+        return a, dr.fma(a, a, h * dr.fma(u, u, v * v))
+
+
+@dataclass(frozen=True)
+class WithAffineDepth:
+    """A projection, and what :class:`AffineDepths` need: the affine covariance with the depth."""
+
+    shape: Projection
+
+    def __call__(
+        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+    ) -> FilmShape:
+        """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
+        film = self.shape(rows, camera, position, low_pass)
+        slopes = camera.lens.clamped_slopes(camera, position)
+        m0, m1, n = film_axes(rows, camera, position, slopes)
+        p, r, s = film.whitening
+        kx, ky = dr.dot(m0, n), dr.dot(m1, n)
+        kx, ky = dr.fma(p, kx, r * ky), s * ky
+        h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
+        return replace(film, ray=RayTerms(kx, ky, dr.select(h > 0, h, 0)))
+
+
+@dataclass(frozen=True)
+class ParallelDepths(AffineDepths):
+    """The same for rays that are parallel."""
+
+    @staticmethod
+    def _at(keys: list[Any], u: Any, v: Any) -> tuple[Any, Any]:
+        kx, ky = keys[:2]
+        return dr.fma(kx, u, dr.fma(ky, v, 1)), type(u)(1)
+
+
+@dataclass(frozen=True)
+class RayDepths(AffineDepths):
+    """Depths at a pixel for ``RayFalloff``, which computes them."""
+
+    camera: Camera | None = None  # whose film has the anchors
+
+    def for_camera(self, camera: Camera) -> RayDepths:
+        return replace(self, camera=camera)
+
+    def keys(self, splats: Splats2D) -> list[Any]:
+        return [splats.depths * splats.ray.scale]
+
+    def at(
+        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
+    ) -> tuple[Any, Any]:
+        del keys
+        u, v = falloff.coordinates(geometry, x, y)
+        anchor = closest_on_film(self.camera, *geometry[:2])
+        _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
+        return a, denominator
+
+    def _along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
+        del keys
+        return footprint.along
+
 
 FARTHEST = 4.0
 """Between this and its inverse is the depth by which a list is sorted, relative to the mean's."""
@@ -63,14 +182,12 @@ class PixelLists:
         first = dr.prefix_sum(dr.popcnt(masks))
         count = int(first[bins.num_entries])
 
-        items = _Items.of(bins, records, depths, entry, masks, first, max(count, 1))
-        by_depth = stable_order(_levels(items.depths), _LEVELS)
-        lists = dr.gather(t.UInt32, items.micro_tiles, by_depth)
+        at, micro_tiles, entries = _items(bins, records, depths, entry, masks, first, max(count, 1))
+        by_depth = stable_order(_levels(at), _LEVELS)
+        lists = dr.gather(t.UInt32, micro_tiles, by_depth)
         num_lists = bins.grid.num_tiles * MICROS
         order = dr.gather(t.UInt32, by_depth, stable_order(lists, num_lists))
-        entries, lists = (
-            dr.gather(t.UInt32, column, order) for column in (items.entries, items.micro_tiles)
-        )
+        entries, lists = (dr.gather(t.UInt32, c, order) for c in (entries, micro_tiles))
         dr.eval(entries, lists, order)
         return PixelLists(
             entries=entries,
@@ -97,58 +214,48 @@ def _levels(depths: Any) -> Any:
     return dr.select(level < _LEVELS, level, _LEVELS - 1)
 
 
-@dataclass(frozen=True)
-class _Items:
-    """Columns of the items as made."""
+def _items(
+    bins: TileBins,
+    records: Records,
+    depths: AffineDepths,
+    entry: Any,
+    masks: Any,
+    item: Any,
+    count: int,
+) -> tuple[Any, Any, Any]:
+    """Make items: the depths of peaks at the middle of micro-tiles, micro-tiles, and entries.
 
-    depths: Any  # Float: of the peak along the ray through the middle of the micro-tile
-    micro_tiles: Any  # UInt32: tile * 16 + micro-tile within the tile
-    entries: Any  # UInt32: sorted entry
+    entry: sorted entries; masks: their micro-tiles; item: the first of each one's items.
+    """
+    t = types_of(bins.rows.Float)
+    # A single item that is not made, if there are none.
+    items = dr.ones(t.Float, count), dr.zeros(t.UInt32, count), dr.zeros(t.UInt32, count)
+    dr.eval(items)
+    exists = masks != 0
+    geometry, _ = records.load(entry, exists)
+    keys = records.load_keys(entry, exists)
+    tile = dr.gather(t.UInt32, bins.tiles, entry, exists)
+    columns = dr.opaque(t.UInt32, bins.grid.columns)
+    row = tile // columns
+    # Middle of the first micro-tile.
+    x = t.Float((tile - row * columns) * TILE) + MICRO / 2
+    y = t.Float(row * TILE) + MICRO / 2
 
-    @staticmethod
-    def of(
-        bins: TileBins,
-        records: Records,
-        depths: AffineDepths,
-        entry: Any,
-        masks: Any,
-        item: Any,
-        count: int,
-    ) -> _Items:
-        """entry: sorted entries; masks: their micro-tiles; item: the first of each one's items."""
-        t = types_of(bins.rows.Float)
-        # A single item that is not made, if there are none.
-        items = _Items(
-            dr.ones(t.Float, count), dr.zeros(t.UInt32, count), dr.zeros(t.UInt32, count)
-        )
-        dr.eval(items)
-        exists = masks != 0
-        geometry, _ = records.load(entry, exists)
-        keys = records.load_keys(entry, exists)
-        tile = dr.gather(t.UInt32, bins.tiles, entry, exists)
-        columns = dr.opaque(t.UInt32, bins.grid.columns)
-        row = tile // columns
-        # Middle of the first micro-tile.
-        x = t.Float((tile - row * columns) * TILE) + MICRO / 2
-        y = t.Float(row * TILE) + MICRO / 2
+    def body(masks: Any, item: Any) -> tuple:
+        micro = dr.tzcnt(masks)
+        middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
+        a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)
+        # Where there is no peak, there may be one at a neighbour.
+        along = dr.select(a > 0, a / denominator, 1)
+        along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)
+        along = dr.select(along > FARTHEST, FARTHEST, along)
+        values = keys[-1] * along, tile * MICROS + micro, entry
+        for column, value in zip(items, values, strict=True):
+            dr.scatter(column, value, item)
+        return masks & (masks - 1), item + 1
 
-        def body(masks: Any, item: Any) -> tuple:
-            micro = dr.tzcnt(masks)
-            middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
-            a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)
-            # Where there is no peak, there may be one at a neighbour.
-            along = dr.select(a > 0, a / denominator, 1)
-            along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)
-            along = dr.select(along > FARTHEST, FARTHEST, along)
-            dr.scatter(items.depths, keys[-1] * along, item)
-            dr.scatter(items.micro_tiles, tile * MICROS + micro, item)
-            dr.scatter(items.entries, entry, item)
-            return masks & (masks - 1), item + 1
-
-        loop = dr.while_loop(
-            state=(t.UInt32(masks), t.UInt32(item)),
-            cond=lambda masks, item: masks != 0,
-            body=body,
-        )
-        dr.eval(loop, items)
-        return items
+    loop = dr.while_loop(
+        state=(t.UInt32(masks), t.UInt32(item)), cond=lambda masks, item: masks != 0, body=body
+    )
+    dr.eval(loop, items)
+    return items

@@ -30,8 +30,7 @@ from typing import Any
 import drjit as dr
 
 from drgs.accuracy.exact import RayFalloff, ewa_with_depth
-from drgs.accuracy.peak_depths import AffineDepths, RayDepths, WithAffineDepth
-from drgs.accuracy.pixel_lists import PixelLists
+from drgs.accuracy.pixel_lists import AffineDepths, PixelLists, RayDepths, WithAffineDepth
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
@@ -64,10 +63,7 @@ uncut, a fitted scene is 52.4 dB from the true order with 16 places, and 51.3 dB
 @ORDERS.register("pixel")
 @dataclass(frozen=True)
 class PixelOrder(CenterOrder):
-    """Composites by the depth of the peak along each pixel's ray.
-
-    window: K, how many splats a pixel keeps waiting.
-    """
+    """Compositing by the depth of the peak along each pixel's ray."""
 
     window: int
     depths: AffineDepths
@@ -76,7 +72,6 @@ class PixelOrder(CenterOrder):
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
     ) -> tuple[Projection, PixelOrder]:
-        """Return the projection with what depths at a pixel depend on, and the order."""
         shape, depths = projection.shape_with_depth, AffineDepths()
         if projection.falloff is RayFalloff:
             depths = RayDepths()
@@ -85,15 +80,12 @@ class PixelOrder(CenterOrder):
         return shape or WithAffineDepth(projection.shape), cls(approximations.order_window, depths)
 
     def for_camera(self, camera: Camera) -> PixelOrder:
-        """For one camera."""
         return replace(self, depths=self.depths.for_camera(camera))
 
     def keys(self, splats: Splats2D) -> list[Any]:
-        """Columns that the depth at a pixel depends on."""
         return self.depths.keys(splats)
 
     def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
-        """See :func:`drgs.splatting.rasterize.composite`."""
         return _composite(bins, records, self)
 
     def adjoint(
@@ -106,14 +98,12 @@ class PixelOrder(CenterOrder):
         samples: range = ONE_SAMPLE,
         before: SplatGradients | None = None,
     ) -> SplatGradients:
-        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
         inputs = _WalkInputs.of(bins, records, layers.lists, self, samples)
         return _adjoint(inputs, layers, d_features, d_transmittance, before)
 
     def tangent(
         self, bins: TileBins, records: Records, layers: _OrderedLayers, tangents: SplatGradients
     ) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
         return _tangent(bins, records, layers, tangents, self)
 
 
@@ -254,10 +244,7 @@ def _walk(
 
 
 def _insert(places: list[list[Any]], item: list[Any]) -> tuple[list[list[Any]], list[Any]]:
-    """Insert into places sorted by their first number; returns all but the first, and that.
-
-    Of equals, the one that came first stays before.
-    """
+    """Insert into places sorted by their first number, stably; also return the first of all."""
     places = list(places)
     for k in reversed(range(len(places))):
         before = item[0] < places[k][0]
@@ -405,10 +392,7 @@ def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]
 
 
 def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Rows:
-    """Third walk: the sums over the 16 pixels of each item, rows by place.
-
-    pairs: weights and d loss / d ln(alpha), 16 for each place.
-    """
+    """Third walk: the sums of ``pairs`` over the 16 pixels of each item, rows by place."""
     bins, records, lists = inputs.bins, inputs.records, inputs.lists
     lanes, model = inputs.lanes, inputs.model
     t = types_of(bins.rows.Float)
@@ -438,7 +422,6 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Ro
 def _sum_items(
     inputs: _WalkInputs, partials: Rows, before: SplatGradients | None
 ) -> SplatGradients:
-    """Add up the items of each splat."""
     lists, places = inputs.lists, inputs.lists.places()
     UInt32 = type(places)
 

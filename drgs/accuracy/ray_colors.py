@@ -1,8 +1,7 @@
 """Colour in the direction of each pixel's ray: ``sh_direction: pixel``.
 
-Imported when it is chosen. By default a splat has one colour, seen in the direction of its mean
-(3DGS). Here its spherical harmonics are stored, and evaluated in the direction of each pixel. The
-basis functions depend on the pixel alone and are computed once per lane.
+A splat's spherical harmonics are stored, and evaluated in the direction of each pixel. The basis
+functions depend on the pixel alone and are computed once per lane.
 """
 
 from __future__ import annotations
@@ -31,10 +30,7 @@ def stored_coefficients(rows: GaussianRows, direction: Any, sh_degree: int) -> l
 
 @dataclass(frozen=True)
 class RayColors(SplatFeatures):
-    """Of what is stored, the first are SH coefficients; the others are composited as they are.
-
-    Not differentiated: the direction, in the camera.
-    """
+    """Colours by SH coefficients, stored first. Not differentiated: the direction."""
 
     sh_degree: int
     camera: Camera | None = None
@@ -42,19 +38,15 @@ class RayColors(SplatFeatures):
 
     @property
     def num_coefficients(self) -> int:
-        """Stored numbers that are coefficients."""
         return CHANNELS * num_coefficients(self.sh_degree)
 
     def num_planes(self, num_stored: int) -> int:
-        """Planes that come of ``num_stored`` numbers per splat."""
         return num_stored - self.num_coefficients + CHANNELS
 
     def for_camera(self, camera: Camera) -> RayColors:
-        """For one camera, whose pixels' rays are the directions."""
         return replace(self, camera=camera)
 
     def check_differentiable_in_camera(self) -> None:
-        """They are not: the direction is the camera's. Degree 0 has none."""
         if self.sh_degree == 0:
             return
         raise UnsupportedError(
@@ -62,11 +54,9 @@ class RayColors(SplatFeatures):
         )
 
     def weighing(self) -> RayColors:
-        """What has the weights of compositing as derivatives of the first coefficient."""
         return Weighing(self.sh_degree, self.camera)
 
     def bind(self, lanes: Lanes, positions: Positions) -> RayColors:
-        """The basis functions at the 16 pixels of each lane."""
         points = positions.points(lanes, type(self.camera.near))
         basis = tuple(sh_basis(self._direction(x, y), self.sh_degree) for x, y in points)
         return replace(self, basis=basis)
@@ -76,7 +66,6 @@ class RayColors(SplatFeatures):
         return dr.normalize(camera.rotation.T @ camera.lens.ray(camera, x, y))
 
     def at(self, stored: list[Any], pixel: int) -> list[Any]:
-        """max(0, sum_k basis_k coefficient_k + 0.5), then what else is stored."""
         colors = [
             dr.select(value < COLOR_MIN, COLOR_MIN, value) for value in self._sums(stored, pixel)
         ]
@@ -92,7 +81,6 @@ class RayColors(SplatFeatures):
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
     ) -> list[Any]:
-        """See :class:`SplatFeatures`. Where a colour is clamped, its derivative is zero."""
         d_colors = [
             dr.select(value < COLOR_MIN, 0, weight * derivative)
             for value, derivative in zip(self._sums(stored, pixel), g[:CHANNELS], strict=True)
@@ -107,7 +95,6 @@ class RayColors(SplatFeatures):
         ]
 
     def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
-        """Tangents of the features at a pixel."""
         d_colors = [type(d_stored[0])(0)] * CHANNELS
         for k, basis in enumerate(self.basis[pixel]):
             d = d_stored[CHANNELS * k : CHANNELS * (k + 1)]
@@ -125,6 +112,5 @@ class Weighing(RayColors):
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
     ) -> list[Any]:
-        """Weights times the derivatives of the first plane; whatever the colour is."""
         del stored, pixel
         return [dr.fma(weight, g[0], totals[0]), *totals[1:]]

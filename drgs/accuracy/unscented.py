@@ -49,10 +49,7 @@ where slopes are clamped. Such splats are projected by the affine approximation.
 def unscented_shape(
     rows: GaussianRows, camera: Camera, position: Any, low_pass: float
 ) -> FilmShape:
-    """The unscented transform of a Gaussian through the camera.
-
-    position: Array3f, camera axes, the mean. Not differentiated: where :data:`NEAREST` decides.
-    """
+    """Return the unscented transform; not differentiated: where :data:`NEAREST` decides."""
     points = _sigma_points(camera.lens, rows, camera, position)
     # The mean itself has the offset 0.
     columns = [
@@ -112,7 +109,6 @@ def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Any) -> _Sigm
 
 
 def _same(slopes: list[Any] | None, clamped: list[Any] | None) -> Any:
-    """Whether slopes are not clamped; a lens that has none does not clamp."""
     if slopes is None:
         return True
     return (slopes[0] == clamped[0]) & (slopes[1] == clamped[1])

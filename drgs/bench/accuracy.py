@@ -22,7 +22,6 @@ import drjit.llvm.ad as llvm
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.accuracy.sample_points import SamplePoints
 from drgs.bench.output import add_out, columns_table, machine, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
 from drgs.bench.timing import count_operations, seconds
@@ -35,6 +34,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.types import View
 from drgs.effects.smoothing import baked
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.film import SamplePoints
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference

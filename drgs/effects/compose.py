@@ -1,13 +1,19 @@
-"""The one place where an effect is put into a pipeline."""
+"""Effects put into a pipeline, and composited features: normals, and those that the user names."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
+from drgs.core.arrays import types_of
 from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.splatting.projection import GaussianRows, Splats2D
 from drgs.splatting.rendering import Pipeline
 
 
@@ -43,3 +49,38 @@ def without_effects(camera: Camera, ignored: Collection[str]) -> Camera:
     if "motion" in ignored:
         camera = replace(camera, shutter=None)
     return camera
+
+
+def normal_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+    """The normals of flat Gaussians, in the world: three planes.
+
+    A Gaussian's normal is its shortest axis, a unit vector that points to the camera. What is
+    composited is the alpha-weighted sum, whose length is at most alpha. Differentiable in the
+    quaternions. Not differentiated: which axis is the shortest, and which way it points.
+    """
+    del splats
+    t = types_of(type(rows.logit_opacities))
+    rotation = quat_to_rotation(rows.quats)
+    a, b, c = dr.detach(rows.log_scales)
+    first, second = (a <= b) & (a <= c), b <= c
+
+    def shortest(row: int) -> Any:
+        return dr.select(
+            first, rotation[row, 0], dr.select(second, rotation[row, 1], rotation[row, 2])
+        )
+
+    normal = t.Array3f([shortest(row) for row in range(3)])
+    direction = camera.lens.view_direction(camera, rows.means - camera.center)
+    away = dr.detach(dr.dot(normal, direction)) > 0
+    return list(dr.select(away, -normal, normal))
+
+
+@dataclass(frozen=True)
+class NamedFeature:
+    """Numbers that each Gaussian has under a name: as many planes as there are."""
+
+    name: str
+
+    def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+        del splats, camera
+        return list(rows.features[self.name])

@@ -1,10 +1,8 @@
 """Depth of field: what is out of focus is blurred, as a thin lens blurs it.
 
-Imported when a camera has an aperture. A point is spread over a disc; here the disc's variance is
-added to the splat's covariance on the film, and its opacity falls such that its integral stays. The
-alpha at which it ends falls with it: a surface of many small splats, each of them hardly there when
-it is far out of focus, is as opaque as in focus. What a picture by many rays shows beyond that,
-such as what is seen past the blurred edge of something near, needs the rays.
+A point is spread over a disc, whose variance is added to the splat's covariance on the film; the
+opacity falls such that its integral stays, and the alpha at which it ends with it: many small
+splats far out of focus are as opaque as in focus. What is seen past a blurred edge needs rays.
 """
 
 from __future__ import annotations
@@ -31,10 +29,7 @@ class Defocused:
     def __call__(
         self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
     ) -> FilmShape:
-        """The blurred shape, whose ``dimming`` keeps the integral.
-
-        Its determinants are those of the low-pass alone.
-        """
+        """Return the blurred shape, whose ``dimming`` keeps the integral."""
         film = self.shape(rows, camera, position, low_pass)
         spread = camera.aperture.variance(camera, position.z)
         blurred = self.shape(rows, camera, position, low_pass + spread)
@@ -58,39 +53,31 @@ class DimmedFalloff(GaussianFalloff):
 
     @property
     def num_geometry(self) -> int:
-        """Numbers of a splat."""
         return self.of.num_geometry + 1
 
     @property
     def num_moments(self) -> int:
-        """Sums over pixels, by splat."""
         return self.of.num_moments
 
     def for_camera(self, camera: Camera) -> DimmedFalloff:
-        """For one camera."""
         return replace(self, of=self.of.for_camera(camera))
 
     def log2_opacity(self, geometry: list[Any]) -> Any:
-        """The base-2 logarithm of the opacity, dimmed."""
         return self.of.log2_opacity(geometry[:-1])
 
     def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
-        """The base-2 logarithm of the smallest alpha of a splat; see ``NEGLIGIBLE_ALPHA``."""
         log2_dimming = geometry[-1]
         floor = cutoffs.log2_floor(self.log2_opacity(geometry) - log2_dimming) + log2_dimming
         least = math.log2(NEGLIGIBLE_ALPHA)
         return dr.select(floor > least, floor, least)
 
     def geometry(self, splats: Splats2D) -> list[Any]:
-        """Columns, one value per Gaussian."""
         return [*self.of.geometry(splats), dr.log2(splats.dimming)]
 
     def differentiable(self, splats: Splats2D) -> list[Any]:
-        """What :meth:`derivatives` are with respect to."""
         return [*self.of.differentiable(splats), dr.detach(splats.dimming)]
 
     def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
-        """Centre and half sizes (Array2f, px) of the box around what shows."""
         return self.of.bounds(splats, geometry[:-1], reach)
 
     def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
@@ -98,11 +85,9 @@ class DimmedFalloff(GaussianFalloff):
         return self.of.outline(geometry[:-1], reach)
 
     def coordinates(self, geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
-        """U d at a point of the film, px."""
         return self.of.coordinates(geometry[:-1], x, y)
 
     def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
-        """At the 16 pixels of each lane."""
         return self.of.footprint(geometry[:-1], offsets_from, active)
 
     def moments(self, footprint: Footprint, weights: list[Any], positions: Positions) -> list[Any]:
@@ -115,11 +100,9 @@ class DimmedFalloff(GaussianFalloff):
         return [*derivatives, dr.zeros(type(totals[0]), dr.width(totals[0]))]
 
     def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
-        """Tangents of the geometry."""
         return [*self.of.pack_tangents(geometry[:-1], tangents[:-1]), tangents[-1]]
 
     def tangent(
         self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
     ) -> list[Any]:
-        """Tangent of ln(alpha) at the 16 pixels."""
         return self.of.tangent(geometry[:-1], footprint, d_geometry[:-1])

@@ -42,11 +42,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class OccludedFeatures(SplatFeatures):
-    """SplatFeatures of splats that surfaces may hide.
-
-    The last stored number is the splat's depth; the last planes are the sums of the weights in
-    front of each surface.
-    """
+    """Features of splats that surfaces may hide; last planes: the weights in front of each."""
 
     features: SplatFeatures
     surfaces: tuple[Surface, ...]  # nearest first
@@ -54,7 +50,6 @@ class OccludedFeatures(SplatFeatures):
     bound: list[Any] = field(default_factory=list)  # at the 16 pixels of a lane: (z, rest behind)
 
     def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
-        """Divide as without surfaces; each group has the depth, and the weights in front."""
         depth, end = num_stored - 1, self.num_planes(num_stored)
         fronts = range(end - len(self.surfaces), end)
         return [
@@ -67,19 +62,15 @@ class OccludedFeatures(SplatFeatures):
         ]
 
     def num_planes(self, num_stored: int) -> int:
-        """Planes that come of ``num_stored`` numbers per splat."""
         return self.features.num_planes(num_stored - 1) + len(self.surfaces)
 
     def for_camera(self, camera: Camera) -> OccludedFeatures:
-        """For one camera."""
         return replace(self, features=self.features.for_camera(camera))
 
     def check_differentiable_in_camera(self) -> None:
-        """Check the features; surfaces stay where they are."""
         self.features.check_differentiable_in_camera()
 
     def bind(self, lanes: Lanes, positions: Positions) -> OccludedFeatures:
-        """For the lanes of one kernel: loads the surfaces."""
         rests, bound = [1.0] * PIXELS, []
         for surface in self.surfaces:
             depths = load_pixels(surface.depth, lanes, self.grid)
@@ -93,14 +84,12 @@ class OccludedFeatures(SplatFeatures):
         )
 
     def at(self, stored: list[Any], pixel: int) -> list[Any]:
-        """Return the splat's features at a pixel, as far as they are seen, and 1 in front."""
         *others, depth = stored
         seen = self._seen(depth, pixel)
         values = [seen * value for value in self.features.at(others, pixel)]
         return values + self._in_front(type(depth)(1), depth, pixel)
 
     def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
-        """As :meth:`at` says; it is the weight that is scaled, once for all features."""
         *others, depth = stored
         own, fronts = self._split(planes)
         seen = self.features.add(own, others, pixel, self._seen(depth, pixel) * weight)
@@ -108,7 +97,6 @@ class OccludedFeatures(SplatFeatures):
         return [*seen, *(front + more for front, more in pairs)]
 
     def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
-        """As :meth:`at` says; it is the sum that is scaled."""
         *others, depth = stored
         own, fronts = self._split(g)
         gradient = self._seen(depth, pixel) * self.features.feature_gradient(others, pixel, own)
@@ -120,7 +108,6 @@ class OccludedFeatures(SplatFeatures):
     def add_derivatives(
         self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
     ) -> list[Any]:
-        """As :meth:`at` says; the depth has none."""
         *others, depth = stored
         *totals, nothing = totals
         weight = self._seen(depth, pixel) * weight
@@ -128,14 +115,12 @@ class OccludedFeatures(SplatFeatures):
         return [*sums, nothing]
 
     def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
-        """Tangents of the features at a pixel."""
         *others, depth = stored
         seen = self._seen(depth, pixel)
         tangents = self.features.tangents(others, d_stored[:-1], pixel)
         return [seen * value for value in tangents] + [type(depth)(0)] * len(self.surfaces)
 
     def _split(self, planes: list[Any]) -> tuple[list[Any], list[Any]]:
-        """Split planes into those of the features and the sums in front of each surface."""
         count = len(self.surfaces)
         return planes[:-count], planes[-count:]
 
@@ -150,7 +135,6 @@ class OccludedFeatures(SplatFeatures):
         return seen
 
     def _in_front(self, value: Any, depth: Any, pixel: int) -> list[Any]:
-        """Return a splat's number for each surface that it is in front of, 0 for others."""
         return [dr.select(depth <= z, value, 0) for z, _ in self.bound[pixel]]
 
 

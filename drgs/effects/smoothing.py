@@ -1,10 +1,15 @@
 """The 3D smoothing filter: Gaussians no smaller than what the training cameras can tell apart.
 
-Imported when Gaussians come with it. A scene that was photographed with a sampling rate nu (pixels
-per scene unit, focal length over depth) says nothing about detail below its Nyquist limit; a
-rendering that is nearer, or larger, shows what the fit has made up there. Mip-Splatting (Yu et al.
-2024, section 4.1) therefore convolves each Gaussian with one of variance 0.2 / nu^2, nu being the
-largest rate of all cameras that see it, and keeps its integral.
+A scene that was photographed with a sampling rate nu (pixels per scene unit, focal length over
+depth) holds no detail below its Nyquist limit. Mip-Splatting (Yu et al. 2024, section 4.1)
+therefore convolves each Gaussian with one of variance 0.2 / nu^2, nu being the largest rate of all
+cameras that see it, and keeps its integral.
+
+:func:`baked` and :func:`baked_for_viewers` change Gaussians in closed form so that other viewers,
+which add 0.3 square pixels to each splat's covariance and leave its opacity as it is, show them
+about as they were fitted. What is added on the film is taken from the Gaussians beforehand, as far
+as there is something to take from, and opacities make up for the rest, such that a splat keeps its
+integral over the film (section 5).
 """
 
 from __future__ import annotations
@@ -18,9 +23,17 @@ import drjit as dr
 import numpy as np
 
 from drgs.cameras.camera import Camera
+from drgs.config.approximations import Approximations
 from drgs.core.arrays import types_of
 from drgs.gaussians.parameters import Gaussians
-from drgs.splatting.projection import GaussianRows
+from drgs.splatting.projection import (
+    GaussianRows,
+    OpacityRule,
+    compensated_opacity,
+    load_rows,
+    plain_opacity,
+    project,
+)
 
 VARIANCE = 0.2
 """Of the filter, in squared distances between samples (Mip-Splatting, equation 9 and its code)."""
@@ -30,10 +43,7 @@ FILM_MARGIN = 0.15
 
 
 def smoothed(rows: GaussianRows) -> GaussianRows:
-    """Gaussians whose covariance is widened by ``rows.smoothing``^2, and dimmed in proportion.
-
-    The filter is differentiated where an object is scaled with it, and is no parameter itself.
-    """
+    """Widen the covariance of Gaussians by ``rows.smoothing``^2, and dim them in proportion."""
     variance = dr.square(rows.smoothing)
     log_scales = dr.log(dr.exp(2 * rows.log_scales) + variance) / 2
     dimming = dr.exp(dr.sum(rows.log_scales - log_scales))
@@ -58,7 +68,6 @@ def smoothing_of(means: Any, cameras: Iterable[Camera]) -> Any:
 
 
 def _rates(points: Any, camera: Camera) -> Any:
-    """Return the rates of one camera, px per scene unit; 0 where it does not see a point."""
     lens = camera.lens
     seen, position, depth = lens.visibility(camera, camera.rotation @ (points - camera.center))
     film = lens.project_point(camera, position)
@@ -70,10 +79,7 @@ def _rates(points: Any, camera: Camera) -> Any:
 
 
 def baked(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians (numpy) with the filter in their scales and opacities.
-
-    For viewers that know nothing of it. Opacities are rounded to below 1.
-    """
+    """Return the Gaussians (numpy) with the filter in their scales, and opacities below 1."""
     g = gaussians.numpy()
     if g.smoothing is None:
         return g
@@ -90,3 +96,65 @@ def baked(gaussians: Gaussians) -> Gaussians:
         logit_opacities=(np.log(opacities) - np.log1p(-opacities)).astype(np.float32),
         smoothing=None,
     )
+
+
+KEPT_VARIANCE = 0.04
+"""Parts of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
+derivatives by their scales."""
+
+USUAL = Approximations()
+"""What viewers do."""
+
+
+def baked_for_viewers(
+    gaussians: Gaussians, cameras: Iterable[Camera], fitted: Approximations
+) -> Gaussians:
+    """Gaussians (numpy) that look about the same without ``fitted.low_pass`` and ``antialiased``.
+
+    With l and L the low-pass of the fit and that of viewers, and nu the largest rate (px per scene
+    unit) of the ``cameras`` that see a Gaussian,
+
+        s'^2 = max(s^2 - (L - l) / nu^2, 0.04 s^2),   o' = o sum(a sqrt(det C)) / sum(sqrt(det C')),
+
+    where C and C' are the covariances on the film, low-pass included, a is what compensation leaves
+    of the opacity, and the sums go over the cameras that see the Gaussian. One that no camera sees
+    keeps its opacity.
+
+    gaussians: Dr.Jit arrays, without a smoothing filter. Detached.
+    """
+    cameras = list(cameras)
+    host = dr.detach(gaussians).numpy()
+    nyquist = np.array(smoothing_of(gaussians.means, cameras), np.float64)
+    taken = (USUAL.low_pass - fitted.low_pass) * np.square(nyquist) / VARIANCE
+    variances = np.exp(2 * host.log_scales.astype(np.float64))
+    left = np.maximum(variances - taken[:, None], KEPT_VARIANCE * variances)
+    baked = replace(host, log_scales=(np.log(left) / 2).astype(np.float32))
+    before = _integrals(gaussians, cameras, fitted)
+    after = _integrals(baked.to(type(gaussians.means)), cameras, USUAL)
+    factor = np.divide(before, after, out=np.ones_like(after), where=after > 0)
+    opacities = factor / (1 + np.exp(-host.logit_opacities.astype(np.float64)))
+    tiny = np.finfo(np.float32).tiny
+    opacities = np.clip(opacities, tiny, 1 - np.finfo(np.float32).eps)
+    logits = np.log(opacities) - np.log1p(-opacities)
+    return replace(baked, logit_opacities=logits.astype(np.float32))
+
+
+def _integrals(
+    gaussians: Gaussians, cameras: Iterable[Camera], approximations: Approximations
+) -> np.ndarray:
+    """Over the film, of each splat's alpha, over 2 pi: summed over ``cameras``; (N,) float64."""
+    rule = compensated_opacity if approximations.antialiased else plain_opacity
+    rows = load_rows(gaussians, 0)
+    total = dr.zeros(type(rows.logit_opacities), gaussians.num_gaussians)
+    for camera in cameras:
+        total += _integral(rows, camera, rule, approximations.low_pass)
+        dr.eval(total)
+    return np.array(total, np.float64)
+
+
+def _integral(rows: GaussianRows, camera: Camera, rule: OpacityRule, low_pass: float) -> Any:
+    splats = project(rows, camera, 0, rule, low_pass=low_pass, least_alpha=0.0)
+    beside = (splats.means2d < camera.film_start) | (splats.means2d > camera.film_end)
+    p, _, s = splats.whitening
+    seen = splats.visible & ~(beside.x | beside.y)
+    return dr.select(seen, splats.opacities / dr.abs(p * s), 0)

@@ -1,14 +1,8 @@
-"""Inside Mitsuba's ``aov``: what the single rays of a whole picture see.
+"""Inside Mitsuba's ``aov``: splats along the single rays of a whole image.
 
-Imported when ``aov`` asks. That integrator takes the picture of a nested one, and its derivatives,
-from ``render``, ``render_backward`` and ``render_forward``. It then calls ``sample`` with the rays
-of a picture of its own, all pixels at once, and takes from that the AOVs of the nested integrator
-and what the film holds besides its picture.
-
-Splats are composited over whole images, so rays are only answered if they are those of one: ray k
-starts in pixel k // n of the sensor that was rendered last, n of them a pixel. Where in its pixel
-each of them starts is found by looking at it through the camera; the splats are then evaluated at
-these very points.
+Imported when ``aov`` calls ``sample``, with the rays of all pixels at once. Splats are composited
+over whole images, so that ray k must start in pixel k // n of the sensor that was rendered last, n
+rays a pixel. Each is found by looking at it through the camera, and the splats are evaluated there.
 """
 
 from __future__ import annotations
@@ -20,13 +14,11 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
-from drgs.accuracy.sample_points import SamplePoints
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import interleave
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.film import Channels, pixel_corners
+from drgs.integrator.film import Channels, SamplePoints, by_sample, in_passes, pixel_corners
 from drgs.integrator.image_render import hybrid_of
-from drgs.integrator.sampling import by_sample, in_passes
 from drgs.integrator.sensor_render import SensorRender, constant_background
 from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
 from drgs.integrator.state import SplatsState
@@ -59,13 +51,7 @@ class ImageRays:
 
     @staticmethod
     def of(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> ImageRays:
-        """Find where in their pixels the rays start.
-
-        sensor: of which a picture was rendered last, None if there was none; near: near plane of
-        the integrator, scene units.
-
-        Raises UnsupportedError for rays that are not those of a picture of this sensor.
-        """
+        """Find where in pixels the rays start; UnsupportedError unless they are of an image."""
         if sensor is None:
             raise UnsupportedError(REFUSAL)
         film = sensor.film()
@@ -113,13 +99,13 @@ class ImageRays:
             hybrid = hybrid.with_surfaces(view.num_surfaces())
             view = replace(view, hybrid=hybrid)
         channels = self._gathered(view.channels(view.planes(), constant_background(splats)))
-        splats.cache.forget_view(NESTED)
+        for kind in ("frames", "surfaces"):
+            splats.cache.forget(f"{kind} {NESTED}")
         if hybrid is not None:
             channels = self._with_surfaces(channels, hybrid, sampler, active)
         return channels
 
     def _gathered(self, passes: Sequence[Channels]) -> Channels:
-        """Channels by ray, from those by pixel of each pass."""
         samples = by_sample(self.positions, passes[: len(self.positions)])
         planes = zip(*samples, strict=True)
         return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
@@ -127,10 +113,7 @@ class ImageRays:
     def _with_surfaces(
         self, channels: Channels, hybrid: Hybrid, sampler: mi.Sampler, active: mi.Bool
     ) -> Channels:
-        """The channels with what the nested integrator sees along the rays.
-
-        hybrid: see ``drgs.integrator.surfaces.Hybrid``, whose own channels are at the end.
-        """
+        """Add what the nested integrator sees along the rays."""
         insertion = hybrid.insertion
         aovs, own = channels[3 : -len(insertion.channels)], channels[-len(insertion.channels) :]
         behind = own[2 * insertion.num_surfaces :] or [mi.Float(0)] * 3
@@ -140,7 +123,6 @@ class ImageRays:
 
 
 def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
-    """Return where on the film rays start, px; whether they belong to this camera."""
     offset = camera.rotation @ mi.Vector3f(ray.o - mi.Point3f(camera.center))
     direction = camera.rotation @ mi.Vector3f(ray.d)
     place, radius = camera.place_of_ray(offset, direction)

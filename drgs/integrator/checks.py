@@ -1,7 +1,4 @@
-"""Checks of scenes: their Gaussians, their shapes, and the size of an image.
-
-What cannot be rendered is refused in words before anything is allocated or compiled.
-"""
+"""Checks of scenes, before anything is allocated or compiled."""
 
 from __future__ import annotations
 
@@ -22,11 +19,6 @@ of the smallest film."""
 
 NESTED_SAMPLE_BYTES = 64
 """About what Mitsuba's path tracers take at least for a sample: its ray, sampler and radiance."""
-
-
-# ----------------------------------------------------------------------------------------------
-# Gaussians
-# ----------------------------------------------------------------------------------------------
 
 
 def check_shapes(gaussians: Gaussians) -> None:
@@ -80,11 +72,6 @@ def check_degree(degree: int, gaussians: Gaussians) -> None:
         )
 
 
-# ----------------------------------------------------------------------------------------------
-# Shapes
-# ----------------------------------------------------------------------------------------------
-
-
 def ellipsoids_in(scene: mi.Scene) -> list[mi.Shape]:
     """Shapes whose Gaussians are rendered as splats."""
     return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
@@ -96,11 +83,7 @@ def surfaces_in(scene: mi.Scene) -> list[mi.Shape]:
 
 
 def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]:
-    """Raise UnsupportedError where a scene has instances, and Gaussians in a shape group.
-
-    Surfaces would show these as dark solids. last: the result of the last call, which holds what
-    has been checked: a shape group stays as it was loaded.
-    """
+    """Raise UnsupportedError for instances of Gaussians; last: those already checked."""
     instances = [shape for shape in scene.shapes() if shape.class_name() == "Instance"]
     if not instances or list(map(id, instances)) == list(map(id, last)):
         return instances
@@ -113,11 +96,6 @@ def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]
                 "to_world, or a nested splats"
             )
     return instances
-
-
-# ----------------------------------------------------------------------------------------------
-# Images
-# ----------------------------------------------------------------------------------------------
 
 
 def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: int) -> None:
@@ -155,10 +133,7 @@ def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: 
 
 
 def check_columns(columns: dict[str, int]) -> None:
-    """Raise PluginError where more is put out than a kernel can be compiled for.
-
-    columns: of each AOV, by its name.
-    """
+    """Raise PluginError where AOVs have more channels (by name) than a kernel can have."""
     if sum(columns.values()) > MAX_FEATURES:
         counts = ", ".join(f"{name} {count:,}" for name, count in columns.items())
         raise PluginError(
@@ -168,10 +143,7 @@ def check_columns(columns: dict[str, int]) -> None:
 
 
 def check_ids(parameter: str, names: Sequence[str], nodes: Sequence[mi.Object]) -> None:
-    """Raise PluginError for names that none of a scene's nodes has for its id.
-
-    parameter: what has the names, and of what they must be ids.
-    """
+    """Raise PluginError for names that are no node's id; parameter: what has the names."""
     known = [node.id() for node in nodes]
     for name in names:
         if name not in known:

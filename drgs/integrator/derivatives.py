@@ -1,8 +1,4 @@
-"""Refusals of derivatives that a picture with surfaces does not have.
-
-Imported when a picture with surfaces is differentiated. What is refused would be wrong: the terms
-that are missing are no noise. Each message begins with the parameter's name.
-"""
+"""Refusals of derivatives that would be wrong in an image with surfaces."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, listed
 from drgs.integrator.checks import ellipsoids_in
-from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.rays import passes_splats
 from drgs.integrator.state import SplatsState
 
 ATTACHED = ("PathIntegrator", "DirectIntegrator")
@@ -74,15 +70,9 @@ class Parameter:
 
 
 def check_derivatives(
-    splats: SplatsState,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    mode: dr.ADMode,
+    splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
 ) -> None:
-    """Raise UnsupportedError for a parameter whose derivative would be wrong.
-
-    scene: with surfaces.
-    """
+    """Raise UnsupportedError for a parameter whose derivative would be wrong."""
     if (splats.light != "none" or splats.shadows) and _has_attached_gaussians(splats, scene):
         raise UnsupportedError(
             f"splats: with light '{splats.light}' and shadows "
@@ -113,7 +103,7 @@ def check_derivatives(
 
 def _has_attached_gaussians(splats: SplatsState, scene: mi.Scene) -> bool:
     parts = splats.parts(ellipsoids_in(scene))
-    values = [value for part in parts for value in part.values.parameters().values()]
+    values = [value for part in parts for value in part.values.values()]
     return any(dr.grad_enabled(value) for value in values)
 
 
@@ -160,7 +150,6 @@ def _is_padded(parameter: Parameter) -> bool:
 
 
 def _why_not(parameter: Parameter, splats: SplatsState) -> str | None:
-    """Why a derivative would be wrong, and what to do; None: it is right."""
     nested, owner = splats.nested, parameter.owners[0]
     kind = SPLATPATH if nested is None else type_of(nested)
     is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)

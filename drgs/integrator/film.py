@@ -1,21 +1,28 @@
 """Samples of a film: where pixels are evaluated, and how an image comes of the values.
 
-Between the integrator and Mitsuba's films. :class:`CenterSamples` evaluates each pixel once, at its
-centre; ``drgs.integrator.sampling`` derives from it for several samples per pixel.
+:class:`CenterSamples` evaluates each pixel once, at its centre. :class:`DrawnSamples` evaluates it
+at several points that Mitsuba's samplers choose: each pass evaluates every pixel at one point or,
+of a small film, at several (:class:`SamplePoints`). With a box filter the samples are averaged, in
+their order: the same bytes in every run. Any other filter spreads a sample over its neighbours,
+which Mitsuba does by atomic additions: such an image is the same up to rounding. No samples are
+taken beyond the film, also where it has ``sample_border``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.core.arrays import divide, from_host, interleave, quotient
+from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.footprint import PixelCenters, Positions
+from drgs.splatting.footprint import PixelCenters, Positions, flat_columns, total
+from drgs.splatting.grid import MICRO, Lanes, TileGrid
+from drgs.splatting.lanes import load_pixels
 
 Channels = list[Any]
 """Channels of one pass for a film, each Float (samples * H * W,): red, green, blue, perhaps alpha,
@@ -111,10 +118,7 @@ def pixels_adjoint(
 
 
 def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) -> np.ndarray:
-    """(developed channels, channels): the linear map that a film applies to each pixel.
-
-    maps: remembers those of films, by their description.
-    """
+    """Return the linear map that a film applies to each pixel: (developed channels, channels)."""
     key = f"{film} {', '.join(aovs)}"
     if key not in maps:
         maps[key] = _found_map(film, aovs)
@@ -140,3 +144,157 @@ def _found_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
             "pixel's channels linearly"
         )
     return matrix
+
+
+PIXELS_PER_PASS = 1 << 17
+"""Most pixels of a pass of several samples: a launch of fewer costs more than what it computes."""
+
+SAMPLES_PER_KERNEL = 16
+"""Of more samples per pixel, the sums of a box filter are evaluated in between: compilers take
+longer than proportionally to a kernel's length. Of other filters, which reach over many
+pixels, each pass is evaluated by itself."""
+
+
+def in_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePoints, ...]:
+    """Divide samples into passes; points: of all, those of a pixel are neighbours."""
+    at_once = min(max(PIXELS_PER_PASS // num_pixels, 1), count)
+    passes = []
+    for first in range(0, count, at_once):
+        samples = min(at_once, count - first)
+        sample, pixel = divide(dr.arange(mi.UInt32, samples * num_pixels), num_pixels, samples)
+        place = pixel * dr.opaque(mi.UInt32, count) + sample + dr.opaque(mi.UInt32, first)
+        passes.append(SamplePoints(*dr.gather(mi.Point2f, points, place), samples))
+    return tuple(passes)
+
+
+def by_sample(positions: Sequence[SamplePoints], passes: Sequence[Channels]) -> Iterator[Channels]:
+    """Divide the channels of passes into those of each sample, Float (H * W,)."""
+    for points, channels in zip(positions, passes, strict=True):
+        if points.samples == 1:
+            yield channels
+            continue
+        dr.eval(channels)
+        num_pixels = dr.width(points.x) // points.samples
+        for sample in range(points.samples):
+            pixel = dr.arange(mi.UInt32, num_pixels) + dr.opaque(mi.UInt32, sample * num_pixels)
+            yield [dr.gather(mi.Float, p, pixel, mode=dr.ReduceMode.Permute) for p in channels]
+
+
+class DrawnSamples(CenterSamples):
+    """``spp`` samples per pixel, drawn by a copy of the sensor's sampler."""
+
+    def __init__(
+        self,
+        sensor: mi.Sensor,
+        seed: int | mi.UInt32,
+        spp: int,
+        maps: dict[str, np.ndarray],
+        aovs: Sequence[str] = (),
+    ) -> None:
+        super().__init__(sensor.film(), maps, aovs)
+        seed = int(seed[0]) if dr.is_jit_v(seed) else seed  # its owner may change it in place
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(spp)
+        spp = sampler.sample_count()  # some round it up
+        size = self.film.crop_size()
+        num_pixels = size[0] * size[1]
+        sampler.set_samples_per_wavefront(spp)
+        sampler.seed(seed, num_pixels * spp)
+        points = sampler.next_2d()
+        self.positions = in_passes(points, spp, num_pixels)
+        dr.eval([(p.x, p.y) for p in self.positions])
+        self.key = (seed, spp, str(sensor.sampler()))
+
+    def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
+        film = self.film
+        if film.rfilter().is_box_filter():
+            count = sum(point.samples for point in self.positions)
+            sums = [mi.Float(0)] * len(passes[0])
+            for number, channels in enumerate(by_sample(self.positions, passes), 1):
+                sums = [total + plane for total, plane in zip(sums, channels, strict=True)]
+                if number % SAMPLES_PER_KERNEL == 0 and number < count:
+                    dr.eval(sums)
+            return develop_pixels(film, [total / count for total in sums], self.aovs)
+        film.prepare(self.aovs)
+        block = film.create_block()
+        for point, channels in zip(self.positions, passes, strict=True):
+            values = with_weight(film, channels, mi.Float(1))
+            corner = pixel_corners(film, point.samples) + mi.Vector2f(film.crop_offset())
+            block.put(corner + mi.Point2f(point.x, point.y), values)
+            dr.eval(block.tensor())  # a kernel for each pass: all are the same one
+        film.put_block(block)
+        return film.develop()
+
+    def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
+        if self.film.rfilter().is_box_filter():
+            count = sum(point.samples for point in self.positions)
+            averaged = pixels_adjoint(self.film, self.maps, grad_in, self.aovs)
+            of_sample = [d / count for d in averaged]
+            dr.eval(of_sample)
+            return [[repeat_array(d, point.samples) for d in of_sample] for point in self.positions]
+        # The image is linear in the channels: their values do not matter.
+        num_channels = num_colors(self.film) + len(self.aovs)
+        passes = [
+            [dr.opaque(mi.Float, 0, dr.width(point.x)) for _ in range(num_channels)]
+            for point in self.positions
+        ]
+        with dr.resume_grad():
+            dr.enable_grad(passes)
+            image = self.develop(passes)
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            derivatives = dr.grad(passes)
+        for of_pass in derivatives:
+            dr.eval(of_pass)  # as in develop
+        return derivatives
+
+
+@dataclass(frozen=True)
+class SamplePoints(Positions):
+    """Points in each pixel, one for each of some samples; equal if the arrays are the same."""
+
+    margin: ClassVar[float] = 0.5
+
+    x: Any = None  # Float (samples * H * W,) in [0, 1): from the pixel's left border, px
+    y: Any = None  # the same, from its upper border
+    samples: int = 1
+    bound: tuple[list[Any], list[Any]] | None = None  # the 16 of each lane
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> SamplePoints:
+        bound = tuple(load_pixels(plane, lanes, grid) for plane in (self.x, self.y))
+        return SamplePoints(bound=bound)
+
+    def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
+        x, y = Float(lanes.x), Float(lanes.y)
+        return [
+            (x + (pixel % MICRO) + px, y + (pixel // MICRO) + py)
+            for pixel, (px, py) in enumerate(zip(*self.bound, strict=True))
+        ]
+
+    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
+        Float = types_of(type(x)).Float
+        first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
+        dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.bound[0])]
+        dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.bound[1])]
+        return _grid(dx), _grid(dy)
+
+    def sum(self, values: list[Any]) -> Any:
+        return total(values)
+
+    def sum_dx(self, values: list[Any], dx: list) -> Any:
+        return total(_products(values, dx))
+
+    def sum_dy(self, values: list[Any], dy: list) -> Any:
+        return total(_products(values, dy))
+
+    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
+        return total(_products(_products(values, dy), dy))
+
+
+def _products(values: list[Any], grid: list[list[Any]]) -> list[Any]:
+    return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
+
+
+def _grid(values: list[Any]) -> list[list[Any]]:
+    return [values[MICRO * j : MICRO * j + MICRO] for j in range(MICRO)]

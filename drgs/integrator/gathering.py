@@ -1,16 +1,45 @@
 """All Gaussians of a picture, put together of those of splat objects and of shapes.
 
 Imported when a scene has more than the Gaussians of one integrator where they are. Each
-:class:`Part` converts what is stored of some Gaussians to raw parameters in world space, and
-derivatives along and back. Gradients take the way back by gathers alone: nothing is added
-atomically, and they are the same to the last bit in every run.
+:class:`Part` converts what is stored of some Gaussians to raw parameters in world space; Dr.Jit
+differentiates the conversions. Columns are gathered and interleaved as permutations: nothing is
+added atomically, and derivatives are the same to the last bit in every run.
+
+A :class:`Placement` moves the Gaussians of an object by a ``to_world`` x' = k R x + t:
+
+    mean' = k R mean + t    quat' = q_R quat    log_scale' = log_scale + ln k
+    smoothing' = k smoothing    shN' = D(R) shN
+
+with D the rotation of spherical harmonics (:mod:`drgs.gaussians.rotation`). k and R are those of
+the similarity that is nearest to the matrix, so that each of its twelve numbers has a derivative:
+a change dA of its upper 3 x 3 block A rotates by w and scales by 1 + l, where
+
+    dA A^-1 = l I + [w]x + S
+
+and S, symmetric and without trace, changes nothing. Along l and w, means change by l r + w x r with
+r = mean' - t, quaternions by (0, w) quat' / 2, and harmonics by sum_a w_a G_a shN' with G_a the
+generators of D.
+
+A :class:`Conversion` reads Mitsuba's shapes ``ellipsoids`` and ``ellipsoidsmesh``, which keep, of N
+Gaussians, ``data`` (10 N: per row centre, standard deviations, quaternion xyzw), ``opacities`` (N)
+in 0..1 and ``sh_coeffs`` (3 K N: per row K coefficients of red, green, blue)::
+
+    log_scales = ln |scales|    logit_opacities = ln(o / (1 - o))    shN = D sh_coeffs
+
+with D the rotation by which a shape was turned, as Mitsuba turns centres and quaternions but no
+coefficients. o is clamped to :data:`OPACITIES`: the derivative at o = 1 is that of the inside;
+outside of 0..1 it is zero. What has no positive opacity, or a standard deviation of zero, is not
+visible, and its derivatives are zero. The sign of a standard deviation means nothing, as for
+``volprim_rf_basic``. Numbers written in place through a view of a shape's memory are not noticed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+import operator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 from typing import Any, Protocol
 
 import drjit as dr
@@ -18,30 +47,34 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import from_host, interleave, tangent_of, types_of
+from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.gaussians.rotation import sh_rotation_generators, sh_rotation_matrices
+from drgs.gaussians.rotation import (
+    left_multiplication_matrix,
+    sh_rotation_generators,
+    sh_rotation_matrices,
+)
 from drgs.gaussians.sh import num_coefficients
+from drgs.gaussians.similarity import Similarity
+
+TO_WORLD = "to_world"
+
+PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
 
 
 class Part(Protocol):
-    """Conversion of stored Gaussians to raw parameters in world space, and its derivatives."""
+    """Conversion of stored Gaussians to raw parameters in world space."""
 
-    values: Any  # PyTree with num_gaussians, sh_degree and parameters(), by name; in a gathered
-    # part detached: holding it keeps its indices from being reused
+    values: dict[str, Any]  # arrays by name; detached in a gathered part, which holds them so that
+    # their indices are not reused
 
     @property
     def fixed(self) -> object:
         """Anything else that the conversion depends on; equal if the same."""
 
     def gaussians(self) -> Gaussians:
-        """All parameters, detached."""
-
-    def tangent(self, tangent: Mapping[str, Any]) -> Gaussians:
-        """Derivatives of the parameters along those of ``values.parameters()``."""
-
-    def adjoint(self, gradients: Gaussians, names: Collection[str]) -> dict[str, Any]:
-        """Derivatives with respect to parameters of these names, from those of ``gaussians()``."""
+        """Return all parameters, differentiable with respect to ``values``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +82,7 @@ class Gathered:
     """All Gaussians of a rendering, by part."""
 
     parts: list[Part]  # detached
+    sizes: list[tuple[int, int]]  # by part: number of Gaussians, degree
     gaussians: Gaussians  # detached and evaluated
 
     def matches(self, parts: Sequence[Part]) -> bool:
@@ -58,29 +92,40 @@ class Gathered:
         ) and [part.fixed for part in self.parts] == [part.fixed for part in parts]
 
     def accumulate(self, parts: Sequence[Part], gradients: Gaussians) -> None:
-        """Hand the same parts, attached, their derivatives."""
+        """Accumulate derivatives into the same parts, attached."""
         start = 0
-        for part, own in zip(parts, self.parts, strict=True):
-            parameters = part.values.parameters()
-            attached = {k: v for k, v in parameters.items() if dr.width(v) and dr.grad_enabled(v)}
-            num = own.values.num_gaussians
+        for part, own, (num, degree) in zip(parts, self.parts, self.sizes, strict=True):
+            attached = {k: v for k, v in part.values.items() if dr.width(v) and dr.grad_enabled(v)}
             if attached and num > 0:
-                rows = _rows(gradients, start, num, own.values.sh_degree)
-                for name, derivative in own.adjoint(rows, list(attached)).items():
-                    dr.accum_grad(attached[name], derivative)
+                copy = replace(own, values=dr.detach(own.values))
+                dr.enable_grad([copy.values[name] for name in attached])
+                rows = _arrays(_rows(gradients, start, num, degree))
+                found = _arrays(copy.gaussians())
+                outputs = {k: v for k, v in found.items() if k in rows and dr.grad_enabled(v)}
+                for name, values in outputs.items():
+                    dr.accum_grad(values, rows[name])
+                dr.enqueue(dr.ADMode.Backward, list(outputs.values()))
+                dr.traverse(dr.ADMode.Backward)
+                for name, values in attached.items():
+                    dr.accum_grad(values, dr.grad(copy.values[name]))
             start += num
 
     def tangents(self, parts: Sequence[Part]) -> Gaussians:
-        """Derivatives of all Gaussians, from those set on the same parts, attached."""
-        tangents = []
+        """Return derivatives of all Gaussians along those set on the same parts, attached."""
+        found = []
         for part, own in zip(parts, self.parts, strict=True):
-            parameters = part.values.parameters()
-            tangents.append(own.tangent({k: tangent_of(v) for k, v in parameters.items()}))
-        return _joined(tangents, self.gaussians.sh_degree)
+            copy = replace(own, values=dr.detach(own.values))
+            dr.enable_grad(copy.values)
+            for name, values in part.values.items():
+                dr.set_grad(copy.values[name], tangent_of(values))
+            moved = copy.gaussians()
+            dr.forward_to(moved)
+            found.append(_gaussians({k: tangent_of(v) for k, v in _arrays(moved).items()}))
+        return _joined(found, self.gaussians.sh_degree)
 
 
 def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
-    """The Gaussians of all parts in their order, of the highest degree that any has.
+    """Return the Gaussians of all parts in their order, of the highest degree that any has.
 
     last: the result of the last call, which is returned again while nothing has changed. Features
     and coefficients that a part lacks are zeros, and so is a smoothing filter.
@@ -89,61 +134,51 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     if last is not None and last.matches(parts):
         return last
     converted = [part.gaussians() for part in parts]
-    gaussians = _joined(converted, max(part.sh_degree for part in converted))
+    sizes = [(part.num_gaussians, part.sh_degree) for part in converted]
+    gaussians = _joined(converted, max(degree for _, degree in sizes))
     dr.eval(gaussians)
-    return Gathered(parts, gaussians)
-
-
-_ROWS = {
-    **{"means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3)},
-    **{"logit_opacities": (), "smoothing": ()},
-}
-"""Shapes of the rows that do not depend on the degree."""
+    return Gathered(parts, sizes, gaussians)
 
 
 def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
-    """Concatenate the rows of all parts."""
-    parts = [part for part in parts if part.num_gaussians > 0]
-    found, rows = [_arrays(part) for part in parts], _row_shapes(degree)
-    rows |= {k: v.shape[1:] for arrays in found for k, v in arrays.items() if k not in rows}
+    found = [(part.num_gaussians, _arrays(part)) for part in parts if part.num_gaussians > 0]
+    shapes = {k: v.shape[1:] for _, arrays in found for k, v in arrays.items()}
+    shapes["shN"] = _sh_shape(degree)
     whole = {}
-    for name in dict.fromkeys(name for arrays in found for name in arrays):
-        blocks = [
-            _block(arrays.get(name), 0, part.num_gaussians, part.num_gaussians, rows[name])
-            for arrays, part in zip(found, parts, strict=True)
-        ]
+    for name, row in shapes.items():
+        blocks = [_block(arrays.get(name), 0, num, num, row) for num, arrays in found]
         filled = [block for block in blocks if dr.width(block) > 0]  # dr.concat takes no others
-        whole[name] = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
-    return _gaussians(whole, rows, sum(part.num_gaussians for part in parts))
+        flat = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
+        whole[name] = _shaped(flat, sum(num for num, _ in found), row)
+    return _gaussians(whole)
 
 
 def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
     """Return ``num`` rows from row ``start`` on, with the coefficients that ``degree`` has."""
-    arrays, rows = _arrays(gaussians), _row_shapes(degree)
-    rows |= {k: v.shape[1:] for k, v in arrays.items() if k not in rows}
-    blocks = {
-        name: _block(values, start, num, gaussians.num_gaussians, rows[name])
-        for name, values in arrays.items()
-    }
-    return _gaussians(blocks, rows, num)
+    arrays = _arrays(gaussians)
+    shapes = {k: v.shape[1:] for k, v in arrays.items()} | {"shN": _sh_shape(degree)}
+    total = gaussians.num_gaussians
+    blocks = {k: _block(v, start, num, total, shapes[k]) for k, v in arrays.items()}
+    return _gaussians({k: _shaped(v, num, shapes[k]) for k, v in blocks.items()})
 
 
-def _row_shapes(degree: int) -> dict[str, tuple[int, ...]]:
-    return {**_ROWS, "shN": (num_coefficients(degree) - 1, 3)}
+def _sh_shape(degree: int) -> tuple[int, int]:
+    return num_coefficients(degree) - 1, 3
+
+
+def _shaped(flat: Any, num: int, row: tuple[int, ...]) -> Any:
+    return mi.TensorXf(flat, (num, *row)) if row else flat
 
 
 def _arrays(part: Gaussians) -> dict[str, Any]:
-    """Return all arrays that a part has, by name."""
     named = {name: getattr(part, name) for name in (*PARAMETER_NAMES, "smoothing")}
     return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
 
 
-def _gaussians(arrays: dict[str, Any], rows: dict[str, tuple[int, ...]], num: int) -> Gaussians:
-    """Return Gaussians of flat arrays; rows: shapes of their rows."""
-    shaped = {k: mi.TensorXf(v, (num, *rows[k])) if rows[k] else v for k, v in arrays.items()}
-    names = [name for name in shaped if name not in (*_ROWS, "shN")]
-    features = {name: shaped.pop(name) for name in names}
-    return Gaussians(**shaped, features=features or None)
+def _gaussians(arrays: dict[str, Any]) -> Gaussians:
+    features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
+    own = {k: v for k, v in arrays.items() if k not in features}
+    return Gaussians(**own, features=features or None)
 
 
 def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) -> Any:
@@ -162,24 +197,35 @@ def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) 
 
 
 def columns(flat: Any, width: int) -> list[Any]:
-    """The columns of rows of ``width`` numbers; see :func:`interleaved`."""
+    """Return the columns of rows of ``width`` numbers; see :func:`interleaved`."""
     if width == 0:
         return []
     UInt32 = types_of(type(flat)).UInt32
     row = dr.arange(UInt32, dr.width(flat) // width) * width
-    return [dr.gather(type(flat), flat, row + k) for k in range(width)]
+    return [dr.gather(type(flat), flat, row + k, mode=dr.ReduceMode.Permute) for k in range(width)]
 
 
 def interleaved(values: list[Any]) -> Any:
-    """Columns as rows again, flat; of no columns, an empty array."""
+    """Return columns as rows again, flat; of no columns, an empty array."""
     return interleave(values) if values else mi.Float()
 
 
-# ----------------------------------------------------------------------------------------------
-# Spherical harmonics
-# ----------------------------------------------------------------------------------------------
+def number_of(flat: Any, index: int) -> Any:
+    """Return one entry of an array, in no kernel: other numbers need no other one."""
+    return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))
 
-PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
+
+def product(matrix: Any, vector: list[Any], start: int = 0) -> list[Any]:
+    """Multiply by a square matrix, flat from ``start`` on."""
+    rows = [
+        [number_of(matrix, start + j * len(vector) + k) for k in range(len(vector))]
+        for j in range(len(vector))
+    ]
+    return [_sum(a * x for a, x in zip(row, vector, strict=True)) for row in rows]
+
+
+def _sum(terms: Any) -> Any:
+    return reduce(operator.add, terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,34 +236,237 @@ class Turn:
 
     @staticmethod
     def by(rotation: np.ndarray) -> Turn:
-        """The rotation of spherical harmonics; rotation: (3, 3), x' = R x."""
+        """Return the rotation of spherical harmonics; rotation: (3, 3), x' = R x."""
         return Turn._from(sh_rotation_matrices(rotation, 3))
 
     @staticmethod
     def generators() -> list[Turn]:
-        """Derivatives of turned coefficients along rotations about x, y and z."""
+        """Return derivatives of turned coefficients along rotations about x, y and z."""
         return [Turn._from(matrices) for matrices in sh_rotation_generators(3)]
 
     @staticmethod
     def _from(matrices: Sequence[np.ndarray]) -> Turn:
         return Turn(from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices])))
 
-    def of(self, columns: list[Any], transposed: bool = False) -> list[Any]:
-        """Columns of the coefficients of degree 1 and above, three a coefficient; turned."""
+    def of(self, columns: list[Any]) -> list[Any]:
+        """Turn columns of the coefficients of degree 1 and above, three a coefficient."""
         turned, start = [], 0
         for degree in range(1, PER_DEGREE[len(columns) // 3 + 1] + 1):
             size = 2 * degree + 1
             band = columns[3 * (degree**2 - 1) :][: 3 * size]
-            for k in range(size):
-                cells = [j * size + k if transposed else k * size + j for j in range(size)]
-                row = [number_of(self.matrices, start + cell) for cell in cells]
-                for c in range(3):
-                    terms = [a * x for a, x in zip(row, band[c::3], strict=True)]
-                    turned.append(sum(terms[1:], terms[0]))
+            channels = [product(self.matrices, band[c::3], start) for c in range(3)]
+            turned += [value for values in zip(*channels, strict=True) for value in values]
             start += size * size
         return turned
 
 
-def number_of(flat: Any, index: int) -> Any:
-    """One entry of an array, in no kernel: other numbers need no other one."""
-    return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))
+# ----------------------------------------------------------------------------------------------
+# Objects
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """The move of an object into the scene: see :class:`Part`."""
+
+    values: dict[str, Any]  # arrays of the object's Gaussians, and its to_world: Matrix4f
+    fixed: str  # name of the parameter to_world, in messages
+
+    @staticmethod
+    def of(gaussians: Gaussians, to_world: Any, name: str) -> Placement:
+        """Place Gaussians by a matrix of one lane."""
+        return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
+
+    def gaussians(self) -> Gaussians:
+        """Return all parameters; PluginError where they leave float32."""
+        arrays = {name: values for name, values in self.values.items() if name != TO_WORLD}
+        if dr.grad_enabled(self.values[TO_WORLD]) or not self._place.is_identity:
+            arrays |= self._moved(arrays)
+        return _gaussians(arrays)
+
+    @cached_property
+    def _place(self) -> Similarity:
+        return similarity_of(self.values[TO_WORLD], self.fixed)
+
+    def _moved(self, arrays: dict[str, Any]) -> dict[str, Any]:
+        place, split = self._place, {k: _columns_of(arrays[k]) for k in ("means", "quats", "shN")}
+        turned = {
+            "means": product(_device(place.scale * place.rotation), split["means"]),
+            "quats": product(_device(left_multiplication_matrix(place.rotation)), split["quats"]),
+            "shN": Turn.by(place.rotation).of(split["shN"]),
+        }
+        scale = _device(np.array([place.scale, np.log(place.scale)]))
+        log_scales = [c + number_of(scale, 1) for c in _columns_of(arrays["log_scales"])]
+        moved = turned | {"log_scales": log_scales}
+        if "smoothing" in arrays:
+            moved["smoothing"] = [arrays["smoothing"] * number_of(scale, 0)]
+        if dr.grad_enabled(self.values[TO_WORLD]):
+            moved = self._with_motion(moved)
+        translation = _device(place.translation)
+        moved["means"] = [c + number_of(translation, k) for k, c in enumerate(moved["means"])]
+        self._check_finite(split, moved)
+        smoothing = {k: moved.pop(k)[0] for k in list(moved) if k == "smoothing"}
+        tensors = {k: mi.TensorXf(interleaved(v), arrays[k].shape) for k, v in moved.items()}
+        return tensors | smoothing
+
+    def _check_finite(self, own: dict[str, Any], moved: dict[str, Any]) -> None:
+        pairs = zip(own["means"] + own["quats"], moved["means"] + moved["quats"], strict=True)
+        dr.eval(moved["means"], moved["quats"])
+        beyond = [dr.isfinite(before) & ~dr.isfinite(after) for before, after in pairs]
+        rows = dr.compress(reduce(operator.or_, beyond))
+        if dr.width(rows) > 0:
+            raise PluginError(
+                f"{self.fixed} moves Gaussian {rows[0]} beyond the end of float32, 3.4e38; crop or "
+                "scale the object"
+            )
+
+    def _with_motion(self, moved: dict[str, Any]) -> dict[str, Any]:
+        """Attach Gaussians, turned about the object's origin, to a change of the matrix.
+
+        Numbers that are not finite, of Gaussians that are not visible, do not move: they would make
+        all of a sum NaN.
+        """
+        scale, w, shift = self._motion(dr.width(moved["means"]))
+        arms = {
+            k: [dr.select(dr.isfinite(c), c, 0) for c in dr.detach(values)]
+            for k, values in moved.items()
+        }
+        r, (real, *imaginary) = mi.Vector3f(arms["means"]), arms["quats"]
+        v = mi.Vector3f(imaginary)
+        about_axes = zip(*(turn.of(arms["shN"]) for turn in Turn.generators()), strict=True)
+        changes = {
+            "means": list(scale * r + dr.cross(w, r) + shift),
+            "quats": [-dr.dot(w, v) / 2, *((w * real + dr.cross(w, v)) / 2)],
+            "shN": [w.x * x + w.y * y + w.z * z for x, y, z in about_axes],
+            "log_scales": [scale] * 3,
+            "smoothing": [c * scale for c in arms.get("smoothing", [])],
+        }
+        return {
+            k: [a + b for a, b in zip(values, changes[k], strict=True)]
+            for k, values in moved.items()
+        }
+
+    def _motion(self, num: int) -> tuple[mi.Float, mi.Vector3f, mi.Vector3f]:
+        """Return l, w and the translation of a change of the matrix: attached zeros (N,)."""
+        matrix, place = self.values[TO_WORLD], self._place
+        change = matrix - dr.detach(matrix)
+        inverse = _device(place.rotation.T / place.scale)
+        inverse = mi.Matrix3f([number_of(inverse, k) for k in range(9)])
+        d = mi.Matrix3f([change[i, k] for i in range(3) for k in range(3)]) @ inverse
+        zero = dr.opaque(mi.Float, 0, num)
+        return (
+            (d[0, 0] + d[1, 1] + d[2, 2]) / 3 + zero,
+            mi.Vector3f(d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]) / 2 + zero,
+            mi.Vector3f([change[i, 3] for i in range(3)]) + zero,
+        )
+
+
+def similarity_of(to_world: Any, name: str) -> Similarity:
+    """Return the similarity nearest to a Matrix4f; PluginError unless it is close to one."""
+    matrix = np.array(dr.detach(to_world), np.float64)
+    if matrix.size != 16:
+        raise PluginError(f"{name} must be one transform, got {matrix.shape[2]}")
+    return Similarity.of(matrix.reshape(4, 4), name)
+
+
+def _device(values: np.ndarray) -> mi.Float:
+    return from_host(mi.Float, values.ravel())
+
+
+def _columns_of(tensor: Any) -> list[Any]:
+    return columns(tensor.array, math.prod(tensor.shape[1:]))
+
+
+DATA = 10
+"""Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""
+
+OPACITIES = (2.0**-64, 1 - 2.0**-24)
+"""The largest float32 below 1, whose logit is 16.6; and an opacity that no picture shows, so far
+from zero that neither it nor its reciprocal leaves float32."""
+
+HIDDEN = -1e4
+"""A logit whose sigmoid is exactly zero."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Reading
+# ----------------------------------------------------------------------------------------------
+
+
+def read(shape: mi.Shape) -> dict[str, Any]:
+    """Read the shape's arrays, attached. Raises PluginError that names what does not fit."""
+    values = mi.traverse(shape)
+    where = f"splats: the {_name(shape)}"
+    missing = [name for name in ("opacities", "sh_coeffs") if name not in values]
+    if missing:
+        others = [name for name in values.keys() if not name.startswith("extent")]  # noqa: SIM118
+        raise PluginError(
+            f"{where} must have the attributes opacities and sh_coeffs; missing: "
+            f"{', '.join(missing)}; it has: {', '.join(others)}"
+        )
+    num = dr.width(values["data"]) // DATA
+    allowed = {"opacities": [1], "sh_coeffs": [3 * k for k in PER_DEGREE]}
+    for name, widths in allowed.items():
+        got = dr.width(values[name])
+        if num == 0 or got not in [num * width for width in widths]:
+            words = " or ".join(f"({num}, {width})" for width in widths)
+            raise PluginError(f"{where} must have {name} of shape {words}, got {got} numbers")
+    return {name: values[name] for name in ("data", *allowed)}
+
+
+def _name(shape: mi.Shape) -> str:
+    kind = "ellipsoidsmesh" if shape.is_mesh() else "ellipsoids"
+    return f"shape '{shape.id()}' ({kind})" if shape.id() else f"shape without an id ({kind})"
+
+
+# ----------------------------------------------------------------------------------------------
+# Converting
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Conversion:
+    """The conversion of a shape's arrays to raw parameters; see ``gathering.Part``."""
+
+    values: dict[str, Any]  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
+    fixed: Turn | None  # of the harmonics, which is not differentiated
+
+    def gaussians(self) -> Gaussians:
+        num = dr.width(self.values["opacities"])
+        data = columns(self.values["data"], DATA)
+        sh = columns(self.values["sh_coeffs"], dr.width(self.values["sh_coeffs"]) // num)
+        scales, (x, y, z, w) = [dr.abs(scale) for scale in data[3:6]], data[6:]
+        # Written such that a NaN is not visible.
+        is_visible = (scales[0] > 0) & (scales[1] > 0) & (scales[2] > 0)
+        higher = sh[3:] if self.fixed is None else self.fixed.of(sh[3:])
+        opacity = self._opacity(is_visible)
+        logits = dr.log(opacity / (1 - opacity))
+        log_scales = [dr.log(dr.select(is_visible, scale, 1)) for scale in scales]
+        return Gaussians(
+            means=mi.TensorXf(interleave(data[:3]), (num, 3)),
+            quats=mi.TensorXf(interleave([w, x, y, z]), (num, 4)),
+            log_scales=mi.TensorXf(interleave(log_scales), (num, 3)),
+            logit_opacities=dr.select(is_visible, logits, HIDDEN),
+            sh0=mi.TensorXf(interleave(sh[:3]), (num, 1, 3)),
+            shN=mi.TensorXf(interleaved(higher), (num, len(sh) // 3 - 1, 3)),
+        )
+
+    def _opacity(self, is_visible: mi.Bool) -> mi.Float:
+        """Return opacities between bounds, attached where they were within 0..1; a NaN stays."""
+        (lowest, highest), value = OPACITIES, self.values["opacities"]
+        clamped = dr.detach(dr.select(value < lowest, lowest, value))
+        clamped = dr.select(clamped > highest, highest, clamped)
+        inside = (value >= 0) & (value <= 1) & is_visible
+        return dr.select(inside, dr.replace_grad(clamped, value), clamped)
+
+
+def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, Turn]) -> list[Conversion]:
+    """Read the values of shapes, attached; turns: by their ids, "": of all others."""
+    unknown = set(turns) - {shape.id() for shape in shapes} - {""}
+    if unknown:
+        found = ", ".join(f"'{shape.id()}'" for shape in shapes if shape.id()) or "none"
+        raise PluginError(
+            f"splats: shapes_to_world_{min(unknown)} must end with the id of a shape of type "
+            f"ellipsoids or ellipsoidsmesh, ids are: {found}"
+        )
+    return [Conversion(read(shape), turns.get(shape.id(), turns.get(""))) for shape in shapes]

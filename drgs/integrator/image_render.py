@@ -1,14 +1,9 @@
 """An image of the integrator ``splats``: its sensors, and the channels of the film.
 
-An :class:`ImageRender` has a :class:`SensorRender` for each sensor; they are several only for a
-``batch``. That renders frames (``drgs.splatting.rendering``), one for each time at which its
-shutter is open and each pass of samples, composites them over the background, and returns channels
-of the film. The film develops these (``drgs.integrator.film``), and a nested integrator's image of
-surfaces is inserted (``drgs.integrator.surfaces``). :meth:`ImageRender.backward` and
+An :class:`ImageRender` has a :class:`SensorRender` for each sensor of a ``batch``, or one. The film
+develops their channels (``drgs.integrator.film``), and a nested integrator's image of surfaces is
+inserted (``drgs.integrator.surfaces``). :meth:`ImageRender.backward` and
 :meth:`ImageRender.tangent` run the same way back and along.
-
-Frames are reused while nothing that they depend on has changed: ``mi.render`` calls ``render`` and,
-later, ``render_backward`` on the same integrator, with other pictures possibly in between.
 """
 
 from __future__ import annotations
@@ -23,14 +18,14 @@ import mitsuba as mi
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_image
 from drgs.integrator.film import CenterSamples
-from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.rays import passes_splats
 from drgs.integrator.sensor_render import Planes, SensorRender, constant_background
 from drgs.integrator.sensors import is_batch, num_poses, sensors_of
 from drgs.integrator.state import SplatsState
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:  # imported where a scene calls for them
-    from drgs.integrator.batch import SideBySide
+    from drgs.integrator.sensors import SideBySide
     from drgs.integrator.surfaces import Hybrid
 
 
@@ -45,16 +40,9 @@ class ImageRender:
 
     @staticmethod
     def of(
-        splats: SplatsState,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        seed: int | mi.UInt32,
-        spp: int,
+        splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
     ) -> ImageRender:
-        """Choose where the sensor's pixels are evaluated, and how its film develops them.
-
-        seed, spp: as ``mi.render`` has them; 0 samples per pixel: those of the sensor's sampler.
-        """
+        """Choose where pixels are evaluated; spp: 0 for that of the sensor's sampler."""
         hybrid = hybrid_of(splats, scene, sensor, seed, spp)
         names = splats.aov_names()
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
@@ -65,7 +53,7 @@ class ImageRender:
         if spp == 1 and film.rfilter().is_box_filter():
             samples = CenterSamples(film, maps, names)
         else:
-            from drgs.integrator.sampling import DrawnSamples
+            from drgs.integrator.film import DrawnSamples
 
             samples = DrawnSamples(sensor, seed, spp, maps, names)
         whole = SensorRender(
@@ -80,22 +68,18 @@ class ImageRender:
         )
         if not is_batch(sensor):
             return ImageRender([whole], samples, hybrid)._with_surfaces()
-        from drgs.integrator.batch import SideBySide
+        from drgs.integrator.sensors import SideBySide
 
         batch = SideBySide.of(sensor)
         views = [
             replace(
-                whole,
-                index=index,
-                sensor=one,
-                positions=batch.positions(whole.positions, index),
+                whole, index=index, sensor=one, positions=batch.positions(whole.positions, index)
             )
             for index, one in enumerate(batch.sensors)
         ]
         return ImageRender(views, samples, hybrid, batch)._with_surfaces()
 
     def _with_surfaces(self) -> ImageRender:
-        """Return the same with channels for all surfaces that are seen one through the other."""
         if self.hybrid is None:
             return self
         hybrid = self.hybrid.with_surfaces(max(view.num_surfaces() for view in self.views))
@@ -110,11 +94,7 @@ class ImageRender:
         return self.hybrid.insertion.develop(image, self.hybrid.pictures())
 
     def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
-        """Return derivatives with respect to the Gaussians; accumulate all others.
-
-        params: as ``mi.render`` has them; grad_in: derivative of the loss with respect to the
-        image.
-        """
+        """Return derivatives with respect to the Gaussians; accumulate all others."""
         if self.hybrid is not None:
             own, nested = self._image_of_splats(), self.hybrid.pictures()
             grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
@@ -128,10 +108,7 @@ class ImageRender:
         return reduce(rendering.sum_of_gradients, gradients)
 
     def tangent(self, params: object, tangents: Gaussians) -> mi.TensorXf:
-        """Return the directional derivative of the image.
-
-        tangents: of the Gaussians; those of all other parameters are set on them.
-        """
+        """Return the directional derivative; tangents: of the Gaussians."""
         splats = self.views[0].splats
         d_planes = [view.plane_tangents(tangents) for view in self.views]
         planes = [view.planes() for view in self.views]
@@ -154,29 +131,23 @@ class ImageRender:
         return self.hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
 
     def _image_of_splats(self) -> mi.TensorXf:
-        """Return the image of the splats, with the channels that surfaces need."""
         constant = constant_background(self.views[0].splats)
         return self._developed([view.planes() for view in self.views], constant)
 
     def _developed(self, planes: list[Planes], constant: mi.Color3f | None) -> mi.TensorXf:
-        """planes: by view."""
         pictures = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
         passes = pictures[0] if self.batch is None else self.batch.put_together(pictures)
         return self.samples.develop(passes)
 
 
 def hybrid_of(
-    splats: SplatsState,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    seed: int | mi.UInt32,
-    spp: int,
+    splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
 ) -> Hybrid | None:
     """Return the surfaces' part of an image; None where there are none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
+    from drgs.integrator.rays import StraightRays
     from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces
-    from drgs.integrator.transparency import StraightRays
 
     cache, hide_emitters = splats.cache, splats.hide_emitters
     surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
@@ -192,7 +163,7 @@ def hybrid_of(
         if passes_splats(nested):
             nested.use_transport(None)  # another integrator may have given it one
     else:
-        from drgs.integrator.ray_transport import nested_with_transport
+        from drgs.integrator.splat_transport import nested_with_transport
 
         num_paths = splats.nested_spp or spp or sensor.sampler().sample_count()
         nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))

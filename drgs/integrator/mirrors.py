@@ -1,14 +1,10 @@
 """Flat mirrors among probes: the splats as cameras see them that are mirrored in their planes.
 
-Imported where a scene has probes. A ray of a camera that a plane mirrors goes on along a ray
-of the camera that is mirrored in it: what it meets of splats is a pixel of the latter's picture.
-That is rendered by the kernels that make all others, with a few texels for each pixel. Splats on
-the other side of the plane are left out, and so are those behind the surface that the mirrored ray
-meets: a ray that ends elsewhere, as at the edge of such a surface, looks at those of the texels
-around it that end where it does.
-
-A ray that leaves the plane on none of the mirrored camera's rays, after other bounces or scattered,
-is not known.
+A ray of a camera that a plane mirrors goes on along a ray of the mirrored camera: what it meets of
+splats is a pixel of that one's image, which has a few texels for each pixel. Splats on the other
+side of the plane are left out, and so are those behind the surface that the mirrored ray meets: a
+ray looks at those of the texels around it that end where it does. A ray that leaves the plane on
+none of the mirrored camera's rays, after other bounces or scattered, is not known.
 
 Nothing here is differentiated.
 """
@@ -23,16 +19,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.accuracy.peak_depths import BoundedDepths
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.path_segment import PathSegment
+from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
-from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.probe import LOW_PASS, Seen
 from drgs.splatting import rendering
 
@@ -66,11 +60,6 @@ SAME_END = (0.1, 0.01)
 from the mirror on, and to that from the camera to the mirror: both are allowed."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Planes
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Plane:
     """Points x with normal . x = offset, world; arrays of them, by mirror, in :class:`Mirrors`."""
@@ -88,10 +77,7 @@ class Plane:
         return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
 
     def mirror(self, camera: Camera) -> Camera:
-        """Mirror a camera: each pixel sees what the mirror shows there.
-
-        Its axes have the other handedness, which the projection does not notice.
-        """
+        """Mirror a camera, whose axes then have the other handedness."""
         n = self.normal
         turned = [
             list(axis - 2 * dr.dot(axis, n) * n) for axis in map(mi.Vector3f, camera.rotation)
@@ -162,11 +148,6 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
     return axes[:, 0].tolist(), float(axes[:, 0] @ middle)
 
 
-# ----------------------------------------------------------------------------------------------
-# Pictures
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Mirrors:
     """Pictures of the splats that cameras see in mirrors."""
@@ -183,10 +164,7 @@ class Mirrors:
         approximations: Approximations,
         sh_degree: int,
     ) -> Mirrors:
-        """Render the pictures. Cameras that move have none.
-
-        scene: of the surfaces.
-        """
+        """Render the images, of cameras that do not move; scene: of the surfaces."""
         normals = np.array([mirror.normal for mirror in mirrors], np.float32)
         every = Plane(mi.Vector3f(normals.T), mi.Float([mirror.offset for mirror in mirrors]))
         cameras = [c for c in map(camera_from_sensor, states) if c.shutter is None]
@@ -238,10 +216,7 @@ class _View:
         far: mi.Float,
         active: mi.Bool,
     ) -> Seen:
-        """Look up what rays meet, as far as they go on along those of the camera.
-
-        origin, direction: those of the mirrored rays, as if they had gone through the mirror.
-        """
+        """Look up what mirrored rays meet, as far as they go on along those of the camera."""
         camera, rounding = self.camera, OFF_SURFACE * (1 + dr.max(dr.abs(origin)))
         origin = camera.rotation @ (mi.Vector3f(origin) - camera.center)
         direction = camera.rotation @ mi.Vector3f(direction)
@@ -291,7 +266,6 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
 
 
 def _enlarged(camera: Camera, scale: float) -> Camera:
-    """Scale a camera's film, and add a border."""
     factor = dr.opaque(mi.Float, scale)
     changes = {
         name: factor * getattr(camera, name) + BORDER
@@ -322,7 +296,7 @@ def _picture(
     dr.make_opaque(plane, camera)
     nearest, farthest, ends = _trace(camera, plane, scene)
     pipeline = with_effects(pipeline, gaussians, camera)
-    depths = BoundedDepths(pipeline.order.depths, nearest, farthest)
+    depths = replace(pipeline.order.depths, bounds=(nearest, farthest))
     order = replace(pipeline.order, depths=depths)
     frame = rendering.render(gaussians, camera, replace(pipeline, order=order))
     T, *color = frame.planes()

@@ -1,156 +1,222 @@
 """Properties of scene descriptions, read and checked for the plugins.
 
-The readers of single values serve both plugins, the others ``splats``. All raise
+:data:`SETTINGS` declares the settings of ``splats``; :func:`read` reads such a table. Errors are
 :class:`drgs.core.errors.PluginError` with the plugin's name, that of the property, what was
-expected and what was given; where the type is wrong, its subclass ``PluginTypeError``.
+expected and what was given; where the type is wrong, ``PluginTypeError``.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.approximations import DECLARED, Approximations, Declared, Value, said_by
+from drgs.config.approximations import DECLARED, Approximations, Value, said_by
 from drgs.core.constants import MAX_INT, NEAR
 from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
 from drgs.core.origin import WORLD, shown_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.checks import check_shapes, degree_of
-from drgs.integrator.path_segment import passes_splats
+from drgs.integrator.checks import check_shapes
+from drgs.integrator.rays import passes_splats
 from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
     from drgs.integrator.gathering import Turn
 
+
+# ----------------------------------------------------------------------------------------------
+# Tables of properties
+# ----------------------------------------------------------------------------------------------
+
+
+class Property(NamedTuple):
+    """A value of one type that a plugin can be given."""
+
+    kind: type  # bool, int, float or str
+    default: Value | None
+    expected: str  # what messages ask for
+    allows: Callable[[Any], bool] = lambda value: True
+    words: Sequence[str] = ()
+
+
+def flag(default: bool) -> Property:
+    """Declare true or false."""
+    return Property(bool, default, "true or false")
+
+
+def number(default: float) -> Property:
+    """Declare a number that is finite in single precision, in which it is kept."""
+    return Property(float, default, "a finite number", lambda v: math.isfinite(_single(v)))
+
+
+def positive(default: float) -> Property:
+    """Declare a number above 0 and finite, in single precision as well."""
+    return Property(float, default, "a positive number", lambda v: 0 < _single(v) < math.inf)
+
+
+def integer(default: int | None, least: int, most: int = MAX_INT) -> Property:
+    """Declare an integer from ``least`` to ``most``."""
+    expected = f"an integer from {least} to {most}"
+    if most == MAX_INT:
+        expected = f"an integer of at least {least}"
+    return Property(int, default, expected, lambda v: least <= v <= most)
+
+
+def one_of(*words: str) -> Property:
+    """Declare one of several words, the first of which is the default."""
+    return Property(str, words[0], f"one of {', '.join(words)}", words.__contains__, words)
+
+
+def _single(value: float) -> float:
+    with np.errstate(over="ignore"):
+        return float(np.float32(value))
+
+
+def read(props: mi.Properties, declared: Mapping[str, Property]) -> dict[str, Any]:
+    """Return the values of declared properties that are given, and defaults for the others."""
+    return {
+        name: _checked(props, name, one) if name in props else one.default
+        for name, one in declared.items()
+    }
+
+
+def _checked(props: mi.Properties, name: str, declared: Property) -> Any:
+    value, where = props[name], f"{props.plugin_name()}: {name} must be"
+    if declared.kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not declared.kind:
+        raise PluginTypeError(f"{where} {declared.expected}, got {value!r}")
+    if not declared.allows(value):
+        hint = did_you_mean(str(value), declared.words)
+        raise PluginError(f"{where} {declared.expected}, got {value!r}{hint}")
+    return value
+
+
+def matrix(props: mi.Properties, name: str) -> np.ndarray:
+    """Return a transform that is given: (4, 4) float64."""
+    value = props[name]
+    if props.type(name) != mi.Properties.Type.Transform:
+        raise PluginTypeError(
+            f"{props.plugin_name()}: {name} must be a transform, got {type(value).__name__}"
+        )
+    return np.array(value.matrix, np.float64)
+
+
+def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:
+    """Raise PluginError for a property that nobody has read: a mistyped name."""
+    for name in props.unqueried():
+        hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
+        raise PluginError(f"{props.plugin_name()}: there is no parameter {name}{hint}")
+
+
+# ----------------------------------------------------------------------------------------------
+# The integrator's
+# ----------------------------------------------------------------------------------------------
+
+SETTINGS = {
+    "near": positive(NEAR),
+    "hide_emitters": flag(False),
+    "srgb_primitives": flag(True),
+    "sh_degree": integer(None, 0, 3),
+    "nested_spp": integer(0, least=0),
+    "light": one_of("none", "probe", "rays"),
+    "light_samples": integer(4, 0, 4096),
+    "unseen": one_of("none", "rays"),
+    "exposure": positive(1.0),
+}
+"""Settings of ``splats`` that are single values, besides the approximations."""
+
+APPROXIMATIONS = {
+    name: Property(one.kind, one.default, one.expected, one.allows, one.words)
+    for name, one in DECLARED.items()
+}
+
 FEATURE = "feature_"
-"""What the names of parameters begin with that hold numbers of the user's own."""
+"""Prefix of the names of parameters that hold numbers of the user's own."""
 
 SHAPES_TO_WORLD = "shapes_to_world"
-"""What the names of parameters begin with that tell the ``to_world`` of shapes."""
-
-
-KNOWN = (
-    *("filename", "to_world", SHAPES_TO_WORLD, "sh_degree", "background", "hide_emitters", "near"),
-    *("srgb_primitives", "nested_spp", "light", "light_samples", "probes", "shadows", "exposure"),
-    *("unseen", "aovs", "ignore", "smoothing"),
-    *DECLARED,
-    *PARAMETER_NAMES,
-)
-"""Names of the properties of ``splats``, but for those that begin with :data:`FEATURE` or
-:data:`SHAPES_TO_WORLD`, and nested objects."""
-
+"""Prefix of the names of parameters that hold the ``to_world`` of shapes."""
 
 OF_OBJECTS = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
 """Names of the properties of a ``splats`` that is nested in another, but for :data:`FEATURE`."""
 
+KNOWN = (
+    *("filename", "to_world", SHAPES_TO_WORLD, "background", "probes", "shadows", "aovs", "ignore"),
+    *("smoothing", *SETTINGS, *APPROXIMATIONS, *PARAMETER_NAMES),
+)
+"""Names of the properties of ``splats``, but for nested objects and names with a prefix."""
+
 UNNAMED = "_arg_"
 """Prefix of the names that Mitsuba gives to nested objects without one."""
-
-LIGHT_SAMPLES = 4
-"""Splats that a ray of ``light: rays`` draws."""
-
-MAX_LIGHT_SAMPLES = 4096
-"""Limit of a pixel's samples, too. With 0, all splats that a ray passes are composited."""
-
-LIGHTS = ("none", "probe", "rays")
-"""How light passes between splats and surfaces."""
-
-UNSEEN = ("none", "rays")
-"""What probes do not see."""
 
 
 def read_state(
     props: mi.Properties, objects: Mapping[str, SplatObject], nested: mi.Integrator | None
 ) -> SplatsState:
     """Return the state of ``splats``; objects: nested ones, nested: the integrator of surfaces."""
-    gaussians = load_gaussians(props)
-    file, header = str(props.get("filename", "")), header_of(props, gaussians)
-    own = SplatObject(gaussians, to_world_of(props), "to_world" in props, file, header)
+    gaussians, file = load_gaussians(props), str(props.get("filename", ""))
+    said = {n: v for n, v in (gaussians.rendered_with or {}).items() if n not in props}
+    own = SplatObject(gaussians, _to_world(props), "to_world" in props, file, said_by(file, said))
     if own.is_moved:
         own.check_to_world()
-    features = feature_widths({"": own} | {f"{name}.": one for name, one in objects.items()})
-    degrees = [one.gaussians.sh_degree for one in (own, *objects.values())]
-    files = {one.file: one.header for one in (own, *objects.values()) if one.file}
-    header, light = agreed(props, files), light_of(props, nested)
+    every = {"": own} | {f"{name}.": one for name, one in objects.items()}
+    header = _agreed(props, {one.file: one.header for one in every.values() if one.file})
+    given = {name: one for name, one in APPROXIMATIONS.items() if name in props}
+    settings = read(props, SETTINGS)
     state = SplatsState(
         own=own,
         nested_objects=dict(objects),
-        has_own=gaussians.num_gaussians > 0,
-        turns=turns_of_shapes(props),
-        background=background_of(props),
+        turns=_turns_of_shapes(props),
+        background=_background(props),
         nested=nested,
-        default_degree=max(degrees),
-        given_degree=degree_of(props["sh_degree"]) if "sh_degree" in props else None,
-        approximations=approximations_of(props, header),
+        default_degree=max(one.gaussians.sh_degree for one in every.values()),
+        given_degree=settings.pop("sh_degree"),
+        approximations=Approximations(**{**header, **read(props, given)}),
         header=header,
-        near=positive(props, "near", NEAR),
-        aovs=aovs_of(props, [*AOVS, *features]),
-        ignore=ignored_effects(props),
-        hide_emitters=boolean(props, "hide_emitters", False),
-        srgb_primitives=boolean(props, "srgb_primitives", True),
-        nested_spp=integer(props, "nested_spp", 0, least=0),
-        light=light,
-        light_samples=integer(props, "light_samples", LIGHT_SAMPLES, 0, MAX_LIGHT_SAMPLES),
-        probes=probes_of(props, light),
-        unseen=one_of(props, "unseen", UNSEEN),
-        shadows=ids_of(props, "shadows"),
-        exposure=positive(props, "exposure", 1.0),
+        aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
+        ignore=_words(props, "ignore"),
+        probes=_words(props, "probes"),
+        shadows=_words(props, "shadows"),
+        **settings,
     )
+    _check_settings(state)
     refuse_unknown(props, KNOWN)
     state.check_columns()
     return state
 
 
-def light_of(props: mi.Properties, nested: mi.Integrator | None) -> str:
-    """Return ``light``, one of :data:`LIGHTS`."""
-    light = one_of(props, "light", LIGHTS)
-    if light != LIGHTS[0] and nested is not None and not passes_splats(nested):
+def _check_settings(state: SplatsState) -> None:
+    light, nested = state.light, state.nested
+    if light != "none" and nested is not None and not passes_splats(nested):
         raise PluginError(
             f"splats: with light '{light}', the nested integrator must be splatpath, got "
             f"{nested.class_name()}; it takes max_depth, rr_depth and hide_emitters as path does"
         )
-    return light
-
-
-def ids_of(props: mi.Properties, name: str) -> tuple[str, ...]:
-    """Return a list of ids from a text with commas."""
-    return tuple(part.strip() for part in props.get(name, "").split(",") if part.strip())
-
-
-def probes_of(props: mi.Properties, light: str) -> tuple[str, ...]:
-    """Ids of the objects that have a probe."""
-    names = ids_of(props, "probes")
-    if light == "probe" and not names:
+    if light == "probe" and not state.probes:
         raise PluginError(
             "splats: with light 'probe', probes must be ids of shapes and emitters, got none"
         )
-    return names
+    for word in state.ignore:
+        if word not in IGNORABLE:
+            raise PluginError(
+                f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
+            )
 
 
-def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:
-    """Raise PluginError for a property that nobody has read: a mistyped name.
-
-    Mitsuba would refuse it as well, without the name that was meant. Called when everything that
-    is known has been read.
-    """
-    for name in props.unqueried():
-        where = f"{props.plugin_name()}: there is no parameter {name}"
-        hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
-        raise PluginError(where + hint)
+def _words(props: mi.Properties, name: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in str(props.get(name, "")).split(",") if part.strip())
 
 
 def load_gaussians(props: mi.Properties) -> Gaussians:
-    """The Gaussians of a scene description: a PLY file, or six tensors; or none."""
-    given = [name for name in PARAMETER_NAMES if name in props]
-    given += ["smoothing"] if "smoothing" in props else []
+    """Return the Gaussians of a scene description: of a file, or six tensors; or none."""
+    given = [name for name in (*PARAMETER_NAMES, "smoothing") if name in props]
     features = {n: _tensor(props, n) for n in props.keys() if n.startswith(FEATURE)}  # noqa: SIM118
     if "filename" in props:
         if given:
@@ -160,30 +226,38 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
         path = mi.file_resolver().resolve(str(props["filename"]))
         gaussians = replace(_loaded(str(path)).to(mi.TensorXf), features=features)
     elif given or features or "to_world" in props:
-        missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
-        if missing:
-            raise PluginError(
-                "splats: give 'filename', or the Gaussians as tensors "
-                f"{', '.join(PARAMETER_NAMES)}; missing: {', '.join(missing)}"
-            )
-        values = {name: _tensor(props, name) for name in given}
-        if "shN" not in given:
-            values["shN"] = dr.zeros(mi.TensorXf, (next(iter(values["means"].shape), 0), 0, 3))
-        for name in ("logit_opacities", "smoothing"):
-            if name in values:
-                values[name] = _column(name, values[name])
-        gaussians = Gaussians(**values, features=features)
+        gaussians = replace(_gaussians_of_tensors(props, given), features=features)
     else:
-        shapes = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3)}
-        shapes |= {"sh0": (0, 1, 3), "shN": (0, 0, 3)}
-        tensors = {name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}
-        return Gaussians(**tensors, logit_opacities=mi.Float())
+        return _no_gaussians()
     check_shapes(gaussians)
     return gaussians
 
 
+def _gaussians_of_tensors(props: mi.Properties, given: Sequence[str]) -> Gaussians:
+    missing = [name for name in PARAMETER_NAMES if name not in given and name != "shN"]
+    if missing:
+        raise PluginError(
+            "splats: give 'filename', or the Gaussians as tensors "
+            f"{', '.join(PARAMETER_NAMES)}; missing: {', '.join(missing)}"
+        )
+    values = {name: _tensor(props, name) for name in given}
+    if "shN" not in given:
+        values["shN"] = dr.zeros(mi.TensorXf, (next(iter(values["means"].shape), 0), 0, 3))
+    for name in ("logit_opacities", "smoothing"):
+        if name in values:
+            values[name] = _column(name, values[name])
+    return Gaussians(**values)
+
+
+def _no_gaussians() -> Gaussians:
+    shapes = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3)}
+    shapes |= {"sh0": (0, 1, 3), "shN": (0, 0, 3)}
+    tensors = {name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}
+    return Gaussians(**tensors, logit_opacities=mi.Float())
+
+
 def _loaded(path: str) -> Gaussians:
-    """The Gaussians of a file, in coordinates that Mitsuba's float32 can tell apart."""
+    """Return the Gaussians of a file, in coordinates that Mitsuba's float32 can tell apart."""
     gaussians = Gaussians.load(path)
     if gaussians.origin != WORLD:
         note = (
@@ -194,14 +268,29 @@ def _loaded(path: str) -> Gaussians:
     return replace(gaussians, origin=WORLD)
 
 
-def to_world_of(props: mi.Properties) -> mi.AffineTransform4f:
-    """The transform that places Gaussians in the scene; the identity where none is given."""
+def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
+    """Copy a tensor: parameters are assigned in place, the caller's are not."""
+    value = props[name]
+    if not dr.is_array_v(value):
+        raise PluginTypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
+    if not dr.is_jit_v(value):  # of the host, as is what a property set makes of three numbers
+        value = np.array(value, np.float32)
+    return mi.TensorXf(value)
+
+
+def _column(name: str, tensor: mi.TensorXf) -> mi.Float:
+    if math.prod(tensor.shape[1:]) != 1:
+        raise PluginError(f"splats: {name} must have the shape (N), got {tuple(tensor.shape)}")
+    return mi.Float(tensor.array)
+
+
+def _to_world(props: mi.Properties) -> mi.AffineTransform4f:
     if "to_world" not in props:
         return mi.AffineTransform4f()
     return mi.AffineTransform4f(matrix(props, "to_world").astype(np.float32))
 
 
-def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
+def _turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
     """Return rotations of spherical harmonics by ids of shapes, and under "" for all others."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
@@ -216,8 +305,8 @@ def turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
     return turns
 
 
-def background_of(props: mi.Properties) -> mi.Color3f | mi.Texture:
-    """A colour in display space, or a texture."""
+def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:
+    """Return a colour in display space, or a texture."""
     value = props.get("background", 0.0)
     if isinstance(value, mi.Texture):
         return value
@@ -235,83 +324,21 @@ def background_of(props: mi.Properties) -> mi.Color3f | mi.Texture:
     return color
 
 
-def ignored_effects(props: mi.Properties) -> tuple[str, ...]:
-    """Return the effects that are not simulated."""
-    words = [word.strip() for word in str(props.get("ignore", "")).split(",") if word.strip()]
-    for word in words:
-        if word not in IGNORABLE:
-            raise PluginError(
-                f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
-            )
-    return tuple(words)
-
-
-def aovs_of(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
-    """Return types of AOVs by name, each of ``kinds``."""
+def _aovs(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
     aovs = {}
-    for item in str(props.get("aovs", "")).split(","):
-        if not item.strip():
-            continue
+    for item in _words(props, "aovs"):
         name, _, kind = (part.strip() for part in item.partition(":"))
         if not name or kind not in kinds or name in aovs:
             raise PluginError(
                 f"splats: aovs must be a list of name:type with names of their own and types of "
-                f"{', '.join(kinds)}, got {item.strip()!r}"
+                f"{', '.join(kinds)}, got {item!r}"
             )
         aovs[name] = kind
     return aovs
 
 
-def nested_integrators(props: mi.Properties) -> dict[str, mi.Integrator]:
-    """Nested integrators by name: their key, or in XML the id where no name is given."""
-    # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
-    is_object = mi.Properties.Type.Object
-    names = [name for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
-    objects = {name: props[name] for name in names if name != "background"}
-    for name, value in objects.items():
-        if not isinstance(value, mi.Integrator):
-            raise PluginError(
-                f"splats: {name} must be an integrator, the only object besides the texture "
-                f"background, got {value.class_name()}{did_you_mean(name, ['background'])}"
-            )
-    return {
-        (value.id() or name) if name.startswith(UNNAMED) else name: value
-        for name, value in objects.items()
-    }
-
-
-def only_one(nested: Sequence[mi.Integrator]) -> mi.Integrator | None:
-    """The integrator of surfaces, if there is one."""
-    if len(nested) > 1:
-        raise PluginError(
-            f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
-        )
-    return nested[0] if nested else None
-
-
-def check_object(name: str, given: Sequence[str]) -> None:
-    """Raise PluginError for properties of a nested ``splats`` that are not those of an object."""
-    others = [n for n in given if n not in OF_OBJECTS and not n.startswith(FEATURE)]
-    if others:
-        raise PluginError(
-            f"splats: {name} is nested in another splats integrator, whose settings hold for all "
-            f"that it renders: give {others[0]} to that one, or leave it out; a nested one takes "
-            f"{', '.join(OF_OBJECTS)} and {FEATURE}..."
-        )
-    if not given:
-        raise PluginError(
-            f"splats: {name} has no Gaussians: give it 'filename', or tensors "
-            f"{', '.join(PARAMETER_NAMES)}"
-        )
-
-
-def agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> dict[str, Value]:
-    """The approximations that files say and that no property gives.
-
-    files: by name, what a file says; for the others it is made with the defaults.
-
-    Raises PluginError where files differ.
-    """
+def _agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> dict[str, Value]:
+    """Return what headers set and no property gives; PluginError where files differ."""
     made_with = {file: Approximations.of(said) for file, said in files.items()}
     names = [name for name in DECLARED if name not in props]
     for name in names:
@@ -325,117 +352,45 @@ def agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> di
     return {name: said[name] for said in files.values() for name in names if name in said}
 
 
-def header_of(props: mi.Properties, gaussians: Gaussians) -> dict[str, Value]:
-    """Return the approximations that the file's header sets and no property gives."""
-    values = gaussians.rendered_with or {}
-    return said_by(
-        str(props.get("filename", "")), {n: v for n, v in values.items() if n not in props}
-    )
-
-
-def approximations_of(props: mi.Properties, said: Mapping[str, Value]) -> Approximations:
-    """The approximations among the properties, else as ``said``; all others are the default."""
-    values = {n: _approximation(props, n, d) for n, d in DECLARED.items() if n in props}
-    return Approximations(**{**said, **values})
-
-
-def _approximation(props: mi.Properties, name: str, declared: Declared) -> Value:
-    """Return one approximation, of the type that it is declared with."""
-    value = props[name]
-    if declared.kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not declared.kind:
-        raise PluginTypeError(_message(props, name, _KINDS[declared.kind], value))
-    if not declared.allows(value):
-        raise PluginError(_message(props, name, declared.expected, value))
-    return value
-
-
-_KINDS = {bool: "true or false", int: "an integer", float: "a number", str: "text"}
-
-
-def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
-    """A tensor of the integrator's own: parameters are assigned in place, the caller's are not."""
-    value = props[name]
-    if not dr.is_array_v(value):
-        raise PluginTypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
-    if not dr.is_jit_v(value):  # of the host, as is what a property set makes of three numbers
-        value = np.array(value, np.float32)
-    return mi.TensorXf(value)
-
-
-def _column(name: str, tensor: mi.TensorXf) -> mi.Float:
-    """A tensor of shape (N,) or (N, 1) as the flat array that is kept of it."""
-    if math.prod(tensor.shape[1:]) != 1:
-        raise PluginError(f"splats: {name} must have the shape (N), got {tuple(tensor.shape)}")
-    return mi.Float(tensor.array)
-
-
 # ----------------------------------------------------------------------------------------------
-# Single values
+# Nested integrators
 # ----------------------------------------------------------------------------------------------
 
 
-def boolean(props: mi.Properties, name: str, default: bool) -> bool:
-    """True or false."""
-    value = props.get(name, default)
-    if not isinstance(value, bool):
-        raise PluginTypeError(_message(props, name, "true or false", value))
-    return value
+def nested_integrators(props: mi.Properties) -> dict[str, mi.Integrator]:
+    """Return nested integrators by name: their key, or in XML the id where no name is given."""
+    # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
+    is_object = mi.Properties.Type.Object
+    names = [name for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
+    nested = {}
+    for name in names:
+        value = props[name]
+        if name == "background":
+            continue
+        if not isinstance(value, mi.Integrator):
+            raise PluginError(
+                f"splats: {name} must be an integrator, the only object besides the texture "
+                f"background, got {value.class_name()}{did_you_mean(name, ['background'])}"
+            )
+        nested[(value.id() or name) if name.startswith(UNNAMED) else name] = value
+    return nested
 
 
-def integer(props: mi.Properties, name: str, default: int, least: int, most: int = MAX_INT) -> int:
-    """An integer of at least ``least`` and at most ``most``."""
-    value, expected = props.get(name, default), f"an integer of at least {least}"
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise PluginTypeError(_message(props, name, expected, value))
-    if value > most:
-        expected = f"an integer from {least} to {most}"
-    if not least <= value <= most:
-        raise PluginError(_message(props, name, expected, value))
-    return value
+def only_one(nested: Sequence[mi.Integrator]) -> mi.Integrator | None:
+    """Return the integrator of surfaces, if there is one."""
+    if len(nested) > 1:
+        raise PluginError(
+            f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
+        )
+    return nested[0] if nested else None
 
 
-def number(props: mi.Properties, name: str, default: float) -> float:
-    """A number that is finite in single precision, in which it is kept."""
-    return _number(props, name, default, "a finite number")
-
-
-def positive(props: mi.Properties, name: str, default: float) -> float:
-    """A number above 0 and finite, in single precision as well."""
-    value = _number(props, name, default, "a positive number")
-    if np.float32(value) <= 0:
-        raise PluginError(_message(props, name, "a positive number", value))
-    return value
-
-
-def _number(props: mi.Properties, name: str, default: float, expected: str) -> float:
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise PluginTypeError(_message(props, name, expected, value))
-    with np.errstate(over="ignore"):
-        if not np.isfinite(np.float32(value)):
-            raise PluginError(_message(props, name, expected, value))
-    return float(value)
-
-
-def one_of(props: mi.Properties, name: str, known: Sequence[str]) -> str:
-    """Return one of several words, the first of which is the default."""
-    value = props.get(name, known[0])
-    if value not in known:
-        message = _message(props, name, f"one of {', '.join(known)}", value)
-        raise PluginError(message + did_you_mean(str(value), known))
-    return value
-
-
-def matrix(props: mi.Properties, name: str) -> np.ndarray:
-    """(4, 4) float64, of a transform that is given."""
-    if props.type(name) != mi.Properties.Type.Transform:
-        got = type(props[name]).__name__
-        where = f"{props.plugin_name()}: {name}"
-        raise PluginTypeError(f"{where} must be a transform, got {got}")
-    return np.array(props[name].matrix, np.float64)
-
-
-def _message(props: mi.Properties, name: str, expected: str, got: object) -> str:
-    return f"{props.plugin_name()}: {name} must be {expected}, got {got!r}"
+def check_object(name: str, given: Sequence[str]) -> None:
+    """Raise PluginError for properties of a nested ``splats`` that are not those of an object."""
+    others = [n for n in given if n not in OF_OBJECTS and not n.startswith(FEATURE)]
+    if others or not given:
+        got = f"{others[0]}, which holds for all: give it to the outer one" if others else "nothing"
+        raise PluginError(
+            f"splats: {name} is nested in another splats integrator, and must be given Gaussians "
+            f"by {', '.join(OF_OBJECTS)} and {FEATURE}... alone, got {got}"
+        )

@@ -1,8 +1,4 @@
-"""Mitsuba objects from a dataset: sensors for the views, a scene with the integrator.
-
-The trainer and the commands reach the integrator through these dictionaries, as any Mitsuba scene
-would.
-"""
+"""Mitsuba objects from a dataset: sensors for the views, a scene with the integrator."""
 
 from __future__ import annotations
 
@@ -34,11 +30,7 @@ def make_scene(
     background: tuple[float, float, float] | Path,
     **settings: object,
 ) -> mi.Scene:
-    """A scene that holds nothing but the ``splats`` integrator, working in display space.
-
-    gaussians: numpy or Dr.Jit arrays; background: display space, or a file with a picture;
-    settings: of the integrator.
-    """
+    """Return a scene of the integrator ``splats`` alone, with ``settings``, in display space."""
     uploaded = gaussians.to(mi.TensorXf)
     tensors = {name: getattr(uploaded, name) for name in PARAMETER_NAMES}
     if uploaded.smoothing is not None:
@@ -60,11 +52,7 @@ def _picture(path: Path) -> dict[str, object]:
 
 
 def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, remedy: str) -> None:
-    """Raise :class:`UserError` for a lens that the projection cannot render.
-
-    It would be refused when its view is rendered, perhaps long after a fit has begun. where: the
-    message's beginning; remedy: its end.
-    """
+    """Raise UserError for a lens that the projection cannot render; where, remedy: words."""
     bent = next((view for view in views if view.lens is not None), None)
     if model.projection == "exact" and bent is not None:
         names = ", ".join(bent.lens.coefficients())
@@ -75,10 +63,7 @@ def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, rem
 
 
 def check_sizes(views: Iterable[Viewpoint], remedy: str) -> None:
-    """Raise :class:`UserError` for a picture that cannot be held, before anything is allocated.
-
-    remedy: the message's end.
-    """
+    """Raise :class:`UserError` for an image that cannot be held; remedy: end of the message."""
     for view in views:
         is_blurred = view.motion is not None and view.motion.shutter == "global"
         samples = view.motion.samples if is_blurred else 1

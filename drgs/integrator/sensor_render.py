@@ -1,8 +1,9 @@
 """An image of one sensor: frames, their planes, and the channels of its film.
 
-A :class:`SensorRender` renders the frames of its camera (``drgs.splatting.rendering``), or reuses
-those of the last image where nothing has changed. It composites them over the background, and adds
-the surfaces.
+A :class:`SensorRender` renders frames (``drgs.splatting.rendering``), one for each time at which
+the shutter is open and each pass of samples, or reuses those of the last image where nothing has
+changed. It composites them over the background, and adds the surfaces. Derivatives of a
+background's texels are added atomically: they are the same in every run only up to rounding.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import Channels, offsets_of
+from drgs.integrator.film import Channels, offsets_of, pixel_corners, samples_in
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
@@ -28,6 +29,7 @@ from drgs.splatting.footprint import Positions
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.surfaces import Hybrid
     from drgs.integrator.visible_surfaces import Layers
+
 
 Passes = list[Channels]
 """Channels by pass: of one sample per pixel or, on a small film, of several."""
@@ -106,14 +108,11 @@ class SensorRender:
         return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
-        """Return the channels of each pass for the film: the mean over the times.
-
-        constant: the background, where it is a colour; display space.
-        """
+        """Return the mean over times of each pass's channels; constant: the background."""
         behind = self._behind(constant)
         seen = repeat(repeat(None))
         if self.hybrid is not None:
-            seen = self.splats.cache.traced[self.index].value
+            seen = self._traced_surfaces(self._state().detached()).value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -184,14 +183,11 @@ class SensorRender:
         return channels
 
     def _behind(self, constant: mi.Color3f | None) -> _Behind:
-        """Evaluate the background, in the space of the channels."""
         splats = self.splats
         environment = None if splats.hide_emitters else self.scene.environment()
         if environment is None and constant is not None:
             nothing = repeat(repeat(None))
             return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
-        from drgs.integrator.background import background_radiance
-
         behind = splats.background if environment is None else environment
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
@@ -203,46 +199,39 @@ class SensorRender:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Behind(colors, environment is not None, radiance)
 
-    # ------------------------------------------------------------------------------------------
-    # Frames
-    # ------------------------------------------------------------------------------------------
-
     def _frames(self) -> list[list[rendering.Frame]]:
-        """Render, or reuse the last frames if nothing that they depend on has changed.
-
-        One list for each time at which the shutter is open, of a frame for each pass.
-        """
+        """Return frames by time and by pass, those of the last image where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
-        state, kept = self._state().detached(), self.splats.cache.frames
+        state = self._state().detached()
         traced = None if self.hybrid is None else self._traced_surfaces(state)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
-        last = kept.get(self.index)
-        if last is None or not last.matches(*key):
+
+        def render() -> list[list[rendering.Frame]]:
             seen = repeat(None) if traced is None else traced.value
-            frames = [
+            return [
                 _render(gaussians, camera, pipeline, self.positions, of_time)
                 for camera, of_time in zip(self._cameras(state), seen, strict=False)
             ]
-            last = kept[self.index] = Cached(frames, *key)
-        return last.value
+
+        return self.splats.cache.find(f"frames {self.index}", *key, render).value
 
     def _traced_surfaces(self, state: SensorState) -> Cached:
-        """Trace the scene's surfaces, or reuse the last ones: Layers by time and by pass."""
         from drgs.integrator.visible_surfaces import trace_surfaces
 
-        kept, sensor, hides = self.splats.cache.traced, self.sensor, self.splats.hide_emitters
+        sensor, hides = self.sensor, self.splats.hide_emitters
         settings = self.hybrid.surfaces, self.key, hides, sensor.far_clip(), *state.settings
-        last = kept.get(self.index)
-        if last is None or not last.matches(settings, state.device):
-            seen = trace_surfaces(
+        return self.splats.cache.find(
+            f"surfaces {self.index}",
+            settings,
+            state.device,
+            lambda: trace_surfaces(
                 self.hybrid.rays,
                 sensor,
                 self._cameras(state),
                 self._offsets,
                 with_normals="normal" in self.splats.aovs.values(),
-            )
-            last = kept[self.index] = Cached(seen, settings, state.device)
-        return last
+            ),
+        )
 
     def num_surfaces(self) -> int:
         """Number of surfaces that are seen one through the other."""
@@ -256,7 +245,6 @@ class SensorRender:
         return read_sensor(self.sensor, self.splats.near)
 
     def _cameras(self, state: SensorState) -> list[Camera]:
-        """Return the camera at each time, detached, without what is ignored."""
         return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
     def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
@@ -270,7 +258,6 @@ class SensorRender:
 
 
 def _mean(passes: Sequence[Passes]) -> Passes:
-    """Return the mean over several times, summed in their order."""
     total: list[Passes] = []
     for first in range(0, len(passes), PASSES_PER_KERNEL):
         dr.eval(total)
@@ -327,10 +314,7 @@ def _render(
 
 
 def constant_background(splats: SplatsState) -> mi.Color3f | None:
-    """The background without gradients, if it is a colour; display space.
-
-    No literal, or every colour would be a new kernel.
-    """
+    """Return the background, detached and in no kernel, if it is a colour."""
     if isinstance(splats.background, mi.Texture):
         return None
     constant = mi.Color3f(dr.detach(splats.background))
@@ -341,26 +325,64 @@ def constant_background(splats: SplatsState) -> mi.Color3f | None:
 def accumulate_in_sensor(
     ignored: Collection[str], state: SensorState, gradients: list[list[Any]]
 ) -> None:
-    """Accumulate derivatives of a sensor's cameras into what its parameters were computed from.
-
-    ignored: effects that are not simulated; state: attached; gradients: by time, of
-    ``Camera.numbers()``.
-    """
+    """Accumulate derivatives by ``Camera.numbers()``, by time, into a sensor."""
     numbers = [camera.numbers() for camera in _attached_cameras(ignored, state)]
     _accumulate_through(numbers, gradients)
 
 
 def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
-    """Return the camera at each time, attached to the sensor's parameters."""
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
     return cameras_in_time(without_effects(state.make(state), ignored))
 
 
 def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:
-    """Accumulate into what the values were computed from."""
     pairs = zip(chain(*values), chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
     for value, gradient in attached:
         dr.accum_grad(value, gradient)
     dr.enqueue(dr.ADMode.Backward, [value for value, _ in attached])
     dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
+
+
+LENS_POINTS = 16
+"""At which an aperture is sampled, for each place on the film: always the same, so that nothing is
+random. What is much brighter than its surroundings and smaller than the gaps between them is seen
+as so many pictures of itself."""
+
+
+def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f) -> mi.Color3f:
+    """Return an emitter's radiance at a place of the crop window, px; black where the lens ends."""
+    ray, seen, count = camera.view_directions(place.x, place.y, LENS_POINTS)
+    interaction = dr.zeros(mi.SurfaceInteraction3f, count * dr.width(place))
+    # As the environment is infinitely far, only directions count.
+    interaction.wi = -mi.Vector3f(dr.normalize(ray))
+    radiance = mi.Color3f(emitter.eval(interaction))
+    if seen is not True:
+        radiance = dr.select(seen, radiance, 0)
+    if count == 1 or dr.width(radiance) == 1:  # the latter: the same from everywhere
+        return radiance
+    return mi.Color3f([dr.block_sum(color, count) for color in radiance]) / count
+
+
+def stretched_radiance(texture: mi.Texture, film: mi.Film, place: mi.Point2f) -> mi.Color3f:
+    """Return a texture that is stretched over the whole film; place: on the crop window, px."""
+    interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
+    interaction.uv = (place + mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.size())
+    return mi.Color3f(texture.eval(interaction))
+
+
+def background_radiance(
+    film: mi.Film,
+    background: mi.Emitter | mi.Texture,
+    cameras: Sequence[Camera],
+    offsets: Sequence[tuple[mi.Float | float, mi.Float | float]],
+) -> list[list[mi.Color3f]]:
+    """Return the background at all pixels, by time and by pass.
+
+    cameras: of each time; offsets: of each pass, x and y from the pixel's upper left corner, px.
+    """
+    places = [pixel_corners(film, samples_in(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
+    if isinstance(background, mi.Texture):
+        found = [stretched_radiance(background, film, place) for place in places]
+        return [found] * len(cameras)
+    return [[environment_radiance(background, camera, p) for p in places] for camera in cameras]

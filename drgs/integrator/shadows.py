@@ -1,17 +1,15 @@
 """Shadows of surfaces on splats.
 
-Imported where a scene asks for it. A splat's colour is that of photographs, in which an object that
-was put among the splats is not. The shadow of such objects is estimated once for each splat, and
-not for each view: with E the irradiance at its mean from the scene's lamps and environment, which
-stand for those of the photographs, and E' that without the objects, its colour is multiplied by
+A splat's colour is that of photographs, in which an object that was put among the splats is not.
+The shadow of such objects is estimated once for each splat, and not for each view: with E the
+irradiance at its mean from the scene's lamps and environment, which stand for those of the
+photographs, and E' that without the objects, its colour is multiplied by
 
     f = (E / E')^(1 / 2.2),
 
 in each channel: display-encoded colours are about the 2.2nd root of radiance, and f multiplies the
 harmonics. A splat faces along its shortest axis, to both sides. Light that splats weaken counts as
-little as they let through, and at least :data:`HIDDEN`, so that splats below others have a shadow.
-
-Not simulated: light that the objects reflect onto splats.
+little as they let through, and at least :data:`HIDDEN`. Light that objects reflect is left out.
 """
 
 from __future__ import annotations
@@ -26,10 +24,10 @@ from drgs.core.constants import SH_C0
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.checks import check_ids
-from drgs.integrator.ray_transport import ray_splats_of
-from drgs.integrator.state import Cached, SplatsState
+from drgs.integrator.rays import StraightRays, has_transparent_parts
+from drgs.integrator.splat_transport import ray_splats_of
+from drgs.integrator.state import SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
-from drgs.integrator.transparency import StraightRays, has_transparent_parts
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
@@ -56,16 +54,15 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
     """
     gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
     surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
-    last, cache.shaded = cache.shaded, None
-    if last is None or not last.matches((surfaces,), gaussians):
-        estimate = _Estimate(
-            scene=_rays_through(surfaces.objects),
-            without=_rays_through(_without(surfaces.objects, splats.shadows)),
-            splats=ray_splats_of(gaussians, splats.approximations, degree=0),
-        )
-        darkened = _darkened(gaussians, estimate.ratios(gaussians))
-        last = Cached(darkened, (surfaces,), gaussians)
-    cache.shaded = last
+
+    def estimate() -> Gaussians:
+        rays = _rays_through(surfaces.objects)
+        without = _rays_through(_without(surfaces.objects, splats.shadows))
+        blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
+        return _darkened(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
+
+    cache.shaded = None
+    cache.shaded = cache.find("shaded", (surfaces,), gaussians, estimate).value
 
 
 def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:
@@ -111,7 +108,6 @@ class _Estimate:
         normals: mi.Vector3f,
         let_through: Callable[[mi.Ray3f, mi.Float], mi.Float],
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        """Return the irradiance, and that which the objects block; let_through: by the splats."""
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, dr.width(points))
         place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
@@ -149,7 +145,6 @@ class _Estimate:
 
 
 def _unhindered(ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
-    """Return full transmittance."""
     del ray, sample
     return mi.Float(1)
 

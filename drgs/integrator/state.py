@@ -1,14 +1,12 @@
 """The state of the integrator ``splats``: what it was given, and what it keeps between renderings.
 
-The plugin owns one :class:`SplatsState`; the functions of this package take it as an argument.
-``mi.render`` has Dr.Jit traverse the integrator with its state, which resolves annotations in
-whatever variant is active: types that are imported on demand, or belong to one variant, are ``Any``
-here and named beside it.
+``mi.render`` has Dr.Jit traverse it, which resolves annotations in whatever variant is active:
+types that are imported on demand, or belong to one variant, are ``Any`` here and named beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -38,11 +36,6 @@ AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """Outputs besides colour, and the names of their channels as in Mitsuba's ``aov``."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Results and cache
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class BackwardResult:
     """Results of a backward pass that ``mi.render`` cannot return; N Gaussians."""
@@ -56,8 +49,7 @@ class BackwardResult:
         """Return the sum over pixels of each Gaussian's weight times ``plane``: Float (N,).
 
         plane: Float (H * W,). The weight is alpha times transmittance, as composited; its mean over
-        samples, and over the times at which the shutter was open. To be called before a parameter
-        changes.
+        samples and times. To be called before a parameter changes.
         """
         sums = [rendering.weighted_sums(frame, plane) for frame in self.frames]
         return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
@@ -75,40 +67,34 @@ class Cached:
     settings: tuple[object, ...]  # compared by ==
     arrays: Any  # a PyTree, detached: compared by variables
 
-    def matches(self, settings: tuple[object, ...], arrays: Any) -> bool:
-        """Return whether the value is that of these settings and arrays."""
-        return self.settings == settings and same_variables(self.arrays, arrays)
-
 
 @dataclass
 class RenderCache:
-    """Intermediate results of the last renderings; sensors are known by their places in a batch."""
+    """Intermediate results of the last renderings."""
 
-    frames: dict[int, Cached] = field(default_factory=dict)  # by time, one for each pass
-    traced: dict[int, Cached] = field(default_factory=dict)  # visible_surfaces.Layers, likewise
+    kept: dict[str, Cached] = field(default_factory=dict)  # by what they are
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
     gathered: Any = None  # drgs.integrator.gathering.Gathered; None: the own Gaussians, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[Any] = field(default_factory=list)  # mi.Shape: of the last scene, checked
     sensor: Any = None  # mi.Sensor that was rendered last
     surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
-    ray_splats: Cached | None = None  # drgs.light.walk.RaySplats
-    probes: Cached | None = None  # drgs.light.probe.Probes
     too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
-    flat_mirrors: Cached | None = None  # by probe: drgs.integrator.mirrors.FlatMirror
-    mirrors: Cached | None = None  # drgs.integrator.mirrors.Mirrors
-    shaded: Cached | None = None  # Gaussians in the shadow of surfaces
-    summary: str = ""  # that was logged last
+    shaded: Any = None  # Gaussians in the shadow of surfaces; None: there are no such shadows
 
-    def forget_view(self, index: int) -> None:
-        """Drop a sensor that will not be rendered again."""
-        self.frames.pop(index, None)
-        self.traced.pop(index, None)
+    def find(
+        self, name: str, settings: tuple[object, ...], arrays: Any, make: Callable[[], Any]
+    ) -> Cached:
+        """Return what was kept under a name, made anew unless settings and arrays are the same."""
+        last = self.kept.get(name)
+        is_same = last is not None and last.settings == settings
+        if not is_same or not same_variables(last.arrays, arrays):
+            last = self.kept[name] = Cached(make(), settings, arrays)
+        return last
 
-
-# ----------------------------------------------------------------------------------------------
-# State
-# ----------------------------------------------------------------------------------------------
+    def forget(self, prefix: str) -> None:
+        """Drop what was kept under names that begin with ``prefix``."""
+        self.kept = {k: v for k, v in self.kept.items() if not k.startswith(prefix)}
 
 
 @dataclass
@@ -121,12 +107,16 @@ class SplatObject:
     file: str = ""
     header: dict[str, Value] = field(default_factory=dict)  # approximations of the file's header
 
+    @property
+    def has_gaussians(self) -> bool:
+        """False for an integrator that renders those of objects and shapes alone."""
+        return self.gaussians.num_gaussians > 0
+
     def check_to_world(self) -> None:
         """Raise PluginError for a ``to_world`` that is no similarity; find whether it moves."""
-        from drgs.integrator.placement import similarity_of
+        from drgs.integrator.gathering import similarity_of
 
-        place = similarity_of(self.to_world.matrix, "splats: to_world")
-        self.is_moved = not place.is_identity
+        self.is_moved = not similarity_of(self.to_world.matrix, "splats: to_world").is_identity
 
 
 @dataclass
@@ -135,7 +125,6 @@ class SplatsState:
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
-    has_own: bool  # whether ``own`` has Gaussians
     turns: dict[str, Any]  # drgs.integrator.gathering.Turn by shapes' ids; "": of all others
     background: Any  # Color3f, display space; or mi.Texture, linear
     nested: Any  # mi.Integrator of surfaces, or None
@@ -161,7 +150,7 @@ class SplatsState:
     @property
     def objects(self) -> dict[str, SplatObject]:
         """All objects that have Gaussians, by the prefix of their parameters' names."""
-        own = {"": self.own} if self.has_own else {}
+        own = {"": self.own} if self.own.has_gaussians else {}
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
     @property
@@ -198,6 +187,31 @@ class SplatsState:
         """Return the names of the channels besides colour and alpha."""
         return [f"{name}.{c}" for name, kind in self.aovs.items() for c in self.channels_of(kind)]
 
+    def settings(self) -> dict[str, object]:
+        """Return settings by name, without those that are off or at their default."""
+        gathered = self.cache.gathered
+        parts = [one.gaussians for one in self.objects.values()]
+        parts = parts if gathered is None else [gathered.gaussians]
+        lit = {} if self.light == "none" else {"light": self.light, "exposure": self.exposure}
+        others = {
+            "objects": ", ".join(self.nested_objects),
+            "hide_emitters": self.hide_emitters,
+            "aovs": ", ".join(f"{name}:{kind}" for name, kind in self.aovs.items()),
+            "nested": self.nested and self.nested.class_name(),
+            "nested_spp": self.nested_spp,
+            **lit,
+            "ignore": ", ".join(self.ignore),
+        }
+        return {
+            "gaussians": sum(p.num_gaussians for p in parts) or "those of the scene's shapes",
+            "sh_degree": self.sh_degree,
+            "background": self.background,
+            "near": self.near,
+            "srgb_primitives": self.srgb_primitives,
+            **self.approximations.others_than_default,
+            **{name: value for name, value in others.items() if value},
+        }
+
     def channels_of(self, kind: str) -> Sequence[int | str]:
         """Return the suffixes of an AOV's channels."""
         return AOVS[kind] if kind in AOVS else range(self.feature_widths[kind])
@@ -206,19 +220,12 @@ class SplatsState:
         """Raise PluginError for AOVs of too many channels."""
         check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
 
-    # ------------------------------------------------------------------------------------------
-    # Parameters
-    # ------------------------------------------------------------------------------------------
-
     def parameters_changed(self, keys: list[str], is_object: bool) -> None:
-        """Check that the own parameters fit together; keys: names, none for all.
-
-        is_object: whether another integrator renders them.
-        """
+        """Check that own parameters fit together; keys: none for all."""
         if keys != ["background"]:
-            self.cache.frames.clear()
+            self.cache.forget("frames")
             self.cache.gathered = None
-        if not self.has_own:
+        if not self.own.has_gaussians:
             return
         own = self.own
         if dr.width(own.gaussians.shN) == 0:  # not exposed, so that its rows could not be set
@@ -243,13 +250,9 @@ class SplatsState:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All rendered Gaussians, world space: the parameters, whose arrays may be attached.
-
-        Detached where they are moved, or of several parts. Those of a scene's shapes are among them
-        once it was rendered.
-        """
+        """All rendered Gaussians, world space; attached where they are the parameters."""
         shaded = self.cache.shaded
-        return self.unshaded_gaussians if shaded is None else shaded.value
+        return self.unshaded_gaussians if shaded is None else shaded
 
     @property
     def unshaded_gaussians(self) -> Gaussians:
@@ -282,7 +285,6 @@ class SplatsState:
 
     @property
     def _is_placed(self) -> bool:
-        """True if Gaussians are moved, or are to be differentiated along a move."""
         is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
         return bool(self.nested_objects) or is_moved
 
@@ -290,20 +292,17 @@ class SplatsState:
         """Return Gaussians of objects and shapes, attached, in the order of rendering."""
         parts = self._placements()
         if shapes or self.turns:
-            from drgs.integrator.ellipsoids import conversions_of
+            from drgs.integrator.gathering import conversions_of
 
             parts += conversions_of(shapes, self.turns)
         return parts
 
     def _placements(self) -> list[Part]:
-        from drgs.integrator.placement import PlacedGaussians, Placement
+        from drgs.integrator.gathering import Placement
 
         return [
-            Placement(
-                PlacedGaussians(self.rendered_part_of(one), one.to_world.matrix),
-                f"splats: {prefix}to_world",
-            )
-            for prefix, one in self.objects.items()
+            Placement.of(self.rendered_part_of(one), one.to_world.matrix, f"splats: {k}to_world")
+            for k, one in self.objects.items()
         ]
 
     def accumulate(self, scene: mi.Scene, gradients: Gaussians) -> None:
@@ -350,7 +349,7 @@ def feature_of(kind: str) -> rendering.Feature:
     """Return the composited feature of an AOV of this kind, other than alpha."""
     if kind == "depth":
         return rendering.depth_feature
-    from drgs.effects.features import NamedFeature, normal_features
+    from drgs.effects.compose import NamedFeature, normal_features
 
     return normal_features if kind == "normal" else NamedFeature(kind)
 

@@ -1,9 +1,7 @@
 """Summary of the simulated effects of a scene, of what asked for each, and of the others.
 
-An effect is composed in when the dataset, the sensor or the configuration calls for it. What is not
-called for is not imported. Commands print such a summary at their start, one line an effect:
-:func:`summary_of_sensors` of a Mitsuba scene, :func:`summary_of_views` of pictures of Gaussians.
-That of a fit is in ``drgs.training.summary``.
+Commands print one at their start, a line an effect: :func:`summary_of_sensors` of a Mitsuba scene,
+:func:`summary_of_views` of images of Gaussians. That of a fit is in ``drgs.training.summary``.
 """
 
 from __future__ import annotations
@@ -105,10 +103,7 @@ def summary_of_sensors(
 def summary_of_views(
     splats: SplatsState, views: Sequence[Viewpoint], said: Collection[str] = ()
 ) -> list[SimulatedEffect]:
-    """Return the effects for views or viewpoints before the integrator's background.
-
-    said: names of the approximations that the Gaussians' file has decided.
-    """
+    """Return the effects for views; said: approximations that the Gaussians' file decided."""
     count = f"{len(views)} cameras"
     of_cameras = [
         effect_of(views, count).unless(word in splats.ignore)

@@ -1,23 +1,19 @@
 """Meshes and other surfaces that a scene holds besides its splats.
 
-Imported when a scene has surfaces. A nested integrator, such as Mitsuba's ``path``, makes a picture
-of them. What that shows at a pixel lies at the depths of the surfaces there, between the splats
-(``drgs.integrator.visible_surfaces``): with p_k the part of the light that the k-th surface stops,
-T_k the transmittance of the splats in front of it, T that of all splats, L_k what the surface sends
-to the camera, B the background, and C and A the sums of the colours and weights of the splats as
-far as surfaces let them through (``drgs.effects.occlusion``),
+Imported when a scene has surfaces. A nested integrator, such as Mitsuba's ``path``, renders them at
+the depths of the surfaces in each pixel, between the splats (``drgs.integrator.visible_surfaces``).
+With p_k the part of the light that the k-th surface stops, T_k the transmittance of the splats in
+front of it, T that of all splats, L_k what the surface sends to the camera, B the background, and C
+and A the sums of the colours and weights of the splats as far as surfaces let them through
+(``drgs.effects.occlusion``), a pixel is
 
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
-With N_k the nested picture of what is behind the first k surfaces, times what these let through
-(``drgs.integrator.transparency``), L_k = N_(k - 1) - N_k. Behind the last surface there is only the
-background: where the nested integrator shows it, N_k is there (1 - sum_k p_k) B, and else 0. Light
-does not pass from one to the other: splats neither light surfaces nor are lit by them, and cast no
-shadows (``light`` and ``shadows`` do that).
+With N_k the nested image of what is behind the first k surfaces, times what these let through
+(``drgs.integrator.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is (1 - sum_k p_k) B
+where the nested integrator shows the background, and else 0.
 
-Derivatives flow to the splats and, through the nested integrator, to the parameters of surfaces and
-emitters. Not differentiated: the depth of a surface and the part of a pixel that it covers, and
-with that its silhouette.
+Not differentiated: the depth of a surface, the part of a pixel that it covers, its silhouette.
 """
 
 from __future__ import annotations
@@ -34,22 +30,17 @@ import numpy as np
 from drgs.core.arrays import image_of, planes_of
 from drgs.core.errors import PluginError, UnsupportedError, listed, one_line, root_cause
 from drgs.core.private import same_variables
-from drgs.integrator.derivatives import (
-    Parameter,
-    attached_parameters,
-    parameter_value,
-    type_of,
-)
+from drgs.integrator.derivatives import Parameter, attached_parameters, parameter_value, type_of
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
 from drgs.integrator.film import pixels_adjoint as film_adjoint
-from drgs.integrator.path_segment import passes_splats
-from drgs.integrator.sensors import sensors_of
-from drgs.integrator.transparency import (
+from drgs.integrator.rays import (
     RaysBehind,
     StraightRays,
     has_transparent_parts,
+    passes_splats,
     sensor_behind,
 )
+from drgs.integrator.sensors import sensors_of
 from drgs.integrator.visible_surfaces import Layers, rest_behind
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")
@@ -159,10 +150,7 @@ class Insertion:
     def values(
         self, layers: Layers, fronts: Sequence[mi.Float], radiance: mi.Color3f | None
     ) -> Channels:
-        """Return those channels of a pass.
-
-        fronts: for each surface, see :class:`VisibleSurface`; radiance: B, linear.
-        """
+        """Return those channels of a pass; fronts: sums of weights; radiance: B, linear."""
         values = []
         for surface, front in zip(layers, fronts, strict=True):
             values += [surface.share(front), surface.coverage]
@@ -214,7 +202,6 @@ class Insertion:
         return develop_pixels(self.film, tangents, self.aovs)
 
     def _inserted(self, planes: list[mi.Float], nested: list[list[mi.Float]]) -> Channels:
-        """Return the channels for the film."""
         to_developed, to_rgb = self._color_maps()
         count = len(to_developed)
         rest, own = planes[count : -len(self.channels)], planes[-len(self.channels) :]
@@ -248,10 +235,7 @@ class Insertion:
         return list(weight * mi.math.linear_to_srgb(mean))
 
     def _color_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the maps from linear RGB to the film's colours (RGB, XYZ, luminance), and back.
-
-        Of luminance there is no way back but to some colour that has it.
-        """
+        """Return the maps from linear RGB to the film's colours (RGB, XYZ, luminance), and back."""
         matrix = film_map(self.film, self.maps, ())
         has_alpha = num_colors(self.film) == 4
         to_developed = matrix[: len(matrix) - has_alpha, :3]
@@ -345,10 +329,7 @@ class Hybrid:
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 
     def _where_they_matter(self, differentiate: Callable[[mi.Sensor], Any]) -> list[Any]:
-        """Differentiate each nested picture; None for those that do not depend on parameters.
-
-        What is behind a window may not show the window. Raises the error if no picture depends.
-        """
+        """Differentiate nested images; None for those that do not depend on parameters."""
         found, errors = [], []
         for sensor in self._sensors():
             try:
@@ -384,10 +365,7 @@ class Hybrid:
 
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
-        """Yield the parameters that the nested integrator is to differentiate.
-
-        Its errors, which are about variables, are raised again with the parameters' names.
-        """
+        """Yield the nested integrator's parameters, with whose names its errors are raised."""
         with dr.resume_grad(), _sample_count_kept(self.sensor):
             parameters = list(attached_parameters(self.rays.scene))
             try:

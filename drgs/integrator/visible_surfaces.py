@@ -1,13 +1,9 @@
 """The surfaces that a camera sees at each pixel: depths, and what they stop of the light behind.
 
-Imported when a scene has surfaces. Rays go from the camera to the first visible surface, and past
-what lets light pass straight on (``null``, ``mask``, ``thindielectric``) to the next one: each is
-seen by the part of the light that it stops of what arrives there.
-
-Where a surface ends within a pixel, it covers a part of it. With one sample per pixel, rays are
-traced through :data:`EDGE_SAMPLES` places of each pixel next to where surfaces end and the
-background begins; with several samples, each has its own depth. A ``thinlens`` sees depths and
-coverage from the middle of its aperture.
+Rays go from the camera to the first visible surface, and past what lets light pass straight on to
+the next one. Where a surface ends within a pixel, it covers a part of it: with one sample per
+pixel, rays are traced through :data:`EDGE_SAMPLES` places of such pixels; with several samples,
+each has its own depth. A ``thinlens`` sees depths and coverage from the middle of its aperture.
 """
 
 from __future__ import annotations
@@ -22,7 +18,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.effects.occlusion import Surface
 from drgs.integrator.film import pixel_corners, samples_in
-from drgs.integrator.transparency import INVISIBLE, StraightRays
+from drgs.integrator.rays import INVISIBLE, StraightRays
 
 EDGE_GRID = 4
 
@@ -43,17 +39,15 @@ class VisibleSurface(Surface):
     normal: Any  # Normal3f, world, times the coverage; None where no AOV needs it
 
     def at(self, pixel: mi.UInt32) -> VisibleSurface:
-        """Return the surface at some of the pixels."""
         planes = (dr.gather(mi.Float, plane, pixel) for plane in (self.depth, self.coverage))
         normal = None if self.normal is None else dr.gather(mi.Normal3f, self.normal, pixel)
         return VisibleSurface(*planes, normal)
 
     def share(self, front: mi.Float) -> mi.Float:
-        """Return the weight of the surface; front: sum of the splats' weights in front of it."""
+        """Return the weight of the surface; front: sum of the weights of splats in front of it."""
         return self.coverage * (1 - front)
 
     def aov_values(self, kind: str, front: mi.Float) -> list[mi.Float] | None:
-        """Return what the surface contributes to the channels of an AOV; None: nothing."""
         if kind == "depth":
             return [self.share(front) * self.depth]
         if kind == "normal":
@@ -99,7 +93,6 @@ def trace_surfaces(
 
 
 def _padded(layers: Layers, count: int) -> Layers:
-    """Return ``count`` surfaces, the last of which are not there."""
     first = layers[0]
     zero = dr.zeros(mi.Float, dr.width(first.coverage))
     far = zero + FAR_AWAY
@@ -116,10 +109,7 @@ class _Tracer:
     with_normals: bool
 
     def trace(self, camera: Camera, corner: mi.Point2f, x: Any, y: Any) -> Layers:
-        """Return what rays meet at places of pixels.
-
-        corner: upper left corners of the pixels, px; x, y: from there.
-        """
+        """Return what rays meet at x, y from the corners of pixels, px."""
         place = corner + mi.Point2f(x, y)
         camera = camera.at_row(place.y)
         ray, active = self._camera_rays(camera, place)
@@ -154,13 +144,8 @@ class _Tracer:
         return ray, dr.full(mi.Bool, True, dr.width(ray)) & mi.Bool(seen)
 
     def _surface(
-        self,
-        camera: Camera,
-        ray: mi.Ray3f,
-        hit: mi.PreliminaryIntersection3f,
-        coverage: mi.Float,
+        self, camera: Camera, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, coverage: mi.Float
     ) -> VisibleSurface:
-        """Return what has been hit."""
         valid = coverage > 0
         point = ray.o + dr.select(valid, hit.t, 1) * ray.d
         _, _, depth = camera.lens.visibility(camera, camera.rotation @ (point - camera.center))

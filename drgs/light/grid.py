@@ -57,15 +57,6 @@ class Ellipsoids:
 
 
 @dataclass(frozen=True)
-class Cell:
-    """The cells of rays, one a lane."""
-
-    first: Any  # UInt32: first entry of its list
-    last: Any  # UInt32: one behind the last
-    exit: Any  # Float: where the ray leaves it, or empty ones around it; at least a step ahead
-
-
-@dataclass(frozen=True)
 class SplatGrid:
     """Lists of Gaussians by cell."""
 
@@ -94,8 +85,11 @@ class SplatGrid:
             last = dr.select(high < last, high, last)
         return first, last
 
-    def cell(self, origin: Any, direction: Any, t: Any) -> Cell:
-        """The cell that rays enter at t."""
+    def cell(self, origin: Any, direction: Any, t: Any) -> tuple[Any, Any, Any]:
+        """Return the first entry and the end of the list of the cell that rays enter at t.
+
+        Then where they leave it, or empty ones around it; at least a step ahead.
+        """
         t_ = types_of(type(self.size))
         count = t_.Float(self.resolution)
         distance = self._distance(origin + direction * t)
@@ -121,7 +115,7 @@ class SplatGrid:
             side = dr.select(side > 0, dr.select(side < count, side, count), 0)
             until = ((side * (2 / count) - 1) * half + (self.center[k] - origin[k])) / direction[k]
             leaves = dr.select(until < leaves, until, leaves)
-        return Cell(first, first + number, dr.select(leaves > ahead, leaves, ahead))
+        return first, first + number, dr.select(leaves > ahead, leaves, ahead)
 
     def _cube(self, distance: Any) -> tuple[Any, Any]:
         """The smallest cube that a point is in: its number, and its size in innermost ones."""

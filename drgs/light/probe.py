@@ -1,16 +1,14 @@
 """Probes: the splats as they look from one place, in all directions.
 
-A probe is a cube of six pictures around a centre, made by the kernels that make all others: colour,
-coverage, and distance of the splats in each direction. A ray that starts near the centre sees about
-the same points, but not in its own direction. Where it meets the splats is searched on it: it goes
-on, in steps that look the same size from the centre, until it is behind what the probe sees in the
-direction of where it is. What it meets there is what the probe sees. Where it gets behind something
-that it has not met, as what is seen there was nearer all the time, the probe cannot tell what it
-meets: that lies in the shadow of the centre. Such rays are not known.
+A probe is a cube of six images around a centre: colour, coverage, and distance of the splats in
+each direction. A ray that starts near the centre sees about the same points, but not in its own
+direction: where it meets the splats is searched on it, in steps that look the same size from the
+centre, until it is behind what the probe sees in the direction of where it is. Where it gets behind
+something that it has not met, as what is seen there was nearer all the time, it is in the shadow of
+the centre, and what it meets is not known.
 
-Rays that stand for others around them look at smaller pictures, of which each texel is the mean
-over a larger angle (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance
-Sampling").
+Rays that stand for others around them look at smaller images, of which each texel is the mean over
+a larger angle (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance Sampling").
 
 Nothing here is differentiated.
 """
@@ -100,7 +98,7 @@ class Probes:
         texels, nearest = [], []
         for center, plane in zip(centers, planes, strict=True):
             beyond = _beyond(t, plane, pipeline)
-            faces = [_Face(center, k).render(gaussians, beyond, near, decode) for k in range(6)]
+            faces = [_face(center, k, gaussians, beyond, near, decode) for k in range(6)]
             levels = [_joined(faces)]
             for level in range(1, LEVELS):
                 levels.append(_halved(levels[-1], SIZE >> level))
@@ -124,10 +122,7 @@ class Probes:
     def look(
         self, probe: Any, origin: Any, direction: Any, far: Any, level: Any, active: Any
     ) -> Seen:
-        """Look along rays up to ``far``.
-
-        probe, level: UInt32, of each ray; direction: unit vectors.
-        """
+        """Look along unit directions up to ``far``; probe, level: UInt32, of each ray."""
         t = types_of(type(far))
         start = origin - dr.gather(t.Array3f, self.centers, probe, active)
         reach = LEAST_REACH * dr.gather(t.Float, self.nearest, probe, active)
@@ -205,11 +200,6 @@ def _beyond(t: Any, plane: np.ndarray, pipeline: rendering.Pipeline) -> renderin
     return replace(pipeline, rows=rows)
 
 
-# ----------------------------------------------------------------------------------------------
-# Cubes
-# ----------------------------------------------------------------------------------------------
-
-
 def _num_texels(level: int) -> int:
     return 6 * ((SIZE >> level) + 2 * BORDER) ** 2
 
@@ -282,45 +272,41 @@ def _place_on_cube(v: Any) -> tuple[Any, Any, Any]:
     return face, dr.select(is_negative, down, right), dr.select(is_negative, right, down)
 
 
-@dataclass(frozen=True)
-class _Face:
-    """One of the cube's images."""
+def _face(
+    center: np.ndarray,
+    number: int,
+    gaussians: Gaussians,
+    pipeline: rendering.Pipeline,
+    near: float,
+    decode: Callable[[list[Any]], list[Any]],
+) -> list[Any]:
+    """Render a side of a cube (+x, -x, +y, ...), borders included.
 
-    center: np.ndarray
-    number: int  # +x, -x, +y, ...
-
-    def render(
-        self,
-        gaussians: Gaussians,
-        pipeline: rendering.Pipeline,
-        near: float,
-        decode: Callable[[list[Any]], list[Any]],
-    ) -> list[Any]:
-        """Red, green, blue, coverage, nearness of its texels, borders included."""
-        Float = type(gaussians.means.array)
-        UInt32, edge = types_of(Float).UInt32, SIZE + 2 * BORDER
-        axis, is_negative = divmod(self.number, 2)
-        forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
-        if is_negative:
-            forward, right, down = -forward, down, right
-        K = np.array([[SIZE / 2, 0, edge / 2], [0, SIZE / 2, edge / 2], [0, 0, 1]])
-        rotation = np.stack([right, down, forward])
-        camera = Camera.create(Float, rotation, self.center, K, edge, edge, near)
-        T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
-        coverage = 1 - T
-        shows = coverage > 0
-        color = decode([c / dr.select(shows, coverage, 1) for c in color])
-        texel = dr.arange(UInt32, edge * edge)
-        x, y = ((Float(p) + (0.5 - edge / 2)) * (2 / SIZE) for p in (texel % edge, texel // edge))
-        distance = depth * dr.sqrt(1 + x * x + y * y)  # times coverage
-        nearness = dr.select(shows & (distance > 0), coverage * coverage / distance, 0)
-        columns = [*(c * coverage for c in color), coverage, nearness]
-        dr.eval(columns)
-        return columns
+    Red, green, blue, coverage, nearness of its texels.
+    """
+    Float = type(gaussians.means.array)
+    UInt32, edge = types_of(Float).UInt32, SIZE + 2 * BORDER
+    axis, is_negative = divmod(number, 2)
+    forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
+    if is_negative:
+        forward, right, down = -forward, down, right
+    K = np.array([[SIZE / 2, 0, edge / 2], [0, SIZE / 2, edge / 2], [0, 0, 1]])
+    rotation = np.stack([right, down, forward])
+    camera = Camera.create(Float, rotation, center, K, edge, edge, near)
+    T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
+    coverage = 1 - T
+    shows = coverage > 0
+    color = decode([c / dr.select(shows, coverage, 1) for c in color])
+    texel = dr.arange(UInt32, edge * edge)
+    x, y = ((Float(p) + (0.5 - edge / 2)) * (2 / SIZE) for p in (texel % edge, texel // edge))
+    distance = depth * dr.sqrt(1 + x * x + y * y)  # times coverage
+    nearness = dr.select(shows & (distance > 0), coverage * coverage / distance, 0)
+    columns = [*(c * coverage for c in color), coverage, nearness]
+    dr.eval(columns)
+    return columns
 
 
 def _joined(parts: list[list[Any]]) -> list[Any]:
-    """Texels behind each other."""
     columns = [dr.concat(columns) for columns in zip(*parts, strict=True)]
     dr.eval(columns)
     return columns

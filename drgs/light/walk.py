@@ -205,7 +205,6 @@ class RaySplats:
         return Sampled([t.Array3f(color) for color in found], exist, T)
 
     def _color(self, row: Any, basis: list[Any], active: Any) -> list[Any]:
-        """Display space, seen along rays."""
         t = types_of(self.shapes.Float)
         numbers = self.colors.load(row, active)[: 3 * num_coefficients(self.sh_degree)]
         color = []
@@ -217,10 +216,7 @@ class RaySplats:
         return color
 
     def transmittance(self, segment: Segment, least: Any) -> Any:
-        """Float: what all Gaussians of a segment let through, whichever comes first.
-
-        least: Float; where it is less, it is anything that is less.
-        """
+        """Return what segments let through; where that is less than ``least``, anything less."""
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
 
@@ -299,13 +295,11 @@ class _Walk:
         grid = self.splats.grid
 
         def body(at: _Place) -> tuple[_Place]:
-            cell = grid.cell(self.origin, self.direction, at.end)
-            return (_Place(at.end, cell.exit, cell.first, cell.first, cell.last, at.turn),)
+            first, last, leaves = grid.cell(self.origin, self.direction, at.end)
+            return (_Place(at.end, leaves, first, first, last, at.turn),)
 
         (at,) = dr.while_loop(
-            state=(at,),
-            cond=lambda at: (at.entry == at.last) & (at.end < self.stop),
-            body=body,
+            state=(at,), cond=lambda at: (at.entry == at.last) & (at.end < self.stop), body=body
         )
         return replace(at, turn=type(at.turn)(0))
 

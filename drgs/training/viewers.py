@@ -1,7 +1,7 @@
 """Gaussians for other viewers: what ``point_cloud_viewers.ply`` holds beside the fit's own.
 
 Viewers render with the defaults of ``drgs.config.approximations``. A copy of Gaussians that were
-fitted otherwise is changed in closed form (``drgs.effects.viewers``) and then fitted for a few
+fitted otherwise is changed in closed form (``drgs.effects.smoothing``) and then fitted for a few
 iterations more as viewers render it, with the number of Gaussians fixed and with the cameras and
 colours that the fit has found. The fit's own Gaussians do not depend on any of it.
 """
@@ -23,8 +23,7 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
-from drgs.effects.smoothing import baked
-from drgs.effects.viewers import baked_for_viewers
+from drgs.effects.smoothing import baked, baked_for_viewers
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor

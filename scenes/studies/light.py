@@ -173,8 +173,8 @@ def _stage(place: mi.ScalarTransform4f, integrator: dict[str, object]) -> dict[s
 
 def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
     """(H, W) bool: pixels whose middle shows a shape of a scene, and no splats before it."""
-    from drgs.integrator.path_segment import PathSegment
-    from drgs.integrator.ray_transport import RayTransport
+    from drgs.integrator.rays import PathSegment
+    from drgs.integrator.splat_transport import RayTransport
 
     sensor, integrator = scene.sensors()[0], scene.integrator()
     width, height = sensor.film().crop_size()

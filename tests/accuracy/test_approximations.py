@@ -256,7 +256,7 @@ def test_equal_approximations_make_equal_pipelines():
 
 
 CHOSEN_MODULES = (
-    "exact", "peak_depths", "pixel_lists", "pixel_order", "ray_colors", "sample_points",
+    "exact", "pixel_lists", "pixel_order", "ray_colors",
     "unscented",
 )  # fmt: skip
 

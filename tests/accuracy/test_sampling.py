@@ -31,9 +31,8 @@ from support.walls import Wall
 from support.walls import load as load_wall
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.accuracy.sample_points import SamplePoints
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.sampling import PIXELS_PER_PASS, SAMPLES_PER_KERNEL, DrawnSamples
+from drgs.integrator.film import PIXELS_PER_PASS, SAMPLES_PER_KERNEL, DrawnSamples, SamplePoints
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -213,9 +212,9 @@ def test_a_seed_that_was_changed_in_place_gives_other_points():
         return np.array(integrator.render(loaded, sensor, seed=seed))
 
     before = picture(seed)
-    frames = integrator.state.cache.frames[0]
+    frames = integrator.state.cache.kept["frames 0"]
     np.testing.assert_array_equal(picture(seed), before)
-    assert integrator.state.cache.frames[0] is frames
+    assert integrator.state.cache.kept["frames 0"] is frames
     seed += 1
     np.testing.assert_array_equal(picture(seed), picture(1))
     assert np.abs(picture(1) - before).max() > 1e-3
@@ -437,14 +436,14 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
     integrator.render_backward(loaded, params, weights, sensor, 5, samples)
     gradients = {key: np.array(dr.grad(value)) for key, value in values.items()}
     assert all(np.abs(gradient).max() > 0 for gradient in gradients.values())
-    (frames, *_) = integrator.state.cache.frames[0].value
+    (frames, *_) = integrator.state.cache.kept["frames 0"].value
     return {"image": np.array(image), "tangent": np.array(tangent), **gradients}, len(frames)
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypatch):
     monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
-    monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 1)
+    monkeypatch.setattr("drgs.integrator.film.PIXELS_PER_PASS", 1)
     expected, passes = outcome(name)
     assert passes == 3
 
@@ -461,7 +460,7 @@ def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypat
         patch.setattr("drgs.splatting.rendering.ENTRIES_AT_ONCE", 1)
         assert check() == 1
     width, height = SCENES[name]().sensors()[0].film().crop_size()
-    monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 2 * width * height)
+    monkeypatch.setattr("drgs.integrator.film.PIXELS_PER_PASS", 2 * width * height)
     monkeypatch.setattr("drgs.splatting.reduction.BAND_SLOTS", 16)
     assert check() == 2
 
@@ -500,6 +499,6 @@ def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):
         return np.array(loaded.integrator().last.weighted_sums(plane))
 
     found = weights()
-    monkeypatch.setattr("drgs.integrator.sampling.PIXELS_PER_PASS", 1)
+    monkeypatch.setattr("drgs.integrator.film.PIXELS_PER_PASS", 1)
     assert found.max() > 0
     np.testing.assert_allclose(found, weights(), rtol=1e-6)

@@ -108,11 +108,11 @@ def test_a_fit_that_goes_on_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
 def test_a_fit_as_viewers_render_has_one_file(tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.delitem(sys.modules, "drgs.training.viewers", raising=False)
-    monkeypatch.delitem(sys.modules, "drgs.effects.viewers", raising=False)
+    monkeypatch.delitem(sys.modules, "drgs.effects.smoothing", raising=False)
     assert_fits(write_project(tmp_path), "--out", tmp_path / "out")
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
     assert "viewers" not in json.loads((tmp_path / "out" / METRICS).read_text())
-    assert not {"drgs.training.viewers", "drgs.effects.viewers"} & set(sys.modules)
+    assert not {"drgs.training.viewers", "drgs.effects.smoothing"} & set(sys.modules)
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None
 
 

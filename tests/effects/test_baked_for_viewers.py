@@ -9,7 +9,7 @@ from support.small_capture import blobs, make_dataset
 from support.small_fits import double, reference_camera
 
 from drgs.config.approximations import Approximations
-from drgs.effects.viewers import KEPT_VARIANCE, baked_for_viewers
+from drgs.effects.smoothing import KEPT_VARIANCE, baked_for_viewers
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.reference import splatting as reference

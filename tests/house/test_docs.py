@@ -1,10 +1,9 @@
 """What the plugins' tables of parameters say is what there is."""
 
-import ast
 import re
+import sys
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from itertools import chain
 
 import mitsuba as mi
 import numpy as np
@@ -17,6 +16,7 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator.properties import KNOWN
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -52,58 +52,47 @@ def source(plugin) -> str:
 
 
 def table(plugin) -> list[Row]:
-    documentation = source(plugin).split(".. pluginparameters::")[1].split("    This ")[0]
+    """The plugin's table in the section "Parameters" of docs/mitsuba.md."""
+    page = (REPOSITORY / "docs" / "mitsuba.md").read_text().partition("\n## Parameters\n")[2]
+    section = page.partition(f"\n### `{plugin}`\n")[2].partition("\n### ")[0]
     rows = []
-    for item in re.split(r"\n     \* - ", documentation)[1:]:
-        names, kind, text, *flags = item.split("\n       - ")
-        flags = re.findall(r"\|(\w+)\|", flags[0]) if flags else []
-        rows.append(Row(tuple(names.split(", ")), kind, " ".join(text.split()), frozenset(flags)))
+    for line in section.splitlines():
+        if line.startswith(("| `", "| (")):
+            names, kind, text = (cell.strip() for cell in line.strip("|").split(" | "))
+            kind, *flags = kind.split(", ")
+            flags = {"exposed", *flags} if flags else ()
+            rows.append(
+                Row(tuple(names.replace("`", "").split(", ")), kind, text, frozenset(flags))
+            )
     return rows
 
 
-def names_read(plugin) -> set[str]:
-    """Every name that the code asks a property set for, itself or through a function."""
-    names = set()
-    reading = [source(plugin)]
-    if plugin == "splats":
-        reading.append((REPOSITORY / "drgs" / "integrator" / "properties.py").read_text())
-    for node in chain.from_iterable(ast.walk(ast.parse(text)) for text in reading):
-        if isinstance(node, ast.Call):
-            of_props = isinstance(node.func, ast.Attribute) and _is_props(node.func.value)
-            found = node.args[:1] if of_props else []
-            if node.args and _is_props(node.args[0]):
-                found = node.args[1:2]
-        elif isinstance(node, ast.Subscript) and _is_props(node.value):
-            found = [node.slice]
-        elif isinstance(node, ast.Compare) and _is_props(node.comparators[0]):
-            found = [node.left]
-        else:
-            continue
-        names |= {n.value for n in found if isinstance(n, ast.Constant)}
-    return names
-
-
-def _is_props(node) -> bool:
-    return isinstance(node, ast.Name) and node.id == "props"
+def names_in_docstring(plugin) -> set[str]:
+    documentation = source(plugin).split('    """')[1]
+    items = re.findall(r"^    - ((?:``[\w.]+``,?\s*)+): ", documentation, re.M)
+    return {name for item in items for name in re.findall(r"``([\w.]+)``", item)}
 
 
 NESTED = "(Nested plugin)"
-OTHERS = {
-    # Read by name lists and prefixes.
-    "splats": {*PARAMETER_NAMES, *(field.name for field in fields(Approximations))}
-    | {NESTED, "feature_...", "shapes_to_world", "shapes_to_world_..."},
-    # Coefficients; and what Mitsuba's base class reads.
-    "calibrated": {*RadialTangential.names, *ThinPrismFisheye.names, "to_world", "shutter_open"},
-}
+PREFIXED = {"feature_...", "shapes_to_world_..."}
 
 both_plugins = pytest.mark.parametrize("plugin", ["splats", "calibrated"])
 
 
-@both_plugins
-def test_the_table_lists_every_name_that_is_read(plugin):
+def known(plugin) -> set[str]:
+    module = sys.modules[f"drgs.plugins.llvm_ad_rgb.{plugin}"]
+    return {
+        "splats": {*KNOWN, *PREFIXED},
+        "splatpath": set(getattr(module, "PROPERTIES", ())),
+        "calibrated": set(getattr(module, "KNOWN", ())),
+    }[plugin]
+
+
+@pytest.mark.parametrize("plugin", ["splats", "splatpath", "calibrated"])
+def test_the_table_and_the_docstring_list_every_name_that_is_read(plugin):
     listed = [name for row in table(plugin) for name in row.names]
     assert len(listed) == len(set(listed))
-    assert set(listed) == names_read(plugin) | OTHERS[plugin]
+    assert set(listed) - {NESTED} == known(plugin) == names_in_docstring(plugin)
 
 
 def loaded(plugin) -> list[mi.Object]:
@@ -160,7 +149,7 @@ def test_the_table_marks_what_is_exposed_and_differentiable(plugin):
     assert actual == expected
 
 
-KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
+KINDS = {bool: "bool", int: "int", float: "float", str: "string"}
 
 
 def default_of(plugin, name):

@@ -138,7 +138,7 @@ def test_a_feature_that_is_not_put_out_costs_nothing():
     scene = Scene()
     loaded = load(scene, "", feature_mine=mi.TensorXf(features_of(scene)))
     mi.render(loaded)
-    (frame,) = loaded.integrator().state.cache.frames[0].value[0]
+    (frame,) = loaded.integrator().state.cache.kept["frames 0"].value[0]
     assert len(frame.planes()) == 4 and loaded.integrator().gaussians.features is None
 
 

@@ -329,13 +329,13 @@ def test_a_changed_environment_needs_no_new_frame_and_no_new_kernel():
 
     set_to([0.1, 0.2, 0.3])
     set_to([0.2, 0.3, 0.4])
-    frames = loaded.integrator().state.cache.frames[0]
+    frames = loaded.integrator().state.cache.kept["frames 0"]
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         set_to([0.3, 0.4, 0.5])
         history = dr.kernel_history([dr.KernelType.JIT])
     assert history and all(kernel["cache_hit"] for kernel in history)
-    assert loaded.integrator().state.cache.frames[0] is frames
+    assert loaded.integrator().state.cache.kept["frames 0"] is frames
 
 
 def test_a_new_view_before_an_environment_needs_no_new_kernel():

@@ -233,7 +233,7 @@ REFUSED = {
     ),
     "no samples": (
         {"shutter_samples": 0},
-        "PluginError: calibrated: shutter_samples must be an integer of at least 1, got 0",
+        "PluginError: calibrated: shutter_samples must be an integer from 1 to 1000, got 0",
     ),
     "too many samples": (
         {"shutter_samples": 1001},
@@ -241,7 +241,7 @@ REFUSED = {
     ),
     "part of a sample": (
         {"shutter_samples": 2.5},
-        "PluginTypeError: calibrated: shutter_samples must be an integer of at least 1, got 2.5",
+        "PluginTypeError: calibrated: shutter_samples must be an integer from 1 to 1000, got 2.5",
     ),
     "large coefficient": (
         {"lens": "fisheye", "k2": 1e7},

@@ -11,8 +11,8 @@ from support.lit_scenes import gaussians
 from support.rays import Rays, splats_of
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.integrator.path_segment import PathSegment
-from drgs.integrator.ray_transport import DECODED_WITHIN, DECODING, ROULETTE, RayTransport
+from drgs.integrator.rays import PathSegment
+from drgs.integrator.splat_transport import DECODED_WITHIN, DECODING, ROULETTE, RayTransport
 from drgs.light.walk import _hashes
 from drgs.splatting.cutoffs import Cutoffs
 

@@ -15,8 +15,7 @@ import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
 MODULES = (
-    "drgs.integrator.ray_transport",
-    "drgs.integrator.probe_transport",
+    "drgs.integrator.splat_transport",
     "drgs.integrator.shadows",
 )
 """Of light between splats and surfaces, and of nothing else; and so is this package:"""
@@ -162,5 +161,5 @@ def test_nothing_of_light_is_imported_until_a_scene_asks_for_it(run_python):
     lit = [(True, {"light": "rays"}), (True, {"shadows": "ball"})]
     *before, rays, shadows = imported_for(run_python, plain + lit)
     assert before == [[]] * len(plain)
-    assert {"drgs.integrator.ray_transport", "drgs.light.grid", "drgs.light.walk"} <= set(rays)
+    assert {"drgs.integrator.splat_transport", "drgs.light.grid", "drgs.light.walk"} <= set(rays)
     assert "drgs.integrator.shadows" in shadows

@@ -20,7 +20,7 @@ from support.lit_scenes import (
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.ray_transport import DECODED_WITHIN, DECODING
+from drgs.integrator.splat_transport import DECODED_WITHIN, DECODING
 from drgs.reference import light as reference
 from drgs.reference import splatting
 

@@ -139,5 +139,5 @@ def test_channels_that_are_not_asked_for_cost_nothing():
     for aovs, count in (("", 4), ("a:alpha", 4), ("z:depth", 5)):
         loaded = with_channels(scene, aovs)
         mi.render(loaded)
-        frames = loaded.integrator().state.cache.frames[0].value
+        frames = loaded.integrator().state.cache.kept["frames 0"].value
         assert len(frames[0][0].planes()) == count

@@ -139,7 +139,7 @@ def test_an_unchanged_scene_is_not_rendered_again():
     loaded = Scene().load()
     dr.eval(mi.render(loaded))
     assert kernels_of(lambda: dr.eval(mi.render(loaded))) <= 2
-    loaded.integrator().state.cache.frames.clear()
+    loaded.integrator().state.cache.forget("frames")
     assert kernels_of(lambda: dr.eval(mi.render(loaded))) > 10
 
 
@@ -307,7 +307,7 @@ def test_a_new_view_needs_no_new_kernel():
 def test_a_stale_frame_is_not_kept():
     loaded = Scene().load()
     mi.render(loaded)
-    frame = weakref.ref(loaded.integrator().state.cache.frames[0].value[0][0])
+    frame = weakref.ref(loaded.integrator().state.cache.kept["frames 0"].value[0][0])
     params = mi.traverse(loaded)
     params["integrator.means"] = params["integrator.means"] + 1
     params.update()

@@ -7,7 +7,6 @@ from support.splats_checks import assert_images_agree, fresh_image, fresh_integr
 from support.views import (
     VIEWS,
     Scene,
-    gradients_of,
     image_of,
     pose,
     tensors,
@@ -128,30 +127,3 @@ def test_a_plan_names_what_asked_for_each_effect():
     blurred = plan_of(sensor_like(VIEWS[1], **moving()), background=picture)
     assert "  background: a picture (the integrator's background)\n" in blurred
     assert "  motion: blurred (the sensor)\n" in blurred
-
-
-@pytest.fixture
-def logged(monkeypatch):
-    """What this integrator says at the level of information; other messages are dropped."""
-    lines = []
-    monkeypatch.setattr(mi, "Log", lambda level, text: lines.append((level, text)))
-    before = mi.log_level()
-    yield lines
-    mi.set_log_level(before)
-
-
-def test_a_plan_is_logged_once_where_somebody_listens(logged):
-    """Again when it is another."""
-    scene = Scene()
-    loaded = scene.load()
-    mi.render(loaded)
-    assert logged == []
-    mi.set_log_level(mi.LogLevel.Info)
-    for _ in range(3):
-        mi.render(loaded)
-    sensor = loaded.sensors()[0]
-    assert logged == [(mi.LogLevel.Info, f"splats: {loaded.integrator().summary(loaded, sensor)}")]
-    gradients_of(loaded, scene.weights(), ["means"])
-    assert len(logged) == 1
-    mi.render(loaded, sensor=mi.load_dict(sensor_like(VIEWS[1], "thinlens", **BLURRED)))
-    assert len(logged) == 2 and "depth of field: a thin lens" in logged[1][1]

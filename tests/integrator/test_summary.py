@@ -29,8 +29,8 @@ from drgs.training.summary import summary_of_fit
 MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.polynomials", "cameras.radial_tangential", "cameras.thin_lens",
-    "cameras.thin_prism_fisheye", "effects.defocus", "effects.features", "effects.occlusion",
-    "effects.smoothing", "integrator.background", "integrator.ray_transport", "integrator.shadows",
+    "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
+    "effects.smoothing", "integrator.splat_transport", "integrator.shadows",
     "integrator.surfaces",
     "light.grid", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
@@ -492,7 +492,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
         "perspective": [],
-        "environment": ["drgs.integrator.background"],
+        "environment": [],
         "distorted": [
             "drgs.cameras.distortion",
             "drgs.cameras.polynomials",
@@ -500,7 +500,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         ],
         "thin lens": ["drgs.cameras.thin_lens", "drgs.effects.defocus"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
-        "light": ["drgs.integrator.ray_transport", "drgs.light.grid", "drgs.light.walk"],
+        "light": ["drgs.integrator.splat_transport", "drgs.light.grid", "drgs.light.walk"],
     }
 
 

@@ -265,7 +265,7 @@ def test_samples_of_the_nested_integrator_are_left_to_it(spp):
     loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
     first = image_of(loaded, spp=spp, seed=3)
     assert loaded.sensors()[0].sampler().sample_count() == 1
-    loaded.integrator().state.cache.frames.clear()
+    loaded.integrator().state.cache.forget("frames")
     np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
 
 

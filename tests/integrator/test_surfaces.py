@@ -371,7 +371,7 @@ def test_numbers_of_the_host_count_too():
     params.update()
     after = image_of(loaded)
     loaded.integrator().state.cache.surfaces = None
-    loaded.integrator().state.cache.traced.clear()
+    loaded.integrator().state.cache.forget("surfaces")
     np.testing.assert_array_equal(after, image_of(loaded))
     assert np.abs(after - before).max() > 0.01
 

@@ -4,8 +4,7 @@ import inspect
 
 import pytest
 
-from drgs.accuracy import exact, peak_depths, pixel_order, ray_colors
-from drgs.accuracy.sample_points import SamplePoints
+from drgs.accuracy import exact, pixel_lists, pixel_order, ray_colors
 from drgs.cameras import (
     distortion,
     fisheye,
@@ -16,6 +15,7 @@ from drgs.cameras import (
     thin_prism_fisheye,
 )
 from drgs.effects import defocus, occlusion
+from drgs.integrator.film import SamplePoints
 from drgs.splatting import footprint, rendering
 
 CLASSES = {
@@ -26,10 +26,9 @@ CLASSES = {
         ray_colors.RayColors,
     ),
     rendering.CenterOrder: (pixel_order.PixelOrder,),
-    peak_depths.AffineDepths: (
-        peak_depths.ParallelDepths,
-        peak_depths.RayDepths,
-        peak_depths.BoundedDepths,
+    pixel_lists.AffineDepths: (
+        pixel_lists.ParallelDepths,
+        pixel_lists.RayDepths,
     ),
     lens.Lens: (
         lens.Pinhole,
@@ -86,4 +85,4 @@ def test_a_class_has_what_its_protocol_says(protocol, implementation):
 def test_what_is_missing_is_found():
     assert "view_direction" in missing(lens.Lens, thin_lens.RoundAperture)
     assert missing(lens.Lens, lens.Perspective) == ["project_point", "projection_jacobian"]
-    assert "at" in missing(peak_depths.AffineDepths, footprint.SplatFeatures)
+    assert "at" in missing(pixel_lists.AffineDepths, footprint.SplatFeatures)

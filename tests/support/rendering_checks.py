@@ -8,8 +8,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from drgs.accuracy.sample_points import SamplePoints
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.film import SamplePoints
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 from support.helpers import (

@@ -102,7 +102,7 @@ def test_entries_and_slots_at_the_start_are_those_of_a_rendering(monkeypatch):
         dr.enable_grad(params["integrator.means"])
         params.update()
         dr.backward(dr.mean(mi.render(scene, params, sensor=sensor, spp=1).array))
-        frame = scene.integrator().state.cache.frames[0].value[0][0]
+        frame = scene.integrator().state.cache.kept["frames 0"].value[0][0]
         entries.append(frame.bins.num_entries)
     found = memory._at_start(dataset.train, gaussians, 0.2, 1.0)
     assert found == pytest.approx((max(entries), max(slots)), rel=0.1)

@@ -1,9 +1,9 @@
-"""Surfaces that let light pass straight on (``null``, ``mask``, ``thindielectric``).
+"""Rays between surfaces: segments of paths, and rays that pass straight on.
 
-Imported when a scene has surfaces. The opacity of a surface at a point is what it does not let pass
-straight on, averaged over red, green and blue. What is less opaque than :data:`INVISIBLE` is not
-there: rays go on as if it were not. A sensor whose rays start behind the first k visible surfaces
-has any nested integrator render what these let through.
+The opacity of a surface at a point is what it does not let pass straight on (``null``, ``mask``,
+``thindielectric``), averaged over red, green and blue. What is less opaque than :data:`INVISIBLE`
+is not there: rays go on as if it were not. A sensor whose rays start behind the first k visible
+surfaces has any nested integrator render what these let through.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -30,10 +30,7 @@ def has_transparent_parts(scene: mi.Scene) -> bool:
 
 @dataclass(frozen=True)
 class StraightRays:
-    """Rays through a scene that go straight on until something is visible.
-
-    Loops name their state: a scene in it would carry its attached parameters into them.
-    """
+    """Rays that go straight on until something is visible. In no loop's state: it would attach."""
 
     scene: mi.Scene
     hide_emitters: bool  # whether surfaces that are emitters are invisible
@@ -42,10 +39,7 @@ class StraightRays:
     def next_visible(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
-        """Return a ray that starts behind all that is invisible, its hit, and the hit's opacity.
-
-        The opacity is 0 where nothing is hit.
-        """
+        """Return a ray behind all that is invisible, its hit, and the hit's opacity, 0 for none."""
         hit, opacity = self._meet(ray, active)
         if not self.sees_through:
             return ray, hit, opacity
@@ -89,7 +83,6 @@ class StraightRays:
     def _meet(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.PreliminaryIntersection3f, mi.Float]:
-        """Return what rays hit, and its opacity."""
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         return hit, self._opacity(ray, hit)
 
@@ -104,17 +97,9 @@ class StraightRays:
         return dr.select(hit.is_valid(), opacity, 0)
 
 
-# ----------------------------------------------------------------------------------------------
-# Sensors behind windows
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class RaysBehind:
-    """Rays behind the first ``count`` visible surfaces, and all that is invisible before the next.
-
-    Rays that end at one of these surfaces have the weight 0, others what the surfaces let through.
-    """
+    """Rays behind the first ``count`` visible surfaces; the weight is what these let through."""
 
     rays: StraightRays
     count: int
@@ -137,16 +122,12 @@ class RaysBehind:
 
 
 def sensor_behind(sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind) -> mi.Sensor:
-    """Return a sensor with the same film, sampler and rays, which start behind surfaces.
-
-    sensors: those of a ``batch``, side by side; else the sensor itself.
-    """
+    """Return a sensor whose rays start behind surfaces; sensors: those of a ``batch``."""
     return _sensor_type(mi.variant())(sensor, sensors, behind)
 
 
 @cache
 def _sensor_type(variant: str) -> type:
-    """Return the type of such sensors, which derives from the variant's own."""
     del variant
 
     class SensorBehind(mi.Sensor):
@@ -167,14 +148,12 @@ def _sensor_type(variant: str) -> type:
         def sample_ray(
             self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
         ) -> tuple[mi.Ray3f, mi.Spectrum]:
-            """See ``mi.Sensor.sample_ray``."""
             ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
             return mi.Ray3f(ray), weight
 
         def sample_ray_differential(
             self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
         ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-            """See ``mi.Sensor.sample_ray_differential``."""
             # Not by the batch, whose calls reach all sensors that there are, this one included.
             place, found = sample2.x * len(self.sensors), None
             for k, sensor in enumerate(self.sensors):
@@ -185,7 +164,36 @@ def _sensor_type(variant: str) -> type:
             return ray, found[1] * passes
 
         def to_string(self) -> str:
-            """Return the text that Mitsuba prints."""
             return f"SensorBehind[{self.sensors}]"
 
     return SensorBehind
+
+
+@dataclass(frozen=True)
+class PathSegment:
+    """A part of a path: from one vertex to the next, or to an emitter."""
+
+    ray: mi.Ray3f  # maxt: where it ends
+    start: mi.ShapePtr  # that it leaves
+    end: mi.EmitterPtr  # that it reaches, if it is one
+    pdf: mi.Float  # of the direction, by solid angle; inf: there was no other
+    is_open: mi.Bool  # whether it leaves a scene without an environment: black is the last splat
+
+
+class SplatTransport(Protocol):
+    """Radiance and transmittance of the splats along segments of paths."""
+
+    def composite_segment(
+        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """Return linear radiance and transmittance of segments; sample: in 0..1."""
+        ...
+
+    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return the transmittance of the splats along segments, or an estimate of it."""
+        ...
+
+
+def passes_splats(integrator: mi.Integrator) -> bool:
+    """Return whether an integrator's paths can pass splats, as those of ``splatpath`` do."""
+    return hasattr(integrator, "use_transport")

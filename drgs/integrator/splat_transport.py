@@ -1,12 +1,30 @@
-"""Light between splats and surfaces, looked up in probes (:mod:`drgs.light.probe`).
+"""Light between splats and surfaces, for the integrator ``splatpath``.
 
-Imported where a scene asks for it. A probe stands in the middle of an object of the scene: of a
-shape, or of an emitter. Rays that start at the object look there; so do rays to an emitter that has
-one, from shapes that have none, as far as their transmittance goes. All others pass no splats.
+Imported where a scene asks for it. Splats have display-encoded colours: what a ray has composited
+of them, C with transmittance T, is the colour C / (1 - T) with the coverage 1 - T. Its radiance is
 
-Where a probe does not know what a ray meets, another transport is used: none
-(:class:`drgs.integrator.path_segment.NoSplats`), or, where an object is so close to splats that its
-middle sees others than its surface does, that of rays.
+    exposure (1 - T) lin(C / (1 - T)),
+
+so that what is opaque looks the same in a mirror, and a white fog before a white wall stays white.
+Where a ray leaves a scene that has no environment, black is the last splat: exposure lin(C).
+
+To composite all that a ray passes takes long. By default, a few splats are drawn with their weights
+instead, n of them. Their colours c estimate the powers of C / (1 - T), without bias: from the sums
+s_k of c^k,
+
+    m: s_1 / n,   m^2: (s_1^2 - s_2) / (n (n - 1)),
+    m^3: (s_1^3 - 3 s_1 s_2 + 2 s_3) / (n (n - 1) (n - 2))
+
+(Hoeffding 1948), of which lin is a sum to within :data:`DECODED_WITHIN`. How far the draws had to
+look for splats estimates T, and does not depend on which splats they have: the product of both is
+without bias as well. For rays that meet black at last, a draw is black with the probability T.
+
+:class:`ProbeTransport` looks segments up in probes (:mod:`drgs.light.probe`), which stand in the
+middle of objects of the scene, shapes or emitters. Rays that start at the object look there; so do
+rays to an emitter that has one, from shapes that have none, as far as their transmittance goes. All
+others pass no splats. Where a probe does not know what a ray meets, it is nothing or, where an
+object is so close to splats that its middle sees others than its surface does, what
+:class:`RayTransport` finds.
 """
 
 from __future__ import annotations
@@ -21,13 +39,128 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
+from drgs.config.approximations import Approximations
 from drgs.core.errors import PluginError
+from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_ids
-from drgs.integrator.path_segment import PathSegment, SplatTransport
+from drgs.integrator.rays import PathSegment, SplatTransport
+from drgs.integrator.sensor_render import decode
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
-from drgs.integrator.state import Cached, SplatsState
+from drgs.integrator.state import SplatsState
 from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
+from drgs.light.walk import RaySplats, Segment
+from drgs.splatting.projection import load_rows
 from drgs.splatting.rendering import color_features, depth_feature
+
+DECODING = (0.012522878, 0.682171111, 0.305306011)
+"""Of the first three powers of a display-encoded colour, whose sum is nearly linear radiance
+(Chapman, "sRGB approximations for HLSL", 2012)."""
+
+DECODED_WITHIN = 2e-3
+"""Of a colour in 0..1, decoded by :data:`DECODING`."""
+
+LEAST_SAMPLES = 3
+"""Splats that a ray draws, at least: for the third power."""
+
+ROULETTE = 0.25
+"""Transmittance to an emitter, below which the rest of the splats is asked for with a probability:
+few splats make a ray dark, and many more are behind them."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayTransport:
+    """Transport along rays that pass the splats themselves."""
+
+    splats: RaySplats
+    exposure: mi.Float  # (1,): factor of the splats' radiance
+    num_samples: int  # splats that are drawn; 0: all are composited
+
+    @staticmethod
+    def of(splats: SplatsState) -> RayTransport:
+        """Return the transport of an integrator's Gaussians."""
+        gaussians = dr.detach(splats.gaussians)
+        settings = splats.approximations, splats.sh_degree
+        found = splats.cache.find(
+            "ray splats", settings, gaussians, lambda: ray_splats_of(gaussians, *settings)
+        )
+        exposure = dr.opaque(mi.Float, splats.exposure)
+        return RayTransport(found.value, exposure, splats.light_samples)
+
+    def composite_segment(
+        self, segment: PathSegment, sample: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        look = self._sampled if self.num_samples else self._composited
+        color, coverage = look(_segment(segment.ray, active), segment.is_open, sample)
+        return dr.select(active, self.exposure * color, 0), dr.select(active, 1 - coverage, 1)
+
+    def _composited(
+        self, segment: Segment, is_open: mi.Bool, sample: mi.Float
+    ) -> tuple[mi.Color3f, mi.Float]:
+        del sample
+        found = self.splats.composite_segment(segment)
+        coverage = 1 - found.transmittance
+        return decode(mi.Color3f(found.color), dr.select(is_open, 1, coverage)), coverage
+
+    def _sampled(
+        self, segment: Segment, is_open: mi.Bool, sample: mi.Float
+    ) -> tuple[mi.Color3f, mi.Float]:
+        seed, n = dr.reinterpret_array(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
+        drawn = self.splats.sampled(segment, seed, n)
+        colors = [
+            dr.select(is_open & ~exists, 0, mi.Color3f(color))
+            for color, exists in zip(drawn.colors, drawn.exist, strict=True)
+        ]
+        s1, s2, s3 = (sum(color**k for color in colors) for k in (1, 2, 3))
+        mean = s1 / n
+        square = (s1 * s1 - s2) / (n * (n - 1))
+        cube = (s1 * s1 * s1 - 3 * s1 * s2 + 2 * s3) / (n * (n - 1) * (n - 2))
+        a, b, c = DECODING
+        coverage = 1 - drawn.transmittance
+        whole = dr.select(is_open, 1, coverage)
+        return whole * (a * mean + b * square + c * cube), coverage
+
+    def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
+        """An estimate of that of the splats along segments.
+
+        Below :data:`ROULETTE`, Russian roulette: a ray that lets through less than ``sample`` (in
+        0..1) times that is dark, and all others let through as much as that.
+        """
+        least = sample * ROULETTE
+        T = self.splats.transmittance(_segment(segment.ray, active), least)
+        T = dr.select(least > T, 0, dr.maximum(T, ROULETTE))
+        return dr.select(active, T, 1)
+
+
+def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: int) -> RaySplats:
+    """Gaussians as rays meet them, their smoothing filter included."""
+    rows = load_rows(gaussians, degree)
+    if rows.smoothing is not None:
+        from drgs.effects.smoothing import smoothed
+
+        rows = smoothed(rows)
+    return RaySplats.of(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
+
+
+def nested_with_transport(
+    splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
+) -> mi.Integrator:
+    """Return the nested integrator, given the splats; num_paths: of a pixel; sensors: rendered."""
+    nested = splats.nested
+    if nested is None:
+        settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
+        nested = mi.load_dict(settings)
+    if splats.light == "rays":
+        nested.use_transport(RayTransport.of(splats))
+    else:
+        traces = splats.unseen == "rays"
+        unseen = RayTransport.of(splats) if traces else None
+        nested.use_transport(ProbeTransport.of(splats, scene, num_paths, sensors, unseen))
+    return nested
+
+
+def _segment(ray: mi.Ray3f, active: mi.Bool) -> Segment:
+    return Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Bool(active))
+
 
 CLOSE = 1.25
 """Distance of splats from an object's middle, in halves of its size, below which its surface sees
@@ -53,7 +186,7 @@ class ProbeTransport:
     emitters: dict[int, mi.EmitterPtr]  # likewise
     flat: dict[int, int]  # numbers of the mirrors, by that of the probe
     num_paths: mi.Float  # (1,): of a pixel
-    unseen: SplatTransport  # for rays of which probes do not know what they meet
+    unseen: SplatTransport | None  # for rays of which probes do not know what they meet
 
     @staticmethod
     def of(
@@ -61,15 +194,9 @@ class ProbeTransport:
         scene: mi.Scene,
         num_paths: int,
         sensors: Sequence[mi.Sensor],
-        unseen: SplatTransport,
+        unseen: SplatTransport | None,
     ) -> ProbeTransport:
-        """Return the transport by the probes of an integrator's objects.
-
-        sensors: those that flat mirrors are seen by.
-
-        Raises PluginError for the name of an object that the scene does not have, and for an
-        emitter that is nowhere.
-        """
+        """Return the transport by probes; sensors: of flat mirrors. PluginError for ids."""
         objects = _objects(scene, splats.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
@@ -90,10 +217,11 @@ class ProbeTransport:
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        """See :meth:`drgs.integrator.path_segment.SplatTransport.composite_segment`."""
         seen, is_asked, is_reversed = self._look(segment, active)
         is_known = is_asked & seen.is_known
-        radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
+        radiance, T = mi.Color3f(0), mi.Float(1)
+        if self.unseen is not None:
+            radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
         color = mi.Color3f(seen.color)
         color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
         radiance = dr.select(is_known, self.exposure * color, radiance)
@@ -102,7 +230,6 @@ class ProbeTransport:
         return radiance, dr.select(is_known, 1 - seen.coverage, T)
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """Return the transmittance along segments; 1 where it is not known."""
         seen, is_asked, _ = self._look(segment, active)
         return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)
 
@@ -152,15 +279,10 @@ class ProbeTransport:
 def _probes(
     splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
 ) -> Probes:
-    """Render the probes of objects, or return the last ones if all is the same.
+    """Render the probes of objects; flat: mirrors by the probe's number; sensor: that sees them."""
+    gaussians, (centers, planes) = dr.detach(splats.gaussians), _places(objects, flat, sensor)
 
-    flat: mirrors by the probe's number; sensor: that sees them.
-    """
-    gaussians, last = dr.detach(splats.gaussians), splats.cache.probes
-    centers, planes = _places(objects, flat, sensor)
-    places = centers.tolist(), planes.tolist()
-    settings = splats.approximations, splats.sh_degree, splats.near, places
-    if last is None or not last.matches(settings, gaussians):
+    def render() -> Probes:
         approximations = replace(splats.approximations, projection="exact", low_pass=LOW_PASS)
         pipeline = pipeline_of(approximations, splats.sh_degree, (color_features, depth_feature))
         if gaussians.smoothing is not None:
@@ -168,9 +290,12 @@ def _probes(
 
             pipeline = replace(pipeline, rows=smoothed)
         probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
-        last = splats.cache.probes = Cached(probes, settings, gaussians)
         _warn_of_close(splats, objects, flat, probes)
-    return last.value
+        return probes
+
+    places = centers.tolist(), planes.tolist()
+    settings = splats.approximations, splats.sh_degree, splats.near, places
+    return splats.cache.find("probes", settings, gaussians, render).value
 
 
 def _warn_of_close(
@@ -190,33 +315,33 @@ def _warn_of_close(
 
 
 def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, Any]:
-    """Find the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
+    """Return the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
     from drgs.integrator.mirrors import FlatMirror
 
-    settings, last = (splats.cache.surfaces,), splats.cache.flat_mirrors
-    if last is None or not last.matches(settings, ()):
+    def recognise() -> dict[int, Any]:
         every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
-        flat = {k: mirror for k, mirror in every.items() if mirror is not None}
-        last = splats.cache.flat_mirrors = Cached(flat, settings, ())
-    return last.value
+        return {k: mirror for k, mirror in every.items() if mirror is not None}
+
+    return splats.cache.find("flat mirrors", (splats.cache.surfaces,), (), recognise).value
 
 
 def _mirror_images(
     splats: SplatsState, scene: mi.Scene, mirrors: list[Any], states: list[SensorState]
 ) -> Any:
-    """Render what sensors see in flat mirrors, or reuse it; None where there are no mirrors."""
     from drgs.integrator.mirrors import Mirrors
 
-    gaussians, cache = dr.detach(splats.gaussians), splats.cache
+    if not mirrors:
+        return None
+    gaussians, surfaces = dr.detach(splats.gaussians), splats.cache.surfaces
     how = splats.approximations, splats.sh_degree
-    settings = (cache.surfaces, *how, *(state.settings for state in states))
-    arrays, last = (gaussians, [state.device for state in states]), cache.mirrors
-    if last is None or not last.matches(settings, arrays):
-        images = None
-        if mirrors:
-            images = Mirrors.of(mirrors, states, cache.surfaces.traced(scene), gaussians, *how)
-        last = cache.mirrors = Cached(images, settings, arrays)
-    return last.value
+    settings = (surfaces, *how, *(state.settings for state in states))
+    arrays = gaussians, [state.device for state in states]
+    return splats.cache.find(
+        "mirrors",
+        settings,
+        arrays,
+        lambda: Mirrors.of(mirrors, states, surfaces.traced(scene), gaussians, *how),
+    ).value
 
 
 def _places(
@@ -244,7 +369,6 @@ def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:
 
 
 def _center(node: mi.Object) -> list[float]:
-    """World."""
     box = node.bbox()
     if not box.valid():
         raise PluginError(
@@ -261,5 +385,4 @@ def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
 
 
 def _decoded(color: list[mi.Float]) -> list[mi.Float]:
-    """Linear radiance."""
     return [mi.math.srgb_to_linear(channel) for channel in color]
