@@ -16,14 +16,13 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
-from drgs.core.memory import require_memory
-from drgs.io.formats import FORMATS, FileFormat, Scalar
+from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
 from drgs.io.quantization import (
-    decoding_bytes,
     log_scales_from_scales,
     logits_from_opacities,
     normalize_quaternions,
     opacities_from_logits,
+    require_scene_memory,
     round_to_uint32,
 )
 
@@ -37,17 +36,11 @@ which a file of another kind could be told."""
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def encode(
-    gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
-) -> bytes:
-    """A file of Gaussians. Equal ones give equal bytes.
-
-    gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives; harmonics above
-    degree 0 are left out. rendered_with: has no place.
+def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+    """Return a file of Gaussians; harmonics above degree 0 are left out.
 
     Raises :class:`UserError` for positions of more than :data:`MAX_NUMBER`.
     """
-    del rendered_with
     g = gaussians
     if (extent := np.abs(g["means"]).max()) > MAX_NUMBER:
         raise UserError(
@@ -66,15 +59,13 @@ def encode(
     return rows[np.argsort(-importance, kind="stable")].tobytes()
 
 
-def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Gaussians of degree 0 as numpy float32 arrays, and an empty dictionary.
+def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    """Return Gaussians of degree 0 (:data:`drgs.io.formats.Arrays`), and an empty dictionary.
 
-    As :func:`drgs.io.ply.read_gaussians` gives them; opacities of 0 and 1, and scales of 0, are the
-    next ones that their logits and logarithms tell apart.
+    Opacities of 0 and 1, and scales of 0, become the next ones that have logits and logarithms.
 
     Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
     """
-    path = Path(path)
     content = read_bytes(path, "file", MAX_BYTES)
     if not content or len(content) % ROW.itemsize:
         raise UserError(
@@ -82,7 +73,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             "each Gaussian, at least one; it is damaged, or was cut off"
         )
     rows = np.frombuffer(content, ROW)
-    require_memory(path, decoding_bytes(len(rows), 1), f"a scene of {len(rows):,} Gaussians")
+    require_scene_memory(path, len(rows), 1)
     for name, least in (("mean", -MAX_NUMBER), ("scale", 0)):
         values = rows[name]
         bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
@@ -102,7 +93,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "sh0": ((colors - 0.5) / SH_C0)[:, None, :],
         "shN": np.zeros((len(rows), 0, 3)),
     }
-    return {name: values.astype(np.float32) for name, values in arrays.items()}, {}
+    return arrays, {}
 
 
 @FORMATS.register("splat")

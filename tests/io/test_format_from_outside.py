@@ -135,6 +135,14 @@ def test_a_format_without_a_suffix_is_refused_with_its_package(installed):
         formats.format_for("a.npz")
 
 
+def test_a_broken_package_does_not_disturb_formats_that_drgs_ships(installed, tmp_path):
+    (installed / "npz_format.py").write_text("import no_such_module")
+    blobs().save(tmp_path / "a.ply")
+    assert Gaussians.load(tmp_path / "a.ply").num_gaussians == 30
+    with pytest.raises(UserError, match='cannot load the extension "npz"'):
+        blobs().save(tmp_path / "a.npz")
+
+
 def test_a_suffix_that_drgs_has_stays_its_own(installed):
     module = installed / "npz_format.py"
     module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = ".ply"'))
