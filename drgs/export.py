@@ -21,12 +21,13 @@ from drgs.core.constants import LOW_PASS
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
+from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.orbits import up_of
 from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.formats import OTHER_FORMATS, FileFormat, file_formats, format_for
+from drgs.io.formats import FileFormat, file_formats, format_for
 from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
@@ -269,7 +270,7 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
     known = targets()
     if name not in known:
         got = f"got {one_line(name, 40)}{did_you_mean(name, known)}" if name else "got none"
-        raise UserError(f"--format: must be one of {', '.join(known)}, {got}; {OTHER_FORMATS}")
+        raise UserError(f"--format: must be one of {', '.join(known)}, {got}; {HOW_TO_INSTALL}")
     suffix = known[name].suffix
     if args.out is None:
         read_as = format_for(args.what)

@@ -14,13 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
-    BeforeValidator,
     Field,
     PlainSerializer,
     PlainValidator,
-    SerializeAsAny,
     ValidationInfo,
     create_model,
     field_validator,
@@ -34,7 +31,7 @@ from drgs.config.density import (
     DensifyConfig,
     schedule_shares,
 )
-from drgs.config.extensions import check_loss, check_reader, check_sections
+from drgs.config.extensions import LossName, ReaderName, Sections
 from drgs.config.section import Count, Rate, Section, Weight
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
@@ -92,7 +89,7 @@ class DataConfig(Section):
     source: str = Field(
         "", description="Where to get the data: printed in the error if the folder is missing."
     )
-    type: Annotated[str, AfterValidator(check_reader)] = Field(
+    type: ReaderName = Field(
         "auto",
         description="Layout of the folder. auto: nerf_synthetic if there is a "
         "transforms_train.json, nerfstudio if there is a transforms.json, colmap if there is a "
@@ -375,9 +372,7 @@ class OptimizerConfig(Section):
 class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
-    type: Annotated[str, AfterValidator(check_loss)] = Field(
-        "photometric", description="photometric, or the name of an extension."
-    )
+    type: LossName = Field("photometric", description="photometric, or the name of an extension.")
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
     window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
     sigma: float = Field(1.5, ge=0.1, le=1000, description="px: its standard deviation.")
@@ -484,9 +479,7 @@ class FitConfig(Section):
         "none, as in the paper.",
     )
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
-    extensions: Annotated[
-        dict[str, SerializeAsAny[BaseModel] | None], BeforeValidator(check_sections)
-    ] = Field(
+    extensions: Sections = Field(
         default_factory=dict,
         description="Sections of extensions, by name. An effect or a term of the loss takes part "
         "if it has one, be it empty.",

@@ -22,9 +22,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from traceback import walk_tb
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
@@ -122,10 +124,23 @@ class Registry(Generic[T]):
 
         return decorate
 
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is an extension of this name; installed packages are asked last."""
+        return name in self._shipped or name in self._extensions or name in self.names()
+
+    @property
+    def shipped(self) -> list[str]:
+        """The names of the extensions that drgs ships, in their order."""
+        return list(self._shipped)
+
+    def installed(self) -> list[Extension[T]]:
+        """Return the extensions that drgs does not ship, by name."""
+        _load_installed()
+        return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
+
     def names(self) -> list[str]:
-        """Return the names of all extensions, those of installed packages included, sorted."""
-        load_installed()
-        return sorted({*self._shipped, *self._extensions})
+        """Return the names of all extensions, shipped ones first."""
+        return [*self._shipped, *(extension.name for extension in self.installed())]
 
     def get(self, name: str, place: str = "") -> Extension[T]:
         """Return the extension of this name, importing what defines it.
@@ -136,9 +151,7 @@ class Registry(Generic[T]):
         """
         if name not in self._extensions and name in self._shipped:
             import_module(self._shipped[name])
-        if name not in self._extensions:
-            load_installed()
-        if name not in self._extensions:
+        if name not in self:
             known = self.names()
             start = f"{place}: " if place else ""
             raise UserError(
@@ -147,15 +160,47 @@ class Registry(Generic[T]):
             )
         return self._extensions[name]
 
-    def installed(self) -> list[Extension[T]]:
-        """Return the extensions that drgs does not ship, by name."""
-        load_installed()
-        return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
 
-    @property
-    def shipped(self) -> list[str]:
-        """The names of the extensions that drgs ships, in their order."""
-        return list(self._shipped)
+class ClassRegistry(Registry[Any]):
+    """A registry of classes that kernels call while Dr.Jit traces them: lenses, approximations.
+
+    What their methods raise is reported with the name of the class, which is its attribute
+    ``kind``.
+    """
+
+    def register(
+        self, name: str, section: type[BaseModel] | None = None
+    ) -> Callable[[Registered], Registered]:
+        """Return a decorator that registers a class under ``name``; see :class:`Registry`."""
+        decorate = super().register(name, section)
+
+        def register_class(cls: Registered) -> Registered:
+            decorate(cls)
+            cls.kind = name
+            if name not in self._shipped:
+                _report_errors(cls, self._extensions[name])
+            return cls
+
+        return register_class
+
+
+def _report_errors(cls: type, extension: Extension[Any]) -> None:
+    """Wrap the methods that ``cls`` itself defines in :meth:`Extension.reporting`."""
+
+    def reporting(method: FunctionType) -> Callable[..., Any]:
+        @wraps(method)
+        def call(*args: Any, **named: Any) -> Any:
+            with extension.reporting():
+                return method(*args, **named)
+
+        return call
+
+    for name, method in list(vars(cls).items()):
+        is_called = not name.startswith("__") or name in ("__call__", "__post_init__")
+        if is_called and isinstance(method, FunctionType):
+            setattr(cls, name, reporting(method))
+        elif isinstance(method, staticmethod):
+            setattr(cls, name, staticmethod(reporting(method.__func__)))
 
 
 _registries: list[Registry] = []
@@ -194,7 +239,7 @@ _loaded: set[str] = set()
 """Entry points whose modules have been imported: they register at import, once."""
 
 
-def load_installed() -> None:
+def _load_installed() -> None:
     """Import the modules of the entry points of the group ``drgs``.
 
     Raises :class:`ExtensionError` naming the entry point if one cannot be imported.
@@ -205,9 +250,9 @@ def load_installed() -> None:
             _loaded.add(point.value)
 
 
-def _load(point: EntryPoint) -> Any:
+def _load(point: EntryPoint) -> None:
     try:
-        return point.load()
+        point.load()
     except Exception as error:
         package = "" if point.dist is None else f" of the package {point.dist.name}"
         cause = one_line(f"{type(error).__name__}: {error}")

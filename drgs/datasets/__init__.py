@@ -106,7 +106,7 @@ def reader_name(config: DataConfig, sections: Mapping[str, Any] = NO_SECTIONS) -
         ) from None
     if config.type != "auto":
         return config.type
-    for extension in [*map(READERS.get, READERS.shipped), *READERS.installed()]:
+    for extension in map(READERS.get, READERS.names()):
         if extension.value.from_config(section_of(extension, sections)).recognizes(
             config.path, names
         ):

@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, Valid
 from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
-from drgs.config.explain import expectation
+from drgs.config.section import expectation
 from drgs.core.constants import MAX_COEFFICIENT
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened

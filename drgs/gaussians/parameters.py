@@ -21,6 +21,7 @@ from drgs.core.arrays import from_host
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, shown_origin
+from drgs.core.registry import HOW_TO_INSTALL
 
 PARAMETER_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -75,12 +76,12 @@ class Gaussians:
         Raises ``drgs.core.errors.UserError`` (a ValueError) for another suffix, or where the format
         cannot hold them.
         """
-        from drgs.io.formats import OTHER_FORMATS, file_formats, format_for
+        from drgs.io.formats import file_formats, format_for
 
         chosen = format_for(path)
         if chosen is None:
             suffixes = ", ".join(each.value.suffix for each in file_formats())
-            raise UserError(f"{path}: the name must end in one of {suffixes}; {OTHER_FORMATS}")
+            raise UserError(f"{path}: the name must end in one of {suffixes}; {HOW_TO_INSTALL}")
         content = self.to_bytes(chosen.name)
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)

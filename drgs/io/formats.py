@@ -20,7 +20,7 @@ import numpy as np
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
 from drgs.core.origin import WORLD, Origin
-from drgs.core.registry import ENTRY_POINT_GROUP, Extension, ExtensionError, Registry
+from drgs.core.registry import Extension, ExtensionError, Registry
 
 Scalar = bool | int | float | str
 
@@ -120,14 +120,9 @@ FORMATS: Registry[type[FileFormat]] = Registry(
     },
 )
 
-OTHER_FORMATS = (
-    f'other formats come with packages that have an entry point of the group "{ENTRY_POINT_GROUP}"'
-)
-"""Remedy in messages."""
-
 
 def file_formats() -> list[Extension[type[FileFormat]]]:
-    """Return all formats, by name."""
+    """Return all formats."""
     return [FORMATS.get(name) for name in FORMATS.names()]
 
 

@@ -91,7 +91,7 @@ def test_helps_and_messages_list_it(installed, tmp_path):
     (tmp_path / "a.obj").touch()
     _, text = drgs(installed, "render", tmp_path / "a.obj", "--out", tmp_path)
     assert ".npz" in text and 'entry point of the group "drgs"' in text
-    with pytest.raises(UserError, match=r"in one of .*\.npz, .*entry point of the group"):
+    with pytest.raises(UserError, match=r"in one of .*\.npz; .*entry point of the group"):
         blobs().save(tmp_path / "a.obj")
     with pytest.raises(UserError, match=r'"npzz"; did you mean npz\?; there are .*entry point'):
         blobs().to_bytes("npzz")

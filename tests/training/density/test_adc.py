@@ -33,9 +33,13 @@ SMALL, LARGE, HUGE = 0.01, 0.2, 0.5  # world units: cloned, split, pruned after 
 HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
 
 
+def config_of(max_gaussians=1_000_000, **adc):
+    return DensifyConfig(max_gaussians=max_gaussians, adc=adc)
+
+
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
     rows = rows_of(optimizer, seed)
-    return densify_and_prune(rows, statistics(gradient_norms), DensifyConfig(**config), iteration)
+    return densify_and_prune(rows, statistics(gradient_norms), config_of(**config), iteration)
 
 
 # ---- statistics
@@ -71,7 +75,9 @@ def test_invisible_gradients_are_ignored_even_if_they_are_nan():
 # ---- schedule
 @pytest.mark.parametrize("white", [False, True])
 def test_schedule_is_that_of_the_reference_training_loop(white):
-    config = DensifyConfig(start=20, stop=200, every=10, reset_every=60, white_background_reset=20)
+    config = DensifyConfig(
+        start=20, stop=200, every=10, adc={"reset_every": 60, "white_background_reset": 20}
+    )
     for i in range(1, 300):
         densify = reset = False
         if i < 200:
@@ -84,7 +90,7 @@ def test_schedule_is_that_of_the_reference_training_loop(white):
 
 
 def test_extra_reset_can_be_off():
-    config = DensifyConfig(white_background_reset=None)
+    config = DensifyConfig(adc={"white_background_reset": None})
     assert not any(should_reset(config, i, True) for i in range(1, 3000))
 
 
@@ -304,7 +310,7 @@ def test_random_populations_follow_the_rules_and_the_cap(seed):
     report = run(optimizer, norms, iteration=iteration, seed=seed, **config)
     after = values(optimizer)
 
-    config = DensifyConfig(**config)
+    config = config_of(**config)
     kept, cloned, split = naive_decisions(
         norms.astype(float), scales, opacities, iteration == LATE, config
     )
