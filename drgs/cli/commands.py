@@ -17,7 +17,6 @@ from drgs.cli.interrupts import exit_on_interrupt, importing
 from drgs.cli.output import notes_printed, printable_anywhere
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import UserError, did_you_mean, one_line
-from drgs.core.files import check_path
 from drgs.core.processes import ending_together, one_voice, process_count
 from drgs.core.registry import reporting_extensions
 
@@ -158,9 +157,8 @@ def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable
 def file_or_folder(text: str) -> Path:
     """The type of an argument that is the path of a file or folder, which need not exist."""
     try:
-        check_path(text)
         return Path(text).expanduser()
-    except (ValueError, RuntimeError) as error:  # the latter: there is no such user
+    except RuntimeError as error:  # there is no such user
         raise argparse.ArgumentTypeError(f"{one_line(error)}: {one_line(text, 40)}") from None
 
 

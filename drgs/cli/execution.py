@@ -17,8 +17,7 @@ import mitsuba as mi
 
 from drgs.cli.commands import at_least
 from drgs.cli.interrupts import importing
-from drgs.core.denormals import denormals_flushed
-from drgs.core.environment import VARIANTS
+from drgs.core.environment import VARIANTS, denormals_flushed
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import why_out_of_memory
 
