@@ -58,7 +58,7 @@ from scipy.spatial.transform import Rotation
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import markdown_table
-from drgs.cli.errors import exit_on_user_error
+from drgs.cli.ending import exit_on_user_error
 from drgs.config.approximations import said_by
 from drgs.core.arrays import interleave
 from drgs.core.errors import UserError

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
+from drgs.cli.ending import StopRequest
 from drgs.cli.execution import select_variant
-from drgs.cli.interrupts import StopRequest
 from drgs.cli.progress import RunProgress
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
@@ -73,7 +73,7 @@ class Console:
         return RunProgress(what, total, done)
 
     def stop_request(self) -> AbstractContextManager[StopRequest]:
-        """See :class:`drgs.cli.interrupts.StopRequest`."""
+        """See :class:`drgs.cli.ending.StopRequest`."""
         return StopRequest()
 
 
