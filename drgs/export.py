@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +25,8 @@ from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.orbits import up_of
 from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
-from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.similarity import turned_towards
 from drgs.io.formats import FileFormat, file_formats, format_for
 from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
@@ -163,12 +163,17 @@ def add_arguments(parser: CommandParser) -> None:
 def _add_cleaning(parser: CommandParser) -> None:
     add = parser.add_argument_group("what is kept, and how it lies").add_argument
     corners = tuple(f"{axis}{end}" for end in "01" for axis in "XYZ")
-    number = {"type": finite_number}
-    add("--crop", **number, nargs=6, metavar=corners, help="keep what is between two corners")
-    add("--min-opacity", **number, metavar="P", help="leave out what is less opaque, 0 to 1")
+    add(
+        "--crop",
+        type=finite_number,
+        nargs=6,
+        metavar=corners,
+        help="keep what is between two corners",
+    )
+    add("--min-opacity", type=_opacity, metavar="P", help="leave out what is less opaque, 0 to 1")
     add(
         "--max-size",
-        **number,
+        type=_size,
         metavar="S",
         help="leave out what has a larger standard deviation, scene units",
     )
@@ -189,32 +194,38 @@ def _add_cleaning(parser: CommandParser) -> None:
     )
 
 
+def _opacity(text: str) -> float:
+    if not 0 <= (number := finite_number(text)) <= 1:
+        raise argparse.ArgumentTypeError(f"must be between 0 and 1, got {text}")
+    return number
+
+
+def _size(text: str) -> float:
+    if not (number := finite_number(text)) > 0:
+        raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
+    return number
+
+
 def run(args: argparse.Namespace) -> None:
     """Export what the command line names."""
     name, out = _destination(args)
     target = targets()[name]
-    selection = _selection(args)
     source = load_source(args.what, target.honoured)
     if out.resolve() == source.path.resolve():
         raise UserError(f"--out {out}: is what is exported; choose another name")
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
     up = _up(args, source, target)
-    gaussians = _selected(source, selection)
+    gaussians = _selected(source, args)
     if up is not None:
         gaussians = turned_towards(gaussians, up, target.up)
     if args.order == "morton":
-        gaussians = taken(gaussians, morton_order(gaussians.means))
+        gaussians = take(gaussians, morton_order(gaussians.means))
     content = target.encode(replace(source, gaussians=gaussians, is_turned=up is not None))
     FolderRecord(out.parent, COMMAND).claim([out.name])
     with atomic_path(out) as temporary:
         temporary.write_bytes(content)
     FolderRecord(out.parent, COMMAND).seal()
     print(f"written: {out} ({len(content) / 1e6:.1f} MB)")
-
-
-# ----------------------------------------------------------------------------------------------
-# What is exported, and where to
-# ----------------------------------------------------------------------------------------------
 
 
 def load_source(what: Path, honoured: Honoured | None = None) -> Source:
@@ -292,32 +303,49 @@ def _target_of(path: Path) -> str | None:
     return None if found is None else found.name
 
 
-# ----------------------------------------------------------------------------------------------
-# What is kept, and how it lies
-# ----------------------------------------------------------------------------------------------
+def kept_by(
+    gaussians: Gaussians,
+    box: Sequence[float] | None = None,
+    min_opacity: float | None = None,
+    max_scale: float | None = None,
+) -> dict[str, np.ndarray]:
+    """Return which Gaussians (N,) each criterion that is given keeps.
+
+    gaussians: numpy; box: two opposite corners, world, of the means; max_scale: largest standard
+    deviation, world units.
+    """
+    kept = {}
+    if box is not None:
+        corners = np.reshape(box, (2, 3))
+        means = gaussians.means.astype(np.float64) + gaussians.origin
+        inside = (means >= corners.min(axis=0)) & (means <= corners.max(axis=0))
+        kept["box"] = inside.all(axis=1)
+    if min_opacity is not None:
+        kept["opacity"] = gaussians.opacities >= min_opacity
+    if max_scale is not None:
+        kept["size"] = gaussians.scales.max(axis=1) <= max_scale
+    return kept
 
 
-def _selection(args: argparse.Namespace) -> Selection:
-    opacity, size = args.min_opacity, args.max_size
-    if opacity is not None and not 0 <= opacity <= 1:
-        raise UserError(f"--min-opacity: must be between 0 and 1, got {opacity:g}")
-    if size is not None and not size > 0:
-        raise UserError(f"--max-size: must be above 0, got {size:g}")
-    return Selection(None if args.crop is None else tuple(args.crop), opacity, size)
+def take(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+    """Return some of the Gaussians (numpy); rows: indices, or (N,) of truth values."""
+    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+    arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
+    features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
+    return replace(gaussians, **arrays, features=features)
 
 
-def _selected(source: Source, selection: Selection) -> Gaussians:
+def _selected(source: Source, args: argparse.Namespace) -> Gaussians:
     """Return the Gaussians that are kept, and print their number."""
-    gaussians = source.gaussians
-    kept_by = selection.kept_by(gaussians)
-    if not kept_by:
-        return gaussians
-    kept = np.logical_and.reduce(list(kept_by.values()))
-    lost = ", ".join(f"{name} {np.count_nonzero(~k):,}" for name, k in kept_by.items())
+    found = kept_by(source.gaussians, args.crop, args.min_opacity, args.max_size)
+    if not found:
+        return source.gaussians
+    kept = np.logical_and.reduce(list(found.values()))
+    lost = ", ".join(f"{name} {np.count_nonzero(~k):,}" for name, k in found.items())
     print(f"kept: {np.count_nonzero(kept):,}; left out by {lost}", flush=True)
     if not kept.any():
         raise UserError(f"{source.path}: nothing is left; crop and filter less")
-    return taken(gaussians, kept)
+    return take(source.gaussians, kept)
 
 
 def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray | None:
