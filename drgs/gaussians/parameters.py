@@ -127,25 +127,30 @@ class Gaussians:
         means, quats, scales, opacities, sh = (
             np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)
         )
-        where = "Gaussians.from_numpy(): "
-        if means.shape[1:] != (3,):
-            raise ValueError(f"{where}means must be of shape (N, 3), got {means.shape}")
-        num = len(means)
+        num = len(np.atleast_1d(means))
         coefficients = [(degree + 1) ** 2 for degree in range(4)]
-        for name, values, shapes in (
-            ("quats", quats, [(num, 4)]),
-            ("scales", scales, [(num, 3)]),
-            ("opacities", opacities, [(num,)]),
-            ("sh", sh, [(num, count, 3) for count in coefficients]),
+        is_open = (opacities > 0) & (opacities < 1)
+        for name, holds, expected, got in (
+            ("means", means.shape == (num, 3), "of shape (N, 3)", means.shape),
+            ("quats", quats.shape == (num, 4), f"of shape {(num, 4)}", quats.shape),
+            ("scales", scales.shape == (num, 3), f"of shape {(num, 3)}", scales.shape),
+            ("opacities", opacities.shape == (num,), f"of shape {(num,)}", opacities.shape),
+            (
+                "sh",
+                sh.shape in [(num, count, 3) for count in coefficients],
+                " or ".join(f"of shape {(num, count, 3)}" for count in coefficients),
+                sh.shape,
+            ),
+            ("scales", (scales > 0).all(), "positive", scales.min(initial=np.inf)),
+            (
+                "opacities",
+                is_open.all(),
+                "between 0 and 1",
+                opacities[~is_open].max(initial=-np.inf),
+            ),
         ):
-            if values.shape not in shapes:
-                expected = " or ".join(str(shape) for shape in shapes)
-                raise ValueError(f"{where}{name} must be of shape {expected}, got {values.shape}")
-        if not (scales > 0).all():
-            raise ValueError(f"{where}scales must be positive, got {scales.min()}")
-        if not ((opacities > 0) & (opacities < 1)).all():
-            wrong = opacities[~((opacities > 0) & (opacities < 1))][0]
-            raise ValueError(f"{where}opacities must be between 0 and 1, got {wrong}")
+            if not holds:
+                raise ValueError(f"Gaussians.from_numpy(): {name} must be {expected}, got {got}")
         return Gaussians(
             means=means,
             quats=quats,

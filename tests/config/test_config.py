@@ -173,7 +173,7 @@ def test_a_configuration_is_frozen(load):
         (
             "densify: {adc: {prune_opacity: 0.01}}",
             "densify.adc.prune_opacity must be < densify.adc.reset_opacity (0.01), or a reset "
-            "removes everything; got 0.01",
+            "removes everything, got 0.01",
         ),
         (
             "densify: {max_gaussians: 500}\ninit: {num_points: 501}",
