@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from drgs.datasets.viewpoints import near_one
 from drgs.effects.smoothing import baked
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import turned_towards
-from drgs.io.formats import FileFormat, file_formats, format_for
+from drgs.io.formats import file_formats, format_for
 from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
@@ -87,33 +88,32 @@ class Target:
 
 def targets() -> dict[str, Target]:
     """Return what ``--format`` takes, by name: the file formats, and the page."""
-    found = {each.name: _format_target(each.name, each.value) for each in file_formats()}
+    found = {
+        each.name: Target(
+            suffix=each.value.suffix,
+            text=each.value.description,
+            encode=lambda source, name=each.name: source.gaussians.to_bytes(name),
+            up=Y_DOWN if each.value.up is None else Z_UP,
+            has_axes=each.value.up is not None,
+            honoured=_honoured_by_playcanvas if each.name == PLAYCANVAS else None,
+        )
+        for each in file_formats()
+    }
     return {**found, "html": PAGE}
-
-
-def _format_target(name: str, chosen: type[FileFormat]) -> Target:
-    return Target(
-        chosen.suffix,
-        chosen.description,
-        lambda source: source.gaussians.to_bytes(name),
-        Y_DOWN if chosen.up is None else Z_UP,
-        has_axes=chosen.up is not None,
-        honoured=_honoured_by_playcanvas if name == PLAYCANVAS else None,
-    )
 
 
 def _page(source: Source) -> bytes:
     """Encode a page with the first view and the background of the fit; black if there is none."""
     gaussians, folder = source.gaussians, source.folder
-    background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
-    cameras = (
-        None if folder is None or source.is_turned else training_cameras(folder, gaussians.origin)
-    )
+    title, background, cameras = source.path.name, (0.0, 0.0, 0.0), None
+    if folder is not None:
+        title = folder.resolve().name
+        background = load_run_config(folder).data.background_rgb
+        cameras = None if source.is_turned else training_cameras(folder, gaussians.origin)
     if cameras is not None:
         standpoint = Standpoint.of_views(cameras, gaussians)
     else:
         standpoint = Standpoint.of_gaussians(gaussians, Z_UP)
-    title = source.path.name if folder is None else folder.resolve().name
     shown = Shown(gaussians, Approximations.of(gaussians.rendered_with or {}))
     return viewer_page(title, shown, standpoint, background)
 
@@ -229,11 +229,11 @@ def run(args: argparse.Namespace) -> None:
 
 
 def load_source(what: Path, honoured: Honoured | None = None) -> Source:
-    """The Gaussians of a fit's folder that are meant for other programs, or those of a file.
+    """Load the Gaussians of a fit's folder that are meant for other programs, or those of a file.
 
     honoured: by the target. The fit's own Gaussians are taken where that is all that they need.
-    What a file says that other programs would not do is a :class:`UserNote`; what they do anyway is
-    dropped. A smoothing filter is baked in.
+    Approximations of a file that other programs would not make are a :class:`UserNote`; defaults
+    are dropped. A smoothing filter is baked in.
     """
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")
@@ -245,32 +245,22 @@ def load_source(what: Path, honoured: Honoured | None = None) -> Source:
                 f"{what}: must be the output folder of a fit that has ended, but there is no "
                 f"{CONFIG if names else GAUSSIANS} in it"
             )
-        path = what / (GAUSSIANS if _shows_own(what, honoured) else names[0])
+        fitted = load_run_config(what).model.approximations if honoured else None
+        shows_own = fitted and fitted.others_than_default.keys() <= honoured(fitted)
+        path = what / (names[-1] if shows_own else names[0])
     gaussians = Gaussians.load(path)
     said = said_by(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in said.items() if value != DECLARED[name].default}
     shown = frozenset() if honoured is None else honoured(Approximations.of(said))
-    if unknown := {name: value for name, value in others.items() if name not in shown}:
-        _note_rendering(path, unknown)
+    if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
+        beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
+        note = (
+            f"{path}: made to be rendered with {', '.join(unknown)}; programs that do not will "
+            "show it otherwise" + (f"; export {beside} instead" if beside.is_file() else "")
+        )
+        warnings.warn(UserNote(note), stacklevel=2)
     gaussians = baked(replace(gaussians, rendered_with=others or None))
     return Source(gaussians, path, what if what.is_dir() else None)
-
-
-def _shows_own(folder: Path, honoured: Honoured) -> bool:
-    """Return whether a fit's own Gaussians are there, and need no other approximations."""
-    if honoured is None or not (folder / GAUSSIANS).is_file():
-        return False
-    fitted = load_run_config(folder).model.approximations
-    return fitted.others_than_default.keys() <= honoured(fitted)
-
-
-def _note_rendering(path: Path, others: dict[str, object]) -> None:
-    """Programs that do not know of it show something else."""
-    words = ", ".join(f"{name} {str(value).lower()}" for name, value in others.items())
-    beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
-    remedy = f"; export {beside} instead" if beside.is_file() else ""
-    note = f"{path}: made to be rendered with {words}; programs that do not will show it otherwise"
-    warnings.warn(UserNote(note + remedy), stacklevel=2)
 
 
 def _destination(args: argparse.Namespace) -> tuple[str, Path]:
@@ -349,7 +339,7 @@ def _selected(source: Source, args: argparse.Namespace) -> Gaussians:
 
 
 def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray | None:
-    """(3,) what is up in the model's world; None: it is not to be turned. With a line about it."""
+    """Return the direction (3,) that is up, and print it; None: the model is not to be turned."""
     words = args.up
     if words is None and not target.has_axes:
         return None
@@ -362,7 +352,10 @@ def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray 
             raise UserError(
                 f"--up cameras: needs the output folder of a fit with {VIEWS}; give --up X Y Z"
             )
-        up, why = _snapped(up_of(cameras)), " (the training cameras')"
+        up, why = up_of(cameras), " (the training cameras')"
+        axis = np.argmax(np.abs(up))
+        if abs(up[axis]) >= SNAPPED:  # what was estimated is off by a little
+            up = np.sign(up[axis]) * np.eye(3)[axis] + 0.0
     else:
         up, why = _direction(words), "" if args.up else " (give --up otherwise)"
     print(f"up: {' '.join(f'{x:.3g}' for x in up)}{why}", flush=True)
@@ -370,21 +363,13 @@ def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray 
 
 
 def _direction(words: Sequence[str]) -> np.ndarray:
-    try:
+    with suppress(ValueError):
         up = np.array([float(word) for word in words])
-    except ValueError:
-        up = np.zeros(0)
-    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
-        got = one_line(" ".join(words), 60)
-        raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
-    up = near_one(up)
-    return up / np.linalg.norm(up)
-
-
-def _snapped(up: np.ndarray) -> np.ndarray:
-    """The axis that is next to it, if one is: what was estimated is off by a little."""
-    axis = np.argmax(np.abs(up))
-    return np.sign(up[axis]) * np.eye(3)[axis] + 0.0 if abs(up[axis]) >= SNAPPED else up
+        if up.shape == (3,) and np.isfinite(up).all() and up.any():
+            up = near_one(up)
+            return up / np.linalg.norm(up)
+    got = one_line(" ".join(words), 60)
+    raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
 
 
 if __name__ == "__main__":
