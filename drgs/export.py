@@ -264,7 +264,6 @@ def load_source(what: Path, honoured: Honoured | None = None) -> Source:
 
 
 def _destination(args: argparse.Namespace) -> tuple[str, Path]:
-    """Return the name of the target, and the file."""
     name = args.format
     if name is None and args.out is not None:
         name = _target_of(args.out)
@@ -286,7 +285,6 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
 
 
 def _target_of(path: Path) -> str | None:
-    """Return the target that a file's name ends in."""
     if path.name.lower().endswith(PAGE.suffix):
         return "html"
     found = format_for(path)
@@ -326,7 +324,6 @@ def take(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
 
 
 def _selected(source: Source, args: argparse.Namespace) -> Gaussians:
-    """Return the Gaussians that are kept, and print their number."""
     found = kept_by(source.gaussians, args.crop, args.min_opacity, args.max_size)
     if not found:
         return source.gaussians

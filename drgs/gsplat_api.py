@@ -248,7 +248,6 @@ def _tensor(name: str, value: Any, tensor_type: type) -> Any:
 
 
 def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
-    """Raise ValueError for a shape that does not fit."""
     sizes: dict[str | int, int] = {}  # by letter
     for name, value in inputs.items():
         is_sh = name == "colors" and sh_degree is not None
@@ -268,7 +267,6 @@ def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
 
 
 def _fits(got: tuple[int, ...], shape: tuple[int | str, ...]) -> bool:
-    """Return whether a shape is one with letters for numbers that are free."""
     return len(got) == len(shape) and all(
         isinstance(wanted, str) or number == wanted
         for number, wanted in zip(got, shape, strict=True)
@@ -463,7 +461,6 @@ class _View:
         return {"viewmats": from_host(Float, d_viewmat), "Ks": from_host(Float, d_K)}
 
     def _camera_tangents(self, directions: Mapping[str, Any]) -> list[Any]:
-        """Return tangents of a camera's numbers."""
         d_viewmat = np.array(directions["viewmats"], np.float64)[self.index]
         d_K = np.array(directions["Ks"], np.float64)[self.index]
         moved = d_viewmat[:3, 3] + d_viewmat[:3, :3] @ self.center

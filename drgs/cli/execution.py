@@ -128,7 +128,6 @@ class _RangeReports:
 
 @contextmanager
 def _range_checks() -> Iterator[_RangeReports]:
-    """Within the block, Dr.Jit is in debug mode."""
     reports = _RangeReports(sys.stderr)
     tracer = sys.gettrace()  # debug mode installs its own
     try:

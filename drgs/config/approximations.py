@@ -112,7 +112,6 @@ class Declared:
 
 
 def _declare(default: Value, description: str, limits: Limits | None = None, **others: Any) -> Any:
-    """Return the field of a dataclass with a declaration."""
     return field(
         default=default,
         metadata={"declared": Declared(default, description, limits=limits, **others)},

@@ -123,7 +123,6 @@ def _read_yaml(path: Path) -> dict:
 
 
 def _validated(values: dict, where: str, folder: Path, overrides: Iterable[str]) -> FitConfig:
-    """Return a configuration of ``values``, whose paths are relative to ``folder``."""
     for key in PATH_KEYS:
         section, leaf = key.split(".")
         entries = values.get(section)

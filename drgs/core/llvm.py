@@ -137,7 +137,6 @@ class _VariantCheck:
 
 
 def _library_folders() -> list[str]:
-    """Return where libLLVM may be: only folders for this machine's architecture and word size."""
     return [
         *filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)),
         os.path.join(sys.prefix, "lib"),  # conda environments

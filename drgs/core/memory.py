@@ -153,7 +153,6 @@ def _flush_cache_of_drjit() -> None:
 
 
 def _of_process() -> int:
-    """Bytes that ``ulimit -v`` leaves."""
     process = psutil.Process()
     if not hasattr(psutil, "RLIMIT_AS"):  # not Linux
         return _UNLIMITED

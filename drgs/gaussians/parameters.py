@@ -206,7 +206,6 @@ class Gaussians:
         return replace(self, **tensors, features=features)
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
-        """Numpy arrays turned as a whole; float32."""
         from drgs.gaussians.similarity import rotate_gaussians, to_float32
 
         parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
 from drgs.io.ply import NUM_REST, encode_elements, has_packed_vertices, read_elements
 from drgs.io.quantization import (
+    colors_from_sh0,
     drop_largest_component,
     logits_from_opacities,
     morton_order,
@@ -35,6 +35,7 @@ from drgs.io.quantization import (
     require_scene_memory,
     restore_largest_component,
     round_to_uint32,
+    sh0_from_colors,
 )
 
 CHUNK = 256
@@ -72,7 +73,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     values = {
         "packed_position": g["means"].astype(np.float64),
         "packed_scale": np.clip(g["log_scales"].astype(np.float64), -MAX_LOG_SCALE, MAX_LOG_SCALE),
-        "packed_color": 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64),
+        "packed_color": colors_from_sh0(g["sh0"]),
     }
     bounds = {name: _bounds(v) for name, v in values.items()}
     parts = {name: _parts(v, *bounds[name]) for name, v in values.items()}
@@ -125,7 +126,6 @@ def _packed(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 
 def _structured(names: list[str], rows: np.ndarray) -> np.ndarray:
-    """Return the columns of an array by name."""
     return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in names])[:, 0]
 
 
@@ -155,7 +155,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "quats": restore_largest_component(largest.astype(np.intp), others).astype(np.float32),
         "log_scales": _between(path, rows, "packed_scale"),
         "logit_opacities": logits_from_opacities(_unpacked(vertex, "packed_color")[:, 3]),
-        "sh0": ((color - 0.5) / SH_C0)[:, None, :],
+        "sh0": sh0_from_colors(color),
         "shN": _harmonics(path, sh, len(vertex)),
     }
     return arrays, statements
@@ -164,7 +164,6 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
 def _require(
     path: str | Path, element: str, rows: np.ndarray, names: Mapping | list[str], kind: str
 ) -> None:
-    """Refuse properties that are missing or of another type."""
     types = {name: rows.dtype[name].newbyteorder("<").str[1:] for name in rows.dtype.names}
     if wrong := [name for name in names if types.get(name) != kind]:
         raise UserError(

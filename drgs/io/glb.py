@@ -27,13 +27,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
-from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError, one_line
 from drgs.core.files import read_bytes
 from drgs.core.origin import WORLD, near_means
 from drgs.io.formats import FORMATS, MAX_ORIGIN, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
 from drgs.io.ply import STATEMENT
 from drgs.io.quantization import (
+    colors_from_sh0,
     log_scales_from_scales,
     logits_from_opacities,
     normalize_quaternions,
@@ -101,12 +101,12 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
 def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return arrays of float32 or bytes by name, each a multiple of 4 bytes long."""
     opacities = opacities_from_logits(g["logit_opacities"])
-    colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
+    rgba = np.column_stack([colors_from_sh0(g["sh0"]), opacities])
     limits = np.finfo(np.float32)
     scales = np.exp(np.clip(g["log_scales"].astype(np.float64), -200, np.log(float(limits.max))))
     attributes = {
         "POSITION": g["means"],
-        "COLOR_0": round_to_uint32(np.column_stack([colors, opacities]) * 255, 255).astype("u1"),
+        "COLOR_0": round_to_uint32(rgba * 255, 255).astype("u1"),
         f"{EXTENSION}:ROTATION": np.roll(normalize_quaternions(g["quats"]), -1, axis=1),
         f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": opacities[:, None],
@@ -121,7 +121,6 @@ def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _harmonics(count: int) -> list[str]:
-    """Names of ``count`` coefficients, in their order."""
     return [
         f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
         for degree in range(4)
@@ -132,7 +131,6 @@ def _harmonics(count: int) -> list[str]:
 def _document(
     attributes: Mapping[str, np.ndarray], extras: Mapping[str, object] | None
 ) -> dict[str, object]:
-    """The JSON part."""
     views, accessors, start = [], [], 0
     for name, values in attributes.items():
         views.append(
@@ -253,8 +251,6 @@ class _Accessor(_Part):
 
 
 class _View(_Part):
-    """A part of the buffer."""
-
     buffer: Literal[0]
     byte_offset: Index = 0
     byte_length: Index
@@ -374,10 +370,6 @@ class _Document:
 
 
 def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Document:
-    """Check the JSON part of a file, and find its splats.
-
-    Raises :class:`UserError` naming the file, the key, what was expected and what was got.
-    """
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:

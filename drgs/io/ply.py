@@ -266,7 +266,6 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
 
 
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
-    """Return the values in the comments of a header; lines: of the header."""
     found: dict[str, str] = {}
     comments = [line for line in lines if line.startswith(b"comment ")]
     for comment in comments:
@@ -283,7 +282,6 @@ def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
 
 
 def _scalar(text: str) -> Scalar:
-    """Return a truth value or a number, if ``text`` is one."""
     if text in ("true", "false"):
         return text == "true"
     for kind in (int, float):
@@ -369,7 +367,6 @@ def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
 def _check_rows(
     path: str | Path, vertex: np.ndarray, names: tuple[str, ...], fits: np.ndarray, expected: str
 ) -> None:
-    """Refuse numbers (N, len(names)) that do not fit."""
     bad = np.argwhere(~fits)
     if len(bad):
         row, column = bad[0]

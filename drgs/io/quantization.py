@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drgs.core.constants import SH_C0
 from drgs.core.memory import require_memory
 
 LARGEST_LOGIT = 23 * math.log(2)
@@ -58,6 +59,16 @@ def log_scales_from_scales(scales: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
         logarithms = np.log(scales.astype(np.float64))
     return np.maximum(logarithms, SMALLEST_LOG_SCALE).astype(np.float32)
+
+
+def colors_from_sh0(sh0: np.ndarray) -> np.ndarray:
+    """Return base colours (N, 3) float64, display space, of coefficients (N, 1, 3)."""
+    return 0.5 + SH_C0 * sh0[:, 0].astype(np.float64)
+
+
+def sh0_from_colors(colors: np.ndarray) -> np.ndarray:
+    """Return coefficients (N, 1, 3) of base colours (N, 3), display space."""
+    return ((colors - 0.5) / SH_C0)[:, None, :]
 
 
 def normalize_quaternions(quats: np.ndarray) -> np.ndarray:

@@ -13,17 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
 from drgs.io.quantization import (
+    colors_from_sh0,
     log_scales_from_scales,
     logits_from_opacities,
     normalize_quaternions,
     opacities_from_logits,
     require_scene_memory,
     round_to_uint32,
+    sh0_from_colors,
 )
 
 MAX_BYTES = 1 << 33
@@ -53,8 +54,8 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     rows = np.empty(len(opacities), ROW)
     rows["mean"] = g["means"]
     rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
-    colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
-    rows["rgba"] = round_to_uint32(np.column_stack([colors, opacities]) * 255, 255)
+    rgba = np.column_stack([colors_from_sh0(g["sh0"]), opacities])
+    rows["rgba"] = round_to_uint32(rgba * 255, 255)
     rows["quat"] = round_to_uint32(normalize_quaternions(g["quats"]) * 128 + 128, 255)
     return rows[np.argsort(-importance, kind="stable")].tobytes()
 
@@ -84,13 +85,12 @@ def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]
                 f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, "
                 f"got {values[row, axis]}; is it a .splat file?"
             )
-    colors = rows["rgba"][:, :3] / 255
     arrays = {
         "means": rows["mean"],
         "quats": rows["quat"].astype(np.float64) / 128 - 1,
         "log_scales": log_scales_from_scales(rows["scale"]),
         "logit_opacities": logits_from_opacities(rows["rgba"][:, 3] / 255),
-        "sh0": ((colors - 0.5) / SH_C0)[:, None, :],
+        "sh0": sh0_from_colors(rows["rgba"][:, :3] / 255),
         "shN": np.zeros((len(rows), 0, 3)),
     }
     return arrays, {}

@@ -255,7 +255,6 @@ def _checked_header(path: Path, fields: tuple, versions: tuple[int, ...]) -> _He
 
 
 def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
-    """Read versions 2 and 3."""
     with gzip.open(io.BytesIO(content)) as stream:
 
         def take(size: int, least: int) -> bytes:
@@ -285,7 +284,6 @@ def _checked_size(place: object, data: bytes, expected: int) -> bytes:
 
 
 def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
-    """Read version 4."""
     _checked_size(Place(path, "byte", 0), content, HEADER_4.size)
     *fields, num_streams, table = HEADER_4.unpack_from(content)
     header = _checked_header(path, tuple(fields), (4,))
