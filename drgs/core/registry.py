@@ -22,11 +22,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import wraps
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from traceback import walk_tb
-from types import FunctionType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
@@ -162,11 +160,7 @@ class Registry(Generic[T]):
 
 
 class ClassRegistry(Registry[Any]):
-    """A registry of classes that kernels call while Dr.Jit traces them: lenses, approximations.
-
-    What their methods raise is reported with the name of the class, which is its attribute
-    ``kind``.
-    """
+    """A registry of classes, each of which has its name as the attribute ``kind``."""
 
     def register(
         self, name: str, section: type[BaseModel] | None = None
@@ -175,32 +169,10 @@ class ClassRegistry(Registry[Any]):
         decorate = super().register(name, section)
 
         def register_class(cls: Registered) -> Registered:
-            decorate(cls)
             cls.kind = name
-            if name not in self._shipped:
-                _report_errors(cls, self._extensions[name])
-            return cls
+            return decorate(cls)
 
         return register_class
-
-
-def _report_errors(cls: type, extension: Extension[Any]) -> None:
-    """Wrap the methods that ``cls`` itself defines in :meth:`Extension.reporting`."""
-
-    def reporting(method: FunctionType) -> Callable[..., Any]:
-        @wraps(method)
-        def call(*args: Any, **named: Any) -> Any:
-            with extension.reporting():
-                return method(*args, **named)
-
-        return call
-
-    for name, method in list(vars(cls).items()):
-        is_called = not name.startswith("__") or name in ("__call__", "__post_init__")
-        if is_called and isinstance(method, FunctionType):
-            setattr(cls, name, reporting(method))
-        elif isinstance(method, staticmethod):
-            setattr(cls, name, staticmethod(reporting(method.__func__)))
 
 
 _registries: list[Registry] = []
