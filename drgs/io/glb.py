@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasPath, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from drgs.core.errors import Place, UserError, one_line
@@ -257,20 +257,17 @@ class _View(_Part):
     byte_stride: Annotated[int, Field(ge=4, le=252)] | None = None
 
 
-class _Splatting(_Part):
-    kernel: Literal["ellipse"]
-    color_space: Literal["srgb_rec709_display"]
-    extensions: Annotated[dict[str, object], Field(max_length=0)] = {}
-
-
-class _Extensions(_Part):
-    splatting: _Splatting = Field(alias=EXTENSION)
+def _of_extension(key: str, **settings: object) -> object:
+    """Return the field of a primitive for a value of its extension."""
+    return Field(validation_alias=AliasPath("extensions", EXTENSION, key), **settings)
 
 
 class _Primitive(_Part):
     attributes: dict[str, Index]
     mode: Literal[0]
-    extensions: _Extensions
+    kernel: Literal["ellipse"] = _of_extension("kernel")
+    color_space: Literal["srgb_rec709_display"] = _of_extension("colorSpace")
+    further: dict[str, object] = _of_extension("extensions", default={}, max_length=0)
     extras: object = None
 
 

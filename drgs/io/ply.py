@@ -174,8 +174,8 @@ def has_packed_vertices(path: str | Path) -> bool:
     Raises :class:`UserError` as :func:`read_elements` does for a header.
     """
     with _opened(path) as (_, header):
-        packed = ("vertex", "packed_position") in header.properties
-        return packed and "chunk" in header.counts
+        names = [p.name for each in header.elements for p in each.properties]
+        return "chunk" in header.counts and "packed_position" in names
 
 
 def read_elements(
@@ -217,11 +217,6 @@ class _Header:
     def promised(self) -> str:
         """The rows, as messages name them."""
         return listed([f"{n} of {one_line(name, 60)}" for name, n in self.counts.items()])
-
-    @property
-    def properties(self) -> list[tuple[str, str]]:
-        """Names of elements and of their properties."""
-        return [(each.name, p.name) for each in self.elements for p in each.properties]
 
 
 @contextmanager
