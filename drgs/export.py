@@ -10,7 +10,8 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,12 @@ from drgs.core.constants import LOW_PASS
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
+from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.orbits import up_of
 from drgs.effects.smoothing import baked
-from drgs.gaussians.cleaning import Selection, taken, turned_towards
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.formats import OTHER_FORMATS, FileFormat, file_formats, format_for
+from drgs.gaussians.similarity import turned_towards
+from drgs.io.formats import file_formats, format_for
 from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
@@ -85,33 +87,32 @@ class Target:
 
 def targets() -> dict[str, Target]:
     """Return what ``--format`` takes, by name: the file formats, and the page."""
-    found = {each.name: _format_target(each.name, each.value) for each in file_formats()}
+    found = {
+        each.name: Target(
+            suffix=each.value.suffix,
+            text=each.value.description,
+            encode=lambda source, name=each.name: source.gaussians.to_bytes(name),
+            up=Y_DOWN if each.value.up is None else Z_UP,
+            has_axes=each.value.up is not None,
+            honoured=_honoured_by_playcanvas if each.name == PLAYCANVAS else None,
+        )
+        for each in file_formats()
+    }
     return {**found, "html": PAGE}
-
-
-def _format_target(name: str, chosen: type[FileFormat]) -> Target:
-    return Target(
-        chosen.suffix,
-        chosen.description,
-        lambda source: source.gaussians.to_bytes(name),
-        Y_DOWN if chosen.up is None else Z_UP,
-        has_axes=chosen.up is not None,
-        honoured=_honoured_by_playcanvas if name == PLAYCANVAS else None,
-    )
 
 
 def _page(source: Source) -> bytes:
     """Encode a page with the first view and the background of the fit; black if there is none."""
     gaussians, folder = source.gaussians, source.folder
-    background = (0.0, 0.0, 0.0) if folder is None else load_run_config(folder).data.background_rgb
-    cameras = (
-        None if folder is None or source.is_turned else training_cameras(folder, gaussians.origin)
-    )
+    title, background, cameras = source.path.name, (0.0, 0.0, 0.0), None
+    if folder is not None:
+        title = folder.resolve().name
+        background = load_run_config(folder).data.background_rgb
+        cameras = None if source.is_turned else training_cameras(folder, gaussians.origin)
     if cameras is not None:
         standpoint = Standpoint.of_views(cameras, gaussians)
     else:
         standpoint = Standpoint.of_gaussians(gaussians, Z_UP)
-    title = source.path.name if folder is None else folder.resolve().name
     shown = Shown(gaussians, Approximations.of(gaussians.rendered_with or {}))
     return viewer_page(title, shown, standpoint, background)
 
@@ -161,12 +162,17 @@ def add_arguments(parser: CommandParser) -> None:
 def _add_cleaning(parser: CommandParser) -> None:
     add = parser.add_argument_group("what is kept, and how it lies").add_argument
     corners = tuple(f"{axis}{end}" for end in "01" for axis in "XYZ")
-    number = {"type": finite_number}
-    add("--crop", **number, nargs=6, metavar=corners, help="keep what is between two corners")
-    add("--min-opacity", **number, metavar="P", help="leave out what is less opaque, 0 to 1")
+    add(
+        "--crop",
+        type=finite_number,
+        nargs=6,
+        metavar=corners,
+        help="keep what is between two corners",
+    )
+    add("--min-opacity", type=_opacity, metavar="P", help="leave out what is less opaque, 0 to 1")
     add(
         "--max-size",
-        **number,
+        type=_size,
         metavar="S",
         help="leave out what has a larger standard deviation, scene units",
     )
@@ -187,21 +193,32 @@ def _add_cleaning(parser: CommandParser) -> None:
     )
 
 
+def _opacity(text: str) -> float:
+    if not 0 <= (number := finite_number(text)) <= 1:
+        raise argparse.ArgumentTypeError(f"must be between 0 and 1, got {text}")
+    return number
+
+
+def _size(text: str) -> float:
+    if not (number := finite_number(text)) > 0:
+        raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
+    return number
+
+
 def run(args: argparse.Namespace) -> None:
     """Export what the command line names."""
     name, out = _destination(args)
     target = targets()[name]
-    selection = _selection(args)
     source = load_source(args.what, target.honoured)
     if out.resolve() == source.path.resolve():
         raise UserError(f"--out {out}: is what is exported; choose another name")
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
     up = _up(args, source, target)
-    gaussians = _selected(source, selection)
+    gaussians = _selected(source, args)
     if up is not None:
         gaussians = turned_towards(gaussians, up, target.up)
     if args.order == "morton":
-        gaussians = taken(gaussians, morton_order(gaussians.means))
+        gaussians = take(gaussians, morton_order(gaussians.means))
     content = target.encode(replace(source, gaussians=gaussians, is_turned=up is not None))
     FolderRecord(out.parent, COMMAND).claim([out.name])
     with atomic_path(out) as temporary:
@@ -210,17 +227,12 @@ def run(args: argparse.Namespace) -> None:
     print(f"written: {out} ({len(content) / 1e6:.1f} MB)")
 
 
-# ----------------------------------------------------------------------------------------------
-# What is exported, and where to
-# ----------------------------------------------------------------------------------------------
-
-
 def load_source(what: Path, honoured: Honoured | None = None) -> Source:
-    """The Gaussians of a fit's folder that are meant for other programs, or those of a file.
+    """Load the Gaussians of a fit's folder that are meant for other programs, or those of a file.
 
     honoured: by the target. The fit's own Gaussians are taken where that is all that they need.
-    What a file says that other programs would not do is a :class:`UserNote`; what they do anyway is
-    dropped. A smoothing filter is baked in.
+    Approximations of a file that other programs would not make are a :class:`UserNote`; defaults
+    are dropped. A smoothing filter is baked in.
     """
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")
@@ -232,43 +244,32 @@ def load_source(what: Path, honoured: Honoured | None = None) -> Source:
                 f"{what}: must be the output folder of a fit that has ended, but there is no "
                 f"{CONFIG if names else GAUSSIANS} in it"
             )
-        path = what / (GAUSSIANS if _shows_own(what, honoured) else names[0])
+        fitted = load_run_config(what).model.approximations if honoured else None
+        shows_own = fitted and fitted.others_than_default.keys() <= honoured(fitted)
+        path = what / (names[-1] if shows_own else names[0])
     gaussians = Gaussians.load(path)
     said = said_by(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in said.items() if value != DECLARED[name].default}
     shown = frozenset() if honoured is None else honoured(Approximations.of(said))
-    if unknown := {name: value for name, value in others.items() if name not in shown}:
-        _note_rendering(path, unknown)
+    if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
+        beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
+        note = (
+            f"{path}: made to be rendered with {', '.join(unknown)}; programs that do not will "
+            "show it otherwise" + (f"; export {beside} instead" if beside.is_file() else "")
+        )
+        warnings.warn(UserNote(note), stacklevel=2)
     gaussians = baked(replace(gaussians, rendered_with=others or None))
     return Source(gaussians, path, what if what.is_dir() else None)
 
 
-def _shows_own(folder: Path, honoured: Honoured) -> bool:
-    """Return whether a fit's own Gaussians are there, and need no other approximations."""
-    if honoured is None or not (folder / GAUSSIANS).is_file():
-        return False
-    fitted = load_run_config(folder).model.approximations
-    return fitted.others_than_default.keys() <= honoured(fitted)
-
-
-def _note_rendering(path: Path, others: dict[str, object]) -> None:
-    """Programs that do not know of it show something else."""
-    words = ", ".join(f"{name} {str(value).lower()}" for name, value in others.items())
-    beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
-    remedy = f"; export {beside} instead" if beside.is_file() else ""
-    note = f"{path}: made to be rendered with {words}; programs that do not will show it otherwise"
-    warnings.warn(UserNote(note + remedy), stacklevel=2)
-
-
 def _destination(args: argparse.Namespace) -> tuple[str, Path]:
-    """Return the name of the target, and the file."""
     name = args.format
     if name is None and args.out is not None:
         name = _target_of(args.out)
     known = targets()
     if name not in known:
         got = f"got {one_line(name, 40)}{did_you_mean(name, known)}" if name else "got none"
-        raise UserError(f"--format: must be one of {', '.join(known)}, {got}; {OTHER_FORMATS}")
+        raise UserError(f"--format: must be one of {', '.join(known)}, {got}; {HOW_TO_INSTALL}")
     suffix = known[name].suffix
     if args.out is None:
         read_as = format_for(args.what)
@@ -283,43 +284,58 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
 
 
 def _target_of(path: Path) -> str | None:
-    """Return the target that a file's name ends in."""
     if path.name.lower().endswith(PAGE.suffix):
         return "html"
     found = format_for(path)
     return None if found is None else found.name
 
 
-# ----------------------------------------------------------------------------------------------
-# What is kept, and how it lies
-# ----------------------------------------------------------------------------------------------
+def kept_by(
+    gaussians: Gaussians,
+    box: Sequence[float] | None = None,
+    min_opacity: float | None = None,
+    max_scale: float | None = None,
+) -> dict[str, np.ndarray]:
+    """Return which Gaussians (N,) each criterion that is given keeps.
+
+    gaussians: numpy; box: two opposite corners, world, of the means; max_scale: largest standard
+    deviation, world units.
+    """
+    kept = {}
+    if box is not None:
+        corners = np.reshape(box, (2, 3))
+        means = gaussians.means.astype(np.float64) + gaussians.origin
+        inside = (means >= corners.min(axis=0)) & (means <= corners.max(axis=0))
+        kept["box"] = inside.all(axis=1)
+    if min_opacity is not None:
+        kept["opacity"] = gaussians.opacities >= min_opacity
+    if max_scale is not None:
+        kept["size"] = gaussians.scales.max(axis=1) <= max_scale
+    return kept
 
 
-def _selection(args: argparse.Namespace) -> Selection:
-    opacity, size = args.min_opacity, args.max_size
-    if opacity is not None and not 0 <= opacity <= 1:
-        raise UserError(f"--min-opacity: must be between 0 and 1, got {opacity:g}")
-    if size is not None and not size > 0:
-        raise UserError(f"--max-size: must be above 0, got {size:g}")
-    return Selection(None if args.crop is None else tuple(args.crop), opacity, size)
+def take(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+    """Return some of the Gaussians (numpy); rows: indices, or (N,) of truth values."""
+    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+    arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
+    features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
+    return replace(gaussians, **arrays, features=features)
 
 
-def _selected(source: Source, selection: Selection) -> Gaussians:
-    """Return the Gaussians that are kept, and print their number."""
-    gaussians = source.gaussians
-    kept_by = selection.kept_by(gaussians)
-    if not kept_by:
-        return gaussians
-    kept = np.logical_and.reduce(list(kept_by.values()))
-    lost = ", ".join(f"{name} {np.count_nonzero(~k):,}" for name, k in kept_by.items())
+def _selected(source: Source, args: argparse.Namespace) -> Gaussians:
+    found = kept_by(source.gaussians, args.crop, args.min_opacity, args.max_size)
+    if not found:
+        return source.gaussians
+    kept = np.logical_and.reduce(list(found.values()))
+    lost = ", ".join(f"{name} {np.count_nonzero(~k):,}" for name, k in found.items())
     print(f"kept: {np.count_nonzero(kept):,}; left out by {lost}", flush=True)
     if not kept.any():
         raise UserError(f"{source.path}: nothing is left; crop and filter less")
-    return taken(gaussians, kept)
+    return take(source.gaussians, kept)
 
 
 def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray | None:
-    """(3,) what is up in the model's world; None: it is not to be turned. With a line about it."""
+    """Return the direction (3,) that is up, and print it; None: the model is not to be turned."""
     words = args.up
     if words is None and not target.has_axes:
         return None
@@ -332,7 +348,10 @@ def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray 
             raise UserError(
                 f"--up cameras: needs the output folder of a fit with {VIEWS}; give --up X Y Z"
             )
-        up, why = _snapped(up_of(cameras)), " (the training cameras')"
+        up, why = up_of(cameras), " (the training cameras')"
+        axis = np.argmax(np.abs(up))
+        if abs(up[axis]) >= SNAPPED:  # what was estimated is off by a little
+            up = np.sign(up[axis]) * np.eye(3)[axis] + 0.0
     else:
         up, why = _direction(words), "" if args.up else " (give --up otherwise)"
     print(f"up: {' '.join(f'{x:.3g}' for x in up)}{why}", flush=True)
@@ -340,21 +359,13 @@ def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray 
 
 
 def _direction(words: Sequence[str]) -> np.ndarray:
-    try:
+    with suppress(ValueError):
         up = np.array([float(word) for word in words])
-    except ValueError:
-        up = np.zeros(0)
-    length = np.linalg.norm(up)
-    if up.shape != (3,) or not 0 < length < np.inf:
-        got = one_line(" ".join(words), 60)
-        raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
-    return up / length
-
-
-def _snapped(up: np.ndarray) -> np.ndarray:
-    """The axis that is next to it, if one is: what was estimated is off by a little."""
-    axis = np.argmax(np.abs(up))
-    return np.sign(up[axis]) * np.eye(3)[axis] + 0.0 if abs(up[axis]) >= SNAPPED else up
+        if up.shape == (3,) and np.isfinite(up).all() and up.any():
+            up = near_one(up)
+            return up / np.linalg.norm(up)
+    got = one_line(" ".join(words), 60)
+    raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
+from drgs.cli.ending import INTERRUPTED_STATUS
 from drgs.cli.execution import add_execution_arguments, executing
-from drgs.cli.interrupts import INTERRUPTED_STATUS
 from drgs.config.extensions import describe_extensions
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig

@@ -26,7 +26,6 @@ from drgs.effects.compose import NamedFeature
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import GaussianRows, load_rows
 from drgs.splatting.rendering import (
-    Feature,
     Pipeline,
     color_features,
     depth_feature,
@@ -50,6 +49,11 @@ LEAST_SCALE = 1e-18
 OPAQUE_LOGIT = 100.0
 """Its sigmoid is 1 in float64: the opacity is then what it is multiplied by."""
 
+MITSUBA_CAMERAS = (
+    "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render takes "
+    "with the integrator splats"
+)
+
 UNSUPPORTED_GSPLAT_ARGUMENTS = {
     "far_plane": "leave out the Gaussians beyond it",
     "radius_clip": "leave it out: small splats cost little",
@@ -59,22 +63,34 @@ UNSUPPORTED_GSPLAT_ARGUMENTS = {
     "covars": "give quats and scales",
     "with_ut": 'give projection="unscented"',
     "with_eval3d": 'give projection="exact"',
-    **dict.fromkeys(("tile_size", "channel_chunk", "distributed", "segmented"), "leave it out"),
-    **dict.fromkeys(
-        (
-            "camera_model",
-            "radial_coeffs",
-            "tangential_coeffs",
-            "thin_prism_coeffs",
-            "ftheta_coeffs",
-            "rolling_shutter",
-            "viewmats_rs",
-        ),
-        "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render "
-        "takes with the integrator splats",
-    ),
+    "tile_size": "leave it out",
+    "channel_chunk": "leave it out",
+    "distributed": "leave it out",
+    "segmented": "leave it out",
+    "camera_model": MITSUBA_CAMERAS,
+    "radial_coeffs": MITSUBA_CAMERAS,
+    "tangential_coeffs": MITSUBA_CAMERAS,
+    "thin_prism_coeffs": MITSUBA_CAMERAS,
+    "ftheta_coeffs": MITSUBA_CAMERAS,
+    "rolling_shutter": MITSUBA_CAMERAS,
+    "viewmats_rs": MITSUBA_CAMERAS,
 }
 """Parameters of gsplat that there are not, and what to do instead."""
+
+SHAPES = {
+    "means": [("N", 3)],
+    "viewmats": [("C", 4, 4)],
+    "quats": [("N", 4)],
+    "scales": [("N", 3)],
+    "opacities": [("N",)],
+    "Ks": [("C", 3, 3)],
+    "colors": [("N", "D"), ("C", "N", "D")],
+    "backgrounds": [("C", "D")],
+}
+"""Shapes that arrays may have; a letter is the same number everywhere, set where it is first."""
+
+COEFFICIENTS = [("N", "K", 3), ("C", "N", "K", 3)]
+"""Shapes of ``colors`` with ``sh_degree``."""
 
 
 def rasterization(
@@ -145,27 +161,19 @@ def rasterization(
     _require(width >= 1 and height >= 1, "width and height", "1 px or more", (width, height))
     why = why_too_large(int(width), int(height))
     _require(why is None, "width and height", f"smaller: {why}", (width, height))
-    given = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-        "viewmats": viewmats,
-        "Ks": Ks,
-        "backgrounds": backgrounds,
-    }
     tensor_type = _tensor_type(means)
     if "llvm" in tensor_type.__module__:
         ensure_usable_llvm()
+    given = (means, viewmats, quats, scales, opacities, Ks, colors, backgrounds)
     inputs = {
         name: _tensor(name, value, tensor_type)
-        for name, value in given.items()
+        for name, value in zip(SHAPES, given, strict=True)
         if value is not None
     }
     _check_shapes(inputs, sh_degree)
     _check_cameras(*(np.array(inputs[name], np.float64) for name in ("viewmats", "Ks")))
-    features = () if render_mode in ("D", "ED") else (_color_feature(sh_degree),)
+    color = NamedFeature("colors") if sh_degree is None else color_features
+    features = () if render_mode in ("D", "ED") else (color,)
     features += () if render_mode == "RGB" else (depth_feature,)
     pipeline = replace(pipeline_of(selected, sh_degree or 0, features), rows=activated)
     is_camera_attached = any(dr.grad_enabled(inputs[name]) for name in ("viewmats", "Ks"))
@@ -180,11 +188,6 @@ def rasterization(
     return images.numpy(), alphas.numpy(), meta
 
 
-# ----------------------------------------------------------------------------------------------
-# What is given
-# ----------------------------------------------------------------------------------------------
-
-
 def _require(holds: bool, name: str, expected: str, got: object) -> None:
     if not holds:
         raise ValueError(f"rasterization(): {name} must be {expected}, got {got!r}")
@@ -193,24 +196,16 @@ def _require(holds: bool, name: str, expected: str, got: object) -> None:
 def _approximations(
     others: Mapping[str, str | float], eps2d: float, rasterize_mode: str, sh_degree: int | None
 ) -> Approximations:
-    _require(
-        rasterize_mode in RASTERIZE_MODES,
-        "rasterize_mode",
-        f"one of {RASTERIZE_MODES}",
-        rasterize_mode,
-    )
+    expected = f"one of {RASTERIZE_MODES}"
+    _require(rasterize_mode in RASTERIZE_MODES, "rasterize_mode", expected, rasterize_mode)
     _require(sh_degree in (None, 0, 1, 2, 3), "sh_degree", "None or 0 to 3", sh_degree)
     known = {f.name for f in fields(Approximations)} - {"low_pass", "antialiased"}
-    for name in others:
+    for name in others.keys() - known:
+        reason = f"there is no parameter {name}{did_you_mean(name, known)}"
         if name in UNSUPPORTED_GSPLAT_ARGUMENTS:
-            raise TypeError(
-                f"rasterization(): {name} is a parameter of gsplat's that drgs does not have; "
-                f"{UNSUPPORTED_GSPLAT_ARGUMENTS[name]}"
-            )
-        if name not in known:
-            raise TypeError(
-                f"rasterization(): there is no parameter {name}{did_you_mean(name, known)}"
-            )
+            remedy = UNSUPPORTED_GSPLAT_ARGUMENTS[name]
+            reason = f"{name} is a parameter of gsplat's that drgs does not have; {remedy}"
+        raise TypeError(f"rasterization(): {reason}")
     if others.get("sh_direction", "mean") != "mean" and sh_degree is None:
         raise ValueError(
             "rasterization(): sh_direction is of spherical harmonics; give sh_degree, and colors "
@@ -253,36 +248,29 @@ def _tensor(name: str, value: Any, tensor_type: type) -> Any:
 
 
 def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
-    """Raise ValueError for a shape that does not fit."""
-    for name, rest, letters, what in (
-        ("means", (3,), "(N, 3)", "Gaussian"),
-        ("viewmats", (4, 4), "(C, 4, 4)", "camera"),
-    ):
-        got = inputs[name].shape
-        _require(len(got) > 0 and got[1:] == rest, name, f"of shape {letters}", got)
-        _require(got[0] >= 1, name, f"of one {what} at least", got)
-    num, views = inputs["means"].shape[0], inputs["viewmats"].shape[0]
-    shape = inputs["colors"].shape
-    expected = {
-        "quats": (num, 4),
-        "scales": (num, 3),
-        "opacities": (num,),
-        "Ks": (views, 3, 3),
-    }
-    for name, wanted in expected.items():
-        _require(inputs[name].shape == wanted, name, f"of shape {wanted}", inputs[name].shape)
-    if sh_degree is None:
-        fits, wanted = shape[:-1] in ((num,), (views, num)), f"({num}, D) or ({views}, {num}, D)"
-    else:
-        least = (sh_degree + 1) ** 2
-        fits = shape[:-2] in ((num,), (views, num)) and shape[-1] == 3 and shape[-2] >= least
-        wanted = f"({num}, K, 3) or ({views}, {num}, K, 3), K >= {least}, for sh_degree {sh_degree}"
-    _require(fits, "colors", f"of shape {wanted}", shape)
-    width = shape[-1]
-    _require(width <= MAX_FEATURES, "colors", f"of at most {MAX_FEATURES} channels", width)
-    if "backgrounds" in inputs:
-        wanted, got = (views, shape[-1]), inputs["backgrounds"].shape
-        _require(got == wanted, "backgrounds", f"of shape {wanted}", got)
+    sizes: dict[str | int, int] = {}  # by letter
+    for name, value in inputs.items():
+        is_sh = name == "colors" and sh_degree is not None
+        allowed = COEFFICIENTS if is_sh else SHAPES[name]
+        shapes = [tuple(sizes.get(each, each) for each in letters) for letters in allowed]
+        fitting = [k for k, shape in enumerate(shapes) if _fits(value.shape, shape)]
+        expected = " or ".join(str(shape).replace("'", "") for shape in shapes)
+        _require(bool(fitting), name, f"of shape {expected}", value.shape)
+        _require(value.shape[0] >= 1, name, "of one row at least", value.shape)
+        sizes |= zip(allowed[fitting[0]], value.shape, strict=True)
+        if is_sh:
+            least, sizes["D"] = (sh_degree + 1) ** 2, 3
+            expected = f"of K >= {least} coefficients for sh_degree {sh_degree}"
+            _require(sizes["K"] >= least, name, expected, sizes["K"])
+    expected = f"of at most {MAX_FEATURES} channels"
+    _require(sizes["D"] <= MAX_FEATURES, "colors", expected, sizes["D"])
+
+
+def _fits(got: tuple[int, ...], shape: tuple[int | str, ...]) -> bool:
+    return len(got) == len(shape) and all(
+        isinstance(wanted, str) or number == wanted
+        for number, wanted in zip(got, shape, strict=True)
+    )
 
 
 def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
@@ -303,15 +291,6 @@ def activated(rows: GaussianRows) -> GaussianRows:
     sizes = [dr.abs(scale) for scale in rows.features["scales"]]
     logs = [dr.log(dr.select(size > LEAST_SCALE, size, LEAST_SCALE)) for size in sizes]
     return replace(rows, log_scales=t.Array3f(logs), dimming=rows.features["opacities"][0])
-
-
-def _color_feature(sh_degree: int | None) -> Feature:
-    return NamedFeature("colors") if sh_degree is None else color_features
-
-
-# ----------------------------------------------------------------------------------------------
-# Images
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -482,7 +461,6 @@ class _View:
         return {"viewmats": from_host(Float, d_viewmat), "Ks": from_host(Float, d_K)}
 
     def _camera_tangents(self, directions: Mapping[str, Any]) -> list[Any]:
-        """Return tangents of a camera's numbers."""
         d_viewmat = np.array(directions["viewmats"], np.float64)[self.index]
         d_K = np.array(directions["Ks"], np.float64)[self.index]
         moved = d_viewmat[:3, 3] + d_viewmat[:3, :3] @ self.center

@@ -47,6 +47,7 @@ from drgs.core.environment import VARIANTS
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
 from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.core.processes import process_number, start_mpi
+from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.orbits import near_plane_of, orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.datasets.types import Viewpoint
@@ -63,7 +64,7 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.state import is_splats
 from drgs.integrator.summary import described, summary_of_views
-from drgs.io.formats import OTHER_FORMATS, format_for, readable_formats
+from drgs.io.formats import format_for, readable_formats
 from drgs.io.pictures import (
     MITSUBA_FORMATS,
     check_animation,
@@ -509,7 +510,7 @@ def _check(args: argparse.Namespace) -> None:
         suffixes = ", ".join(each.value.suffix for each in readable_formats())
         raise UserError(
             f"{args.what}: must be a file of Gaussians ({suffixes}), a Mitsuba scene (.xml) or the "
-            f"output folder of a fit; {OTHER_FORMATS}"
+            f"output folder of a fit; {HOW_TO_INSTALL}"
         )
 
 

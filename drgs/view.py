@@ -20,8 +20,8 @@ from drgs.cli.commands import (
     finite_number,
     run_command,
 )
+from drgs.cli.ending import StopRequest
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
-from drgs.cli.interrupts import StopRequest
 from drgs.core.environment import required
 from drgs.core.errors import UserError
 from drgs.datasets.orbits import orbit_of_gaussians

@@ -20,7 +20,7 @@ import numpy as np
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import machine
 from drgs.cli.commands import at_least
-from drgs.cli.errors import exit_on_user_error
+from drgs.cli.ending import exit_on_user_error
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure

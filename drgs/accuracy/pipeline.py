@@ -58,7 +58,7 @@ def pipeline_of(
 def _own_falloff(
     approximations: Approximations, projection: type[ProjectionModel]
 ) -> type[GaussianFalloff]:
-    if approximations.falloff != FALLOFFS.words()[0]:
+    if approximations.falloff != FALLOFFS.shipped[0]:
         raise UnsupportedError(
             f"splats: projection '{approximations.projection}' has a falloff of its own, got "
             f"falloff '{approximations.falloff}'; use another projection, or no falloff"

@@ -151,7 +151,12 @@ def bench_config(gaussians: Gaussians) -> FitConfig:
     return FitConfig(
         data={"path": "."},
         model=model.model_dump(),
-        densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
+        densify={
+            "start": 1_000_000,
+            "stop": 1_000_001,
+            "strategy": "adc",
+            "adc": {"reset_every": 1_000_000},
+        },
         iterations=2_000_000,
     )
 

@@ -18,9 +18,9 @@ from typing import Any, ClassVar, Protocol
 import drjit as dr
 
 from drgs.core.arrays import types_of
-from drgs.core.class_registry import ClassRegistry
 from drgs.core.constants import MAX_COEFFICIENT, TAN_CLAMP
 from drgs.core.errors import UserError
+from drgs.core.registry import ClassRegistry
 
 LENSES = ClassRegistry(
     "lens",

@@ -8,16 +8,20 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
-from drgs.cli.errors import exit_on_user_error
-from drgs.cli.interrupts import exit_on_interrupt, importing
-from drgs.cli.output import notes_printed, printable_anywhere
+from drgs.cli.ending import (
+    exit_on_interrupt,
+    exit_on_user_error,
+    importing,
+    notes_printed,
+    printable_anywhere,
+)
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import UserError, did_you_mean, one_line
-from drgs.core.files import check_path
 from drgs.core.processes import ending_together, one_voice, process_count
 from drgs.core.registry import reporting_extensions
 
@@ -99,10 +103,7 @@ def run_command(
     prog: str,
     arguments: Sequence[str] | None = None,
 ) -> None:
-    """Parse a command line and run what it names; an error of the user's ends it with status 2.
-
-    Ctrl-C ends it with status 130. Whatever the names of files and the terminal's encoding are,
-    they can be printed.
+    """Parse a command line and run what it names, as :mod:`drgs.cli.ending` ends commands.
 
     add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones,
     which also hold the whole line as ``command``; and ``is_shared``, where several processes may
@@ -133,7 +134,7 @@ def run_command(
 
 
 def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable[[str], int]:
-    """The type of an argument that is a whole number, ``minimum`` to ``maximum``.
+    """Return the type of an argument that is a whole number, ``minimum`` to ``maximum``.
 
     reason: for ``maximum``, where the error is to name it.
     """
@@ -141,44 +142,36 @@ def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable
     def whole_number(text: str) -> int:
         # Python converts no more than 4,300 digits.
         number = int(text) if re.fullmatch(r"\s*[+-]?[0-9]{1,4000}\s*", text) else None
-        if number is None or number < minimum:
-            raise argparse.ArgumentTypeError(
-                f"must be a whole number >= {minimum}, got {one_line(text, 80) or 'nothing'}"
-            )
-        if number > maximum:
-            because = f" ({reason})" if reason else ""
-            raise argparse.ArgumentTypeError(
-                f"must be at most {maximum:,}{because}, got {one_line(text, 80)}"
-            )
-        return number
+        if number is not None and minimum <= number <= maximum:
+            return number
+        expected = f"a whole number >= {minimum}"
+        if number is not None and number > maximum:
+            expected = f"at most {maximum:,}" + (f" ({reason})" if reason else "")
+        got = one_line(text, 80) or "nothing"
+        raise argparse.ArgumentTypeError(f"must be {expected}, got {got}")
 
     return whole_number
 
 
 def file_or_folder(text: str) -> Path:
-    """The type of an argument that is the path of a file or folder, which need not exist."""
+    """Return the path of an argument that is a file or folder, which need not exist."""
     try:
-        check_path(text)
         return Path(text).expanduser()
-    except (ValueError, RuntimeError) as error:  # the latter: there is no such user
+    except RuntimeError as error:  # there is no such user
         raise argparse.ArgumentTypeError(f"{one_line(error)}: {one_line(text, 40)}") from None
 
 
 def finite_number(text: str) -> float:
-    """The type of an argument that is a finite number."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(
-            f"must be a finite number, got {one_line(text, 80) or 'nothing'}"
-        )
-    return number
+    """Return the value of an argument that is a finite number."""
+    with suppress(ValueError):
+        if math.isfinite(number := float(text)):
+            return number
+    got = one_line(text, 80) or "nothing"
+    raise argparse.ArgumentTypeError(f"must be a finite number, got {got}")
 
 
 def degrees(text: str) -> float:
-    """The type of an argument that is a field of view: degrees, as Mitsuba's ``fov``."""
+    """Return the value of an argument that is a field of view: degrees, as Mitsuba's ``fov``."""
     angle = finite_number(text)
     if not 0 < angle < 180:
         raise argparse.ArgumentTypeError(f"must be between 0 and 180 degrees, got {text}")

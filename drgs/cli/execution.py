@@ -16,9 +16,8 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.cli.commands import at_least
-from drgs.cli.interrupts import importing
-from drgs.core.denormals import denormals_flushed
-from drgs.core.environment import VARIANTS
+from drgs.cli.ending import importing
+from drgs.core.environment import VARIANTS, denormals_flushed
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import why_out_of_memory
 
@@ -51,12 +50,8 @@ def add_variant_argument(
     parser: argparse.ArgumentParser, variants: Sequence[str] | None = VARIANTS
 ) -> None:
     """Add ``--variant``; variants: as for :func:`add_execution_arguments`."""
-    parser.add_argument(
-        "--variant",
-        default=VARIANTS[0],
-        choices=variants,
-        help="Mitsuba variant (default: %(default)s)",
-    )
+    text = "Mitsuba variant (default: %(default)s)"
+    parser.add_argument("--variant", default=VARIANTS[0], choices=variants, help=text)
 
 
 def select_variant(name: str) -> None:
@@ -88,18 +83,18 @@ def executing(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def _thread_count(count: int | None) -> Iterator[None]:
-    if count is None:
-        yield
-        return
     previous = dr.thread_count()
     try:
-        try:
+        if count is not None:
             dr.set_thread_count(count)
-        except RuntimeError as error:
-            raise UserError(f"--threads {count}: the system says: {one_line(error)}") from None
+    except RuntimeError as error:
+        dr.set_thread_count(previous)
+        raise UserError(f"--threads {count}: the system says: {one_line(error)}") from None
+    try:
         yield
     finally:
-        dr.set_thread_count(previous)
+        if count is not None:
+            dr.set_thread_count(previous)
 
 
 class _RangeReports:
@@ -133,7 +128,6 @@ class _RangeReports:
 
 @contextmanager
 def _range_checks() -> Iterator[_RangeReports]:
-    """Within the block, Dr.Jit is in debug mode."""
     reports = _RangeReports(sys.stderr)
     tracer = sys.gettrace()  # debug mode installs its own
     try:

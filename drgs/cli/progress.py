@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from types import TracebackType
 from typing import TextIO
 
 from rich.console import Console
@@ -52,18 +51,11 @@ class RunProgress:
             self._task = self._bar.add_task(what, total=total, completed=done, status="")
 
     def __enter__(self) -> RunProgress:
-        """Start drawing."""
         if self._bar is not None:
             self._bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Stop drawing."""
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 

@@ -5,12 +5,11 @@ Each strategy has a section of its own in it; what all of them share stands besi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
-from drgs.config.extensions import STRATEGIES, check_strategy
+from drgs.config.extensions import STRATEGIES, StrategyName
 from drgs.config.section import Count, Section
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
@@ -94,10 +93,6 @@ class BudgetConfig(Section):
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
 
 
-EARLIER_KEYS = {f"densify.{name}": f"densify.adc.{name}" for name in AdcConfig.model_fields}
-"""Names of values in files of earlier versions, which had one strategy, and what they are now."""
-
-
 class McmcConfig(Section):
     """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
 
@@ -174,7 +169,7 @@ class StopAim(Section):
 class DensifyConfig(Section):
     """How the number of Gaussians changes."""
 
-    strategy: Annotated[str, AfterValidator(check_strategy)] = Field(
+    strategy: StrategyName = Field(
         "budget",
         description="What changes the population. adc: adaptive density control, as in the paper "
         "(Kerbl et al. 2023); budget: growth to a number of Gaussians, where errors are; mcmc: "
@@ -223,33 +218,6 @@ class DensifyConfig(Section):
             raise ValueError("must begin after iteration 0, with growing after")
         return aims
 
-    @model_validator(mode="before")
-    @classmethod
-    def _as_now(cls, values: Any) -> Any:
-        """Values of earlier versions, which had only adc, where they are now."""
-        earlier = [name for name in AdcConfig.model_fields if name in _keys(values)]
-        if not earlier:
-            return values
-        given = values.get("adc", {})
-        if not isinstance(given, Mapping):  # refused by its own check
-            return values
-        if (strategy := values.get("strategy", "adc")) != "adc":
-            raise ValueError(
-                f"must hold {earlier[0]} in the section adc, to which it belongs, where strategy "
-                f"is {strategy}"
-            )
-        if twice := [name for name in earlier if name in given]:
-            raise ValueError(
-                f"must hold {twice[0]} in the section adc or, as in earlier versions, beside it, "
-                "not twice"
-            )
-        others = {name: value for name, value in values.items() if name not in earlier}
-        return {
-            "strategy": "adc",
-            **others,
-            "adc": {**given, **{name: values[name] for name in earlier}},
-        }
-
     def prune_window(self, iterations: int) -> tuple[int, int]:
         """The iteration after which the last phase begins, and that of its last change.
 
@@ -262,7 +230,3 @@ class DensifyConfig(Section):
         """The iteration from which on no row is added or removed; iterations: of the fit."""
         last = self.stop if self.prune.to is None else self.prune_window(iterations)[1]
         return max(self.stop, last) + 1
-
-
-def _keys(values: Any) -> Mapping[str, Any]:
-    return values if isinstance(values, Mapping) else {}

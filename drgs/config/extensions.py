@@ -8,13 +8,11 @@ is there, be it empty. A strategy is chosen by ``densify.strategy``, a loss by `
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ValidationError
-from pydantic_core import PydanticCustomError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, SerializeAsAny, ValidationError
 
-from drgs.config.explain import expectation, shown_value
-from drgs.config.section import Section
+from drgs.config.section import Section, expectation, shown_value
 from drgs.core.errors import did_you_mean
 from drgs.core.registry import HOW_TO_INSTALL, Extension, Registry, all_extensions
 
@@ -61,42 +59,34 @@ READERS: Registry[type] = Registry(
 )
 """Subclasses of :class:`drgs.datasets.reader.DatasetReader`."""
 
-SECTION = f"{Section.__module__}.{Section.__name__}"
-
 GROWTH = ("adc", "budget", "mcmc")
 """Shipped strategies for ``densify.strategy``; the others prune after them."""
 
 
-def check_strategy(name: str) -> str:
-    """Return the name of a strategy; raises ValueError if there is none of this name."""
-    return _check_name(name, GROWTH, STRATEGIES)
+def _name_check(registry: Registry, shipped: tuple[str, ...]) -> AfterValidator:
+    """Return a validator for the name of an extension: one of ``shipped``, or installed."""
+
+    def check(name: str) -> str:
+        if name not in shipped:
+            known = [*shipped, *(extension.name for extension in registry.installed())]
+            if name not in known:
+                quoted = ", ".join(f"'{each}'" for each in known)
+                raise ValueError(
+                    f"must be one of {quoted}{did_you_mean(name, known)} ({HOW_TO_INSTALL})"
+                )
+        return name
+
+    return AfterValidator(check)
 
 
-def check_loss(name: str) -> str:
-    """Return the name of a loss; raises ValueError if there is none of this name."""
-    return _check_name(name, ("photometric",), LOSSES)
+StrategyName = Annotated[str, _name_check(STRATEGIES, GROWTH)]
+LossName = Annotated[str, _name_check(LOSSES, ("photometric",))]
+ReaderName = Annotated[str, _name_check(READERS, ("auto", *READERS.shipped))]
 
 
-def check_reader(name: str) -> str:
-    """Return the name of a dataset reader, or ``auto``; raises ValueError if there is none."""
-    return _check_name(name, ("auto", *READERS.shipped), READERS)
-
-
-def _check_name(name: str, shipped: tuple[str, ...], registry: Registry) -> str:
-    if name not in shipped:
-        known = [*shipped, *(extension.name for extension in registry.installed())]
-        if name not in known:
-            quoted = ", ".join(f"'{each}'" for each in known)
-            raise ValueError(
-                f"must be one of {quoted}{did_you_mean(name, known)} ({HOW_TO_INSTALL})"
-            )
-    return name
-
-
-def check_sections(sections: Any) -> dict[str, BaseModel | None]:
-    """Return the sections of extensions, each as the extension's model; None: it has none."""
+def _check_sections(sections: Any) -> dict[str, BaseModel | None]:
     if not isinstance(sections, Mapping):
-        raise ValueError("must contain sections by the names of extensions")
+        raise ValueError("extensions must contain sections by the names of extensions")
     return {name: _check_section(str(name), values) for name, values in sections.items()}
 
 
@@ -104,17 +94,20 @@ def _check_section(name: str, values: Any) -> BaseModel | None:
     known = {extension.name: extension for extension in all_extensions()}
     if name not in known:
         there_are = f"there are {', '.join(known)}" if known else "none is installed"
-        raise _error(
+        raise ValueError(
             f"extensions.{name}: no extension has this name{did_you_mean(name, known)}; "
             f"{there_are} ({HOW_TO_INSTALL})"
         )
     section = known[name].section
     if section is None:
         if values:
-            raise _error(f"extensions.{name} must be empty: it has no settings")
+            raise ValueError(f"extensions.{name} must be empty: it has no settings")
         return None
     if not issubclass(section, Section):
-        raise _error(f"extensions.{name}: the extension's section must be a subclass of {SECTION}")
+        raise ValueError(
+            f"extensions.{name}: the extension's section must be a subclass of "
+            f"{Section.__module__}.{Section.__name__}"
+        )
     if isinstance(values, BaseModel):
         values = values.model_dump()
     try:
@@ -123,13 +116,14 @@ def _check_section(name: str, values: Any) -> BaseModel | None:
         first = error.errors()[0]
         key = ".".join(["extensions", name, *map(str, first["loc"])])
         if first["type"] == "extra_forbidden":
-            fields = did_you_mean(str(first["loc"][-1]), section.model_fields)
-            raise _error(f"unknown key {key}{fields}") from None
-        raise _error(f"{key} {expectation(first)}, got {shown_value(first['input'])}") from None
+            hint = did_you_mean(str(first["loc"][-1]), section.model_fields)
+            raise ValueError(f"unknown key {key}{hint}") from None
+        text = f"{key} {expectation(first)}, got {shown_value(first['input'])}"
+        raise ValueError(text) from None
 
 
-def _error(text: str) -> PydanticCustomError:
-    return PydanticCustomError("extension", "{text}", {"text": text})
+Sections = Annotated[dict[str, SerializeAsAny[BaseModel] | None], BeforeValidator(_check_sections)]
+"""Sections of extensions by name, each as the extension's model; None: it has none."""
 
 
 def extension_keys() -> list[str]:

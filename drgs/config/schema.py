@@ -14,13 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
-    BeforeValidator,
     Field,
     PlainSerializer,
     PlainValidator,
-    SerializeAsAny,
     ValidationInfo,
     create_model,
     field_validator,
@@ -34,7 +31,7 @@ from drgs.config.density import (
     DensifyConfig,
     schedule_of,
 )
-from drgs.config.extensions import check_loss, check_reader, check_sections
+from drgs.config.extensions import LossName, ReaderName, Sections
 from drgs.config.section import Count, Rate, Section, Weight
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
@@ -61,10 +58,9 @@ DEGREE_SHARE = 1 / 40
 def _color(value: Any) -> Color | None:
     if value is None or (isinstance(value, str) and value in NAMED_COLORS):
         return value
-    if isinstance(value, (list, tuple)) and len(value) == 3:
-        numbers = [v for v in value if isinstance(v, (int, float)) and not isinstance(v, bool)]
-        if len(numbers) == 3 and all(0 <= v <= 1 for v in numbers):
-            return tuple(float(v) for v in numbers)
+    is_triple = isinstance(value, (list, tuple)) and len(value) == 3
+    if is_triple and all(type(v) in (int, float) and 0 <= v <= 1 for v in value):
+        return tuple(float(v) for v in value)
     raise ValueError("must be white, black or three numbers in 0..1")
 
 
@@ -89,7 +85,7 @@ class DataConfig(Section):
     source: str = Field(
         "", description="Where to get the data: printed in the error if the folder is missing."
     )
-    type: Annotated[str, AfterValidator(check_reader)] = Field(
+    type: ReaderName = Field(
         "auto",
         description="Layout of the folder. auto: nerf_synthetic if there is a "
         "transforms_train.json, nerfstudio if there is a transforms.json, colmap if there is a "
@@ -372,9 +368,7 @@ class OptimizerConfig(Section):
 class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
-    type: Annotated[str, AfterValidator(check_loss)] = Field(
-        "photometric", description="photometric, or the name of an extension."
-    )
+    type: LossName = Field("photometric", description="photometric, or the name of an extension.")
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
     window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
     sigma: float = Field(1.5, ge=0.1, le=1000, description="px: its standard deviation.")
@@ -455,6 +449,15 @@ def _is_open(section: BaseModel, name: str) -> bool:
     return name not in section.model_fields_set or getattr(section, name) is None
 
 
+def _require(holds: bool, expected: str, got: object) -> None:
+    if not holds:
+        raise ValueError(f"{expected}, got {got}")
+
+
+def _shown(section: BaseModel) -> str:
+    return f"{{{', '.join(f'{name}: {value}' for name, value in section)}}}"
+
+
 class FitConfig(Section):
     """Everything that decides a fit."""
 
@@ -481,9 +484,7 @@ class FitConfig(Section):
         "none, as in the paper.",
     )
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
-    extensions: Annotated[
-        dict[str, SerializeAsAny[BaseModel] | None], BeforeValidator(check_sections)
-    ] = Field(
+    extensions: Sections = Field(
         default_factory=dict,
         description="Sections of extensions, by name. An effect or a term of the loss takes part "
         "if it has one, be it empty.",
@@ -492,9 +493,7 @@ class FitConfig(Section):
     @property
     def data_for_training(self) -> DataConfig:
         """``data``, without the depths that a loss of weight 0 would not look at."""
-        if self.loss.depth_weight > 0:
-            return self.data
-        return self.data.model_copy(update={"ignore_depth": True})
+        return self.data if self.loss.depth_weight > 0 else self.data_for_rendering
 
     @property
     def data_for_rendering(self) -> DataConfig:
@@ -527,92 +526,67 @@ class FitConfig(Section):
         object.__setattr__(self, section, completed)
 
     @model_validator(mode="after")
-    def _check_start(self) -> FitConfig:
-        start, cloud, half_extent = self.init.start, self.init.point_cloud, self.init.half_extent
-        if start in ("masks", "random") and cloud is not None:
-            raise ValueError(
-                f"init.point_cloud must be null where init.start is {start}, got {cloud}"
-            )
-        if start == "points" and half_extent is not None:
-            raise ValueError(
-                f"init.half_extent must be null where init.start is points, got {half_extent}"
-            )
-        return self
-
-    def _check_last_phase(self) -> None:
-        """It takes place, unless a plan was revised: then time may be up before."""
-        prune, n = self.densify.prune, self.iterations
-        start = self.densify.prune_window(n)[0]
-        if prune.stop is not None and prune.stop <= start:
-            raise ValueError(
-                "densify.prune.stop must be > densify.stop and densify.prune.start "
-                f"({start}), got {prune.stop}"
-            )
-        if self.optimizer.means_lr_aims:
-            return
-        last = {"densify.stop": self.densify.stop, "densify.prune.start": prune.start or 0}
-        for name, iteration in last.items():
-            if iteration >= n:
-                raise ValueError(
-                    f"{name} must be < iterations ({n}), or there is none left for "
-                    f"densify.prune.to, got {iteration}"
-                )
-        if prune.stop is not None and prune.stop > n:
-            raise ValueError(f"densify.prune.stop must be <= iterations ({n}), got {prune.stop}")
-
-    @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
-        densify, optimizer = self.densify, self.optimizer
-        if densify.start >= densify.stop:
-            raise ValueError(
-                f"densify.start must be < densify.stop ({densify.stop}), got {densify.start}"
-            )
+        init, densify, optimizer = self.init, self.densify, self.optimizer
+        if init.start in ("masks", "random"):
+            expected = f"init.point_cloud must be null where init.start is {init.start}"
+            _require(init.point_cloud is None, expected, init.point_cloud)
+        if init.start == "points":
+            expected = "init.half_extent must be null where init.start is points"
+            _require(init.half_extent is None, expected, init.half_extent)
+        expected = f"densify.start must be < densify.stop ({densify.stop})"
+        _require(densify.start < densify.stop, expected, densify.start)
         views, at_once = optimizer.views, optimizer.views_per_step
-        if views > at_once and views % at_once != 0:
-            raise ValueError(
-                "optimizer.views must be a multiple of optimizer.views_per_step "
-                f"({at_once}), or not larger, got {views}"
-            )
-        if optimizer.means_lr_final > optimizer.means_lr:
-            raise ValueError(
-                f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr}), "
-                f"got {optimizer.means_lr_final}"
-            )
-        adc = densify.adc
-        if adc.prune_opacity >= adc.reset_opacity:
-            raise ValueError(
-                f"densify.adc.prune_opacity must be < densify.adc.reset_opacity "
-                f"({adc.reset_opacity}), or a reset removes everything; got {adc.prune_opacity}"
-            )
-        if self.cameras.optimise and self.model.sh_direction != "mean":
-            raise ValueError(
+        expected = f"optimizer.views must be a multiple of optimizer.views_per_step ({at_once}), "
+        is_usable = views <= at_once or views % at_once == 0
+        _require(is_usable, expected + "or not larger", views)
+        last = optimizer.means_lr_final
+        expected = f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr})"
+        _require(last <= optimizer.means_lr, expected, last)
+        opacity, reset = densify.adc.prune_opacity, densify.adc.reset_opacity
+        expected = f"densify.adc.prune_opacity must be < densify.adc.reset_opacity ({reset})"
+        _require(opacity < reset, f"{expected}, or a reset removes everything", opacity)
+        if self.cameras.optimise:
+            expected = (
                 "model.sh_direction must be mean where cameras.optimise is true (colours along "
-                f"rays are not differentiated in the camera), got {self.model.sh_direction}"
+                "rays are not differentiated in the camera)"
             )
+            is_mean = self.model.sh_direction == "mean"
+            _require(is_mean, expected, self.model.sh_direction)
         if densify.prune.to is not None:
             self._check_last_phase()
         caps = {"densify.max_gaussians": densify.max_gaussians}
         if densify.strategy == "mcmc" and densify.mcmc.gaussians is not None:
             caps["densify.mcmc.gaussians"] = densify.mcmc.gaussians
         for name, cap in caps.items():
-            if self.init.point_cloud is None and (self.init.num_points or 0) > cap:
-                raise ValueError(
-                    f"init.num_points must be <= {name} ({cap}), got {self.init.num_points}"
-                )
+            is_used = init.point_cloud is None and init.num_points is not None
+            fits = not is_used or init.num_points <= cap
+            _require(fits, f"init.num_points must be <= {name} ({cap})", init.num_points)
         for before, after in pairwise(self.coarse or ()):
-            if not (before.until < after.until and before.factor > after.factor):
-                raise ValueError(
-                    "coarse must be stages with growing until and falling factor, got "
-                    f"{{until: {before.until}, factor: {before.factor}}} before "
-                    f"{{until: {after.until}, factor: {after.factor}}}"
-                )
+            is_in_order = before.until < after.until and before.factor > after.factor
+            got = f"{_shown(before)} before {_shown(after)}"
+            _require(
+                is_in_order, "coarse must be stages with growing until and falling factor", got
+            )
         aims = optimizer.means_lr_aims
         starts = [aim.after for aim in aims]
-        if starts != sorted(set(starts)) or any(aim.end <= aim.after for aim in aims):
-            raise ValueError(
-                "optimizer.means_lr_aims must have growing after < end, "
-                f"got {', '.join(f'{{after: {aim.after}, end: {aim.end}}}' for aim in aims)}"
-            )
-        if self.loss.window % 2 == 0:
-            raise ValueError(f"loss.window must be odd, got {self.loss.window}")
+        is_growing = starts == sorted(set(starts)) and all(aim.end > aim.after for aim in aims)
+        got = ", ".join(map(_shown, aims))
+        _require(is_growing, "optimizer.means_lr_aims must have growing after < end", got)
+        _require(self.loss.window % 2 == 1, "loss.window must be odd", self.loss.window)
         return self
+
+    def _check_last_phase(self) -> None:
+        """Check that it takes place, unless a plan was revised: then time may be up before."""
+        prune, n = self.densify.prune, self.iterations
+        start = self.densify.prune_window(n)[0]
+        expected = f"densify.prune.stop must be > densify.stop and densify.prune.start ({start})"
+        _require(prune.stop is None or prune.stop > start, expected, prune.stop)
+        if self.optimizer.means_lr_aims:
+            return
+        last = {"densify.stop": self.densify.stop, "densify.prune.start": prune.start or 0}
+        for name, iteration in last.items():
+            expected = f"{name} must be < iterations ({n}), or there is none left for "
+            _require(iteration < n, f"{expected}densify.prune.to", iteration)
+        expected = f"densify.prune.stop must be <= iterations ({n})"
+        _require(prune.stop is None or prune.stop <= n, expected, prune.stop)

@@ -278,7 +278,6 @@ def first_numbers(flat: Any, size: int) -> Any:
 
 
 def _store_shifted(flat: Any, columns: list[Any]) -> None:
-    """Store a row a lane, each of which begins where the last one ends."""
     t, width = types_of(type(flat)), len(columns)
     first = dr.arange(t.UInt32, dr.width(columns)) * width
     begin, shift = first // PACKET, first % PACKET
@@ -305,7 +304,6 @@ def _store_shifted(flat: Any, columns: list[Any]) -> None:
 
 
 def _load_packets(flat: Any, index: Any, width: int) -> list[Any]:
-    """``width`` numbers a lane of rows that are whole packets."""
     packet = types_of(type(flat)).Array4f
     packets = [dr.gather(packet, flat, index + k) for k in range(-(-width // PACKET))]
     return [number for each in packets for number in each][:width]

@@ -7,11 +7,9 @@ lacking permission or a full disk is the user's to repair.
 from __future__ import annotations
 
 import errno
-import math
 import os
 import re
 import stat
-import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -38,25 +36,6 @@ _REMEDIES = {
 }
 
 
-MAX_NAME_BYTES = 255
-"""Of a file or folder, on every file system in use."""
-
-MAX_PATH_BYTES = 3500
-"""Of a path that is given: Linux allows 4,096, and what is written in a folder needs some."""
-
-
-def check_path(path: str | Path) -> None:
-    """Raise ValueError for a path that no file can have, or that leaves no room for files in it."""
-    if "\0" in str(path):
-        raise ValueError("a path cannot hold a zero byte")
-    encoded = os.fsencode(path)
-    longest = max(map(len, encoded.split(os.fsencode(os.sep))))
-    if longest > MAX_NAME_BYTES:
-        raise ValueError(f"a name must have at most {MAX_NAME_BYTES} bytes, got {longest:,}")
-    if len(encoded) > MAX_PATH_BYTES:
-        raise ValueError(f"a path must have at most {MAX_PATH_BYTES:,} bytes, got {len(encoded):,}")
-
-
 STEM_BYTES = 200
 """Of a file's name that is made of another: numbers, suffixes and temporary names follow."""
 
@@ -74,7 +53,7 @@ _SPECIAL = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socke
 
 
 def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = None) -> IO[bytes]:
-    """A regular file, open for reading; ``what`` it should be stands in the errors.
+    """Open a regular file for reading; ``what`` it should be stands in the errors.
 
     A pipe would wait for a writer for ever, and a device need not end: neither is read.
 
@@ -83,24 +62,24 @@ def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = N
     """
     try:
         file = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115  (the caller closes it)
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the {what}: {error.strerror or error}") from None
-    except ValueError as error:  # a name with a zero byte
-        raise UserError(f"{one_line(repr(path))}: cannot read the {what}: {error}") from None
+    except (OSError, ValueError) as error:  # the latter: a name with a zero byte
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{one_line(path)}: cannot read the {what}: {reason}") from None
     status = os.fstat(file.fileno())
-    mode, size = status.st_mode, status.st_size
-    if stat.S_ISREG(mode) and max_bytes is not None and size > max_bytes:
+    reason = None
+    if not stat.S_ISREG(status.st_mode):
+        kind = _SPECIAL.get(stat.filemode(status.st_mode)[0], "something else")
+        reason = f"must be a regular file, got {kind}"
+    elif max_bytes is not None and status.st_size > max_bytes:
+        reason = f"more than {max_bytes:,} bytes"
+    if reason is not None:
         file.close()
-        raise UserError(f"{path}: cannot read the {what}: more than {max_bytes:,} bytes")
-    if not stat.S_ISREG(mode):
-        file.close()
-        kind = _SPECIAL.get(stat.filemode(mode)[0], "something else")
-        raise UserError(f"{path}: cannot read the {what}: must be a regular file, got {kind}")
+        raise UserError(f"{path}: cannot read the {what}: {reason}")
     return file
 
 
 def _open_without_waiting(path: str, flags: int) -> int:
-    """Opening a pipe would otherwise wait for its other end."""
+    """Open a file; that of a pipe would otherwise wait for its other end."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
@@ -140,49 +119,22 @@ def read_text(path: Path, what: str, max_bytes: int, memory_ratio: int = 2) -> s
 
 
 def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file that ``np.savez`` wrote; ``what`` it is stands in the errors.
+    """Return the arrays of an ``.npz`` file that ``np.savez`` wrote; what: as for the above.
 
-    None takes more memory than the file has bytes: what is compressed, or whose header claims
-    another size, is refused before it is read.
-
-    Raises :class:`UserError` for a file that cannot be read or is damaged.
+    Raises :class:`UserError` for a file that cannot be read, is damaged, or too large for memory.
     """
     import numpy as np  # a list of commands needs none
 
     with open_regular(path, what) as file:
         try:
-            _check_sizes(file)
-            file.seek(0)
             require_memory(path, os.fstat(file.fileno()).st_size, f"the {what}")
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
-        except (UserError, MemoryError):
+        except UserError:
             raise
         except Exception as error:  # zipfile and NumPy raise many types for a broken file
             reason = one_line(error) or type(error).__name__
             raise UserError(f"{path}: cannot read the {what}: {reason}") from None
-
-
-def _check_sizes(file: IO[bytes]) -> None:
-    """Raise ValueError where the arrays of an ``.npz`` file are not as large as their parts."""
-    from numpy.lib import format as npy
-
-    left = os.fstat(file.fileno()).st_size
-    with zipfile.ZipFile(file) as archive:
-        for part in archive.infolist():
-            left -= part.file_size
-            if left < 0 or part.compress_type != zipfile.ZIP_STORED:
-                raise ValueError(f"{part.filename} is compressed, or larger than the file")
-            with archive.open(part) as content:
-                version = npy.read_magic(content)
-                read_header = {
-                    (1, 0): npy.read_array_header_1_0,
-                    (2, 0): npy.read_array_header_2_0,
-                }[version]
-                shape, _, dtype = read_header(content)
-                claimed = content.tell() + math.prod(shape) * dtype.itemsize
-            if dtype.hasobject or claimed != part.file_size:
-                raise ValueError(f"{part.filename} is not as large as its header claims")
 
 
 _TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d{1,9})\.tmp(\.[^.]*)?")

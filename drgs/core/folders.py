@@ -14,8 +14,9 @@ import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
 
 from drgs.core.errors import UserError, listed
 from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
@@ -26,12 +27,12 @@ MAX_BYTES = 1 << 26
 _CHUNK = 1 << 20
 
 
-@dataclass(frozen=True)
-class _Content:
+class _Content(BaseModel):
     """Content of the file. Names are relative to the folder, with slashes."""
 
-    files: dict[str, str | None] = field(default_factory=dict)  # digests; None: being written
-    paths: dict[str, str] = field(default_factory=dict)  # relative, by key of a configuration
+    model_config = ConfigDict(strict=True, extra="forbid")
+    files: dict[str, str | None] = {}  # digests; None: being written
+    paths: dict[str, str] = {}  # relative, by key of a configuration
 
 
 class FolderRecord:
@@ -110,41 +111,31 @@ class FolderRecord:
 
     def _write(self, content: _Content) -> None:
         with atomic_path(self.path) as temporary:
-            temporary.write_text(json.dumps(asdict(content), indent=1) + "\n", encoding="utf-8")
+            temporary.write_text(
+                json.dumps(content.model_dump(), indent=1) + "\n", encoding="utf-8"
+            )
         self.exists, self._content = True, content
 
 
 def digest(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, as text; :class:`UserError` where it cannot be read."""
     found = hashlib.sha256()
-    try:
-        with open_regular(path) as file:
-            while chunk := file.read(_CHUNK):
-                found.update(chunk)
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the file: {error.strerror or error}") from None
+    with open_regular(path) as file:
+        while chunk := file.read(_CHUNK):
+            found.update(chunk)
     return found.hexdigest()
 
 
 def _read(path: Path) -> _Content:
     try:
-        content = _Content(**json.loads(read_text(path, "record", MAX_BYTES)))
-        texts = [*content.files, *filter(None, content.files.values()), *content.paths.values()]
-        if not all(isinstance(text, str) for text in texts):
-            raise TypeError
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
-        if isinstance(error, UserError):  # which is a ValueError
-            raise
+        return _Content.model_validate(json.loads(read_text(path, "record", MAX_BYTES)))
+    except UserError:
+        raise
+    except (ValueError, RecursionError):
         raise UserError(
             f"{path}: must be the record of the files that were written here, as the command left "
             "it; remove it if those files are no longer needed, or choose another folder"
         ) from None
-    return content
-
-
-# ----------------------------------------------------------------------------------------------
-# One writer
-# ----------------------------------------------------------------------------------------------
 
 
 @contextmanager

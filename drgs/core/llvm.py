@@ -81,7 +81,7 @@ def check_llvm_variants() -> None:
 
 
 def loaded_version() -> Version | None:
-    """Version of the libLLVM in use, such as (19, 1, 7); None if Dr.Jit has none.
+    """Return the version of the libLLVM in use, such as (19, 1, 7); None if Dr.Jit has none.
 
     Waits for Dr.Jit's start-up, which a thread of its own performs.
     """
@@ -92,7 +92,7 @@ def loaded_version() -> Version | None:
 
 
 def installed_libraries() -> list[tuple[Version, str]]:
-    """(version, path) of every libLLVM in the usual places, the newest first.
+    """Return (version, path) of every libLLVM in the usual places, the newest first.
 
     Versions are read from file names: loading the libraries to ask them would be slow, and two
     of them in one process get in each other's way.
@@ -107,7 +107,7 @@ def installed_libraries() -> list[tuple[Version, str]]:
 
 
 def version_from_name(path: str | Path) -> Version | None:
-    """Version of a libLLVM from its file name, or from its folder if the name has none.
+    """Return the version of a libLLVM from its file name, or from its folder if the name has none.
 
     ``libLLVM-14.so.1`` is (14,), ``libLLVM.so.19.1`` (19, 1), ``llvm/22.1.8/lib/libLLVM.dylib``
     (22, 1, 8). None for any other file (``libLLVMSPIRVLib.so.19``, ``libLLVM-14.a``).
@@ -137,9 +137,8 @@ class _VariantCheck:
 
 
 def _library_folders() -> list[str]:
-    """Where libLLVM may lie: only folders for this machine's architecture and word size."""
-    folders = [f for f in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if f]
-    folders += [
+    return [
+        *filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)),
         os.path.join(sys.prefix, "lib"),  # conda environments
         f"/usr/lib/{platform.machine()}-linux-gnu",
         "/usr/lib64",
@@ -149,40 +148,26 @@ def _library_folders() -> list[str]:
         *glob("/opt/homebrew/Cellar/llvm*/*/lib"),
         *glob("/usr/local/Cellar/llvm*/*/lib"),
     ]
-    return folders
 
 
 def _refusal(version: Version | None) -> str:
+    found = "none that Dr.Jit can load" if version is None else _dotted(version)
+    if version is None and (named := os.environ.get(PATH_VARIABLE)):
+        found += f" ({PATH_VARIABLE}={named})"
     message = (
-        f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed ({TESTED_VERSION} is tested), "
-        f"found {_describe_found(version)}. Install one with '{_install_command()}', or name its "
-        f"file in the environment variable {PATH_VARIABLE}"
+        f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed ({TESTED_VERSION} is tested), found "
+        f"{found}. Install one with '{_install_command()}', or name its file in the environment "
+        f"variable {PATH_VARIABLE}"
     )
-    usable = [path for found, path in installed_libraries() if found[0] >= MINIMUM_VERSION]
+    usable = [path for version, path in installed_libraries() if version[0] >= MINIMUM_VERSION]
     if usable:
         message += f"; here {PATH_VARIABLE}={usable[0]} would do"
-        if not os.environ.get(PATH_VARIABLE):
-            message += ", and so would importing drgs before mitsuba and drjit"
     return message + "."
 
 
-def _describe_found(version: Version | None) -> str:
-    named = os.environ.get(PATH_VARIABLE)
-    if version is not None:
-        return _dotted(version)
-    if named and not os.path.isfile(named):
-        return f"none ({PATH_VARIABLE}={named} is not a file)"
-    candidates = [(version_from_name(named), named)] if named else installed_libraries()
-    for guess, path in candidates[:1]:
-        if guess is not None:
-            return f"{_dotted(guess)} ({path})"
-    return f"none ({PATH_VARIABLE}={named} cannot be used)" if named else "none"
-
-
 def _install_command() -> str:
-    if sys.platform == "darwin":
-        return "brew install llvm"
-    return f"apt-get install libllvm{TESTED_VERSION}"
+    is_mac = sys.platform == "darwin"
+    return "brew install llvm" if is_mac else f"apt-get install libllvm{TESTED_VERSION}"
 
 
 def _dotted(version: Version) -> str:

@@ -77,10 +77,10 @@ def resident_memory() -> int:
 
 def readable(count: float) -> str:
     """A number of bytes as messages write it: ``3.2 GB``."""
-    for unit, size in (("GB", 1e9), ("MB", 1e6)):
-        if count >= 0.9995 * size:
-            return f"{_three_digits(count / size)} {unit}"
-    return f"{count / 1e3:.0f} kB"
+    unit, size = next(
+        ((u, s) for u, s in (("GB", 1e9), ("MB", 1e6)) if count >= 0.9995 * s), ("kB", 1e3)
+    )
+    return f"{float(f'{count / size:.3g}'):,g} {unit}"
 
 
 def require_memory(path: str | Path, needed: int, what: str) -> None:
@@ -88,14 +88,25 @@ def require_memory(path: str | Path, needed: int, what: str) -> None:
 
     Called before they are allocated.
     """
-    if needed <= UNASKED_FILE_BYTES or needed <= available_memory():
-        return
-    _flush_cache_of_drjit()
-    if needed > (available := available_memory()):
+    available = _if_insufficient(needed, UNASKED_FILE_BYTES)
+    if available is not None:
         raise UserError(
             f"{path}: {what} takes about {readable(needed)} of memory, of which "
             f"{readable(available)} are available; {FREE_MEMORY}"
         )
+
+
+def _if_insufficient(needed: int, unasked: int) -> int | None:
+    """Return the available bytes if they are fewer than ``needed``; None: there are enough.
+
+    unasked: bytes that are granted without asking. Memory that Dr.Jit holds for its next arrays
+    counts as available.
+    """
+    if needed <= unasked or needed <= available_memory():
+        return None
+    _flush_cache_of_drjit()
+    available = available_memory()
+    return available if needed > available else None
 
 
 def why_out_of_memory(error: BaseException) -> str | None:
@@ -113,31 +124,25 @@ def why_out_of_memory(error: BaseException) -> str | None:
 
 
 def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) -> str | None:
-    """Why a picture of ``width`` x ``height`` px cannot be rendered here; None: it can.
+    """Return why a picture of ``width`` x ``height`` px cannot be rendered here; None: it can.
 
     channels: of the film, without alpha; samples: per pixel, times those of an open shutter.
-    The text says what is asked for, what there is, and how much would do; the caller says where.
     """
-    asked = f"{_digits(width)} x {_digits(height)} px" + (
-        f" with {samples:,} samples each" if samples > 1 else ""
-    )
+    asked = f"{width} x {height} px" + (f" with {samples:,} samples each" if samples > 1 else "")
     pixels, widest = width * height, max(channels + 1, samples)
     if pixels * widest > MAX_LANES:
         return (
             f"{asked} are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
-            f"{_pixels(MAX_LANES // widest)}"
+            f"{MAX_LANES // widest:,} pixels fit"
         )
     of_channels = CHANNEL_BYTES * (channels - 3)
     of_pixel = PICTURE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
-    needed = pixels * of_pixel
-    if needed <= UNASKED_BYTES or needed <= available_memory():
-        return None
-    _flush_cache_of_drjit()
-    if needed <= (available := available_memory()):
+    available = _if_insufficient(pixels * of_pixel, UNASKED_BYTES)
+    if available is None:
         return None
     return (
-        f"{asked} need about {readable(needed)} of memory, of which {readable(available)} are "
-        f"available; at most {_pixels(available // of_pixel)}"
+        f"{asked} need about {readable(pixels * of_pixel)} of memory, of which "
+        f"{readable(available)} are available; at most {available // of_pixel:,} pixels fit"
     )
 
 
@@ -147,29 +152,7 @@ def _flush_cache_of_drjit() -> None:
         drjit.flush_malloc_cache()
 
 
-def _digits(number: int) -> str:
-    return str(number) if number < 10**12 else f"{number:.3g}"
-
-
-def _pixels(count: int) -> str:
-    return (
-        f"{_three_digits(count)} pixels fit"
-        if count < 1e6
-        else (f"{_three_digits(count / 1e6)} million pixels fit")
-    )
-
-
-def _three_digits(number: float) -> str:
-    return f"{float(f'{number:.3g}'):,g}"
-
-
-# ----------------------------------------------------------------------------------------------
-# What limits memory
-# ----------------------------------------------------------------------------------------------
-
-
 def _of_process() -> int:
-    """Bytes that ``ulimit -v`` leaves."""
     process = psutil.Process()
     if not hasattr(psutil, "RLIMIT_AS"):  # not Linux
         return _UNLIMITED

@@ -96,7 +96,6 @@ def leave_out_avx512() -> None:
 
 
 def _of_llvm_backend(name: str, result: Any) -> Any:
-    """A C++ function of drjit-core, by its mangled name."""
     library = next(iter(sorted(Path(dr.__file__).parent.glob("libdrjit-core.*"))), None)
     if library is None:
         raise OSError("no library of drjit-core")

@@ -122,10 +122,23 @@ class Registry(Generic[T]):
 
         return decorate
 
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is an extension of this name; installed packages are asked last."""
+        return name in self._shipped or name in self._extensions or name in self.names()
+
+    @property
+    def shipped(self) -> list[str]:
+        """The names of the extensions that drgs ships, in their order."""
+        return list(self._shipped)
+
+    def installed(self) -> list[Extension[T]]:
+        """Return the extensions that drgs does not ship, by name."""
+        _load_installed()
+        return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
+
     def names(self) -> list[str]:
-        """Return the names of all extensions, those of installed packages included, sorted."""
-        load_installed()
-        return sorted({*self._shipped, *self._extensions})
+        """Return the names of all extensions, shipped ones first."""
+        return [*self._shipped, *(extension.name for extension in self.installed())]
 
     def get(self, name: str, place: str = "") -> Extension[T]:
         """Return the extension of this name, importing what defines it.
@@ -136,9 +149,7 @@ class Registry(Generic[T]):
         """
         if name not in self._extensions and name in self._shipped:
             import_module(self._shipped[name])
-        if name not in self._extensions:
-            load_installed()
-        if name not in self._extensions:
+        if name not in self:
             known = self.names()
             start = f"{place}: " if place else ""
             raise UserError(
@@ -147,15 +158,21 @@ class Registry(Generic[T]):
             )
         return self._extensions[name]
 
-    def installed(self) -> list[Extension[T]]:
-        """Return the extensions that drgs does not ship, by name."""
-        load_installed()
-        return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
 
-    @property
-    def shipped(self) -> list[str]:
-        """The names of the extensions that drgs ships, in their order."""
-        return list(self._shipped)
+class ClassRegistry(Registry[Any]):
+    """A registry of classes, each of which has its name as the attribute ``kind``."""
+
+    def register(
+        self, name: str, section: type[BaseModel] | None = None
+    ) -> Callable[[Registered], Registered]:
+        """Return a decorator that registers a class under ``name``; see :class:`Registry`."""
+        decorate = super().register(name, section)
+
+        def register_class(cls: Registered) -> Registered:
+            cls.kind = name
+            return decorate(cls)
+
+        return register_class
 
 
 _registries: list[Registry] = []
@@ -194,7 +211,7 @@ _loaded: set[str] = set()
 """Entry points whose modules have been imported: they register at import, once."""
 
 
-def load_installed() -> None:
+def _load_installed() -> None:
     """Import the modules of the entry points of the group ``drgs``.
 
     Raises :class:`ExtensionError` naming the entry point if one cannot be imported.
@@ -205,9 +222,9 @@ def load_installed() -> None:
             _loaded.add(point.value)
 
 
-def _load(point: EntryPoint) -> Any:
+def _load(point: EntryPoint) -> None:
     try:
-        return point.load()
+        point.load()
     except Exception as error:
         package = "" if point.dist is None else f" of the package {point.dist.name}"
         cause = one_line(f"{type(error).__name__}: {error}")

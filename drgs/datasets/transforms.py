@@ -23,7 +23,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, Valid
 from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
-from drgs.config.explain import expectation
+from drgs.config.section import expectation
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened

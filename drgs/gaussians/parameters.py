@@ -21,6 +21,7 @@ from drgs.core.arrays import from_host
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, shown_origin
+from drgs.core.registry import HOW_TO_INSTALL
 
 PARAMETER_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -75,12 +76,12 @@ class Gaussians:
         Raises ``drgs.core.errors.UserError`` (a ValueError) for another suffix, or where the format
         cannot hold them.
         """
-        from drgs.io.formats import OTHER_FORMATS, file_formats, format_for
+        from drgs.io.formats import file_formats, format_for
 
         chosen = format_for(path)
         if chosen is None:
             suffixes = ", ".join(each.value.suffix for each in file_formats())
-            raise UserError(f"{path}: the name must end in one of {suffixes}; {OTHER_FORMATS}")
+            raise UserError(f"{path}: the name must end in one of {suffixes}; {HOW_TO_INSTALL}")
         content = self.to_bytes(chosen.name)
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)
@@ -126,25 +127,30 @@ class Gaussians:
         means, quats, scales, opacities, sh = (
             np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)
         )
-        where = "Gaussians.from_numpy(): "
-        if means.shape[1:] != (3,):
-            raise ValueError(f"{where}means must be of shape (N, 3), got {means.shape}")
-        num = len(means)
+        num = len(np.atleast_1d(means))
         coefficients = [(degree + 1) ** 2 for degree in range(4)]
-        for name, values, shapes in (
-            ("quats", quats, [(num, 4)]),
-            ("scales", scales, [(num, 3)]),
-            ("opacities", opacities, [(num,)]),
-            ("sh", sh, [(num, count, 3) for count in coefficients]),
+        is_open = (opacities > 0) & (opacities < 1)
+        for name, holds, expected, got in (
+            ("means", means.shape == (num, 3), "of shape (N, 3)", means.shape),
+            ("quats", quats.shape == (num, 4), f"of shape {(num, 4)}", quats.shape),
+            ("scales", scales.shape == (num, 3), f"of shape {(num, 3)}", scales.shape),
+            ("opacities", opacities.shape == (num,), f"of shape {(num,)}", opacities.shape),
+            (
+                "sh",
+                sh.shape in [(num, count, 3) for count in coefficients],
+                " or ".join(f"of shape {(num, count, 3)}" for count in coefficients),
+                sh.shape,
+            ),
+            ("scales", (scales > 0).all(), "positive", scales.min(initial=np.inf)),
+            (
+                "opacities",
+                is_open.all(),
+                "between 0 and 1",
+                opacities[~is_open].max(initial=-np.inf),
+            ),
         ):
-            if values.shape not in shapes:
-                expected = " or ".join(str(shape) for shape in shapes)
-                raise ValueError(f"{where}{name} must be of shape {expected}, got {values.shape}")
-        if not (scales > 0).all():
-            raise ValueError(f"{where}scales must be positive, got {scales.min()}")
-        if not ((opacities > 0) & (opacities < 1)).all():
-            wrong = opacities[~((opacities > 0) & (opacities < 1))][0]
-            raise ValueError(f"{where}opacities must be between 0 and 1, got {wrong}")
+            if not holds:
+                raise ValueError(f"Gaussians.from_numpy(): {name} must be {expected}, got {got}")
         return Gaussians(
             means=means,
             quats=quats,
@@ -200,8 +206,7 @@ class Gaussians:
         return replace(self, **tensors, features=features)
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
-        """Numpy arrays turned as a whole; float32."""
-        from drgs.gaussians.rotation import rotate_gaussians, to_float32
+        from drgs.gaussians.similarity import rotate_gaussians, to_float32
 
         parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)
         names = ("means", "quats", "shN")

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from drgs.core.denormals import denormals_kept
+from drgs.core.environment import denormals_kept
 from drgs.datasets.types import View
 from drgs.initialization.film import is_projectable, to_camera, to_film
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.constants import SH_C0
-from drgs.core.denormals import denormals_kept
+from drgs.core.environment import denormals_kept
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians

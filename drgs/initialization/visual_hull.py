@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from drgs.core.denormals import denormals_kept
+from drgs.core.environment import denormals_kept
 from drgs.datasets.types import View
 from drgs.initialization.film import Columns, is_projectable, to_camera, to_film
 from drgs.initialization.start_box import Box

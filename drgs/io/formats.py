@@ -12,17 +12,15 @@ so that a format need not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
 from drgs.core.origin import WORLD, Origin
-from drgs.core.registry import ENTRY_POINT_GROUP, Extension, ExtensionError, Registry
+from drgs.core.registry import Extension, ExtensionError, Registry
 
 Scalar = bool | int | float | str
 
@@ -92,7 +90,8 @@ class FileFormat:
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         """Return the content of a file; equal Gaussians give equal bytes.
 
-        gaussians: in the axes of the file; rendered_with: only what :attr:`metadata` names.
+        gaussians: in the axes of the file, finite unless :attr:`allows_nonfinite`; rendered_with:
+        only what :attr:`metadata` names.
         """
         raise UserError("files of this format can be read, but not written")
 
@@ -121,14 +120,9 @@ FORMATS: Registry[type[FileFormat]] = Registry(
     },
 )
 
-OTHER_FORMATS = (
-    f'other formats come with packages that have an entry point of the group "{ENTRY_POINT_GROUP}"'
-)
-"""Remedy in messages."""
-
 
 def file_formats() -> list[Extension[type[FileFormat]]]:
-    """Return all formats, by name."""
+    """Return all formats."""
     return [FORMATS.get(name) for name in FORMATS.names()]
 
 
@@ -137,15 +131,20 @@ def readable_formats() -> list[Extension[type[FileFormat]]]:
     return [each for each in file_formats() if each.value.read is not FileFormat.read]
 
 
+def _shipped_formats() -> list[Extension[type[FileFormat]]]:
+    return [FORMATS.get(name) for name in FORMATS.shipped]
+
+
 def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
     """Return the format with the longest suffix that a file's name ends in; None: there is none.
 
-    Of several with one suffix, it is the one that drgs ships.
+    Installed packages are imported only where no format that drgs ships has such a suffix.
     """
-    name, installed = Path(path).name.lower(), FORMATS.installed()
-    found = [each for each in file_formats() if name.endswith(each.value.suffix)]
-    order = {each.name: (len(each.value.suffix), each not in installed) for each in found}
-    return max(found, key=lambda each: order[each.name], default=None)
+    for formats in (_shipped_formats, FORMATS.installed):
+        found = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
+        if found:
+            return max(found, key=lambda each: len(each.value.suffix))
+    return None
 
 
 def read_gaussians(
@@ -153,27 +152,28 @@ def read_gaussians(
 ) -> tuple[Extension[type[FileFormat]], dict[str, np.ndarray], dict[str, Scalar]]:
     """Return a file's format, its Gaussians in the axes of the file, and their ``rendered_with``.
 
-    A file with an unknown suffix is read as PLY. Where formats share the last part of a suffix, the
-    content decides.
+    A file with an unknown suffix is read as PLY. Where shipped formats share the last part of a
+    suffix, the content decides.
 
     Raises :class:`UserError` naming the file, the place and what is wrong there.
     """
     open_regular(path).close()
     named = format_for(path) or FORMATS.get("ply")
     last = "." + named.value.suffix.rpartition(".")[2]
-    others = [each for each in file_formats() if each.value.suffix.endswith(last)]
+    others = [each for each in _shipped_formats() if each.value.suffix.endswith(last)]
     for extension in (named, *(each for each in others if each is not named)):
-        with _reporting(extension, path):
-            if not extension.value().recognizes(Path(path)):
-                continue
-            arrays, rendered_with = extension.value().read(Path(path))
-            return extension, _checked(path, arrays), dict(rendered_with)
+        try:
+            with extension.reporting():
+                if not extension.value().recognizes(Path(path)):
+                    continue
+                arrays, rendered_with = extension.value().read(Path(path))
+                return extension, _checked(path, arrays), dict(rendered_with)
+        except ExtensionError as error:
+            raise ExtensionError(f"{path}: {error}") from error.__cause__
     raise UserError(f"{path}: not a {named.name} file")
 
 
-def encode(
-    name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar] | None = None
-) -> bytes:
+def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     """Return the content of a file in the format ``name``; what it cannot hold is left out.
 
     gaussians, rendered_with: as for :meth:`FileFormat.encode`.
@@ -190,19 +190,9 @@ def encode(
         if not len(gaussians["means"]):
             raise UserError(f"the format {name} needs at least one Gaussian, got none")
         _check_finite(gaussians, f"the format {name} holds finite numbers: ")
-    kept = {k: v for k, v in (rendered_with or {}).items() if extension.value.holds(k)}
+    kept = {k: v for k, v in rendered_with.items() if extension.value.holds(k)}
     with extension.reporting():
         return extension.value().encode(gaussians, kept)
-
-
-@contextmanager
-def _reporting(extension: Extension[Any], path: str | Path) -> Iterator[None]:
-    """Raise errors of the block with the name of the extension and that of the file."""
-    try:
-        with extension.reporting():
-            yield
-    except ExtensionError as error:
-        raise ExtensionError(f"{path}: {error}") from error.__cause__
 
 
 def _checked(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
@@ -215,7 +205,8 @@ def _checked(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
         if not num or np.shape(values) not in expected:
             listed = " or ".join(map(str, SHAPES[name]))
             raise ValueError(f"{name}: {listed} per Gaussian expected, got {np.shape(values)}")
-    found = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
+    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused below
+        found = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
     _check_finite(found, f"{path}: numbers must be finite: ")
     return found
 

@@ -6,8 +6,12 @@ Arrays are of numpy, a row per Gaussian.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
+
+from drgs.core.constants import SH_C0
+from drgs.core.memory import require_memory
 
 LARGEST_LOGIT = 23 * math.log(2)
 """Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
@@ -22,13 +26,14 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the other three components, by the index of one of four."""
 
 
-def decoding_bytes(count: int, harmonics: int, turned: bool = False) -> int:
-    """Return about the bytes of memory that decoding so many Gaussians takes.
+def require_scene_memory(path: Path, count: int, harmonics: int, turned: bool = False) -> None:
+    """Raise :class:`UserError` unless there is the memory to decode so many Gaussians.
 
     harmonics: coefficients of each; turned: whether a format's axes are turned to ours afterwards.
     Measured: 276 bytes at degree 0, 808 at degree 3, and 1,372 where they are turned.
     """
-    return count * (240 + (72 if turned else 36) * harmonics)
+    needed = count * (240 + (72 if turned else 36) * harmonics)
+    require_memory(path, needed, f"a scene of {count:,} Gaussians")
 
 
 def round_to_uint32(values: np.ndarray, largest: int) -> np.ndarray:
@@ -56,6 +61,16 @@ def log_scales_from_scales(scales: np.ndarray) -> np.ndarray:
     return np.maximum(logarithms, SMALLEST_LOG_SCALE).astype(np.float32)
 
 
+def colors_from_sh0(sh0: np.ndarray) -> np.ndarray:
+    """Return base colours (N, 3) float64, display space, of coefficients (N, 1, 3)."""
+    return 0.5 + SH_C0 * sh0[:, 0].astype(np.float64)
+
+
+def sh0_from_colors(colors: np.ndarray) -> np.ndarray:
+    """Return coefficients (N, 1, 3) of base colours (N, 3), display space."""
+    return ((colors - 0.5) / SH_C0)[:, None, :]
+
+
 def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
     """Return quaternions (N, 4) float64 of length 1; one of length 0 is the identity.
 
@@ -70,8 +85,7 @@ def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
 def drop_largest_component(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the index (N,) of the largest component, and the other three (N, 3), in their order.
 
-    The sign, which a rotation leaves open, is the one that makes the largest positive. quats:
-    (N, 4) of length 1.
+    quats: (N, 4) of length 1; the sign is chosen such that the largest is positive.
     """
     rows = np.arange(len(quats))
     index = np.argmax(np.abs(quats), axis=1)
@@ -86,11 +100,6 @@ def restore_largest_component(index: np.ndarray, others: np.ndarray) -> np.ndarr
     quats[rows[:, None], _OTHERS[index]] = others
     quats[rows, index] = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
     return quats
-
-
-# ----------------------------------------------------------------------------------------------
-# Order
-# ----------------------------------------------------------------------------------------------
 
 
 MORTON_BITS = 21

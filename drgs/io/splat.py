@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
-from drgs.core.memory import require_memory
-from drgs.io.formats import FORMATS, FileFormat, Scalar
+from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
 from drgs.io.quantization import (
-    decoding_bytes,
+    colors_from_sh0,
     log_scales_from_scales,
     logits_from_opacities,
     normalize_quaternions,
     opacities_from_logits,
+    require_scene_memory,
     round_to_uint32,
+    sh0_from_colors,
 )
 
 MAX_BYTES = 1 << 33
@@ -37,17 +37,11 @@ which a file of another kind could be told."""
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def encode(
-    gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
-) -> bytes:
-    """A file of Gaussians. Equal ones give equal bytes.
-
-    gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives; harmonics above
-    degree 0 are left out. rendered_with: has no place.
+def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+    """Return a file of Gaussians; harmonics above degree 0 are left out.
 
     Raises :class:`UserError` for positions of more than :data:`MAX_NUMBER`.
     """
-    del rendered_with
     g = gaussians
     if (extent := np.abs(g["means"]).max()) > MAX_NUMBER:
         raise UserError(
@@ -60,21 +54,19 @@ def encode(
     rows = np.empty(len(opacities), ROW)
     rows["mean"] = g["means"]
     rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
-    colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
-    rows["rgba"] = round_to_uint32(np.column_stack([colors, opacities]) * 255, 255)
+    rgba = np.column_stack([colors_from_sh0(g["sh0"]), opacities])
+    rows["rgba"] = round_to_uint32(rgba * 255, 255)
     rows["quat"] = round_to_uint32(normalize_quaternions(g["quats"]) * 128 + 128, 255)
     return rows[np.argsort(-importance, kind="stable")].tobytes()
 
 
-def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Gaussians of degree 0 as numpy float32 arrays, and an empty dictionary.
+def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    """Return Gaussians of degree 0 (:data:`drgs.io.formats.Arrays`), and an empty dictionary.
 
-    As :func:`drgs.io.ply.read_gaussians` gives them; opacities of 0 and 1, and scales of 0, are the
-    next ones that their logits and logarithms tell apart.
+    Opacities of 0 and 1, and scales of 0, become the next ones that have logits and logarithms.
 
     Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
     """
-    path = Path(path)
     content = read_bytes(path, "file", MAX_BYTES)
     if not content or len(content) % ROW.itemsize:
         raise UserError(
@@ -82,7 +74,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             "each Gaussian, at least one; it is damaged, or was cut off"
         )
     rows = np.frombuffer(content, ROW)
-    require_memory(path, decoding_bytes(len(rows), 1), f"a scene of {len(rows):,} Gaussians")
+    require_scene_memory(path, len(rows), 1)
     for name, least in (("mean", -MAX_NUMBER), ("scale", 0)):
         values = rows[name]
         bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
@@ -93,16 +85,15 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
                 f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, "
                 f"got {values[row, axis]}; is it a .splat file?"
             )
-    colors = rows["rgba"][:, :3] / 255
     arrays = {
         "means": rows["mean"],
         "quats": rows["quat"].astype(np.float64) / 128 - 1,
         "log_scales": log_scales_from_scales(rows["scale"]),
         "logit_opacities": logits_from_opacities(rows["rgba"][:, 3] / 255),
-        "sh0": ((colors - 0.5) / SH_C0)[:, None, :],
+        "sh0": sh0_from_colors(rows["rgba"][:, :3] / 255),
         "shN": np.zeros((len(rows), 0, 3)),
     }
-    return {name: values.astype(np.float32) for name, values in arrays.items()}, {}
+    return arrays, {}
 
 
 @FORMATS.register("splat")

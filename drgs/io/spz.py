@@ -1,7 +1,7 @@
 """SPZ files of Niantic: 20 bytes per Gaussian, and 45 for harmonics of degree 3, then compressed.
 
-Source of the layout: the README of nianticlabs/spz and its reference implementation. Behind a
-header stand the numbers of all Gaussians, attribute by attribute:
+Source of the layout: the README of nianticlabs/spz and its reference implementation. After a
+header come the numbers of all Gaussians, attribute by attribute:
 
 - positions: x, y, z as signed whole numbers of 24 bits, in steps that the header gives as 2^-bits;
 - opacities: 8 bits;
@@ -16,7 +16,7 @@ What is out of range is cut off. Versions 2 and 3 are one gzip stream. Version 4
 clear and a Zstandard stream for each attribute, which the extra ``spz`` reads. Version 3 is
 written: every program reads it. The axes are right, up and back: y is up.
 
-A flag says that Gaussians were fitted with compensated opacities, ``antialiased``.
+A flag marks Gaussians that were fitted with compensated opacities, ``antialiased``.
 """
 
 from __future__ import annotations
@@ -35,14 +35,13 @@ import numpy as np
 from drgs.core.environment import required
 from drgs.core.errors import Place, UserError, UserNote, one_line
 from drgs.core.files import read_bytes
-from drgs.core.memory import require_memory
-from drgs.io.formats import FORMATS, FileFormat, Scalar
+from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
 from drgs.io.quantization import (
-    decoding_bytes,
     drop_largest_component,
     logits_from_opacities,
     normalize_quaternions,
     opacities_from_logits,
+    require_scene_memory,
     restore_largest_component,
     round_to_uint32,
 )
@@ -78,29 +77,12 @@ implementation's are twice as wide: on ``scenes/lego_mini.yml``, they save 17 % 
 GZIP_LEVEL = 6
 """The reference implementation's: the highest takes nine times as long for 3 % less."""
 
-MAX_RATIO = 64
-"""How many times larger the numbers may be than the file: those of fits compress 2 times, a grid of
-216,000 equal Gaussians 35 times, and zeros 1,000 times."""
-
-MAX_EXTENSIONS = 1 << 24
-"""Bytes that are passed over."""
-
 XYZW = np.array([1, 2, 3, 0])
 """Columns of a quaternion wxyz."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Writing
-# ----------------------------------------------------------------------------------------------
-
-
-def encode(
-    gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
-) -> bytes:
-    """A file of Gaussians, version 3. Equal Gaussians give equal bytes.
-
-    gaussians: finite, by the names that :func:`drgs.io.ply.read_gaussians` gives, in axes with y
-    up; rendered_with: only ``antialiased`` has a place.
+def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+    """Return a file of Gaussians, version 3.
 
     Raises :class:`UserError` for positions of more than 2^23, or where most Gaussians are smaller
     or larger than scales can be here; a :class:`UserNote` tells where some are.
@@ -109,7 +91,7 @@ def encode(
     _check_scales(g["log_scales"])
     num, degree = len(g["means"]), round(np.sqrt(g["shN"].shape[1] + 1)) - 1
     bits = _fractional_bits(g["means"])
-    flags = ANTIALIASED if (rendered_with or {}).get("antialiased") else 0
+    flags = ANTIALIASED if rendered_with.get("antialiased") else 0
     parts = (
         _packed_positions(g["means"], bits),
         round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255),
@@ -179,11 +161,6 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
     return rounded_levels
 
 
-# ----------------------------------------------------------------------------------------------
-# Reading
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Header:
     """Content of the header, before the numbers."""
@@ -202,15 +179,14 @@ class _Header:
         return tuple(self.num * size for size in (9, 1, 3, 3, rotation, harmonics))
 
 
-def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Gaussians as numpy float32 arrays with y up, and whether they are ``antialiased``.
+def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+    """Return Gaussians (:data:`drgs.io.formats.Arrays`), y up, and whether ``antialiased``.
 
-    As :func:`drgs.io.ply.read_gaussians` gives them; opacities of 0 and 1 are the next ones that
-    sigmoids tell apart. Extensions of vendors are passed over, with a :class:`UserNote`.
+    Opacities of 0 and 1 become the next ones that sigmoids tell apart. Extensions of vendors are
+    passed over, with a :class:`UserNote`.
 
     Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
     """
-    path = Path(path)
     content = read_bytes(path, "file", MAX_BYTES)
     if content.startswith(GZIP_MAGIC):
         header, parts = _read_gzip(path, content)
@@ -222,16 +198,11 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             "SPZ file"
         )
     if header.flags & EXTENSIONS:
-        note = "has extensions of a vendor, which are passed over; one may say other axes"
+        note = "has extensions of a vendor, which are passed over; one may mean other axes"
         warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
-    said = {"antialiased": True} if header.flags & ANTIALIASED else {}
-    return _decoded(header, parts), said
-
-
-def _decoded(header: _Header, parts: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays; parts: bytes of each attribute."""
     positions, opacities, colors, scales, rotations, harmonics = (
-        part.reshape(header.num, -1) for part in parts
+        np.frombuffer(part, "u1").reshape(header.num, -1) if part else np.zeros((header.num, 0))
+        for part in parts
     )
     arrays = {
         "means": _unpacked_positions(positions) / 2.0**header.fractional_bits,
@@ -241,7 +212,7 @@ def _decoded(header: _Header, parts: list[np.ndarray]) -> dict[str, np.ndarray]:
         "sh0": ((colors / 255 - 0.5) / COLOR_SCALE)[:, None, :],
         "shN": (harmonics.astype(np.float32).reshape(header.num, -1, 3) - 128) / 128,
     }
-    return {name: values.astype(np.float32) for name, values in arrays.items()}
+    return arrays, {"antialiased": True} if header.flags & ANTIALIASED else {}
 
 
 def _unpacked_positions(rows: np.ndarray) -> np.ndarray:
@@ -266,114 +237,81 @@ def _unpacked_rotations(rows: np.ndarray, version: int) -> np.ndarray:
 
 
 def _checked_header(path: Path, fields: tuple, versions: tuple[int, ...]) -> _Header:
-    magic, version, num, degree, bits, flags = fields[:6]
+    """Check the header's numbers, and that there is memory for what it promises."""
+    magic, version, num, degree, bits, flags = fields
     place = Place(path, "byte", 0)
     if magic != MAGIC:
         raise UserError(f"{place}: the header must begin with {MAGIC.decode()}, got {magic!r}")
-    if version not in versions:
-        known = " or ".join(map(str, versions))
-        raise UserError(f"{place}: the version must be {known} in such a stream, got {version}")
     for name, value, least, most in (
+        ("the version", version, versions[0], versions[-1]),
         ("the number of Gaussians", num, 1, 2**32 - 1),
         ("the degree of harmonics", degree, 0, 3),
-        ("the bits behind the point of positions", bits, 0, POSITION_BITS),
+        ("the number of fractional bits of positions", bits, 0, POSITION_BITS),
     ):
         if not least <= value <= most:
-            raise UserError(f"{place}: {name} must be from {least} to {most:,}, got {value:,}")
+            raise UserError(f"{place}: {name} must be from {least} to {most}, got {value}")
+    require_scene_memory(path, num, (degree + 1) ** 2, turned=True)
     return _Header(version, num, degree, bits, flags)
 
 
-def _check_room(path: Path, header: _Header, size: int) -> None:
-    """Refuse what the header promises before memory is allocated for it."""
-    unpacked = sum(header.sizes)
-    if unpacked > MAX_RATIO * size:
-        raise UserError(
-            f"{Place(path, 'byte', 0)}: {header.num:,} Gaussians were expected, {unpacked:,} bytes "
-            f"when unpacked, for which a file of {size:,} bytes has no room: at most {MAX_RATIO} "
-            "times as many; it is damaged, or was cut off"
-        )
-    needed = decoding_bytes(header.num, (header.degree + 1) ** 2, turned=True)
-    require_memory(path, needed, f"a scene of {header.num:,} Gaussians")
-
-
-def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:
-    """Read versions 2 and 3."""
+def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
     with gzip.open(io.BytesIO(content)) as stream:
-        header = _checked_header(path, HEADER.unpack(_take(path, stream, HEADER.size)), (2, 3))
-        _check_room(path, header, len(content))
-        body = _take(path, stream, sum(header.sizes))
-        most = MAX_EXTENSIONS if header.flags & EXTENSIONS else 0
-        _take(path, stream, 0, most)  # to the end, where the checksum is
-    return header, np.split(np.frombuffer(body, np.uint8), np.cumsum(header.sizes)[:-1])
+
+        def take(size: int, least: int) -> bytes:
+            place = f"{Place(path, 'byte', stream.tell())} of the unpacked stream"
+            try:
+                data = stream.read(size)
+            except (OSError, EOFError, zlib.error) as error:
+                raise UserError(f"{place}: the gzip stream is damaged: {one_line(error)}") from None
+            return _checked_size(place, data, least)
+
+        fields = HEADER.unpack(take(HEADER.size, HEADER.size))
+        header = _checked_header(path, fields[:6], (2, 3))
+        parts = [take(size, size) for size in header.sizes]
+        while take(1 << 16, 0):  # to the end, where the checksum is
+            if not header.flags & EXTENSIONS:
+                raise UserError(f"{path}: the end was expected after {header.num:,} Gaussians")
+    return header, parts
 
 
-def _take(path: Path, stream: gzip.GzipFile, size: int, end: int | None = None) -> bytes:
-    """Return the next ``size`` bytes; end: most bytes that may follow, None: any number."""
-    place = f"{Place(path, 'byte', stream.tell())} of the unpacked stream"
-    try:
-        data = stream.read(size if end is None else size + end + 1)
-    except (OSError, EOFError, zlib.error) as error:
-        raise UserError(f"{place}: the gzip stream is damaged: {one_line(error)}") from None
-    if len(data) < size:
+def _checked_size(place: object, data: bytes, expected: int) -> bytes:
+    if len(data) < expected:
         raise UserError(
-            f"{place}: {size:,} bytes were expected, and it ends after {len(data):,}; the file is "
-            "damaged, or was cut off"
+            f"{place}: {expected:,} bytes were expected, got {len(data):,}; the file is damaged, "
+            "or was cut off"
         )
-    if end is not None and len(data) > size + end:
-        raise UserError(f"{place}: the end was expected, and more follows")
     return data
 
 
-def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[np.ndarray]]:
-    """Version 4."""
-    if len(content) < HEADER_4.size:
-        raise UserError(
-            f"{Place(path, 'byte', len(content))}: a header of {HEADER_4.size} bytes was expected, "
-            "and the file ends; it was cut off"
-        )
+def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
+    _checked_size(Place(path, "byte", 0), content, HEADER_4.size)
     *fields, num_streams, table = HEADER_4.unpack_from(content)
     header = _checked_header(path, tuple(fields), (4,))
-    _check_room(path, header, len(content))
     sizes = [size for size in header.sizes if size]
-    if num_streams != len(sizes):
-        raise UserError(
-            f"{Place(path, 'byte', 15)}: {len(sizes)} streams were expected, got {num_streams}"
-        )
     start = table + num_streams * TABLE_ENTRY.size
-    if not HEADER_4.size <= table <= start <= len(content):
+    if num_streams != len(sizes) or not HEADER_4.size <= table <= start <= len(content):
         raise UserError(
-            f"{Place(path, 'byte', 16)}: the place of the table of streams must be within the "
-            f"file, got {table:,}"
+            f"{Place(path, 'byte', 15)}: a table of {len(sizes)} streams within the file was "
+            f"expected, got {num_streams} at byte {table:,}; the file is damaged, or was cut off"
         )
     parts = []
-    for index, expected in enumerate(sizes):
-        entry = table + index * TABLE_ENTRY.size
-        packed, unpacked = TABLE_ENTRY.unpack_from(content, entry)
-        if unpacked != expected or packed > len(content) - start:
-            raise UserError(
-                f"{Place(path, 'byte', entry)}: a stream of {expected:,} bytes within the file was "
-                f"expected, got {packed:,} bytes for {unpacked:,}"
-            )
-        parts.append(_unpacked_stream(path, start, content[start : start + packed], expected))
+    for index, size in enumerate(sizes):
+        packed, _ = TABLE_ENTRY.unpack_from(content, table + index * TABLE_ENTRY.size)
+        place = Place(path, "byte", start)
+        part = _checked_size(place, content[start : start + packed], packed)
+        parts.append(_unpacked_stream(place, part, size))
         start += packed
-    if start != len(content):
-        raise UserError(f"{Place(path, 'byte', start)}: the end of the file was expected")
-    return header, [*parts, *[np.zeros(0, np.uint8)] * (len(header.sizes) - len(parts))]
+    return header, parts + [b""] * (len(header.sizes) - len(parts))
 
 
-def _unpacked_stream(path: Path, start: int, packed: bytes, expected: int) -> np.ndarray:
-    zstandard = required("zstandard", "spz", f"{path}: an SPZ file of version 4")
-    place = Place(path, "byte", start)
+def _unpacked_stream(place: Place, packed: bytes, expected: int) -> bytes:
+    what = f"{place.path}: an SPZ file of version 4"
+    zstandard = required("zstandard", "spz", what)
     try:
-        claimed = zstandard.frame_content_size(packed)
-        if claimed not in (-1, expected):
-            raise UserError(f"{place}: {expected:,} bytes were expected, got {claimed:,}")
-        data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=expected)
+        stream = zstandard.ZstdDecompressor().stream_reader(packed)
+        return _checked_size(place, stream.read(expected), expected)
     except zstandard.ZstdError as error:
         raise UserError(f"{place}: the Zstandard stream is damaged: {error}") from None
-    if len(data) != expected:
-        raise UserError(f"{place}: {expected:,} bytes were expected, got {len(data):,}")
-    return np.frombuffer(data, np.uint8)
 
 
 @FORMATS.register("spz")

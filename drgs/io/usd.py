@@ -2,8 +2,8 @@
 
 The schema is that of OpenUSD's ``usdVol``, from version 26.03 on: positions, orientations (unit
 quaternions wxyz), linear scales, opacities after the sigmoid, and harmonics Gaussian by Gaussian in
-the order and with the signs of the 3DGS reference. The stage says that z is up, and that colours
-are in display space.
+the order and with the signs of the 3DGS reference. In the stage, z is up and colours are in display
+space.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from drgs.core.environment import required
 from drgs.core.errors import UserError
 from drgs.core.origin import WORLD
-from drgs.io.formats import FORMATS, ORIGIN, FileFormat, Scalar, pop_origin
+from drgs.io.formats import FORMATS, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
 from drgs.io.quantization import normalize_quaternions, opacities_from_logits
 
 PRIM = "/Gaussians"
@@ -29,13 +29,8 @@ EXTENT = 3.0
 """Standard deviations of a Gaussian that count for the extent."""
 
 
-def encode(
-    gaussians: Mapping[str, np.ndarray], rendered_with: Mapping[str, Scalar] | None = None
-) -> bytes:
-    """A binary USD file of Gaussians. Equal Gaussians give equal bytes.
-
-    gaussians: by the names that :func:`drgs.io.ply.read_gaussians` gives, with z up;
-    rendered_with: only the origin has a place, as the translation of the prim.
+def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+    """Return a binary USD file of Gaussians; the origin is the translation of the prim.
 
     Raises :class:`UserError` where OpenUSD is not installed or too old.
     """
@@ -50,18 +45,18 @@ def encode(
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, Sdf.Path(PRIM))
     stage.SetDefaultPrim(splats.GetPrim())
-    origin = pop_origin("rendered_with", dict(rendered_with or {}))
+    origin = pop_origin("rendered_with", dict(rendered_with))
     if origin != WORLD:
         UsdGeom.Xformable(splats).AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(origin)
     Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr(COLOR_SPACE)
     means = _float32(g["means"])
     scales = _float32(np.exp(np.minimum(g["log_scales"].astype(np.float64), 80)))
+    quats_xyzw = _float32(np.roll(normalize_quaternions(g["quats"]), -1, axis=1))
+    opacities = _float32(opacities_from_logits(g["logit_opacities"]))
     harmonics = np.concatenate([g["sh0"], g["shN"]], axis=1)
     splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(means))
-    orientations = Vt.QuatfArray.FromNumpy(_float32(_imaginary_first(g["quats"])))
-    splats.CreateOrientationsAttr(orientations)
+    splats.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(quats_xyzw))
     splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
-    opacities = _float32(opacities_from_logits(g["logit_opacities"]))
     splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities))
     splats.CreateRadianceSphericalHarmonicsDegreeAttr(round(np.sqrt(harmonics.shape[1])) - 1)
     coefficients = Vt.Vec3fArray.FromNumpy(_float32(harmonics.reshape(-1, 3)))
@@ -73,11 +68,6 @@ def encode(
         path = Path(folder) / "gaussians.usdc"
         stage.GetRootLayer().Export(str(path))
         return path.read_bytes()
-
-
-def _imaginary_first(quats: np.ndarray) -> np.ndarray:
-    """(N, 4) unit quaternions as OpenUSD keeps them in memory: xyzw."""
-    return np.roll(normalize_quaternions(quats), -1, axis=1)
 
 
 def _float32(values: object) -> np.ndarray:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
+from drgs.cli.ending import StopRequest
 from drgs.cli.execution import select_variant
-from drgs.cli.interrupts import StopRequest
 from drgs.cli.progress import RunProgress
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig

@@ -31,7 +31,7 @@ import numpy as np
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.timing import seconds, steps
 from drgs.config.changes import changed
-from drgs.core.denormals import denormals_flushed
+from drgs.core.environment import denormals_flushed
 from drgs.core.processes import ending_together, process_number
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians

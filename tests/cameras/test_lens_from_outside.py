@@ -16,7 +16,7 @@ from support.datasets import load, view_at
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import LENSES, Lens, Pinhole
 from drgs.core.errors import UserError
-from drgs.core.registry import ExtensionError
+from drgs.core.registry import ExtensionError, reporting_extensions
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.initialization.film import to_film
 from drgs.results.refined_cameras import cameras_json
@@ -170,7 +170,8 @@ def test_what_a_lens_raises_has_its_name():
         def project_point(self, camera, position):
             raise KeyError("focal")
 
-    with pytest.raises(ExtensionError, match=r'lens "broken" \(.*\): KeyError: .focal.'):
+    message = r'lens "broken" \(.*\): KeyError: .focal.'
+    with pytest.raises(ExtensionError, match=message), reporting_extensions():
         Broken().project_point(None, None)
     del LENSES._extensions["broken"]
 

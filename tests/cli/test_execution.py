@@ -151,7 +151,13 @@ def scene(tmp_path_factory):
     write_scene(
         folder,
         model={"sh_degree": 1, "sh_increase_every": 2, **USUAL},
-        densify={"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+        densify={
+            "start": 1,
+            "stop": 4,
+            "every": 2,
+            "strategy": "adc",
+            "adc": {"reset_every": 3, "grad_threshold": 1e-6},
+        },
         iterations=3,
         output={"checkpoint_every": 1},
     )

@@ -16,8 +16,7 @@ from PIL import Image
 from support.commands import run_in_process
 
 from drgs.cli.commands import at_least, file_or_folder, run_command
-from drgs.cli.interrupts import exit_on_interrupt
-from drgs.cli.output import printable_anywhere
+from drgs.cli.ending import exit_on_interrupt, printable_anywhere
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.io.pictures import image_size, write_png
@@ -179,7 +178,7 @@ def ended_process(*lines):
     """Status and standard error output of a process that does this within a command."""
     program = "\n".join([
         "import signal",
-        "from drgs.cli.interrupts import exit_on_interrupt, importing",
+        "from drgs.cli.ending import exit_on_interrupt, importing",
         "signal.signal(signal.SIGINT, signal.default_int_handler)",
         "with exit_on_interrupt():",
         *(f"    {line}" for line in lines),

@@ -274,7 +274,7 @@ def pose_turned(view, rotation):
     [
         (
             ["model.ply"],
-            "one of compressed-ply, glb, ply, splat, spz, usd, html, got none",
+            "one of ply, compressed-ply, spz, glb, splat, usd, html, got none",
         ),
         (["model.ply", "--format", "splt"], "got splt; did you mean splat?"),
         (["model.ply", "--out", "a.obj"], "--format: must be one of"),

@@ -418,7 +418,7 @@ SKEWED[1, 0, 1] = 0.5
         ),
         ({"means": np.zeros((3, 24))}, ValueError, r"means must be of shape \(N, 3\), got \(3"),
         ({"means": 1.0}, ValueError, r"means must be of shape \(N, 3\), got \(\)"),
-        ({"means": np.zeros((0, 3))}, ValueError, "means must be of one Gaussian at least"),
+        ({"means": np.zeros((0, 3))}, ValueError, "means must be of one row at least"),
         ({"opacities": np.zeros((24, 1))}, ValueError, r"opacities must be of shape \(24,\)"),
         ({"viewmats": np.eye(4)}, ValueError, r"viewmats must be of shape \(C, 4, 4\), got \(4"),
         ({"Ks": np.eye(3)}, ValueError, r"Ks must be of shape \(2, 3, 3\), got \(3, 3\)"),

@@ -20,7 +20,7 @@ def test_a_shorter_schedule_keeps_its_shares():
 
 
 def test_a_reset_that_is_off_stays_off_and_no_count_falls_to_zero():
-    config = FitConfig(data={"path": "."}, densify={"white_background_reset": None})
+    config = FitConfig(data={"path": "."}, densify={"adc": {"white_background_reset": None}})
     short = with_iterations(config, 30)
     assert short.densify.adc.white_background_reset is None
     assert (short.densify.start, short.densify.stop, short.model.sh_increase_every) == (1, 15, 1)

@@ -102,7 +102,13 @@ def scene(tmp_path_factory):
         model={"sh_degree": 1, "sh_increase_every": 2, "smoothing": True},
         colors={"lr": 0.02},
         cameras={"optimise": True, "focal_lr": 1e-4, "principal_lr": 1e-4},
-        densify={"start": 1, "stop": 4, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+        densify={
+            "start": 1,
+            "stop": 4,
+            "every": 2,
+            "strategy": "adc",
+            "adc": {"reset_every": 3, "grad_threshold": 1e-6},
+        },
         iterations=4,
         output={"save_renders": False},
     ).parent

@@ -5,7 +5,7 @@ import platform
 import numpy as np
 import pytest
 
-from drgs.core.denormals import denormals_flushed, denormals_kept
+from drgs.core.environment import denormals_flushed, denormals_kept
 
 pytestmark = pytest.mark.skipif(
     (platform.libc_ver()[0], platform.machine()) != ("glibc", "x86_64"),
@@ -33,7 +33,7 @@ def test_neighbours_of_equal_points_at_zero_are_found_in_a_command(run_python):
     """In another process: SciPy's tree ended it, as the least number above zero was zero."""
     result = run_python("""
 import numpy as np
-from drgs.core.denormals import denormals_flushed
+from drgs.core.environment import denormals_flushed
 from drgs.initialization.start import mean_squared_neighbour_distance
 points = np.zeros((40, 3), np.float32)
 points[17] = 1          # all others are one point

@@ -2,7 +2,7 @@ import sys
 
 import pytest
 
-from drgs.cli.errors import exit_on_user_error
+from drgs.cli.ending import exit_on_user_error
 from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.llvm import LLVMVersionError
 
@@ -65,7 +65,7 @@ def test_a_reader_of_the_output_may_go(run_python):
     """Of two processes: what is printed has to go through a pipe."""
     program = (
         "import os, sys\n"
-        "from drgs.cli.errors import exit_on_user_error\n"
+        "from drgs.cli.ending import exit_on_user_error\n"
         "read, write = os.pipe()\n"
         "os.dup2(write, 1)\n"
         "os.close(write); os.close(read)\n"

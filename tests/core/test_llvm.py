@@ -143,19 +143,16 @@ def test_the_refusal_names_a_usable_library_that_is_installed(machine, monkeypat
     with pytest.raises(LLVMVersionError) as error:
         ensure_usable_llvm()
     assert str(error.value).endswith(
-        f"; here DRJIT_LIBLLVM_PATH={folder}/libLLVM.so.19.1 would do, and so would importing "
-        "drgs before mitsuba and drjit."
+        f"; here DRJIT_LIBLLVM_PATH={folder}/libLLVM.so.19.1 would do."
     )
 
 
 @pytest.mark.parametrize(
     ("names", "variable", "found"),
     [
-        ([], None, "none"),
-        (["libLLVM-14.so.1"], None, "14 ({folder}/libLLVM-14.so.1)"),
-        ([], "/none.so", "none (DRJIT_LIBLLVM_PATH=/none.so is not a file)"),
-        (["libLLVM-14.so.1"], "{folder}/libLLVM-14.so.1", "14 ({folder}/libLLVM-14.so.1)"),
-        (["x.so"], "{folder}/x.so", "none (DRJIT_LIBLLVM_PATH={folder}/x.so cannot be used)"),
+        ([], None, "none that Dr.Jit can load"),
+        (["libLLVM-14.so.1"], None, "none that Dr.Jit can load"),
+        ([], "/none.so", "none that Dr.Jit can load (DRJIT_LIBLLVM_PATH=/none.so)"),
     ],
 )
 def test_where_drjit_has_no_library_the_refusal_says_what_there_is(
@@ -201,7 +198,7 @@ def test_an_old_library_is_refused_when_an_llvm_variant_is_chosen(run_python, ma
     assert result.returncode == 0, result.stderr
     refusal, variant, fallback = result.stdout.splitlines()
     assert refusal.startswith("drgs: libLLVM 17 or newer is needed (19 is tested), found ")
-    assert f"found {major}" in refusal
+    assert f"found {major}" in refusal or f"libLLVM-{major}" in refusal
     assert "apt-get install libllvm19" in refusal
     assert "DRJIT_LIBLLVM_PATH" in refusal
     assert (variant, fallback) == ("None", "scalar_rgb")
@@ -210,7 +207,7 @@ def test_an_old_library_is_refused_when_an_llvm_variant_is_chosen(run_python, ma
 def test_a_missing_library_is_refused_when_an_llvm_variant_is_chosen(run_python):
     result = run_python(SET_VARIANT, DRJIT_LIBLLVM_PATH="/nonexistent")
     assert result.returncode == 0, result.stderr
-    assert "found none (DRJIT_LIBLLVM_PATH=/nonexistent is not a file)" in result.stdout
+    assert "found none that Dr.Jit can load (DRJIT_LIBLLVM_PATH=/nonexistent)" in result.stdout
 
 
 def test_a_usable_library_passes(run_python):

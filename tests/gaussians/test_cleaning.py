@@ -5,13 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.formats import distance_of_ellipsoids, gaussians_within_ranges
 
-from drgs.gaussians.cleaning import Selection, shortest_rotation, taken, turned_towards
+from drgs.export import kept_by, take
+from drgs.gaussians.similarity import shortest_rotation, turned_towards
 
 
 def test_a_selection_keeps_what_is_within_its_limits():
     g = gaussians_within_ranges(400)
-    selection = Selection(box=(1, -1, 2, -1, 1, 0), min_opacity=0.3, max_scale=0.1)
-    for name, kept in selection.kept_by(g).items():
+    found = kept_by(g, box=(1, -1, 2, -1, 1, 0), min_opacity=0.3, max_scale=0.1)
+    for name, kept in found.items():
         one_by_one = [
             {
                 "box": all(abs(m) <= 1 for m in g.means[i, :2]) and 0 <= g.means[i, 2] <= 2,
@@ -22,13 +23,13 @@ def test_a_selection_keeps_what_is_within_its_limits():
         ]
         assert kept.tolist() == one_by_one
         assert 0 < kept.sum() < 400
-    assert Selection().kept_by(g) == {}
+    assert kept_by(g) == {}
 
 
 def test_rows_are_taken_from_all_that_a_gaussian_has():
     g = gaussians_within_ranges(9)
     rows = np.array([7, 0])
-    found = taken(g, rows)
+    found = take(g, rows)
     for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(found, name), getattr(g, name)[rows])
     assert found.features is None and found.smoothing is None

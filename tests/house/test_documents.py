@@ -209,7 +209,7 @@ WITH_PROGRAMS = tuple(page for page in PAGES if fenced(page, "python"))
 SMALL_FIT = """
 data: {path: lego}
 init: {num_points: 300, half_extent: 1.0}
-densify: {start: 2, stop: 3, white_background_reset: null}
+densify: {start: 2, stop: 3, strategy: adc, adc: {white_background_reset: null}}
 iterations: 4
 """
 

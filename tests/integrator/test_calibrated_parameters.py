@@ -188,7 +188,7 @@ REFUSED = {
     "lens": (
         {"lens": "opencvv"},
         'PluginError: calibrated: lens: no lens is called "opencvv"; did you mean opencv?; '
-        "there are fisheye, opencv, pinhole, thin_prism_fisheye (others come with installed "
+        "there are pinhole, opencv, fisheye, thin_prism_fisheye (others come with installed "
         'packages that have an entry point of the group "drgs")',
     ),
     "lens that is no name": (

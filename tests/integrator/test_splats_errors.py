@@ -125,8 +125,8 @@ REFUSED = {
     ),
     "an unknown projection": (
         {"projection": "affine"},
-        "PluginError: splats: projection must be one of ewa, unscented, exact or of a package with "
-        "an entry point of the group \"drgs\", got 'affine'",
+        "PluginError: splats: projection must be one of ewa, unscented, exact (others come "
+        "with installed packages that have an entry point of the group \"drgs\"), got 'affine'",
     ),
     "a low-pass below zero": (
         {"low_pass": -1},

@@ -91,7 +91,7 @@ def test_helps_and_messages_list_it(installed, tmp_path):
     (tmp_path / "a.obj").touch()
     _, text = drgs(installed, "render", tmp_path / "a.obj", "--out", tmp_path)
     assert ".npz" in text and 'entry point of the group "drgs"' in text
-    with pytest.raises(UserError, match=r"in one of .*\.npz, .*entry point of the group"):
+    with pytest.raises(UserError, match=r"in one of .*\.npz; .*entry point of the group"):
         blobs().save(tmp_path / "a.obj")
     with pytest.raises(UserError, match=r'"npzz"; did you mean npz\?; there are .*entry point'):
         blobs().to_bytes("npzz")
@@ -133,6 +133,14 @@ def test_a_format_without_a_suffix_is_refused_with_its_package(installed):
     reason = r"package drgs-npz \(npz_format\): TypeError: Npz\.suffix must be a suffix in small"
     with pytest.raises(UserError, match=f'cannot load the extension "npz" of the {reason}'):
         formats.format_for("a.npz")
+
+
+def test_a_broken_package_does_not_disturb_formats_that_drgs_ships(installed, tmp_path):
+    (installed / "npz_format.py").write_text("import no_such_module")
+    blobs().save(tmp_path / "a.ply")
+    assert Gaussians.load(tmp_path / "a.ply").num_gaussians == 30
+    with pytest.raises(UserError, match='cannot load the extension "npz"'):
+        blobs().save(tmp_path / "a.npz")
 
 
 def test_a_suffix_that_drgs_has_stays_its_own(installed):

@@ -110,7 +110,7 @@ def test_compressed_elements_behind_lists_are_missed(tmp_path):
     lists = b"element foo 1\nproperty list uchar int bar\nelement sh"
     path = tmp_path / "a.ply"
     path.write_bytes(content.replace(b"element sh", lists, 1))
-    with pytest.raises(UserError, match=r"a\.ply: element sh must have no lists, and come before"):
+    with pytest.raises(UserError, match=r"a\.ply: element sh must .* no lists, and come before"):
         Gaussians.load(path)
 
 

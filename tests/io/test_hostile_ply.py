@@ -60,7 +60,7 @@ def test_finite_logits_are_read_without_a_note(tmp_path):
 
 def test_an_opacity_that_is_no_number_is_refused(tmp_path):
     gaussians_with([np.inf, np.nan]).save(tmp_path / "a.ply")
-    with pytest.raises(UserError, match=r"row 1: opacity must be .* got nan \(1 of 2 rows"):
+    with pytest.raises(UserError, match=r"finite: logit_opacities of Gaussian 1 is nan"):
         Gaussians.load(tmp_path / "a.ply")
 
 
@@ -93,7 +93,7 @@ def test_elements_before_the_vertices_are_passed_over(tmp_path):
     PlyData([lists(1), vertices], text=True).write(str(tmp_path / "a.ply"))
     assert len(read_points(tmp_path / "a.ply")[0]) == 2  # rows of a text are lines
     PlyData([lists(1), vertices]).write(str(tmp_path / "a.ply"))
-    with pytest.raises(UserError, match="element face, which has lists, must come behind"):
+    with pytest.raises(UserError, match=r"element vertex must .* come before elements that have; "):
         read_points(tmp_path / "a.ply")
 
 
@@ -116,12 +116,8 @@ def test_vertices_with_lists_are_refused_before_they_take_memory(tmp_path):
     content = header + b"end_header\n" + bytes(13_000 * (12 + 300))
     (tmp_path / "a.ply").write_bytes(content)
     before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
-    with pytest.raises(UserError) as error:
+    with pytest.raises(UserError, match="element vertex must have at least 1 row, no lists, and"):
         read_points(tmp_path / "a.ply")
-    assert str(error.value) == (
-        f"{tmp_path}/a.ply: element vertex: properties l0, l1, l2 and 297 more must be numbers, "
-        "got lists; write the file without them"
-    )
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert grown < 50_000 and time.perf_counter() - started < 2  # kB
 

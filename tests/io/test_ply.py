@@ -49,9 +49,8 @@ def test_written_gaussians_are_read_back_bitwise(tmp_path, degree):
 
 def test_a_file_without_gaussians_is_refused(tmp_path):
     random_gaussians(0, 3).save(tmp_path / "a.ply")
-    with pytest.raises(UserError) as error:
+    with pytest.raises(UserError, match=r"vertex must have at least 1 row, .* has 0 of vertex$"):
         Gaussians.load(tmp_path / "a.ply")
-    assert str(error.value) == f"{tmp_path}/a.ply: element vertex must have at least 1 row, got 0"
 
 
 def test_the_file_is_laid_out_as_the_3dgs_reference_writes_it(tmp_path):
@@ -144,9 +143,7 @@ def test_unreadable_files_are_named(tmp_path, read):
     with pytest.raises(UserError, match=r"short.ply: not a valid PLY file: "):
         read(tmp_path / "short.ply")
     write_elements(tmp_path / "faces.ply", face=np.zeros(1, [("a", "f4")]))
-    with pytest.raises(
-        UserError, match=r"faces.ply: element vertex is missing; elements are: face"
-    ):
+    with pytest.raises(UserError, match=r"faces.ply: element vertex must .* has 1 of face$"):
         read(tmp_path / "faces.ply")
 
 
@@ -200,10 +197,8 @@ def test_point_colours_are_scaled_to_0_1(tmp_path, values):
 
 def test_point_colours_out_of_range_are_refused(tmp_path):
     write_elements(tmp_path / "a.ply", vertex=points(**channels(np.array([0, 255], "f4"))))
-    with pytest.raises(
-        UserError,
-        match=r"row 1: red, green, blue must be integers in 0..255 or floats in 0..1, got red = 25",
-    ):
+    expected = r"row 1: red must be an integer in 0..255 or a float in 0..1, got 255"
+    with pytest.raises(UserError, match=expected):
         read_points(tmp_path / "a.ply")
 
 
@@ -215,21 +210,18 @@ def test_points_that_are_not_finite_are_refused(tmp_path, value):
     with pytest.raises(UserError) as error:
         read_points(tmp_path / "a.ply")
     assert str(error.value) == (
-        f"{tmp_path}/a.ply: element vertex, row 1: y must be a finite float32 number, got {value} "
-        "(1 of 2 rows are not finite; remove them)"
+        f"{tmp_path}/a.ply: element vertex, row 1: y must be finite, got {value}"
     )
 
 
-def test_the_first_row_that_is_not_finite_is_named(tmp_path):
+def test_the_first_gaussian_that_is_not_finite_is_named(tmp_path):
     g = random_gaussians(9, 1)
-    g.means[7, 0] = np.nan
     g.quats[3, 2] = g.quats[5, 1] = -np.inf
     g.save(tmp_path / "a.ply")
     with pytest.raises(UserError) as error:
         Gaussians.load(tmp_path / "a.ply")
     assert str(error.value) == (
-        f"{tmp_path}/a.ply: element vertex, row 3: rot_2 must be a finite float32 number, got "
-        "-inf (3 of 9 rows are not finite; remove them)"
+        f"{tmp_path}/a.ply: numbers must be finite: quats of Gaussian 3 is -inf; remove it"
     )
 
 
@@ -260,7 +252,7 @@ def test_rows_that_the_file_cannot_hold_take_no_memory(tmp_path, text, count):
     path = tmp_path / "a.ply"
     write_elements(path, text, vertex=points())
     path.write_bytes(path.read_bytes().replace(b"vertex 2", b"vertex %d" % count))
-    with pytest.raises(UserError, match=rf"its header promises {count:,} rows of element vertex"):
+    with pytest.raises(UserError, match=rf"the {count:,} rows that the header promises, got"):
         read_points(path)
 
 

@@ -110,8 +110,8 @@ def test_values_that_contradict_each_other_are_refused(tmp_path):
         (
             "projection",
             "fish",
-            "one of ewa, unscented, exact or of a package with an entry point of the group "
-            '"drgs", got fish',
+            "one of ewa, unscented, exact (others come with installed packages that have an entry "
+            'point of the group "drgs"), got fish',
         ),
         ("alpha_max", "0.99999999999", "above 0 and below 1 in float32, got 0.99999999999"),
     ],
@@ -142,8 +142,8 @@ def test_names_that_are_not_known_are_noted(tmp_path):
     with pytest.warns(UserNote) as notes:
         assert said_by(str(path), Gaussians.load(path).rendered_with) == {}
     assert str(notes[0].message) == (
-        f"{path}: says low_pas, newa, newb and 3 more, which is not known here and makes no "
-        "difference; did you mean low_pass?"
+        f"{path}: specifies low_pas, newa, newb and 3 more, which is not known here and "
+        "ignored; did you mean low_pass?"
     )
 
 

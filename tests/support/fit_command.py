@@ -19,7 +19,13 @@ SMALL = {"data": {"path": "data"}, "init": {"num_points": 40, "half_extent": 0.5
 
 VALUES = {
     "model": {"sh_degree": 1, "sh_increase_every": 3, **USUAL},
-    "densify": {"start": 1, "stop": 7, "every": 2, "reset_every": 3, "grad_threshold": 1e-6},
+    "densify": {
+        "start": 1,
+        "stop": 7,
+        "every": 2,
+        "strategy": "adc",
+        "adc": {"reset_every": 3, "grad_threshold": 1e-6},
+    },
     "iterations": ITERATIONS,
     "output": {"checkpoint_every": 2, "history_every": 1},
 }

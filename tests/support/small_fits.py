@@ -96,7 +96,12 @@ def config_of(**changes) -> FitConfig:
     config = FitConfig(
         data={"path": "."},
         model={"sh_degree": 1, "sh_increase_every": 1, **USUAL},
-        densify={"start": 1_000_000, "stop": 1_000_001, "reset_every": 1_000_000},
+        densify={
+            "start": 1_000_000,
+            "stop": 1_000_001,
+            "strategy": "adc",
+            "adc": {"reset_every": 1_000_000},
+        },
         iterations=400,
     )
     return changed(config, changes)

@@ -54,9 +54,8 @@ def without_what_is_new(values):
     for name in ("decay", "decay_from", "views", "views_from"):
         del values["optimizer"][name]
     densify = values["densify"]
-    adc = densify.pop("adc")
-    kept = {name: densify[name] for name in ("start", "stop", "every", "max_gaussians")}
-    values["densify"] = {**kept, **adc}
+    kept = ("strategy", "start", "stop", "every", "max_gaussians", "adc")
+    values["densify"] = {name: densify[name] for name in kept}
 
 
 def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):

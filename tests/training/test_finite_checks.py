@@ -148,7 +148,10 @@ EVENTS = {
     "saving": ({}, lambda trainer: trainer.state()),
     "returning": ({}, lambda trainer: trainer.gaussians()),
     "densifying": ({"start": 1, "every": 4}, lambda trainer: trainer.step()),
-    "opacity reset": ({"start": 1, "reset_every": 4}, lambda trainer: trainer.step()),
+    "opacity reset": (
+        {"start": 1, "strategy": "adc", "adc": {"reset_every": 4}},
+        lambda trainer: trainer.step(),
+    ),
 }
 
 
@@ -277,7 +280,13 @@ def test_check_values_names_the_first_row_of_any_shape():
 def test_bytes_of_a_good_fit_are_those_without_guards(monkeypatch):
     """Across changes of the population and an opacity reset."""
     changes = {
-        "densify": {"start": 2, "stop": 40, "every": 5, "reset_every": 8, "grad_threshold": 1e-6},
+        "densify": {
+            "start": 2,
+            "stop": 40,
+            "every": 5,
+            "strategy": "adc",
+            "adc": {"reset_every": 8, "grad_threshold": 1e-6},
+        },
         "model": {"sh_degree": 2, "sh_increase_every": 4},
     }
 

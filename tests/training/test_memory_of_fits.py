@@ -283,11 +283,17 @@ def test_the_peak_of_a_fit_is_within_a_quarter_of_the_estimate(
     config = {
         "data": {"path": str(tmp_path / "data")},
         "init": {"num_points": start, "half_extent": 1.3},
-        "densify": {"start": 2, "every": 3, "stop": 26, "grad_threshold": 1e-12},
+        "densify": {
+            "start": 2,
+            "every": 3,
+            "stop": 26,
+            "strategy": "adc",
+            "adc": {"grad_threshold": 1e-12, "white_background_reset": None},
+        },
         "model": {"sh_increase_every": 1},
         "iterations": 30,
     }
-    config["densify"] |= {"max_gaussians": 2 * start, "white_background_reset": None}
+    config["densify"] |= {"max_gaussians": 2 * start}
     (tmp_path / "a.yml").write_text(yaml.safe_dump(config))
     arguments = ["a.yml", "--out", "out"]
     done = run_python(f"import sys; sys.argv[1:] = {arguments}\n{MEASURED}", cwd=tmp_path)

@@ -21,7 +21,13 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-GROWING = {"start": 3, "stop": 60, "every": 4, "grad_threshold": 1e-6, "reset_every": 25}
+GROWING = {
+    "start": 3,
+    "stop": 60,
+    "every": 4,
+    "strategy": "adc",
+    "adc": {"grad_threshold": 1e-6, "reset_every": 25},
+}
 
 
 def make_trainer(coarse=(), **changes):

@@ -50,7 +50,7 @@ def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population(
     monkeypatch.setattr(adc, "_choose_rows", random_rows)
     trainer = make_trainer(
         model={"sh_degree": 3, "sh_increase_every": 12},
-        densify={"start": 3, "stop": 45, "every": 4, "reset_every": 8},
+        densify={"start": 3, "stop": 45, "every": 4, "strategy": "adc", "adc": {"reset_every": 8}},
     )
     seen, new, populations = set(), {}, set()
     while trainer.iteration < 50:
@@ -146,7 +146,13 @@ assert dr.all(dr.isfinite(image.array))
 def test_restored_trainer_continues_to_the_same_bytes():
     """Across a change of the population, an opacity reset and a change of the SH degree."""
     changes = {
-        "densify": {"start": 5, "stop": 40, "every": 5, "reset_every": 15, "grad_threshold": 1e-6},
+        "densify": {
+            "start": 5,
+            "stop": 40,
+            "every": 5,
+            "strategy": "adc",
+            "adc": {"reset_every": 15, "grad_threshold": 1e-6},
+        },
         "model": {"sh_degree": 2, "sh_increase_every": 8},
     }
     uninterrupted, first = make_trainer(**changes), make_trainer(**changes)
@@ -218,7 +224,13 @@ def test_other_models_learn_as_well(model):
 
 def test_without_higher_degrees_the_population_may_change():
     """shN, which has no numbers then, is in no optimizer: its rows follow."""
-    densify = {"start": 2, "stop": 30, "every": 5, "grad_threshold": 1e-9, "clone_scale": 10.0}
+    densify = {
+        "start": 2,
+        "stop": 30,
+        "every": 5,
+        "strategy": "adc",
+        "adc": {"grad_threshold": 1e-9, "clone_scale": 10.0},
+    }
     trainer = make_trainer(model={"sh_degree": 0}, densify=densify)
     reports = [trainer.step().density for _ in range(12)]
     assert sum(report.cloned for report in reports if report) > 0

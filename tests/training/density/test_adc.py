@@ -24,8 +24,12 @@ SMALL, LARGE, HUGE = 0.01, 0.2, 0.5  # world units: cloned, split, pruned after 
 HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
 
 
+def config_of(max_gaussians=1_000_000, **adc):
+    return DensifyConfig(max_gaussians=max_gaussians, adc=adc)
+
+
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
-    strategy = AdaptiveDensityControl(DensifyConfig(**config), False, *statistics(gradient_norms))
+    strategy = AdaptiveDensityControl(config_of(**config), False, *statistics(gradient_norms))
     return strategy.densify_and_prune(rows_of(optimizer, seed), iteration)
 
 
@@ -64,7 +68,9 @@ def test_invisible_gradients_are_ignored_even_if_they_are_nan():
 # ---- schedule
 @pytest.mark.parametrize("white", [False, True])
 def test_schedule_is_that_of_the_reference_training_loop(white):
-    config = DensifyConfig(start=20, stop=200, every=10, reset_every=60, white_background_reset=20)
+    config = DensifyConfig(
+        start=20, stop=200, every=10, adc={"reset_every": 60, "white_background_reset": 20}
+    )
     strategy = AdaptiveDensityControl(config, white)
     for i in range(1, 300):
         densify = reset = False
@@ -78,8 +84,8 @@ def test_schedule_is_that_of_the_reference_training_loop(white):
 
 
 def test_extra_reset_can_be_off():
-    config = DensifyConfig(white_background_reset=None)
-    assert not any(AdaptiveDensityControl(config, True).resets(i) for i in range(1, 3000))
+    strategy = AdaptiveDensityControl(config_of(white_background_reset=None), True)
+    assert not any(strategy.resets(i) for i in range(1, 3000))
 
 
 # ---- single decisions
@@ -293,7 +299,7 @@ def test_random_populations_follow_the_rules_and_the_cap(seed):
     report = run(optimizer, norms, iteration=iteration, seed=seed, **config)
     after = values(optimizer)
 
-    config = DensifyConfig(**config)
+    config = config_of(**config)
     kept, cloned, split = naive_decisions(
         norms.astype(float), scales, opacities, iteration == LATE, config
     )
