@@ -34,11 +34,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from drgs.config.approximations import Approximations
 from drgs.training.history import History
 from drgs.training.loop import AllIterations, iterations
-from drgs.viewer.fit_page import FitPage, watch
 from drgs.viewer.messages import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, is_valid, offers
 from drgs.viewer.page import StartView
-from drgs.viewer.requests import Wishes
+from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.server import serving
+from drgs.viewer.training_viewer import TrainingPage, watch
 
 STOPPING = ("Pause", "End and write results")
 """Buttons that any client may press."""
@@ -104,7 +104,9 @@ def test_a_camera_has_finite_numbers_and_a_direction():
 
 
 def test_a_thousand_invalid_messages_change_nothing_and_print_nothing(server, capfd):
-    FitPage(server, Wishes(), StartView.of(true_dataset().train), Approximations())
+    TrainingPage(
+        server, RenderRequests(), StartView.from_views(true_dataset().train), Approximations()
+    )
     uuids = uuids_that_stop_nothing(server)
     before = {uuid: control.value for uuid, control in controls_of(server).items()}
     callbacks = {uuid: len(c._impl.update_cb) for uuid, c in controls_of(server).items()}
