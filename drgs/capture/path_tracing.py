@@ -106,7 +106,7 @@ class CaptureSettings:
 
     @property
     def hides_lights(self) -> bool:
-        """Whether surfaces that shine are left out: an object's studio is, a room's lamps are not."""
+        """Whether shining surfaces are left out: an object's studio is, a room's lamps are not."""
         return self.cameras != "inside"
 
     def count(self, split: str) -> int:

@@ -302,9 +302,8 @@ def test_a_finished_fit_is_finished_wherever_its_data_is(ended, tmp_path):
 def test_a_fit_of_an_earlier_version_that_was_moved_is_continued_with_a_note(
     stopped, projects, tmp_path
 ):
-    """It had no fingerprint of the data; the folder had no record, and its files fewer values."""
+    """It had no fingerprint of the data, and its files fewer values."""
     out = stopped.rename(tmp_path / "after") / "out"
-    (out / ".drgs-fit.json").unlink()
     with np.load(out / "checkpoint.npz") as file:
         arrays = {name: file[name] for name in file.files if name not in ("data", "config_before")}
     config = json.loads(str(arrays["config"]))

@@ -201,7 +201,7 @@ class CameraRefinement(TrainingEffect):
 
     def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
         """With the lens that was found; where the cameras are is not known better than before."""
-        return tuple(map(self.lens_change.of, views))
+        return tuple(map(self.lens_change.apply, views))
 
     def write(self, folder: Path, dataset: Dataset) -> None:
         """``cameras.json``: the refined training cameras, in the layout of ``transforms.json``.
