@@ -47,7 +47,6 @@ def event_handler(function: Callable[[], None]) -> Callable[[object], Coroutine]
     """Return a handler of any event of viser's, which its event loop runs."""
 
     async def handle(event: object) -> None:
-        del event
         function()
 
     return handle

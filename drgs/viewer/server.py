@@ -38,7 +38,6 @@ class LocalServer(viser.ViserServer):
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Return None: there is no address outside of this machine."""
-        del verbose
         return None
 
 
@@ -160,7 +159,6 @@ def _note_errors_once() -> Callable[[asyncio.AbstractEventLoop, dict[str, Any]],
     noted = set()
 
     def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        del loop
         error = context.get("exception")
         kind = type(error).__name__
         if kind not in noted:

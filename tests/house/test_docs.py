@@ -93,7 +93,12 @@ OTHERS = {
     "splats": {*PARAMETER_NAMES, *(field.name for field in fields(Approximations))}
     | {NESTED, "feature_...", "shapes_to_world", "shapes_to_world_..."},
     # Coefficients; and what Mitsuba's base class reads.
-    "calibrated": {*RadialTangential.names, *ThinPrismFisheye.names, "to_world", "shutter_open"},
+    "calibrated": {
+        *RadialTangential.coefficient_names(),
+        *ThinPrismFisheye.coefficient_names(),
+        "to_world",
+        "shutter_open",
+    },
 }
 
 both_plugins = pytest.mark.parametrize("plugin", ["splats", "calibrated"])
@@ -121,7 +126,7 @@ def loaded(plugin) -> list[mi.Object]:
     }
     lenses = (RadialTangential, ThinPrismFisheye)
     return [
-        mi.load_dict({**common, "lens": lens.kind, **dict.fromkeys(lens.names, 0.0)})
+        mi.load_dict({**common, "lens": lens.kind, **dict.fromkeys(lens.coefficient_names(), 0.0)})
         for lens in lenses
     ]
 
