@@ -170,13 +170,7 @@ def _add_cameras(parser: CommandParser) -> None:
 
 def _add_settings(parser: CommandParser) -> None:
     group = parser.add_argument_group("how Gaussians are rendered")
-    group.add_argument(
-        "--background",
-        nargs="+",
-        metavar="COLOR",
-        help="white, black, R G B in 0..1, or a picture's file (default: the configuration's; "
-        "without one, black, as the integrator splats has it)",
-    )
+    add_background(group)
     group.add_argument(
         "--ignore",
         nargs="+",
@@ -196,6 +190,17 @@ def _add_settings(parser: CommandParser) -> None:
         action="append",
         metavar="KEY=VALUE",
         help="override a value of the configuration, as in data.image_size=200; repeatable",
+    )
+
+
+def add_background(parser: argparse._ActionsContainer) -> None:
+    """Add the argument for :func:`parse_background`."""
+    parser.add_argument(
+        "--background",
+        nargs="+",
+        metavar="COLOR",
+        help="white, black, R G B in 0..1, or a picture's file (default: the configuration's; "
+        "without one, black)",
     )
 
 

@@ -27,7 +27,7 @@ from drgs.core.errors import UserError
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import FIELD_OF_VIEW
-from drgs.render import UP, parse_background
+from drgs.render import UP, add_background, parse_background
 from drgs.results.model import Model, load_model
 from drgs.results.refined_cameras import training_cameras
 from drgs.viewer.frames import LiveScene
@@ -48,13 +48,7 @@ def add_arguments(parser: CommandParser) -> None:
     parser.description = "Look at Gaussians in a browser, rendered live on this machine."
     parser.show_examples("%(prog)s out/lego", "%(prog)s model.ply --background white")
     parser.add_argument("what", type=file_or_folder, metavar="MODEL|OUT_DIR", help="to look at")
-    parser.add_argument(
-        "--background",
-        nargs="+",
-        metavar="COLOR",
-        help="white, black, R G B in 0..1, or a picture's file (default: the configuration's; "
-        "without one, black)",
-    )
+    add_background(parser)
     parser.add_argument(
         "--up",
         type=finite_number,
@@ -93,7 +87,7 @@ def run(args: argparse.Namespace) -> None:
                 page.add_cameras(views, visible=False)
             print(f"{model.gaussians.num_gaussians:,} Gaussians: look at {url(server)}", flush=True)
             print("Ctrl-C ends this", flush=True)
-            scheduler = RenderScheduler(requests, page)
+            scheduler = RenderScheduler(requests, page.show, page.refuse)
             with StopRequest() as stop:
                 while not stop.requested:
                     if not scheduler.serve(lambda: scene):

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -51,6 +52,13 @@ COUNTS = {"views", "val_views", "test_views"}
 ORBITING = {"distance", "azimuth", "elevation"}
 """Settings that place cameras around a scene."""
 
+UNUSED = {
+    "around": set(),
+    "inside": {"distance"},
+    "sensors": {*COUNTS, *ORBITING, "target", "up", "fov"},
+}
+"""Settings that a kind of cameras does not use."""
+
 CLOSED = 0.75
 """Least part of all directions with a surface in a room. Cornell's box, which has five of six
 sides, has 5/6."""
@@ -69,17 +77,11 @@ PLASTIC = 1.2207440846057596
 """The root of x^4 = x + 1: its powers spread points evenly over a box (Roberts 2018, "R_3")."""
 
 
-@dataclass(frozen=True, eq=False)
-class OwnCamera:
+class OwnCamera(NamedTuple):
     """A sensor of the scene itself."""
 
     pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes
     narrower_fov: float  # radians, along the film's smaller side
-
-    @property
-    def center(self) -> np.ndarray:
-        """(3,) world."""
-        return self.pose[:3, 3]
 
 
 def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
@@ -108,7 +110,18 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
     if "cameras" not in given:
         kind = _kind_for(scene, settings, given, own)
         return settings_for(scene, replace(settings, cameras=kind), {*given, "cameras"})
-    derived = _DERIVED[settings.cameras](scene, settings, given, own)
+    for name in sorted(given & UNUSED[settings.cameras]):
+        option = f"--{name.replace('_', '-')}"
+        raise UserError(f"{option}: is not used with --cameras {settings.cameras}; leave it out")
+    if settings.cameras == "sensors":
+        derived = _sensor_settings(own)
+    elif settings.cameras == "inside":
+        spot, _ = _room(scene, settings)
+        derived = {"target": tuple(spot.tolist()), "fov": _fov(settings, INSIDE_FOV)}
+    else:
+        derived = _around_settings(scene, settings, given, own) if own else {}
+    if own and settings.cameras != "sensors":
+        derived["up"] = _up(own)
     return replace(settings, **{name: derived[name] for name in derived.keys() - given})
 
 
@@ -136,7 +149,7 @@ def _kind_for(
     _, is_closed = _room(scene, settings)
     if not is_closed:
         return "around"
-    author_is_inside = any(_look_around(scene, [o.center for o in own])[0] >= CLOSED)
+    author_is_inside = any(_look_around(scene, [o.pose[:3, 3] for o in own])[0] >= CLOSED)
     if not author_is_inside and _is_lit(scene, replace(settings, cameras="around"), given):
         return "around"
     return "inside" if _is_lit(scene, replace(settings, cameras="inside"), given) else "around"
@@ -152,39 +165,23 @@ def _is_lit(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> bool
     return lit_part(np.stack([camera.image(view) for view in views_of(scene, few)])) >= MIN_LIT_PART
 
 
-def _around(
+def _around_settings(
     scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
 ) -> dict[str, object]:
-    """Return settings to look at the scene as its own sensors do."""
-    if not own:
-        return {}
-    derived = {"up": _up(own)}
+    """Return settings to look at the scene as its own sensors do, if they look at its middle."""
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
-    ahead = [(o.center, -o.pose[:3, 2]) for o in own]
+    ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in own]
     seen = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
     if not seen or given & {"fov", "distance"}:
-        return derived
+        return {}
     target = np.mean(seen, axis=0) if settings.target is None else np.array(settings.target)
-    distance = float(np.median([np.linalg.norm(o.center - target) for o in own]))
+    distance = float(np.median([np.linalg.norm(o.pose[:3, 3] - target) for o in own]))
     fov = _fov(settings, float(np.median([o.narrower_fov for o in own])))
-    return derived | {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
+    return {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
 
 
-def _inside(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
-) -> dict[str, object]:
-    """Return settings to look at the place with most room."""
-    _refuse_unused(settings, given & {"distance"})
-    spot, _ = _room(scene, settings)
-    derived = {"target": tuple(spot.tolist()), "fov": _fov(settings, INSIDE_FOV)}
-    return derived | {"up": _up(own)} if own else derived
-
-
-def _sensors(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
-) -> dict[str, object]:
+def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
     """Return as many views as there are sensors."""
-    _refuse_unused(settings, given & {*COUNTS, *ORBITING, "target", "up", "fov"})
     if not own:
         raise UserError(
             "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
@@ -192,15 +189,6 @@ def _sensors(
         )
     tests = len(own[::TEST_EVERY]) if len(own) > 1 else 0
     return {"views": len(own) - tests, "val_views": 0, "test_views": tests}
-
-
-_DERIVED = {"around": _around, "inside": _inside, "sensors": _sensors}
-
-
-def _refuse_unused(settings: CaptureSettings, names: Set[str]) -> None:
-    for name in sorted(names):
-        option = f"--{name.replace('_', '-')}"
-        raise UserError(f"{option}: is not used with --cameras {settings.cameras}; leave it out")
 
 
 def _up(own: list[OwnCamera]) -> str:

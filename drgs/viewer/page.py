@@ -21,7 +21,7 @@ from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import look_at
 from drgs.viewer.controls import CameraControls, event_handler
 from drgs.viewer.frames import Frame, FrameRequest, ViewerCamera
-from drgs.viewer.scheduler import RenderRequests, Screen
+from drgs.viewer.scheduler import RenderRequests
 
 if TYPE_CHECKING:
     import viser
@@ -77,7 +77,7 @@ class StartView:
         return StartView(replace(camera, camera_to_world=pose), up / np.linalg.norm(up))
 
 
-class Page(Screen):
+class Page:
     """A page that shows Gaussians; the base of a fit's."""
 
     def __init__(
@@ -137,7 +137,7 @@ class Page(Screen):
             self._follow(client)
 
     def show(self, client: int, request: FrameRequest, frame: Frame, is_whole: bool) -> None:
-        """See :class:`Screen`; nothing happens where the browser was closed meanwhile."""
+        """Show a frame to a client, unless it has gone; is_whole: it is as large as requested."""
         handle = self.server.get_clients().get(client)
         if handle is None:
             return
@@ -149,7 +149,7 @@ class Page(Screen):
             self._set_text(client, self._describe(client, request, frame))
 
     def refuse(self, client: int, reason: str) -> None:
-        """See :class:`Screen`."""
+        """Show in one line why there is no frame."""
         self._set_text(client, f"**No picture:** {one_line(reason)}")
 
     def _describe(self, client: int, request: FrameRequest, frame: Frame) -> str:

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from drgs.core.errors import UserError, reason_of_mitsuba
 from drgs.viewer.frames import Frame, FrameRequest, LiveScene
@@ -101,16 +100,6 @@ class AdaptiveResolution:
                 self._step -= 1
 
 
-class Screen(Protocol):
-    """A place where frames are shown."""
-
-    def show(self, client: int, request: FrameRequest, frame: Frame, is_whole: bool) -> None:
-        """Show a frame; is_whole: it is as large as requested."""
-
-    def refuse(self, client: int, reason: str) -> None:
-        """Show in one line why there is no frame."""
-
-
 @dataclass
 class _ClientState:
     """The last frame of a client."""
@@ -127,7 +116,8 @@ class RenderScheduler:
     """Renders the requests of all clients in turn."""
 
     requests: RenderRequests
-    screen: Screen
+    show: Callable[[int, FrameRequest, Frame, bool], None]  # to a client; whether it is whole
+    refuse: Callable[[int, str], None]  # a client's request, for a reason of one line
     refresh_after: Callable[[float], float] | None = None
     """Seconds until a whole frame is rendered again, given those that it took; None: never."""
 
@@ -166,10 +156,10 @@ class RenderScheduler:
         is_moving = pending is not state.shown
         start = time.monotonic()
         try:
-            self.screen.show(client, request, scene().frame(request), divisor == 1)
+            self.show(client, request, scene().frame(request), divisor == 1)
         except Exception as error:  # a client's request must not end the fit
             text = str(error) if isinstance(error, UserError) else reason_of_mitsuba(error)
-            self.screen.refuse(client, text)
+            self.refuse(client, text)
             divisor = 1  # a larger frame would fail, too
         state.shown, state.divisor, state.at = pending, divisor, time.monotonic()
         state.seconds = state.at - start

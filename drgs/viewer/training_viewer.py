@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -20,7 +20,7 @@ from drgs.training.trainer import Trainer
 from drgs.viewer.controls import event_handler
 from drgs.viewer.frames import LiveScene
 from drgs.viewer.page import Page, StartView
-from drgs.viewer.scheduler import RenderRequests, RenderScheduler, Screen
+from drgs.viewer.scheduler import RenderRequests, RenderScheduler
 
 if TYPE_CHECKING:
     import viser
@@ -56,16 +56,6 @@ CURVES = {
 """Lines by title."""
 
 
-class TrainingScreen(Screen, Protocol):
-    """A place where a fit is shown."""
-
-    def show_progress(self, trainer: Trainer, history: History, total: int) -> None:
-        """Show the progress without waiting for anything; total: iterations in all."""
-
-    def show_end(self, iterations: int) -> None:
-        """Show that there are no more iterations, and that results are being written."""
-
-
 class EarlyStop:
     """Ends a fit as ``criterion`` decides, or when a viewer client ends it."""
 
@@ -91,13 +81,13 @@ class TrainingViewer:
     def __init__(
         self,
         requests: RenderRequests,
-        screen: TrainingScreen,
+        page: TrainingPage,
         dataset: Dataset,
         criterion: StopCriterion,
     ) -> None:
-        self._requests, self._screen, self._criterion = requests, screen, criterion
+        self._requests, self._page, self._criterion = requests, page, criterion
         self._background = dataset.background
-        self._scheduler = RenderScheduler(requests, screen, _refresh_after)
+        self._scheduler = RenderScheduler(requests, page.show, page.refuse, _refresh_after)
         self._scene: LiveScene | None = None
         self._progress_at = 0.0  # by time.monotonic
         self._fit_s = 0.0  # seconds of the fit's own, waited for here
@@ -111,7 +101,7 @@ class TrainingViewer:
         is_due = self._requests.pending and now - self._progress_at >= PROGRESS_SECONDS
         if history.rows and (is_due or done.is_last):
             self._progress_at = now
-            self._screen.show_progress(trainer, history, self._criterion.num_iterations(trainer))
+            self._page.show_progress(trainer, history, self._criterion.num_iterations(trainer))
         self._serve(trainer)
         while self._requests.paused and not (self._requests.ended or done.is_last or stops()):
             if not self._serve(trainer):
@@ -119,7 +109,7 @@ class TrainingViewer:
         self._scene = None  # what it keeps of the Gaussians would keep memory
         history.leave_out(time.perf_counter() - start - self._fit_s)
         if done.is_last:
-            self._screen.show_end(trainer.iteration)
+            self._page.show_end(trainer.iteration)
 
     def _serve(self, trainer: Trainer) -> bool:
         return self._scheduler.serve(lambda: self._live_scene(trainer))
@@ -138,7 +128,7 @@ class TrainingViewer:
 
 
 class TrainingPage(Page):
-    """The page of a fit: see :class:`TrainingScreen`."""
+    """The page of a fit."""
 
     def add_controls(self) -> None:
         """Add progress, buttons and a curve."""
@@ -154,7 +144,7 @@ class TrainingPage(Page):
         self._folder = gui.add_folder("PSNR [dB]")
 
     def show_progress(self, trainer: Trainer, history: History, total: int) -> None:
-        """See :class:`TrainingScreen`."""
+        """Show the progress without waiting for anything; total: iterations in all."""
         last, done = history.rows[-1], trainer.iteration
         psnr = smoothed([row.psnr for row in history.rows])
         self._status.content = (
@@ -172,7 +162,7 @@ class TrainingPage(Page):
             chart.data, chart.visible = curve, len(curve[0]) > 0
 
     def show_end(self, iterations: int) -> None:
-        """See :class:`TrainingScreen`."""
+        """Show that there are no more iterations, and that results are being written."""
         self._status.content = f"**{iterations:,} iterations are done;** results are being written."
         self._bar.value = 100.0
         self._pause.disabled = self._end.disabled = True

@@ -41,6 +41,9 @@ class Screen:
         if trainer.iteration == self.end_at:
             self.queue.end()
 
+    def refuse(self, client, reason):
+        raise AssertionError(reason)
+
     def show_end(self, iterations):
         self.iterations = iterations
 

@@ -226,8 +226,8 @@ def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
         pass
     watching, length = watch(server, watched, dataset, AllIterations())
     served, history = [], History()
-    show = watching._screen.show
-    watching._screen.show = lambda *frame: (served.append(frame), show(*frame))
+    show = watching._scheduler.show
+    watching._scheduler.show = lambda *frame: (served.append(frame), show(*frame))
     uuids, is_over = uuids_that_stop_nothing(server), threading.Event()
 
     def attack():

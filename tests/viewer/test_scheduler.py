@@ -59,7 +59,7 @@ class Stage:
 
 def make(clock, seconds_a_pixel=0.0, refresh_after=None):
     stage, left = Stage(clock, seconds_a_pixel), RenderRequests()
-    return stage, left, RenderScheduler(left, stage, refresh_after)
+    return stage, left, RenderScheduler(left, stage.show, stage.refuse, refresh_after)
 
 
 def served(them, stage):
