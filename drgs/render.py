@@ -44,13 +44,7 @@ from drgs.core.files import atomic_path, open_regular, shortened
 from drgs.core.processes import process_number, start_mpi
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import (
-    FIELD_OF_VIEW,
-    field_of_view,
-    look_at,
-    pinhole,
-    read_viewpoints,
-)
+from drgs.datasets.viewpoints import FIELD_OF_VIEW, field_of_view, look_at, pinhole, read_viewpoints
 from drgs.effects.compose import IGNORABLE
 from drgs.integrator.scene import render_views
 from drgs.integrator.state import is_splats
@@ -71,11 +65,8 @@ from drgs.results.metrics import Quality, mean_of, psnr, ssim
 from drgs.results.model import Background, Model, Render, load_model
 from drgs.results.refined_cameras import training_cameras
 
-DEFAULT_SIZE = (400, 400)
-"""px, where nothing else decides how large an image is."""
-
-UP = (0.0, 0.0, 1.0)
-"""World: the convention of both dataset layouts."""
+DEFAULT_SIZE = (400, 400)  # px, where nothing else decides how large an image is
+UP = (0.0, 0.0, 1.0)  # world: the convention of both dataset layouts
 
 MAX_FRAMES = 10_000
 """Frames of an orbit: one every two arc minutes. All cameras are made before the first is seen."""

@@ -34,8 +34,7 @@ from drgs.viewer.frames import LiveScene
 from drgs.viewer.page import Page, StartView
 from drgs.viewer.scheduler import RenderRequests, RenderScheduler
 
-IDLE_SECONDS = 0.05
-"""Longest wait until a camera is found to be still, or Ctrl-C to be pressed."""
+IDLE_SECONDS = 0.05  # longest wait until a camera is found to be still, or Ctrl-C to be pressed
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

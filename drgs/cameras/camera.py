@@ -15,8 +15,7 @@ import numpy as np
 from drgs.cameras.lens import PINHOLE, Lens
 from drgs.core.arrays import types_of
 
-MISSED = 0.01
-"""px: largest distance of the point of a ray from the place of the ray."""
+MISSED = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ import numpy as np
 from drgs.cameras.polynomials import first_root, radius_at
 from drgs.core.arrays import types_of
 
-NEWTON_STEPS = 5
-"""Steps for the other terms, which are small: the search starts nearby."""
+NEWTON_STEPS = 5  # steps for the other terms, which are small: the search starts nearby
 
 
 class PlaneDistortion(Protocol):

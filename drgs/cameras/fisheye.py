@@ -13,13 +13,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.lens import (
-    LENSES,
-    CameraParameters,
-    Lens,
-    film_coordinates,
-    pixel_coordinates,
-)
+from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
 from drgs.cameras.polynomials import (
     derivative,
     first_root,

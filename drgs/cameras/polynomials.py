@@ -22,8 +22,7 @@ RADIUS_STEPS = 24
 """Steps of the search for a radius: most need 4 or 5; next to the end of the function, each at
 least halves the error."""
 
-UNBOUNDED = 1e4
-"""A slope that no film shows."""
+UNBOUNDED = 1e4  # a slope that no film shows
 
 
 def horner(coefficients: Sequence[Any], x: Any) -> Any:

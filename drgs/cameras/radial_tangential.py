@@ -34,11 +34,8 @@ from drgs.cameras.polynomials import (
 )
 from drgs.core.arrays import types_of
 
-BORDER = 65
-"""Points on each side of the film's border, whose slopes bound those on the film."""
-
-MISSED = 1e-6
-"""Squared distance, in slopes, at which Newton's method may end."""
+BORDER = 65  # points on each side of the film's border, whose slopes bound those on the film
+MISSED = 1e-6  # squared distance, in slopes, at which Newton's method may end
 
 
 @LENSES.register("opencv")

@@ -35,22 +35,16 @@ KINDS = ("around", "inside", "sensors")
 ELEVATIONS = {"around": (0.0, 90.0), "inside": (-60.0, 60.0)}
 """Degrees above the horizon, lowest and highest. Inside, the ceiling is seen from below."""
 
-INSIDE_FOV = math.radians(70)
-"""In a room, walls are near."""
-
-INSIDE_PART = 0.6
-"""Place of a camera on the way from the target to the wall behind it."""
-
-ENOUGH_SENSORS = 10
-"""Number of sensors from which a scene is photographed from where they are."""
+INSIDE_FOV = math.radians(70)  # in a room, walls are near
+INSIDE_PART = 0.6  # place of a camera on the way from the target to the wall behind it
+ENOUGH_SENSORS = 10  # number of sensors from which a scene is photographed from where they are
 
 TEST_EVERY = 8
 """Every eighth of the scene's own sensors is for testing, as in the nerfstudio layout."""
 
 COUNTS = {"views", "val_views", "test_views"}
 
-ORBITING = {"distance", "azimuth", "elevation"}
-"""Settings that place cameras around a scene."""
+ORBITING = {"distance", "azimuth", "elevation"}  # settings that place cameras around a scene
 
 UNUSED = {
     "around": set(),
@@ -66,8 +60,7 @@ sides, has 5/6."""
 NUM_SPOTS, NUM_DIRECTIONS = 128, 128
 """Points of the bounding box that may be in a room, and rays from each."""
 
-CLEARANCE = 0.1
-"""Quantile of the distances from a spot to its surroundings that measures its room."""
+CLEARANCE = 0.1  # quantile of the distances from a spot to its surroundings that measures its room
 
 PREVIEWS, PREVIEW_SIZE, PREVIEW_SPP = 12, (16, 16), 4
 
@@ -321,9 +314,7 @@ def views_of_sensors(own: list[OwnCamera], settings: CaptureSettings) -> list[Ca
 
 
 def _views(
-    settings: CaptureSettings,
-    target: np.ndarray,
-    distances: Callable[[np.ndarray], np.ndarray],
+    settings: CaptureSettings, target: np.ndarray, distances: Callable[[np.ndarray], np.ndarray]
 ) -> list[CaptureView]:
     """Return views of ``target``; distances: from it, (N,), in directions (N, 3)."""
     views, axis = [], settings.up[-1]

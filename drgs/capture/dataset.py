@@ -43,11 +43,8 @@ POINTS = "points3d.ply"
 MANIFEST = "capture.json"
 MAX_MANIFEST_BYTES = 1 << 20
 
-NUM_FIRST = 10
-"""Images after which a warning is printed if most are empty or black."""
-
-MIN_COVERED = 0.01
-"""Part of an image that is not empty."""
+NUM_FIRST = 10  # images after which a warning is printed if most are empty or black
+MIN_COVERED = 0.01  # part of an image that is not empty
 
 REMEDIES = {
     "around": "give --cameras inside for a room, or --azimuth, --elevation, --target and "

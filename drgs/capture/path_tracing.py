@@ -32,26 +32,19 @@ from drgs.integrator.state import is_splats
 from drgs.io.pictures import to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
 
-NERF_SYNTHETIC_FOV = 0.6911112070083618
-"""Radians: the original's ``camera_angle_x``."""
+NERF_SYNTHETIC_FOV = 0.6911112070083618  # radians: the original's ``camera_angle_x``
 
 SPLITS = ("train", "val", "test")
 
-PATHS_PER_PASS = 2**24
-"""Paths traced at once, at most: their state takes a few hundred MiB."""
+PATHS_PER_PASS = 2**24  # paths traced at once, at most: their state takes a few hundred MiB
 
 SAMPLES_PER_PASS = 64
 """Per pixel, a square: they are stratified together (8x8 multi-jittered), which leaves about half
 the noise variance of as many independent ones."""
 
-NEAR_CLIP, FAR_CLIP = 1e-5, 1e5
-"""Of the bounding box's diagonal."""
-
-MAX_BLACK = 2
-"""Largest channel of a black pixel, of 255."""
-
-MIN_LIT_PART = 0.5
-"""Part of the covered pixels that are lit: less where a camera stands wrong."""
+NEAR_CLIP, FAR_CLIP = 1e-5, 1e5  # of the bounding box's diagonal
+MAX_BLACK = 2  # largest channel of a black pixel, of 255
+MIN_LIT_PART = 0.5  # part of the covered pixels that are lit: less where a camera stands wrong
 
 MAX_LAMPS_IN_A_ROW = 16
 """Surfaces that shine are passed through on the way to the first hit, this many at most."""

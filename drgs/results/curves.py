@@ -19,13 +19,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SMOOTHING_PARTS = 50
-"""The smooth line of a curve is a running mean over this part of all rows."""
+SMOOTHING_PARTS = 50  # the smooth line of a curve is a running mean over this part of all rows
 
 NUM_PANELS = 6
 
-PAGE_DPI = 160
-"""Resolution of a curve in the page, 3.7 inches wide, for fine screens."""
+PAGE_DPI = 160  # resolution of a curve in the page, 3.7 inches wide, for fine screens
 
 
 @dataclass(frozen=True)

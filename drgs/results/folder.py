@@ -35,8 +35,7 @@ COMMAND = "fit"
 
 MAX_CONFIG_BYTES = 1 << 28
 
-FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)
-"""Results that are folders; the others are files."""
+FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)  # results that are folders; the others are files
 
 SECTIONS = {"data", "init", "model", "optimizer", "loss", "densify", "output", "iterations", "seed"}
 """Keys of every ``config.yml`` that a fit has written."""

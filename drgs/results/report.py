@@ -51,13 +51,11 @@ from drgs.results.viewer import Shown, seconds_of_page, write_viewer
 DIFFERENCE_GAIN = 5.0
 """Gain of difference images, 0.5 + gain (fitted - truth): they saturate at 10 % of the range."""
 
-GAP = 4
-"""px between the images of a comparison, white."""
+GAP = 4  # px between the images of a comparison, white
 
 ORBIT_FRAMES = 60
 
-PANEL_WIDTH = 360
-"""px: largest width of an image of a comparison in the page."""
+PANEL_WIDTH = 360  # px: largest width of an image of a comparison in the page
 
 PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
 """Lossy coding leaves a haze around objects before a white background."""
@@ -65,8 +63,7 @@ PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
 TRIED_SECONDS = 0.2
 """Least time for which a view is tried out: one image of a few milliseconds tells little."""
 
-FILES_SECONDS = 0.3
-"""Time of the other files, measured with 50,000 Gaussians."""
+FILES_SECONDS = 0.3  # time of the other files, measured with 50,000 Gaussians
 
 Render = Callable[[tuple[View, ...]], Iterable[np.ndarray]]
 """Yields images (H, W, 3) of views as fitted, display space."""

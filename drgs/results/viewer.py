@@ -54,11 +54,8 @@ DISTANCE = 3.0
 """Distance from the first camera to its target in units of the page, where scales are kept in 8
 bits from 6e-6 to 8e3 and the nearest that one can come is 0.01."""
 
-MIN_TARGET_DEPTH = 0.1
-"""Least depth of the target in the first camera, in radii of the orbit."""
-
-GZIP_LEVEL = 4
-"""Level 9 takes six times as long for 1.6 % less."""
+MIN_TARGET_DEPTH = 0.1  # least depth of the target in the first camera, in radii of the orbit
+GZIP_LEVEL = 4  # level 9 takes six times as long for 1.6 % less
 
 FILE_AXES = np.diag([-1.0, -1.0, 1.0])
 """Rotation from the page's axes (x right, y up, z backward) to those of its PLY."""
@@ -128,10 +125,7 @@ def shows_as_fitted(approximations: Approximations) -> bool:
 
 
 def viewer_page(
-    title: str,
-    shown: Shown,
-    standpoint: Standpoint,
-    background: tuple[float, float, float],
+    title: str, shown: Shown, standpoint: Standpoint, background: tuple[float, float, float]
 ) -> bytes:
     """Return the page, UTF-8; equal arguments give equal bytes.
 

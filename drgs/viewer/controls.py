@@ -32,11 +32,8 @@ SLIDERS = {
 """Least, largest, step and first value of a lens's numbers. The angle is a fisheye's, in degrees,
 vertical; k1 and k2 are OpenCV's; the rest is in units of the distance to the camera's target."""
 
-MAX_SIDES_PX = ("640", "960", "1280", "1920")
-"""Choices for the longer side of an image."""
-
-MAX_FOV = 150.0
-"""Degrees, vertical."""
+MAX_SIDES_PX = ("640", "960", "1280", "1920")  # choices for the longer side of an image
+MAX_FOV = 150.0  # degrees, vertical
 
 MAX_NUMBER = 100.0
 """The largest value of an approximation without an upper limit: of ``low_pass``, a standard

@@ -27,26 +27,14 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import NEAR_CLIP, film_of, make_scene, make_sensors
 from drgs.results.metrics import psnr
 
-MAX_SCENES = 2
-"""Scenes kept, each with a copy of the Gaussians: ``error`` needs two."""
-
-BACKDROP = 0.12
-"""Grey behind depths, normals and opacities."""
-
-MIN_DEPTH_ALPHA = 0.5
-"""Opacity from which a pixel's depth counts for the range of colours."""
-
-DEPTH_RANGE = (2, 98)
-"""Percentiles of these depths at the ends of the colour map."""
+MAX_SCENES = 2  # scenes kept, each with a copy of the Gaussians: ``error`` needs two
+BACKDROP = 0.12  # grey behind depths, normals and opacities
+MIN_DEPTH_ALPHA = 0.5  # opacity from which a pixel's depth counts for the range of colours
+DEPTH_RANGE = (2, 98)  # percentiles of these depths at the ends of the colour map
 
 ERROR_GAIN = 5.0
 
-MOST_ACCURATE = {
-    "order": "pixel",
-    "order_window": 16,
-    "alpha_cut": 0.0,
-    "transmittance_stop": 0.0,
-}
+MOST_ACCURATE = {"order": "pixel", "order_window": 16, "alpha_cut": 0.0, "transmittance_stop": 0.0}
 """Approximations of the image that ``error`` compares with, beside the projection that is the most
 accurate for the lens. Filter and harmonics are the model's own."""
 

@@ -18,11 +18,8 @@ from websockets.asyncio.server import ServerConnection
 if TYPE_CHECKING:
     import asyncio
 
-MAX_MESSAGE_BYTES = 1 << 16
-"""A page's own messages have less than 1 KB."""
-
-MAX_CONNECTIONS = 64
-"""At a time: file descriptors remain for the command itself."""
+MAX_MESSAGE_BYTES = 1 << 16  # a page's own messages have less than 1 KB
+MAX_CONNECTIONS = 64  # at a time: file descriptors remain for the command itself
 
 Coordinate = Annotated[float, Meta(ge=-1e15, le=1e15)]
 """Squares are finite in single precision. A NaN passes, and is checked for below."""

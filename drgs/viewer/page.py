@@ -26,14 +26,9 @@ from drgs.viewer.scheduler import RenderRequests
 if TYPE_CHECKING:
     import viser
 
-JPEG_QUALITY = {False: 70, True: 92}
-"""Quality of images of a moving camera, and of whole ones."""
-
-MAX_FRUSTUMS = 200
-"""Training cameras that are drawn, spread over all of them."""
-
-FRUSTUM_SIZE = 0.04
-"""Size of a frustum in distances from the first camera to its target."""
+JPEG_QUALITY = {False: 70, True: 92}  # quality of images of a moving camera, and of whole ones
+MAX_FRUSTUMS = 200  # training cameras that are drawn, spread over all of them
+FRUSTUM_SIZE = 0.04  # size of a frustum in distances from the first camera to its target
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,8 @@ MOVING_SECONDS = 0.08
 STILL_SECONDS = 0.15
 """Time without a request after which a camera is still; browsers send one at least every 0.05 s."""
 
-DIVISORS = (1, 2, 3, 4, 6, 8)
-"""Divisors of width and height while the camera moves."""
-
-MIN_SIDE_PX = 64
-"""Shorter side of a frame of a moving camera, where the whole one is larger."""
+DIVISORS = (1, 2, 3, 4, 6, 8)  # divisors of width and height while the camera moves
+MIN_SIDE_PX = 64  # shorter side of a frame of a moving camera, where the whole one is larger
 
 
 @dataclass(frozen=True, eq=False)

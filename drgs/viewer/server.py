@@ -24,13 +24,11 @@ from websockets.asyncio.server import Request, Response, ServerConnection
 from drgs.core.errors import UserError, UserNote, one_line
 from drgs.viewer.messages import MAX_MESSAGE_BYTES, PageConnection
 
-ADDRESS = "127.0.0.1"
-"""Only this machine reaches it."""
+ADDRESS = "127.0.0.1"  # only this machine reaches it
 
 LOOPBACK = (ADDRESS, "localhost", "::1")
 
-FIRST_PORTS = range(8080, 8100)
-"""Tried one after the other, unless a port is given."""
+FIRST_PORTS = range(8080, 8100)  # tried one after the other, unless a port is given
 
 
 class LocalServer(viser.ViserServer):
@@ -81,21 +79,14 @@ def free_port(address: str, port: int | None, options: tuple[str, str]) -> int:
 
     viser itself would wait for ever at an address that is not there.
     """
-    try:
-        family, kind, protocol, _, _ = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)[0]
-    except (OSError, UnicodeError):
-        raise UserError(
-            f"{options[0]}: must be an address of this machine, such as {ADDRESS}, got {address}"
-        ) from None
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
     reason = ""
     for candidate in [port] if port is not None else [*FIRST_PORTS, 0]:
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((address, candidate))
+        try:
+            with socket.create_server((address, candidate), family=family) as probe:
                 return probe.getsockname()[1]
-            except OSError as error:
-                reason = error.strerror or str(error)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
     named = f"{options[0]} {address}" if port is None else f"{options[1]} {port}"
     raise UserError(f"{named}: cannot listen at {address}: {reason}; choose another")
 

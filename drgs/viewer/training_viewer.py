@@ -25,23 +25,12 @@ from drgs.viewer.scheduler import RenderRequests, RenderScheduler
 if TYPE_CHECKING:
     import viser
 
-REFRESH_SECONDS = 1.0
-"""Shortest time between two frames of a camera that is still."""
-
-REFRESH_SHARE = 0.05
-"""Largest part of the time for frames of a camera that is still."""
-
-PROGRESS_SECONDS = 0.5
-"""Time between two reports of progress, where a client reads them."""
-
-WAIT_SECONDS = 0.1
-"""Time until a pause notices Ctrl-C."""
-
-MAX_POINTS = 300
-"""Points of a curve."""
-
-ROOM = 1.1
-"""Iterations that curves have room for, in those that are expected once this has changed."""
+REFRESH_SECONDS = 1.0  # shortest time between two frames of a camera that is still
+REFRESH_SHARE = 0.05  # largest part of the time for frames of a camera that is still
+PROGRESS_SECONDS = 0.5  # time between two reports of progress, where a client reads them
+WAIT_SECONDS = 0.1  # time until a pause notices Ctrl-C
+MAX_POINTS = 300  # points of a curve
+ROOM = 1.1  # iterations that curves have room for, in those that are expected once this has changed
 
 STEP_BACK = 1.25
 """Distance of the first camera in that of a training camera, so that these are in the image."""

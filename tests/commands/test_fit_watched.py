@@ -159,7 +159,7 @@ def test_a_port_that_is_taken_and_an_address_of_another_machine_are_refused(tmp_
         assert_fit_refused(config, "--view", "--view-port", port, folder=tmp_path, message=message)
     for address, message in (
         ("192.0.2.1", "--view-address 192.0.2.1: cannot listen at 192.0.2.1"),
-        ("no address", "--view-address: must be an address of this machine"),
+        ("no address", "--view-address no address: cannot listen at no address"),
     ):
         arguments = (config, "--view", "--view-address", address)
         assert_fit_refused(*arguments, folder=tmp_path, message=message)
