@@ -45,7 +45,7 @@ WHOLE_NUMBERS = {
     "points": (0, 5_000_000, f"number of points in {POINTS}"),
     "seed": (0, 2**64 - 1, "of cameras, paths and points"),
 }
-"""By name of the setting: its smallest and largest value, and its help."""
+"""Smallest value, largest value and help by name of the setting."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

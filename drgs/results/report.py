@@ -219,7 +219,7 @@ def write_report(
 
     scores: of the test views, in their order; orbit: the bytes of an animated WebP.
     """
-    chosen = choose_views([score.psnr for score in scores])
+    chosen, has_viewer = choose_views([s.psnr for s in scores]), path.with_name(VIEWER).is_file()
     template = resources.files("drgs.results").joinpath("page.html").read_text("utf-8")
     page = Template(template).substitute(
         title=html.escape(title),
@@ -231,7 +231,7 @@ def write_report(
         still=_data_uri(_first_frame(orbit), lossless=True),
         gaussians=GAUSSIANS,
         viewers=_viewers(metrics),
-        walk=_link_to_viewer(path.with_name(VIEWER)),
+        walk=f'<a href="{VIEWER}">Walk around in it</a>. ' if has_viewer else "",
         command=html.escape(metrics["command"]),
         comparisons="".join(
             _comparison(dataset, render, label, index, scores[index]) for label, index in chosen
@@ -285,10 +285,6 @@ def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[t
         ("Seed", f"{metrics['seed']}"),
         ("Versions", ", ".join(f"{names.get(k, k)} {v}" for k, v in versions.items())),
     ]
-
-
-def _link_to_viewer(path: Path) -> str:
-    return f'<a href="{VIEWER}">Walk around in it</a>. ' if path.is_file() else ""
 
 
 def _viewers(metrics: FitMetrics) -> str:

@@ -193,7 +193,7 @@ SHOWN: dict[str, Callable[[LiveScene, FrameRequest], Frame]] = {
     "opacity": _opacity,
     "error": _error,
 }
-"""What a frame can show, by name. ``error`` is 0.5 + 5 times the difference from the most accurate
+"""Contents of a frame by name. ``error`` is 0.5 + 5 times the difference from the most accurate
 image, in display space."""
 
 
