@@ -361,9 +361,9 @@ def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray 
 def _direction(words: Sequence[str]) -> np.ndarray:
     with suppress(ValueError):
         up = np.array([float(word) for word in words])
-        if up.shape == (3,) and np.isfinite(up).all() and up.any():
-            up = near_one(up)
-            return up / np.linalg.norm(up)
+        length = np.linalg.norm(up)
+        if up.shape == (3,) and 0 < length < np.inf:
+            return up / length
     got = one_line(" ".join(words), 60)
     raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
 

@@ -159,8 +159,8 @@ def add_observers(
         log = EventLog(session.folder.path / EVENTS, session.history)
         session.observers.append(blocks.enter_context(closing(log)))
     if server is not None:
-        from drgs.viewer.fit_page import watch
         from drgs.viewer.server import url
+        from drgs.viewer.training_viewer import watch
 
         watching, session.criterion = watch(
             server, session.trainer, session.dataset, session.criterion

@@ -27,15 +27,14 @@ from drgs.core.errors import UserError
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import FIELD_OF_VIEW
-from drgs.render import UP, Model, load_model
+from drgs.render import UP, add_background, parse_background
+from drgs.results.model import Model, load_model
 from drgs.results.refined_cameras import training_cameras
 from drgs.viewer.frames import LiveScene
 from drgs.viewer.page import Page, StartView
-from drgs.viewer.requests import Wishes
-from drgs.viewer.scheduler import Spectators
+from drgs.viewer.scheduler import RenderRequests, RenderScheduler
 
-IDLE_SECONDS = 0.05
-"""Between two looks at whether a camera is still, or Ctrl-C was pressed."""
+IDLE_SECONDS = 0.05  # longest wait until a camera is found to be still, or Ctrl-C to be pressed
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -48,13 +47,7 @@ def add_arguments(parser: CommandParser) -> None:
     parser.description = "Look at Gaussians in a browser, rendered live on this machine."
     parser.show_examples("%(prog)s out/lego", "%(prog)s model.ply --background white")
     parser.add_argument("what", type=file_or_folder, metavar="MODEL|OUT_DIR", help="to look at")
-    parser.add_argument(
-        "--background",
-        nargs="+",
-        metavar="COLOR",
-        help="white, black, R G B in 0..1, or a picture's file (default: the configuration's; "
-        "without one, black)",
-    )
+    add_background(parser)
     parser.add_argument(
         "--up",
         type=finite_number,
@@ -82,36 +75,26 @@ def run(args: argparse.Namespace) -> None:
         raise UserError(f"{args.what}: there is no such file or folder")
     with executing(args.threads, args.debug):
         select_variant(args.variant)
-        model = model_of(args)
+        model = load_model(args.what, background=parse_background(args.background))
         views = cameras_of(args, model)
         scene = LiveScene(model.gaussians, model.settings, model.background)
-        wishes, start = Wishes(), start_of(args, model, views)
+        requests, start = RenderRequests(), start_of(args, model, views)
         options = ("--address", "--port")
         with serving(args.address or ADDRESS, args.port, options) as server:
-            page = Page(server, wishes, start, scene.approximations)
+            page = Page(server, requests, start, scene.approximations)
             if len(views) > 1:
                 page.add_cameras(views, visible=False)
             print(f"{model.gaussians.num_gaussians:,} Gaussians: look at {url(server)}", flush=True)
             print("Ctrl-C ends this", flush=True)
-            serve(scene, Spectators(wishes, page))
-
-
-def serve(scene: LiveScene, spectators: Spectators) -> None:
-    """Render what is due, until Ctrl-C."""
-    with StopRequest() as stop:
-        while not stop.requested:
-            if not spectators.serve(lambda: scene):
-                spectators.wishes.wait(IDLE_SECONDS)
-
-
-def model_of(args: argparse.Namespace) -> Model:
-    """The Gaussians, with the settings that they were fitted with."""
-    others = dict.fromkeys(("scene", "data", "set", "ignore"))
-    return load_model(argparse.Namespace(what=args.what, background=args.background, **others))
+            scheduler = RenderScheduler(requests, page.show, page.refuse)
+            with StopRequest() as stop:
+                while not stop.requested:
+                    if not scheduler.serve(lambda: scene):
+                        requests.wait(IDLE_SECONDS)
 
 
 def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
-    """Those of a fit's training views, refined if it has refined them; else one that sees all."""
+    """Return a fit's training cameras, refined if it has refined them; else one that sees all."""
     origin = model.gaussians.origin
     if args.what.is_dir() and (views := training_cameras(args.what, origin)) is not None:
         return views
@@ -120,8 +103,8 @@ def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
 
 
 def start_of(args: argparse.Namespace, model: Model, views: Sequence[Viewpoint]) -> StartView:
-    """Where the page's camera stands, and what is up."""
-    start = StartView.of(views, np.median(model.gaussians.numpy().means, axis=0))
+    """Return the page's first camera, and what is up."""
+    start = StartView.from_views(views, np.median(model.gaussians.numpy().means, axis=0))
     return start if args.up is None else start.upright(np.array(args.up))
 
 

@@ -1,8 +1,7 @@
-"""Axes of a camera: OpenCV's (x right, y down, z forward), OpenGL's, and Mitsuba's.
+"""Axes of a camera: OpenCV's (x right, y down, z forward), which drgs uses, and others.
 
-Everything in drgs is in OpenCV's. Datasets are in OpenGL's (x right, y up, z backward), Mitsuba's
-sensors have x to the left, y up and z forward. A matrix here stands on the right of a pose (camera
-to world) and is its own inverse.
+Datasets use OpenGL's (x right, y up, z backward), Mitsuba's sensors x left, y up, z forward. A
+matrix here stands on the right of a pose (camera to world) and is its own inverse.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ OPENGL_TO_MITSUBA = OPENCV_TO_OPENGL @ OPENCV_TO_MITSUBA
 
 
 def between_opencv_and_opengl(pose: np.ndarray) -> np.ndarray:
-    """A pose (4, 4), camera to world, in the other of the two conventions, float64."""
+    """Return a pose (4, 4), camera to world, in the other of the two conventions, float64."""
     turned = np.array(pose, np.float64)
     turned[:3, 1:3] *= -1
     return turned

@@ -1,11 +1,7 @@
-"""Cameras in OpenCV axes.
+"""Cameras in OpenCV axes, with a lens, and perhaps an aperture and a shutter.
 
-A :class:`Camera` is what projection reads. Its numbers are Dr.Jit scalars that live on the device,
-so that kernels are compiled once for all views, and a Mitsuba sensor's transform is never read back
-to the host.
-
-A camera has a *lens* (``drgs.cameras.lens``). It may have an *aperture*, which blurs, and a
-*shutter*, during which it moves: they are imported when a sensor has one.
+Numbers are Dr.Jit scalars on the device: kernels are compiled once for all views, and a Mitsuba
+sensor's transform is never read back to the host.
 """
 
 from __future__ import annotations
@@ -19,8 +15,7 @@ import numpy as np
 from drgs.cameras.lens import PINHOLE, Lens
 from drgs.core.arrays import types_of
 
-MISSED = 0.01
-"""px: how far from its place a ray's point may be seen."""
+MISSED = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
 
 @dataclass(frozen=True)
@@ -76,10 +71,10 @@ class Camera:
         return camera.with_lens(lens)
 
     def look_through(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """The ray through a place of the film (px): its origin, its direction, if it is one.
+        """Return the ray through a place of the film (px): origin, direction, and if it is one.
 
-        Origin and direction (of any length) are Array3f in camera axes. A lens shows nothing at
-        places where its model ends: what it looks for is then found elsewhere.
+        Origin and direction (of any length) are Array3f in camera axes. A lens shows nothing beyond
+        the end of its model.
         """
         direction = self.lens.ray(self, x, y)
         origin = self.lens.origin(self, x, y)
@@ -91,12 +86,10 @@ class Camera:
         return origin, direction, seen & (dr.squared_norm(missed) < MISSED**2)
 
     def view_directions(self, x: Any, y: Any, count: int) -> tuple[Any, Any, int]:
-        """Directions in which places of the film (px) see: Array3f, world, of any length.
+        """Return directions of rays through places of the film (px): Array3f, world, any length.
 
-        count: how many there are of each place, next to each other, where the lens has an aperture,
-        over which they are spread evenly; otherwise there is one.
-
-        Returns them, whether they are any, and how many there are of each place.
+        And whether they are any, and their number at each place, next to each other: ``count``,
+        spread evenly over the aperture if there is one, else 1.
         """
         if self.aperture is not None:
             return *self.aperture.rays(self, x, y, count), count
@@ -105,10 +98,9 @@ class Camera:
         return camera.rotation.T @ ray, seen, 1
 
     def place_of_ray(self, origin: Any, direction: Any) -> tuple[Any, Any]:
-        """Where on the film a ray begins, Array2f, px; and how far from the middle of the lens.
+        """Return the place of a ray on the film, Array2f, px, and the radius of the aperture.
 
-        origin, direction: Array3f, camera axes. The latter is at most the radius of the aperture,
-        Float, scene units.
+        origin, direction: Array3f, camera axes. The radius is Float, scene units.
         """
         if self.aperture is None:
             return self.lens.place_of_ray(self, origin, direction), type(self.near)(0)
@@ -116,30 +108,24 @@ class Camera:
         return self.lens.project_point(self, point), self.aperture.radius
 
     def at_row(self, y: Any) -> Camera:
-        """Where a camera is whose rows are read one after the other, when it reads that of y, px.
-
-        One that does not move is as it is.
-        """
+        """Return the camera when a rolling shutter reads the row at y, px; others as they are."""
         if self.shutter is None:
             return self
         row = (y - self.film_start.y) / (self.film_end.y - self.film_start.y)
         return self.shutter.pose(self, row)
 
     def seeing(self, means: Any) -> Camera:
-        """Where a camera is whose rows are read one after the other, when it reads those of means.
-
-        means: Array3f, world. One that does not move is as it is.
-        """
+        """Return the camera when a rolling shutter reads the rows of means (Array3f, world)."""
         return self if self.shutter is None else self.shutter.camera_of(means, self)
 
     def numbers(self) -> list[Any]:
-        """Pose, focal lengths, principal point and lens as Float of one entry, in a fixed order."""
+        """Return pose, focal lengths, principal point and lens as Float, in a fixed order."""
         return [n for name in _DIFFERENTIABLE for n in _numbers_of(getattr(self, name))]
 
     def by_lane(self, width: int) -> Camera:
-        """The same camera with these numbers stored for each of ``width`` lanes.
+        """Return the camera with these numbers stored for each of ``width`` lanes.
 
-        Derivatives of each lane's are then known apart, and can be summed in a fixed order.
+        The derivatives of all lanes are then separate, and can be summed in a fixed order.
         """
         lanes = dr.zeros(types_of(type(self.near)).UInt32, width)
         return replace(
@@ -147,7 +133,7 @@ class Camera:
         )
 
     def with_lens(self, lens: Lens) -> Camera:
-        """The same camera with another lens."""
+        """Return the same camera with another lens."""
         return replace(self, lens=lens.upload(type(self.near)).for_camera(self))
 
 
@@ -172,5 +158,5 @@ def _gathered(value: Any, lanes: Any) -> Any:
 
 
 def cameras_in_time(camera: Camera) -> list[Camera]:
-    """The cameras whose pictures are averaged: one unless it is blurred by motion."""
+    """Return the cameras whose images are averaged: one unless it is blurred by motion."""
     return [camera] if camera.shutter is None else camera.shutter.cameras(camera)

@@ -1,8 +1,4 @@
-"""Distortion within a plane: mostly along the radius, somewhat beside it.
-
-What lenses with tangential terms share, whatever their plane is: that of slopes
-(``drgs.cameras.radial_tangential``) or that of angles (``drgs.cameras.thin_prism_fisheye``).
-"""
+"""Distortion within a plane, that of slopes or that of angles: radial and tangential terms."""
 
 from __future__ import annotations
 
@@ -16,12 +12,11 @@ import numpy as np
 from drgs.cameras.polynomials import first_root, radius_at
 from drgs.core.arrays import types_of
 
-NEWTON_STEPS = 5
-"""For terms beside the radial ones: small beside these, the search starts nearby."""
+NEWTON_STEPS = 5  # steps for the other terms, which are small: the search starts nearby
 
 
 class PlaneDistortion(Protocol):
-    """Places (x, y) of a plane as the film shows them: with r^2 = x^2 + y^2 and a factor L(r^2),
+    """The distortion of places (x, y), with r^2 = x^2 + y^2 and a factor L(r^2),
 
         x' = L x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = L y + p1 (r^2 + 2 y^2) + 2 p2 x y
 
@@ -29,22 +24,22 @@ class PlaneDistortion(Protocol):
     """
 
     tangential: tuple[Any, ...]  # p1, p2; or none
-    max_squared_radius: Any  # where the model ends
+    max_squared_radius: Any  # the end of the model
 
     def radial(self, squared: Any) -> Any:
-        """L at r^2."""
+        """Return L at r^2."""
         ...
 
     def radial_derivative(self, squared: Any) -> Any:
-        """d L / d r^2."""
+        """Return d L / d r^2."""
         ...
 
     def is_radial(self) -> bool:
-        """Whether places are moved along their radius alone."""
+        """Return whether places are moved along their radius alone."""
         return not self.tangential
 
     def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Places as the film shows them."""
+        """Return places as the film shows them."""
         squared = x * x + y * y
         radial = self.radial(squared)
         if not self.tangential:
@@ -56,7 +51,7 @@ class PlaneDistortion(Protocol):
         )
 
     def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
-        """d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
+        """Return d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
         squared = x * x + y * y
         radial, slope = self.radial(squared), 2 * self.radial_derivative(squared)
         xx, xy, yy = radial + slope * x * x, slope * (x * y), radial + slope * y * y
@@ -67,11 +62,10 @@ class PlaneDistortion(Protocol):
         return xx, xy, xy, yy + 6 * p1 * y + 2 * p2 * x
 
     def undistort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """The places that :meth:`distort` sends to (x, y).
+        """Return the places that :meth:`distort` sends to (x, y), or any finite ones.
 
-        Where there are none, the result is finite and means nothing: :meth:`is_within` and a second
-        look tell. The search is not differentiated, but its last step: a step of Newton's method
-        from the solution has the solution's derivative (the implicit function theorem).
+        Only the last step of the search is differentiated: a step of Newton's method from the
+        solution has the solution's derivative (the implicit function theorem).
         """
         with dr.suspend_grad():
             length = dr.sqrt(x * x + y * y)
@@ -89,13 +83,13 @@ class PlaneDistortion(Protocol):
         return self._step(u, v, x, y)
 
     def _radius(self, radius: Any) -> tuple[Any, Any]:
-        """Distance from the middle at which a radius is seen, by the radial terms alone."""
+        """Return the distorted radius by the radial terms alone, and its derivative."""
         squared = radius * radius
         radial = self.radial(squared)
         return radial * radius, radial + 2 * squared * self.radial_derivative(squared)
 
     def _step(self, u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any]:
-        """One step of Newton's method towards (x, y), unless it would leave the lens model."""
+        """Take a step of Newton's method towards (x, y), unless it would leave the lens model."""
         at_x, at_y = self.distort(u, v)
         dx, dy = x - at_x, y - at_y
         with dr.suspend_grad():
@@ -108,15 +102,15 @@ class PlaneDistortion(Protocol):
         return tuple(dr.select(inside, b, a) for a, b in zip((u, v), following, strict=True))
 
     def is_within(self, x: Any, y: Any) -> Any:
-        """Whether places are in the part that the model is made for."""
+        """Return whether places are within the model."""
         return x * x + y * y < self.max_squared_radius
 
 
 def steepest_fall(tangential: Sequence[float], prism: Sequence[float] = (0.0, 0.0)) -> float:
-    """c >= 0, with -c r the least eigenvalue that terms beside the radial ones have at a radius r.
+    """Return c >= 0, where -c r is the least eigenvalue of the other terms at radius r.
 
-    Of the symmetric part of their Jacobian, in the direction in which it is least. tangential: p1,
-    p2; prism: sx1, sy1, of terms sx1 r^2 in x' and sy1 r^2 in y'. At w = (x, y), with p = (p2, p1)
+    That is of the symmetric part of their Jacobian, in any direction. tangential: p1, p2; prism:
+    sx1, sy1, of terms sx1 r^2 in x' and sy1 r^2 in y'. At w = (x, y), with p = (p2, p1)
     and s = (sx1, sy1), all of them are r^2 (p + s) + 2 (p . w) w, the symmetric part is
     q w^T + w q^T + 2 (p . w) I with q = 2 p + s, and its least eigenvalue (4 p + s) . w - r |q|.
     """
@@ -127,7 +121,7 @@ def steepest_fall(tangential: Sequence[float], prism: Sequence[float] = (0.0, 0.
 def largest_squared_radius(
     numerator: Sequence[float], denominator: Sequence[float], fall: float
 ) -> float:
-    """r^2 within which no two places are distorted to the same; inf: wherever they are.
+    """Return r^2 within which no two places are distorted to the same; inf: there is no limit.
 
     numerator, denominator: of L, coefficients of r^2, r^4, ... beside 1. fall: the
     :func:`steepest_fall` of the other terms.

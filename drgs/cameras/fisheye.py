@@ -1,20 +1,19 @@
 """OpenCV's fisheye lens.
 
-Imported when a sensor or a dataset has one. Coefficients and what lies beyond the lens model: as in
-``drgs.cameras.radial_tangential``.
+Coefficients, and the end of the lens model: as in ``drgs.cameras.radial_tangential``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.lens import LENSES, CameraParameters, Lens
+from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
 from drgs.cameras.polynomials import (
     derivative,
     first_root,
@@ -27,7 +26,7 @@ from drgs.cameras.polynomials import (
 from drgs.core.arrays import is_float64, types_of
 
 MAX_ANGLE = 0.95 * math.pi
-"""From the axis of a fisheye: what is behind it has no place on the film."""
+"""Radians from the axis: points behind the camera have no place on the film."""
 
 NEAR_AXIS = 0.1
 """tan^2 of the angle below which series are used: theta / rho is 0 / 0 on the axis, and what its
@@ -44,12 +43,11 @@ class Fisheye(Lens):
 
         theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
-    in its direction (Kannala and Brandt 2006, as in OpenCV's ``fisheye`` module). What it shows may
-    be beside and behind the camera, so that *depth* is the distance from the centre. Means whose
-    angle has a cosine below ``min_cosine`` are not seen.
+    in its direction (Kannala and Brandt 2006, as in OpenCV's ``fisheye`` module). Means whose angle
+    has a cosine below ``min_cosine`` are not seen.
     """
 
-    names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {"radial_terms": ("k1", "k2", "k3", "k4")}
 
     radial_terms: tuple[Any, ...]  # k1 up to the last that is given
     min_cosine: Any
@@ -57,19 +55,10 @@ class Fisheye(Lens):
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> Fisheye:
         """Return the lens with OpenCV's ``k1`` to ``k4``; what is not given is zero."""
-        terms = up_to_the_last(cls.names, usable_coefficients(coefficients))
+        terms = up_to_the_last(cls.groups["radial_terms"], usable_coefficients(coefficients))
         growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(terms))]
         turn = math.sqrt(first_root(np.array(growth)))
         return cls(terms, math.cos(min(turn, MAX_ANGLE)))
-
-    def coefficients(self) -> dict[str, Any]:
-        """Return the coefficients that are not left out."""
-        return dict(zip(self.names, self.radial_terms, strict=False))
-
-    def with_coefficients(self, values: Mapping[str, Any]) -> Fisheye:
-        """Return other numbers for the same coefficients; where the model ends stays as it is."""
-        names = self.names[: len(self.radial_terms)]
-        return replace(self, radial_terms=tuple(values[name] for name in names))
 
     def shows(self, position: Any) -> Any:
         """Return whether a point's angle from the axis is within the model, Bool."""
@@ -77,21 +66,18 @@ class Fisheye(Lens):
 
     def project_point(self, camera: CameraParameters, position: Any) -> Any:
         """Return the place of a point on the film, Array2f, px."""
-        place = types_of(type(position.x)).Array2f(*place_of(position, self.radial_terms))
-        return camera.focal * place + camera.principal
+        return pixel_coordinates(camera, *place_of(position, self.radial_terms))
 
     def projection_jacobian(
         self, camera: CameraParameters, position: Any, slopes: None = None
     ) -> list[Any]:
         """Return the derivatives of the place on the film, two Array3f, world."""
-        del slopes
         directions = place_directions(camera, position, self.radial_terms)
         return [f * direction for f, direction in zip(camera.focal, directions, strict=True)]
 
     def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
         """Return the direction of the ray through a place of the film (px), Array3f."""
-        t = types_of(type(x))
-        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        t, film = types_of(type(x)), film_coordinates(camera, x, y)
         squared = dr.squared_norm(film)
         off_axis = squared > 0
         radius = dr.sqrt(dr.select(off_axis, squared, 1))
@@ -106,14 +92,14 @@ class Fisheye(Lens):
         return t.Array3f(scale * film.x, scale * film.y, dr.select(off_axis, cosine, 1))
 
     def _distorted_angle(self, angle: Any) -> tuple[Any, Any]:
-        """theta_d of an angle, and its derivative."""
+        """Return theta_d of an angle, and its derivative."""
         squared = angle * angle
         h, dh = polynomial(self.radial_terms, squared), derivative(self.radial_terms, squared)
         return h * angle, h + 2 * dh * squared
 
 
 def place_of(position: Any, coefficients: Sequence[Any] = ()) -> tuple[Any, Any]:
-    """Where a point (Array3f, camera axes) is on the film, in focal lengths from the middle."""
+    """Return the place of a point (Array3f, camera axes) on the film, in focal lengths."""
     x, y, _ = position
     per_radius, _ = _angle_per_radius(position)
     scale = per_radius * polynomial(coefficients, _squared_angle(position, per_radius))
@@ -123,7 +109,7 @@ def place_of(position: Any, coefficients: Sequence[Any] = ()) -> tuple[Any, Any]
 def place_directions(
     camera: CameraParameters, position: Any, coefficients: Sequence[Any] = ()
 ) -> list[Any]:
-    """Derivatives of that place, two Array3f, world: per scene unit.
+    """Return the derivatives of that place, two Array3f, world: per scene unit.
 
     With rho^2 = x^2 + y^2, n^2 = rho^2 + z^2, a = theta / rho, b = (d a / d rho) / rho, and
     theta_d = h theta: the place is A (x, y) with A = h a, (d A / d rho) / rho = B = h b +
@@ -142,7 +128,7 @@ def place_directions(
 
 
 def _angle_per_radius(position: Any) -> tuple[Any, Any]:
-    """a = theta / rho, and b = (z / n^2 - a) / rho^2; near the axis by their series.
+    """Return a = theta / rho and b = (z / n^2 - a) / rho^2, near the axis by their series.
 
     With t = rho / z: z a = 1 - t^2 / 3 + t^4 / 5 ..., z^3 b = -2/3 + 4/5 t^2 - 6/7 t^4 ...
     """

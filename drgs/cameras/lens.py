@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from typing import Any, ClassVar, Protocol
 
 import drjit as dr
@@ -53,18 +54,16 @@ class Lens:
     """A lens whose rays meet in the camera's centre, and may come from beside and behind it.
 
     A subclass defines :meth:`project_point`, :meth:`projection_jacobian` and, unless it leaves that
-    to Newton's method, :meth:`ray`. All other methods have the meaning that most lenses give them;
-    :class:`Perspective` is the base of lenses that see what is in front of them only.
+    to Newton's method, :meth:`ray`. The other methods suit most lenses; :class:`Perspective` is the
+    base of lenses that see what is in front of them only.
     """
 
     kind: ClassVar[str] = ""  # name in LENSES
-    names: ClassVar[tuple[str, ...]] = ()  # of the coefficients; none: those of the fields
     distorts: ClassVar[bool] = True  # whether a pinhole could take its place
     parallel: ClassVar[bool] = False  # whether its rays are, instead of meeting in the camera
-
-    # ------------------------------------------------------------------------------------------
-    # To be defined
-    # ------------------------------------------------------------------------------------------
+    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Names of coefficients by field, a tuple of the first of them; none: a field is a coefficient.
+    """
 
     def project_point(self, camera: CameraParameters, position: Any) -> Any:
         """Return the place of a point on the film, Array2f, px; position: Array3f, camera axes."""
@@ -75,8 +74,7 @@ class Lens:
     ) -> list[Any]:
         """Return the derivatives of x and of y on the film, two Array3f, world: px per scene unit.
 
-        slopes: of the ray along
-        which the point is projected, see :meth:`clamped_slopes`; None for most lenses.
+        slopes: of the ray of projection, see :meth:`clamped_slopes`; None for most lenses.
         """
         raise NotImplementedError
 
@@ -117,14 +115,10 @@ class Lens:
             )
         return step(direction)
 
-    # ------------------------------------------------------------------------------------------
-    # Coefficients
-    # ------------------------------------------------------------------------------------------
-
     @classmethod
     def coefficient_names(cls) -> tuple[str, ...]:
         """Return the names of all coefficients."""
-        return cls.names or tuple(field.name for field in fields(cls))
+        return tuple(chain(*cls.groups.values())) or tuple(field.name for field in fields(cls))
 
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> Lens:
@@ -141,12 +135,18 @@ class Lens:
             raise UserError(f"lens {cls.kind} has the coefficients {names}; got {got}") from None
 
     def coefficients(self) -> dict[str, Any]:
-        """Return the coefficients by name."""
-        return {name: getattr(self, name) for name in self.coefficient_names()}
+        """Return the coefficients by name, without those that are left out."""
+        if not self.groups:
+            return {name: getattr(self, name) for name in self.coefficient_names()}
+        groups = (zip(names, getattr(self, f), strict=False) for f, names in self.groups.items())
+        return dict(chain(*groups))
 
     def with_coefficients(self, values: Mapping[str, Any]) -> Lens:
-        """Return the lens with other numbers for its coefficients; other names are left out."""
-        return replace(self, **{name: values[name] for name in self.coefficients()})
+        """Return the lens with other numbers for its coefficients; the model's end stays."""
+        if not self.groups:
+            return replace(self, **{name: values[name] for name in self.coefficients()})
+        given = {f: names[: len(getattr(self, f))] for f, names in self.groups.items()}
+        return replace(self, **{f: tuple(values[n] for n in names) for f, names in given.items()})
 
     def upload(self, float_type: type) -> Lens:
         """Return the lens with Dr.Jit scalars for its numbers: kernels are the same for all."""
@@ -160,12 +160,7 @@ class Lens:
 
     def for_camera(self, camera: CameraParameters) -> Lens:
         """Return the lens that knows what the film of ``camera`` sees."""
-        del camera
         return self
-
-    # ------------------------------------------------------------------------------------------
-    # Derived: visibility, depth, and which rays are met
-    # ------------------------------------------------------------------------------------------
 
     def shows(self, position: Any) -> Any:
         """Return whether the lens sees a point (Array3f, camera axes) at any distance, Bool.
@@ -175,11 +170,10 @@ class Lens:
         return position.z > 0
 
     def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
-        """Return whether a point is seen, its position, and its depth (scene units).
+        """Return whether a point is seen, its position, and its depth: the distance, scene units.
 
-        Depth is the distance from the centre. The position and the depth of a point that is not
-        seen are replaced: a masked lane must not divide by zero, as 0 * inf would poison the
-        gradient of its neighbours.
+        Position and depth of a point that is not seen are replaced: a masked lane must not divide
+        by zero, as 0 * inf would poison the gradient of its neighbours.
         """
         seen = (dr.norm(position) >= camera.near) & self.shows(position)
         _, position, _ = with_unseen_on_axis(position, seen)
@@ -187,12 +181,10 @@ class Lens:
 
     def true_slopes(self, camera: CameraParameters, position: Any) -> list[Any] | None:
         """Return x / z and y / z of a point; None if the projection is linearised at the point."""
-        del camera, position
         return None
 
     def clamped_slopes(self, camera: CameraParameters, position: Any) -> list[Any] | None:
         """Return the same, but not far outside the film: see ``constants.TAN_CLAMP``."""
-        del camera, position
         return None
 
     def depth_direction(self, camera: CameraParameters, position: Any) -> Any:
@@ -203,7 +195,6 @@ class Lens:
 
     def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
         """Return where a ray of unit ``direction`` (camera axes) reaches two depths."""
-        del direction
         return near, far
 
     def view_direction(self, camera: CameraParameters, offset: Any) -> Any:
@@ -211,17 +202,14 @@ class Lens:
 
         offset: from the camera's centre to the point, Array3f, world.
         """
-        del camera
         return offset
 
     def origin(self, camera: CameraParameters, x: Any, y: Any) -> Any:
         """Return where the ray through a place of the film (px) begins, Array3f, camera axes."""
-        del camera, y
         return types_of(type(x)).Array3f(0, 0, 0)
 
     def place_of_ray(self, camera: CameraParameters, origin: Any, direction: Any) -> Any:
         """Return the place on the film of a ray (Array3f, camera axes), Array2f, px."""
-        del origin
         return self.project_point(camera, direction)
 
 
@@ -237,7 +225,6 @@ class Perspective(Lens):
 
     def true_slopes(self, camera: CameraParameters, position: Any) -> list[Any]:
         """Return x / z and y / z of a point."""
-        del camera
         return [position.x / position.z, position.y / position.z]
 
     def clamped_slopes(self, camera: CameraParameters, position: Any) -> list[Any]:
@@ -281,8 +268,7 @@ class Pinhole(Perspective):
     ) -> list[Any]:
         """Return the derivatives of the place on the film, two Array3f, world: px per scene unit.
 
-        J's rows are focal / z (e_axis - slope e_z), with the ``slopes`` of a mean at ``position``,
-        or of another ray.
+        J's rows are focal / z (e_axis - slope e_z).
         """
         right, down, forward = camera.rotation
         return [
@@ -292,12 +278,21 @@ class Pinhole(Perspective):
 
     def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
         """Return the direction of the ray through a place of the film (px), Array3f."""
-        t = types_of(type(x))
-        film = (t.Array2f(x, y) - camera.principal) / camera.focal
-        return t.Array3f(film.x, film.y, 1)
+        film = film_coordinates(camera, x, y)
+        return types_of(type(x)).Array3f(film.x, film.y, 1)
 
 
 PINHOLE = Pinhole()
+
+
+def film_coordinates(camera: CameraParameters, x: Any, y: Any) -> Any:
+    """Return a place of the film (px) in focal lengths from the principal point, Array2f."""
+    return (types_of(type(x)).Array2f(x, y) - camera.principal) / camera.focal
+
+
+def pixel_coordinates(camera: CameraParameters, x: Any, y: Any) -> Any:
+    """Return the place of the film, Array2f, px; the inverse of :func:`film_coordinates`."""
+    return camera.focal * types_of(type(x)).Array2f(x, y) + camera.principal
 
 
 def check_coefficients(given: Mapping[str, float]) -> None:
@@ -311,10 +306,9 @@ def check_coefficients(given: Mapping[str, float]) -> None:
 
 
 def with_unseen_on_axis(position: Any, seen: Any) -> tuple[Any, Any, Any]:
-    """Return ``seen``, positions with those on the axis that are not seen, and their z.
+    """Return ``seen`` (Bool), positions (Array3f, camera axes), and their z.
 
-    position: Array3f, camera axes; seen: Bool. A mean that is not seen is put at (0, 0, 1), where
-    every lens is differentiable.
+    Points that are not seen are moved to (0, 0, 1), where every lens is differentiable.
     """
     x, y, z = position
     z = dr.select(seen, z, 1)

@@ -1,7 +1,7 @@
 """A camera that moves while its shutter is open: motion blur and rolling shutter.
 
-Imported when a camera has a second pose. Time runs from 0, where the camera is as it says, to 1,
-where it is at the second pose: its centre on a line, turning at a constant rate.
+Time runs from 0, at the camera's pose, to 1, at the second pose: the centre moves on a line, and
+the camera turns at a constant rate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
 
 NEWTON_STEPS = 3
-"""Until a splat's time is known: pixels move by a small part of the film while it is read."""
+"""Steps of the search for a splat's time: pixels move little while the film is read."""
 
 SLOWEST = 1e-4
 """Radians: turns below this are composed by their series, the formulas being 0 / 0 at 0."""
@@ -23,10 +23,10 @@ SLOWEST = 1e-4
 
 @dataclass(frozen=True)
 class Motion:
-    """From the first pose to the second; its subclasses are shutters.
+    """The motion from the first pose to the second; its subclasses are shutters.
 
-    ``cameras`` of a shutter are those whose images are averaged, ``camera_of`` the camera, without
-    a shutter, that sees each of some means.
+    ``cameras`` of a shutter returns those whose images are averaged, ``camera_of`` the camera,
+    without a shutter, that sees each of some means.
     """
 
     label: ClassVar[str]  # for messages
@@ -36,14 +36,14 @@ class Motion:
 
     @staticmethod
     def between(camera: Camera, rotation: Any, center: Any) -> tuple[Any, Any]:
-        """``travel`` and ``turn`` from the pose of ``camera`` to another.
+        """Return ``travel`` and ``turn`` from the pose of ``camera`` to another.
 
         rotation: Matrix3f, world to camera; center: Array3f, world.
         """
         return center - camera.center, rotation_vector(rotation @ camera.rotation.T)
 
     def pose(self, camera: Camera, time: Any) -> Camera:
-        """``camera``, which is at time 0, at another time."""
+        """Return ``camera``, which is at time 0, at another time."""
         turn = rotation_matrix(self.turn * time)
         return replace(
             camera,
@@ -53,7 +53,7 @@ class Motion:
         )
 
     def velocity(self, camera: Camera, offset: Any) -> Any:
-        """Of a point relative to the camera, world axes, per unit of time.
+        """Return the velocity of a point relative to the camera, world axes, per unit of time.
 
         camera: at the time in question; offset: from its centre to the point, world.
         """
@@ -63,14 +63,14 @@ class Motion:
 
 @dataclass(frozen=True)
 class MotionBlur(Motion):
-    """All pixels are open all the time: pictures at ``samples`` times are averaged."""
+    """The mean of images at ``samples`` times."""
 
     label: ClassVar[str] = "blurred"
 
     samples: int
 
     def cameras(self, camera: Camera) -> list[Camera]:
-        """At times in the middle of equal intervals."""
+        """Return the cameras in the middle of equal intervals of time."""
         return [self.pose(camera, (k + 0.5) / self.samples) for k in range(self.samples)]
 
     def camera_of(self, means: Any, camera: Camera) -> Camera:
@@ -85,17 +85,15 @@ class RollingShutter(Motion):
     label: ClassVar[str] = "rolling shutter"
 
     def cameras(self, camera: Camera) -> list[Camera]:
-        """The camera itself: it has one picture."""
+        """Return the camera itself: it has one image."""
         return [camera]
 
     def camera_of(self, means: Any, camera: Camera) -> Camera:
-        """The camera as it is when the row of the film that shows a mean is read.
+        """Return the camera when it reads the row of the film that shows a mean (Array3f, world).
 
-        means: Array3f, world.
-
-        The time is where the row that the mean is seen at says the same: found by Newton's method,
-        of which the last step is differentiated (the implicit function theorem). A splat is
-        projected as a whole at the time of its mean.
+        The time is that of the row on which the mean is seen then, by Newton's method, of which the
+        last step is differentiated (the implicit function theorem). A splat is projected as a whole
+        at the time of its mean.
         """
         still = dr.detach((means, camera))
         time = dr.full(type(means.x), 0.5, dr.width(means))
@@ -106,7 +104,7 @@ class RollingShutter(Motion):
         return self.pose(camera, dr.select(inside, moved, time))
 
     def _step(self, means: Any, camera: Camera, time: Any) -> tuple[Any, Any]:
-        """One step of Newton's method, and whether the time is on the film."""
+        """Take a step of Newton's method; return the time, and whether it is on the film."""
         at = self.pose(camera, time)
         offset = means - at.center
         seen, position, _ = at.lens.visibility(at, at.rotation @ offset)
@@ -123,7 +121,7 @@ class RollingShutter(Motion):
 
 
 def rotation_vector(rotation: Any) -> Any:
-    """Axis times angle, radians, of a rotation by less than half a turn."""
+    """Return axis times angle, radians, of a rotation by less than half a turn."""
     t = types_of(type(rotation[0, 0]))
     twice_sine = t.Array3f(
         rotation[2, 1] - rotation[1, 2],
@@ -139,7 +137,7 @@ def rotation_vector(rotation: Any) -> Any:
 
 
 def rotation_matrix(turn: Any) -> Any:
-    """3 x 3 of axis times angle, radians (Rodrigues)."""
+    """Return the rotation matrix of axis times angle, radians (Rodrigues)."""
     t = types_of(type(turn.x))
     squared = dr.squared_norm(turn)
     turns = squared > SLOWEST**2

@@ -1,23 +1,23 @@
-"""Parallel rays: Mitsuba's ``orthographic``.
-
-Imported when a sensor has them.
-"""
+"""Parallel rays: Mitsuba's ``orthographic``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from drgs.cameras.lens import CameraParameters, Perspective, with_unseen_on_axis
+from drgs.cameras.lens import (
+    CameraParameters,
+    Perspective,
+    film_coordinates,
+    pixel_coordinates,
+    with_unseen_on_axis,
+)
 from drgs.core.arrays import types_of
 
 
 @dataclass(frozen=True)
 class Orthographic(Perspective):
-    """A point (x, y, z) is seen at focal (x, y) + principal, with focal in px per scene unit.
-
-    All rays are parallel: colours are seen along the camera's axis.
-    """
+    """A point (x, y, z) is seen at focal (x, y) + principal, with focal in px per scene unit."""
 
     distorts: ClassVar[bool] = False
     parallel: ClassVar[bool] = True
@@ -28,40 +28,33 @@ class Orthographic(Perspective):
 
     def true_slopes(self, camera: CameraParameters, position: Any) -> None:
         """Return None: the projection is linear."""
-        del camera, position
 
     clamped_slopes = true_slopes
 
     def project_point(self, camera: CameraParameters, position: Any) -> Any:
         """Return the place of a point on the film, Array2f, px."""
-        x, y, _ = position
-        return camera.focal * types_of(type(x)).Array2f(x, y) + camera.principal
+        return pixel_coordinates(camera, position.x, position.y)
 
     def projection_jacobian(
         self, camera: CameraParameters, position: Any, slopes: None = None
     ) -> list[Any]:
         """Return the derivatives of the place on the film, two Array3f, world."""
-        del position, slopes
         right, down, _ = camera.rotation
         return [right * camera.focal.x, down * camera.focal.y]
 
     def view_direction(self, camera: CameraParameters, offset: Any) -> Any:
         """Return the axis: all points are seen along it."""
-        del offset
         return camera.rotation[2]
 
     def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
         """Return the direction of the ray through a place of the film, Array3f, camera axes."""
-        del camera, y
         return types_of(type(x)).Array3f(0, 0, 1)
 
     def origin(self, camera: CameraParameters, x: Any, y: Any) -> Any:
         """Return where the ray through a place of the film (px) begins, Array3f, camera axes."""
-        t = types_of(type(x))
-        film = (t.Array2f(x, y) - camera.principal) / camera.focal
-        return t.Array3f(film.x, film.y, 0)
+        film = film_coordinates(camera, x, y)
+        return types_of(type(x)).Array3f(film.x, film.y, 0)
 
     def place_of_ray(self, camera: CameraParameters, origin: Any, direction: Any) -> Any:
         """Return the place on the film of a ray (Array3f, camera axes), Array2f, px."""
-        del direction
         return self.project_point(camera, origin)

@@ -16,19 +16,17 @@ from drgs.cameras.lens import check_coefficients
 from drgs.core.arrays import types_of
 
 NEGLIGIBLE_COEFFICIENT = 1e-30
-"""A smaller one is as good as 0: at a slope of 1e4, k3 r^6 is 1e-6. Roots of polynomials with
-smaller ones overflow."""
+"""A smaller one is as good as 0: at a slope of 1e4, k3 r^6 is 1e-6. With it, roots overflow."""
 
 RADIUS_STEPS = 24
-"""When the radius is looked for that a lens shows at a place: most need 4 or 5. Next to the place
-where the function ends, each step at least halves the error."""
+"""Steps of the search for a radius: most need 4 or 5; next to the end of the function, each at
+least halves the error."""
 
-UNBOUNDED = 1e4
-"""A slope that no film shows."""
+UNBOUNDED = 1e4  # a slope that no film shows
 
 
 def horner(coefficients: Sequence[Any], x: Any) -> Any:
-    """c_0 + c_1 x + c_2 x^2 + ...; 0.0 without coefficients."""
+    """Return c_0 + c_1 x + c_2 x^2 + ...; 0.0 without coefficients."""
     if not coefficients:
         return 0.0
     total = coefficients[-1]
@@ -38,24 +36,24 @@ def horner(coefficients: Sequence[Any], x: Any) -> Any:
 
 
 def polynomial(coefficients: Sequence[Any], x: Any) -> Any:
-    """1 + c_1 x + c_2 x^2 + ..."""
+    """Return 1 + c_1 x + c_2 x^2 + ..."""
     return horner([1.0, *coefficients], x)
 
 
 def derivative(coefficients: Sequence[Any], x: Any) -> Any:
-    """c_1 + 2 c_2 x + ..."""
+    """Return c_1 + 2 c_2 x + ..."""
     return horner([power * c for power, c in enumerate(coefficients, 1)], x)
 
 
 def first_root(coefficients: np.ndarray) -> float:
-    """The smallest positive root; inf: there is none. coefficients: from the constant term up."""
+    """Return the smallest positive root, or inf. coefficients: from the constant term up."""
     roots = np.polynomial.polynomial.polyroots(np.trim_zeros(coefficients, "b"))
     real = roots.real[(np.abs(roots.imag) < 1e-7 * (1 + np.abs(roots))) & (roots.real > 0)]
     return float(real.min(initial=math.inf))
 
 
 def radius_at(distorted: Callable, target: Any, end: Any) -> Any:
-    """Where an increasing function reaches ``target``; close to ``end`` if it never does.
+    """Return where an increasing function reaches ``target``; close to ``end`` if it never does.
 
     distorted: radius -> its value and its derivative; 0 at 0. Newton's method within a bracket,
     which is divided where a step would leave it (Press et al., "Numerical Recipes", 3rd ed., 9.4):
@@ -85,7 +83,7 @@ def radius_at(distorted: Callable, target: Any, end: Any) -> Any:
 
 
 def _between(low: Any, high: Any) -> Any:
-    """In the middle on the scale r / (1 + r): a bracket may reach from 0 to very far."""
+    """Return the middle on the scale r / (1 + r): a bracket may reach from 0 to very far."""
     middle = (low / (1 + low) + high / (1 + high)) / 2
     return middle / (1 - middle)
 
@@ -100,6 +98,11 @@ def usable_coefficients(given: Mapping[str, float]) -> dict[str, float]:
 
 
 def up_to_the_last(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
-    """Coefficients of a polynomial: zero where one is not given but a later one is."""
+    """Return coefficients of a polynomial: zero where one is not given but a later one is."""
     count = max((n for n, name in enumerate(names, 1) if name in given), default=0)
     return tuple(float(given.get(name, 0.0)) for name in names[:count])
+
+
+def both_or_none(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
+    """Return coefficients if one is given, zero for another that is not."""
+    return tuple(float(given.get(name, 0.0)) for name in names if set(names) & set(given))

@@ -1,8 +1,4 @@
-"""The aperture of a thin lens: what is not in focus is blurred.
-
-Imported when a sensor has one (Mitsuba's ``thinlens``). What it does to splats is in
-``drgs.effects.defocus``.
-"""
+"""The aperture of a thin lens (Mitsuba's ``thinlens``); ``drgs.effects.defocus`` blurs splats."""
 
 from __future__ import annotations
 
@@ -18,13 +14,13 @@ from drgs.core.arrays import types_of
 
 @dataclass(frozen=True)
 class RoundAperture:
-    """A disc: what is at ``focus_distance`` is sharp."""
+    """A disc; points at ``focus_distance`` are sharp."""
 
     radius: Any  # Float, scene units
     focus_distance: Any  # Float, scene units, along the axis
 
     def variance(self, camera: Camera, depth: Any) -> Any:
-        """Along either axis, px^2, of the disc over which a point at ``depth`` is spread.
+        """Return the variance along either axis, px^2, of the blur of a point at ``depth``.
 
         Its radius is focal radius |1 / focus_distance - 1 / depth| (similar triangles), and a
         uniform disc of radius r has the variance r^2 / 4. Pixels are square.
@@ -33,7 +29,7 @@ class RoundAperture:
         return dr.square(radius) / 4
 
     def rays(self, camera: Camera, x: Any, y: Any, count: int) -> tuple[Any, Any]:
-        """Directions (Array3f, world) of ``count`` rays of each place of the film (px); if any.
+        """Return directions (Array3f, world) of ``count`` rays of each place (px), and validity.
 
         They begin all over the disc and meet at the focus distance.
         """
@@ -47,13 +43,13 @@ class RoundAperture:
         return camera.rotation.T @ ray, seen
 
     def in_focus(self, origin: Any, direction: Any) -> Any:
-        """The point of a ray (Array3f, camera axes) where all rays of its place meet."""
+        """Return the point of a ray (Array3f, camera axes) where all rays of its place meet."""
         t = (self.focus_distance - origin.z) / direction.z
         return origin + t * direction
 
 
 def _disc(count: int) -> np.ndarray:
-    """Points (2, count) of the unit disc, each with an equal share of it: a sunflower's seeds."""
+    """Return points (2, count) with equal shares of the unit disc: a sunflower's seeds."""
     k = np.arange(count)
     radii, angles = np.sqrt((k + 0.5) / count), np.pi * (3 - np.sqrt(5)) * k
     return np.array([radii * np.cos(angles), radii * np.sin(angles)])

@@ -1,26 +1,28 @@
 """COLMAP's fisheye lens with tangential and thin prism terms.
 
-Imported when a sensor or a dataset has one. Coefficients and what lies beyond the lens model: as in
-``drgs.cameras.radial_tangential``.
+Coefficients, and the end of the lens model: as in ``drgs.cameras.radial_tangential``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import drjit as dr
 
 from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
 from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
-from drgs.cameras.lens import LENSES, CameraParameters
-from drgs.cameras.polynomials import derivative, polynomial, up_to_the_last, usable_coefficients
+from drgs.cameras.lens import LENSES, CameraParameters, film_coordinates, pixel_coordinates
+from drgs.cameras.polynomials import (
+    both_or_none,
+    derivative,
+    polynomial,
+    up_to_the_last,
+    usable_coefficients,
+)
 from drgs.core.arrays import types_of
-
-RADIAL, TANGENTIAL, PRISM = ("k1", "k2", "k3", "k4"), ("p1", "p2"), ("sx1", "sy1")
-"""Names of coefficients."""
 
 
 @LENSES.register("thin_prism_fisheye")
@@ -36,11 +38,14 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         v' = L v + p1 (r^2 + 2 v^2) + 2 p2 u v + sy1 r^2
 
     (COLMAP's model THIN_PRISM_FISHEYE, in its ``sensor/models.h``; thin prisms: Weng, Cohen and
-    Herniou 1992). What is seen, and what depth is: as with :class:`drgs.cameras.fisheye.Fisheye`;
-    COLMAP itself shows nothing beside and behind the camera.
+    Herniou 1992). COLMAP itself shows nothing beside and behind the camera.
     """
 
-    names: ClassVar[tuple[str, ...]] = (*RADIAL, *TANGENTIAL, *PRISM)
+    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        **Fisheye.groups,
+        "tangential": ("p1", "p2"),
+        "prism": ("sx1", "sy1"),
+    }
 
     tangential: tuple[Any, ...] = ()  # p1, p2; or none
     prism: tuple[Any, ...] = ()  # sx1, sy1; or none
@@ -48,46 +53,32 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> ThinPrismFisheye:
         """Return the lens with COLMAP's coefficients; what is not given is zero."""
-        coefficients = usable_coefficients(coefficients)
-        kept = up_to_the_last(RADIAL, coefficients)
-        tangential, prism = (_both_or_none(names, coefficients) for names in (TANGENTIAL, PRISM))
+        given, (radial, *pairs) = usable_coefficients(coefficients), cls.groups.values()
+        kept = up_to_the_last(radial, given)
+        tangential, prism = (both_or_none(names, given) for names in pairs)
         fall = steepest_fall(tangential or (0.0, 0.0), prism or (0.0, 0.0))
         angle = min(math.sqrt(largest_squared_radius(kept, (), fall)), MAX_ANGLE)
         return cls(kept, math.cos(angle), tangential, prism)
 
-    def coefficients(self) -> dict[str, Any]:
-        """Return the coefficients that are not left out."""
-        tangential = dict(zip(TANGENTIAL, self.tangential, strict=False))
-        prism = dict(zip(PRISM, self.prism, strict=False))
-        return {**super().coefficients(), **tangential, **prism}
-
-    def with_coefficients(self, values: Mapping[str, Any]) -> ThinPrismFisheye:
-        """Return other numbers for the same coefficients; where the model ends stays as it is."""
-        return replace(
-            super().with_coefficients(values),
-            tangential=tuple(values[name] for name in TANGENTIAL if self.tangential),
-            prism=tuple(values[name] for name in PRISM if self.prism),
-        )
-
     @property
     def max_squared_radius(self) -> Any:
-        """Of (u, v), where the model ends."""
+        """The end of the model in (u, v)."""
         return dr.square(dr.acos(self.min_cosine))
 
     def radial(self, squared: Any) -> Any:
-        """L at r^2."""
+        """Return L at r^2."""
         return polynomial(self.radial_terms, squared)
 
     def radial_derivative(self, squared: Any) -> Any:
-        """d L / d r^2."""
+        """Return d L / d r^2."""
         return derivative(self.radial_terms, squared)
 
     def is_radial(self) -> bool:
-        """Whether places are moved along their radius alone."""
+        """Return whether places are moved along their radius alone."""
         return not (self.tangential or self.prism)
 
     def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Places as the film shows them."""
+        """Return places as the film shows them."""
         shown_x, shown_y = super().distort(x, y)
         if not self.prism:
             return shown_x, shown_y
@@ -95,7 +86,7 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         return shown_x + sx1 * squared, shown_y + sy1 * squared
 
     def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
-        """d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
+        """Return d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
         xx, xy, yx, yy = super().distortion_jacobian(x, y)
         if not self.prism:
             return xx, xy, yx, yy
@@ -104,22 +95,19 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
 
     def project_point(self, camera: CameraParameters, position: Any) -> Any:
         """Return the place of a point on the film, Array2f, px."""
-        place = types_of(type(position.x)).Array2f(*self.distort(*place_of(position)))
-        return camera.focal * place + camera.principal
+        return pixel_coordinates(camera, *self.distort(*place_of(position)))
 
     def projection_jacobian(
         self, camera: CameraParameters, position: Any, slopes: None = None
     ) -> list[Any]:
         """Return the derivatives of the place on the film, two Array3f, world."""
-        del slopes
         xx, xy, yx, yy = self.distortion_jacobian(*place_of(position))
         dx, dy = place_directions(camera, position)
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
     def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
         """Return the unit direction of the ray through a place of the film (px), Array3f."""
-        t = types_of(type(x))
-        film = (t.Array2f(x, y) - camera.principal) / camera.focal
+        t, film = types_of(type(x)), film_coordinates(camera, x, y)
         u, v = self.undistort(film.x, film.y)
         squared = u * u + v * v
         off_axis = squared > 0
@@ -127,10 +115,3 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         sine, cosine = dr.sincos(angle)
         scale = dr.select(off_axis, sine / angle, 1)
         return t.Array3f(scale * u, scale * v, dr.select(off_axis, cosine, 1))
-
-
-def _both_or_none(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
-    """Coefficients, where one is given; zero for one that is not."""
-    if not set(names) & set(given):
-        return ()
-    return tuple(float(given.get(name, 0.0)) for name in names)

@@ -1,15 +1,16 @@
-"""Where the cameras of a capture stand: around a scene, inside it, or where its own sensors are.
+"""Placement of a capture's cameras: around a scene, inside it, or where its own sensors are.
 
-What nobody says follows from the scene (:func:`settings_for`). A room is photographed from inside:
-its walls are dark, or not there, from behind. Sensors of the scene say which way is up, what is
-looked at and from how far; if there are many of them, their own pictures are taken.
+Settings that are not given follow from the scene (:func:`settings_for`). A room is photographed
+from inside: its walls are dark, or not there, from behind. Sensors of the scene decide up
+direction, target and distance; if there are many of them, their own images are taken.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +19,7 @@ import numpy as np
 from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
 from drgs.capture.path_tracing import (
     FAR_CLIP,
+    MIN_LIT_PART,
     SPLITS,
     CaptureCamera,
     CaptureSettings,
@@ -29,42 +31,38 @@ from drgs.core.errors import UserError
 from drgs.datasets.viewpoints import look_at
 
 KINDS = ("around", "inside", "sensors")
-"""Of cameras: around the scene, inside it, those of the scene itself."""
 
 ELEVATIONS = {"around": (0.0, 90.0), "inside": (-60.0, 60.0)}
 """Degrees above the horizon, lowest and highest. Inside, the ceiling is seen from below."""
 
-INSIDE_FOV = math.radians(70)
-"""In a room, walls are near."""
-
-INSIDE_PART = 0.6
-"""Of the way from what is looked at to the wall behind a camera: where that camera stands."""
-
-ENOUGH_SENSORS = 10
-"""A scene with so many is photographed from where they are."""
+INSIDE_FOV = math.radians(70)  # in a room, walls are near
+INSIDE_PART = 0.6  # place of a camera on the way from the target to the wall behind it
+ENOUGH_SENSORS = 10  # number of sensors from which a scene is photographed from where they are
 
 TEST_EVERY = 8
-"""Of the scene's own sensors, every eighth is for testing, as in the nerfstudio layout."""
+"""Every eighth of the scene's own sensors is for testing, as in the nerfstudio layout."""
 
 COUNTS = {"views", "val_views", "test_views"}
 
-ORBITING = {"distance", "azimuth", "elevation"}
-"""Settings that say how cameras stand around a scene."""
+ORBITING = {"distance", "azimuth", "elevation"}  # settings that place cameras around a scene
+
+UNUSED = {
+    "around": set(),
+    "inside": {"distance"},
+    "sensors": {*COUNTS, *ORBITING, "target", "up", "fov"},
+}
+"""Settings that a kind of cameras does not use."""
 
 CLOSED = 0.75
-"""Part of all directions in which something stands: at least this in a room. Cornell's box, which
-has five of six sides, has 5/6."""
+"""Least part of all directions with a surface in a room. Cornell's box, which has five of six
+sides, has 5/6."""
 
 NUM_SPOTS, NUM_DIRECTIONS = 128, 128
-"""Points of the bounding box from which we look for a room, and rays from each."""
+"""Points of the bounding box that may be in a room, and rays from each."""
 
-CLEARANCE = 0.1
-"""Quantile of the distances from a spot to what is around it: how much room there is."""
+CLEARANCE = 0.1  # quantile of the distances from a spot to its surroundings that measures its room
 
 PREVIEWS, PREVIEW_SIZE, PREVIEW_SPP = 12, (16, 16), 4
-
-MOST = 0.5
-"""Of what surfaces cover of the pictures: less than this is lit where a camera stands wrong."""
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -72,21 +70,15 @@ PLASTIC = 1.2207440846057596
 """The root of x^4 = x + 1: its powers spread points evenly over a box (Roberts 2018, "R_3")."""
 
 
-@dataclass(frozen=True, eq=False)
-class OwnCamera:
-    """A pinhole (or a thin lens's) of the scene itself."""
+class OwnCamera(NamedTuple):
+    """A sensor of the scene itself."""
 
     pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes
     narrower_fov: float  # radians, along the film's smaller side
 
-    @property
-    def center(self) -> np.ndarray:
-        """(3,) world."""
-        return self.pose[:3, 3]
-
 
 def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
-    """The scene's sensors of the types ``perspective`` and ``thinlens``."""
+    """Return the scene's sensors of the types ``perspective`` and ``thinlens``."""
     found = []
     for sensor in scene.sensors():
         parameters = mi.traverse(sensor)
@@ -103,7 +95,7 @@ def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
 
 
 def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> CaptureSettings:
-    """``settings`` with what is not among the names ``given`` as the scene calls for it.
+    """Return ``settings`` with values from the scene for those that are not named in ``given``.
 
     Raises :class:`UserError` for a setting that the cameras do not use.
     """
@@ -111,12 +103,23 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
     if "cameras" not in given:
         kind = _kind_for(scene, settings, given, own)
         return settings_for(scene, replace(settings, cameras=kind), {*given, "cameras"})
-    derived = _DERIVED[settings.cameras](scene, settings, given, own)
+    for name in sorted(given & UNUSED[settings.cameras]):
+        option = f"--{name.replace('_', '-')}"
+        raise UserError(f"{option}: is not used with --cameras {settings.cameras}; leave it out")
+    if settings.cameras == "sensors":
+        derived = _sensor_settings(own)
+    elif settings.cameras == "inside":
+        spot, _ = _room(scene, settings)
+        derived = {"target": tuple(spot.tolist()), "fov": _fov(settings, INSIDE_FOV)}
+    else:
+        derived = _around_settings(scene, settings, given, own) if own else {}
+    if own and settings.cameras != "sensors":
+        derived["up"] = _up(own)
     return replace(settings, **{name: derived[name] for name in derived.keys() - given})
 
 
 def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
-    """All pictures with their cameras, split after split; settings: of :func:`settings_for`."""
+    """Return all views, split after split; settings: of :func:`settings_for`."""
     if settings.cameras == "sensors":
         return views_of_sensors(own_cameras(scene), settings)
     if settings.cameras == "inside":
@@ -125,69 +128,53 @@ def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
 
 
 # ----------------------------------------------------------------------------------------------
-# What follows from the scene
+# Settings from the scene
 # ----------------------------------------------------------------------------------------------
 
 
 def _kind_for(
     scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
 ) -> str:
-    """One of :data:`KINDS`."""
     if given & ORBITING:
         return "around"
     if len(own) >= ENOUGH_SENSORS and not given & {*COUNTS, "target", "up", "fov"}:
         return "sensors"
-    if not _room(scene, settings).is_closed:
+    _, is_closed = _room(scene, settings)
+    if not is_closed:
         return "around"
-    author_is_inside = any(_look_around(scene, [o.center for o in own])[0] >= CLOSED)
+    author_is_inside = any(_look_around(scene, [o.pose[:3, 3] for o in own])[0] >= CLOSED)
     if not author_is_inside and _is_lit(scene, replace(settings, cameras="around"), given):
         return "around"
     return "inside" if _is_lit(scene, replace(settings, cameras="inside"), given) else "around"
 
 
 def _is_lit(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> bool:
-    """Whether light reaches most of what surfaces cover in a few small pictures of this kind."""
+    """Return whether most surfaces are lit in a few small images of this kind."""
     settings = settings_for(scene, settings, {*given, "cameras"})
     few = replace(
         settings, size=PREVIEW_SIZE, spp=PREVIEW_SPP, views=PREVIEWS, val_views=0, test_views=0
     )
     camera = CaptureCamera(scene, few)
-    return lit_part(np.stack([camera.picture(view) for view in views_of(scene, few)])) >= MOST
+    return lit_part(np.stack([camera.image(view) for view in views_of(scene, few)])) >= MIN_LIT_PART
 
 
-def _around(
+def _around_settings(
     scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
 ) -> dict[str, object]:
-    """As the scene's own sensors look at it."""
-    if not own:
-        return {}
-    derived = {"up": _up(own)}
+    """Return settings to look at the scene as its own sensors do, if they look at its middle."""
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
-    ahead = [(o.center, -o.pose[:3, 2]) for o in own]
+    ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in own]
     seen = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
     if not seen or given & {"fov", "distance"}:
-        return derived
+        return {}
     target = np.mean(seen, axis=0) if settings.target is None else np.array(settings.target)
-    distance = float(np.median([np.linalg.norm(o.center - target) for o in own]))
+    distance = float(np.median([np.linalg.norm(o.pose[:3, 3] - target) for o in own]))
     fov = _fov(settings, float(np.median([o.narrower_fov for o in own])))
-    return derived | {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
+    return {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
 
 
-def _inside(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
-) -> dict[str, object]:
-    """What is looked at is where there is most room."""
-    _refuse_unused(settings, given & {"distance"})
-    spot = tuple(_room(scene, settings).spot.tolist())
-    derived = {"target": spot, "fov": _fov(settings, INSIDE_FOV)}
-    return derived | {"up": _up(own)} if own else derived
-
-
-def _sensors(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
-) -> dict[str, object]:
-    """As many pictures as there are sensors."""
-    _refuse_unused(settings, given & {*COUNTS, *ORBITING, "target", "up", "fov"})
+def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
+    """Return as many views as there are sensors."""
     if not own:
         raise UserError(
             "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
@@ -197,57 +184,44 @@ def _sensors(
     return {"views": len(own) - tests, "val_views": 0, "test_views": tests}
 
 
-_DERIVED = {"around": _around, "inside": _inside, "sensors": _sensors}
-
-
-def _refuse_unused(settings: CaptureSettings, names: Set[str]) -> None:
-    for name in sorted(names):
-        option = f"--{name.replace('_', '-')}"
-        raise UserError(f"{option}: is not used with --cameras {settings.cameras}; leave it out")
-
-
 def _up(own: list[OwnCamera]) -> str:
-    """The axis that is nearest to what is up in the sensors' pictures, such as ``z`` or ``-y``."""
+    """Return the axis that is nearest to up in the sensors' images, such as ``z`` or ``-y``."""
     up = np.mean([o.pose[:3, 1] for o in own], axis=0)
     axis = int(np.argmax(np.abs(up)))
     return f"{'-' if up[axis] < 0 else ''}{'xyz'[axis]}"
 
 
 def _fov(settings: CaptureSettings, narrower: float) -> float:
-    """Radians, horizontal, from the field of view along the picture's smaller side."""
+    """Return the horizontal field of view, radians, from that along the image's smaller side."""
     width, height = settings.size
     if height >= width:
         return narrower
     return 2 * math.atan(width / height * math.tan(narrower / 2))
 
 
-@dataclass(frozen=True, eq=False)
-class _Room:
-    """The place with most room, among those with something in most directions, if there are any."""
+def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]:
+    """Return the place with most room, (3,) world, and whether something is in most directions.
 
-    spot: np.ndarray  # (3,) world
-    is_closed: bool
-
-
-def _room(scene: mi.Scene, settings: CaptureSettings) -> _Room:
+    Places where this is so come first.
+    """
     low, high = np.array(bounding_box(scene), np.float64)
     if settings.target is not None:
         spots = np.array([settings.target])
         if not ((low < spots[0]) & (spots[0] < high)).all():
-            return _Room(spots[0], is_closed=False)
+            return spots[0], False
     else:
         steps = np.arange(NUM_SPOTS)[:, None] * PLASTIC ** -np.arange(1.0, 4.0)
         spots = low + (high - low) * ((0.5 + steps) % 1)
     closed, room = _look_around(scene, spots)
     is_closed = closed >= CLOSED
     best = np.argmax(np.where(is_closed, room, -1)) if is_closed.any() else np.argmax(closed)
-    return _Room(spots[best], bool(is_closed.any()))
+    return spots[best], bool(is_closed.any())
 
 
 def _look_around(scene: mi.Scene, spots: object) -> tuple[np.ndarray, np.ndarray]:
-    """Of (N, 3) places, (N,) the part of all directions with a surface, and the room around.
+    """Return the part of all directions with a surface, and the room, (N,), at places (N, 3).
 
-    A surface that is seen from behind does not count: that is what is inside an object.
+    A surface that is seen from behind does not count: the place is inside an object.
     """
     spots = np.array(spots, np.float64).reshape(-1, 3)
     up = hemisphere(NUM_DIRECTIONS // 2, 0.0, np.random.default_rng(0))
@@ -262,9 +236,9 @@ def _look_around(scene: mi.Scene, spots: object) -> tuple[np.ndarray, np.ndarray
 def _free_way(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) distances to the first surface, lamps included, infinite where there is none.
+    """Return distances to the first surface, lamps included, (N,), infinite where there is none.
 
-    And (N,) bool: whether there is one, and it reflects or transmits on the side that is seen.
+    And whether there is one that reflects or transmits on the side that is seen, (N,) bool.
     """
     if not len(origins):
         return np.empty(0), np.empty(0, bool)
@@ -280,7 +254,7 @@ def _free_way(
 
 
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
-    """What cameras around a scene look at, (3,) world, and their distance from it.
+    """Return the target of cameras around a scene, (3,) world, and their distance from it.
 
     Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
     radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
@@ -303,12 +277,12 @@ def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.
 def views_around(
     settings: CaptureSettings, target: np.ndarray, distance: float
 ) -> list[CaptureView]:
-    """From all sides, at one distance from what is looked at."""
+    """Return views from all sides, at one distance from the target."""
     return _views(settings, target, lambda directions: np.full(len(directions), distance))
 
 
 def views_inside(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
-    """From between ``settings.target`` and what is around it, looking at it."""
+    """Return views from between ``settings.target`` and its surroundings."""
     target = np.array(settings.target)
     low, high = np.array(bounding_box(scene), np.float64)
     if not ((low < target) & (target < high)).all():
@@ -328,47 +302,38 @@ def views_inside(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView
 
 
 def views_of_sensors(own: list[OwnCamera], settings: CaptureSettings) -> list[CaptureView]:
-    """From where the scene's own sensors are."""
-    is_test = [settings.test_views > 0 and n % TEST_EVERY == 0 for n in range(len(own))]
-    views = []
-    for split, wanted in (("train", False), ("test", True)):
-        chosen = [o for o, test in zip(own, is_test, strict=True) if test == wanted]
-        views += [
-            CaptureView(split, index, o.pose, _fov(settings, o.narrower_fov))
-            for index, o in enumerate(chosen)
-        ]
-    return views
+    """Return the views of the scene's own sensors."""
+    has_tests = settings.test_views > 0
+    tests = own[::TEST_EVERY] if has_tests else []
+    train = [o for n, o in enumerate(own) if not (has_tests and n % TEST_EVERY == 0)]
+    return [
+        CaptureView(split, index, o.pose, _fov(settings, o.narrower_fov))
+        for split, cameras in (("train", train), ("test", tests))
+        for index, o in enumerate(cameras)
+    ]
 
 
 def _views(
-    settings: CaptureSettings,
-    target: np.ndarray,
-    distances: Callable[[np.ndarray], np.ndarray],
+    settings: CaptureSettings, target: np.ndarray, distances: Callable[[np.ndarray], np.ndarray]
 ) -> list[CaptureView]:
-    """Cameras that look at ``target``; distances: from it, (N,), in directions (N, 3)."""
-    views = []
-    up = _axis(settings.up)
+    """Return views of ``target``; distances: from it, (N,), in directions (N, 3)."""
+    views, axis = [], settings.up[-1]
+    up = np.eye(3)["xyz".index(axis)] * (-1 if settings.up.startswith("-") else 1)
     for number, split in enumerate(SPLITS):
         rng = np.random.default_rng([settings.seed, number])
         # Test views lie evenly; training views at random, but without gaps.
         jitter = 0.0 if split == "test" else 1.0
         directions = within(hemisphere(settings.count(split), jitter, rng), settings)
-        directions = np.roll(directions, "zxy".index(settings.up[-1]), axis=1) * up.sum()
-        for index, (direction, distance) in enumerate(
-            zip(directions, distances(directions), strict=True)
-        ):
-            pose = look_at(target + distance * direction, target, up) @ OPENCV_TO_OPENGL
+        directions = np.roll(directions, "zxy".index(axis), axis=1) * up.sum()
+        offsets = distances(directions)[:, None] * directions
+        for index, offset in enumerate(offsets):
+            pose = look_at(target + offset, target, up) @ OPENCV_TO_OPENGL
             views.append(CaptureView(split, index, pose, settings.fov))
     return views
 
 
-def _axis(name: str) -> np.ndarray:
-    """(3,) unit: ``x`` to ``z``, or their opposites, such as ``-y``."""
-    return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
-
-
 def within(directions: np.ndarray, settings: CaptureSettings) -> np.ndarray:
-    """Directions (N, 3) of the upper hemisphere about z, moved evenly into the settings' ranges."""
+    """Return directions (N, 3) of the upper hemisphere about z, moved evenly into the ranges."""
     elevation = settings.elevation or ELEVATIONS[settings.cameras]
     if settings.azimuth is None and elevation == ELEVATIONS["around"]:
         return directions
@@ -382,7 +347,7 @@ def within(directions: np.ndarray, settings: CaptureSettings) -> np.ndarray:
 
 
 def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3): unit vectors with z > 0, of equal density per solid angle.
+    """Return unit vectors (count, 3) with z > 0, of equal density per solid angle.
 
     A golden-angle spiral from the rim to the pole: equal steps of height are equal areas (the
     sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all; ``rng``

@@ -1,6 +1,15 @@
-"""Pictures of a Mitsuba scene, path traced, as a dataset.
+"""Path traced images of a Mitsuba scene.
 
-Where the cameras stand is the business of ``drgs.capture.camera_placement``.
+From around a scene, lights are not seen, only what they light: alpha is the part of a pixel that
+surfaces cover (an opacity mask counts, glass is opaque).
+
+A pixel that is half covered is stored as the mean colour c of its covered part and alpha a = 1/2.
+The colour is encoded first and composited then, a srgb(c) + (1 - a) background, as Blender wrote
+the original and as splats are composited. In the premultiplied linear image (a c, a) of the film
+both channels come from the same samples, so c is exactly their quotient.
+
+Each pixel is the plain mean of the samples inside it (a box filter), the only one that Mitsuba
+accumulates in a reproducible order: the same settings give the same bytes.
 """
 
 from __future__ import annotations
@@ -9,8 +18,6 @@ import importlib.util
 import math
 import sys
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -21,46 +28,34 @@ import numpy as np
 
 from drgs.cameras.axes import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
-from drgs.io.pictures import read_image, to_uint8
+from drgs.integrator.state import is_splats
+from drgs.io.pictures import to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
 
-NERF_SYNTHETIC_FOV = 0.6911112070083618
-"""Radians: the original's ``camera_angle_x``."""
+NERF_SYNTHETIC_FOV = 0.6911112070083618  # radians: the original's ``camera_angle_x``
 
 SPLITS = ("train", "val", "test")
 
-PATHS_PER_PASS = 2**24
-"""Paths traced at once, at most: their state takes a few hundred MiB."""
+PATHS_PER_PASS = 2**24  # paths traced at once, at most: their state takes a few hundred MiB
 
 SAMPLES_PER_PASS = 64
 """Per pixel, a square: they are stratified together (8x8 multi-jittered), which leaves about half
 the noise variance of as many independent ones."""
 
-NEAR_CLIP, FAR_CLIP = 1e-5, 1e5
-"""Of the bounding box's diagonal."""
-
-DARK = 2
-"""Levels of 255: no channel of a black pixel is lighter."""
+NEAR_CLIP, FAR_CLIP = 1e-5, 1e5  # of the bounding box's diagonal
+MAX_BLACK = 2  # largest channel of a black pixel, of 255
+MIN_LIT_PART = 0.5  # part of the covered pixels that are lit: less where a camera stands wrong
 
 MAX_LAMPS_IN_A_ROW = 16
 """Surfaces that shine are passed through on the way to the first hit, this many at most."""
 
-
-LIMITS = {
-    "views": (1, 100_000),
-    "val_views": (0, 100_000),
-    "test_views": (0, 100_000),
-    "spp": (1, 2**20),
-    "max_depth": (1, 2**16),
-    "points": (0, 5_000_000),
-    "seed": (0, 2**64 - 1),
-}
-"""By name of the setting, its smallest and largest value."""
+SIGHT_RAYS = 64
+"""Rays through an image along both sides: a fit cannot use anything smaller than their spacing."""
 
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """What the pictures depend on, beside the scene."""
+    """The settings that decide the images, beside the scene."""
 
     views: int = 100  # to train on
     val_views: int = 0
@@ -79,22 +74,13 @@ class CaptureSettings:
     elevation: tuple[float, float] | None = None  # degrees; None: as the kind of cameras has it
 
     def __post_init__(self) -> None:
-        for name, (least, most) in LIMITS.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise UserError(f"{name} must be between {least} and {most:,}, got {value}")
         width, height = self.size
-        if min(width, height) < 1 or width * height > PATHS_PER_PASS:
+        if width * height > PATHS_PER_PASS:
             raise UserError(
-                f"size must be at least 1 x 1 and at most {PATHS_PER_PASS:,} px in all, got "
-                f"{width} x {height}"
+                f"size must be at most {PATHS_PER_PASS:,} px in all, got {width} x {height}"
             )
-        if not 0 < self.fov < math.pi:
-            raise UserError(f"fov must be between 0 and pi (radians), got {self.fov:g}")
         if self.distance is not None and not 0 < self.distance < math.inf:
             raise UserError(f"distance must be > 0, got {self.distance:g}")
-        if self.target is not None and not np.isfinite(self.target).all():
-            raise UserError(f"target must be finite, got {self.target}")
         for name, turn in (("azimuth", 360), ("elevation", 90)):
             low, high = getattr(self, name) or (0, 0)
             if not -turn <= low <= high <= turn:
@@ -113,17 +99,17 @@ class CaptureSettings:
 
     @property
     def hides_lights(self) -> bool:
-        """Whether what shines is left out: of an object's studio it is, of a room it is not."""
+        """Whether shining surfaces are left out: an object's studio is, a room's lamps are not."""
         return self.cameras != "inside"
 
     def count(self, split: str) -> int:
-        """Number of views of a split."""
+        """Return the number of views of a split."""
         return {"train": self.views, "val": self.val_views, "test": self.test_views}[split]
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureView:
-    """One picture to take."""
+    """One image to take."""
 
     split: str
     index: int
@@ -132,36 +118,18 @@ class CaptureView:
 
     @property
     def file_path(self) -> str:
-        """As the transforms file names it, without the suffix."""
+        """Its name in the transforms file, without the suffix."""
         return f"./{self.split}/r_{self.index}"
 
 
-def picture_path(out: Path, view: CaptureView) -> Path:
-    """Where a picture is written."""
-    return out / f"{view.file_path}.png"
-
-
 def load_scene(path: Path) -> mi.Scene:
-    """The scene that an XML or a Python file describes.
+    """Load a scene from an XML file, or from a Python file with a function ``scene()``.
 
-    Raises :class:`UserError` where it describes none, or one of another variant than the active.
+    Raises :class:`UserError` where there is none, or one of another variant than the active.
     """
-    variant = mi.variant()
-    if path.suffix == ".py":
-        try:
-            description = _scene_dictionary(path)
-        finally:
-            other = mi.variant()
-            mi.set_variant(variant)
-        if other != variant:
-            raise UserError(
-                f"{path}: must leave Mitsuba's variant at {variant}, got mi.set_variant("
-                f"{other!r}); choose a variant with --variant"
-            )
-        mi.file_resolver().append(str(path.parent.resolve()))
     try:
         if path.suffix == ".py":
-            scene = load_scene_dictionary(description, path)
+            scene = load_scene_dictionary(_scene_dictionary(path), path)
         else:
             scene = load_scene_file(path)
     except UserError:
@@ -176,24 +144,31 @@ def load_scene(path: Path) -> mi.Scene:
 
 
 def _scene_dictionary(path: Path) -> dict[str, object]:
-    """What ``scene()`` of a Python file returns."""
+    """Return what ``scene()`` of a Python file returns; files in its folder are found by name."""
+    variant = mi.variant()
     try:
-        function = getattr(_import(path), "scene", None)
-        if not callable(function):
-            raise UserError(f"{path}: must define a function scene() that returns a dictionary")
-        description = function()
-    except UserError:
-        raise
+        description = _import(path).scene()
     except (Exception, SystemExit) as error:
-        lines = [
-            f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)
-        ]
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == str(path)]
         if isinstance(error, SyntaxError):
             lines = [error.lineno]
         line = f":{lines[-1]}" if lines else ""
-        raise UserError(f"{path}{line}: {type(error).__name__}: {one_line(error)}") from None
+        raise UserError(
+            f"{path}{line}: {type(error).__name__}: {one_line(error)}; it must define a function "
+            "scene() that returns a dictionary"
+        ) from None
+    finally:
+        other = mi.variant()
+        mi.set_variant(variant)
+    if other != variant:
+        raise UserError(
+            f"{path}: must leave Mitsuba's variant at {variant}, got mi.set_variant({other!r}); "
+            "choose a variant with --variant"
+        )
     if not isinstance(description, dict) or description.get("type") != "scene":
         raise UserError(f'{path}: scene() must return a dictionary with "type": "scene"')
+    mi.file_resolver().append(str(path.parent.resolve()))
     return description
 
 
@@ -208,8 +183,24 @@ def _import(path: Path) -> ModuleType:
     return module
 
 
+def refuse_splats(path: Path, scene: mi.Scene) -> None:
+    """Raise :class:`UserError` for a scene with splats, which path tracing would leave out."""
+    integrator = scene.integrator()
+    nested = [] if integrator is None else mi.traverse(integrator).hierarchy  # itself included
+    if any(map(is_splats, nested)):
+        found = "its integrator is splats"
+    elif any("Ellipsoids" in node.class_name() for node in mi.traverse(scene).hierarchy):
+        found = "it has shapes of type ellipsoids"
+    else:
+        return
+    raise UserError(
+        f"{path}: the scene holds splats ({found}), which path tracing leaves out; take pictures "
+        f"of it with python -m drgs.render {path} --out DIR, or remove the splats from the file"
+    )
+
+
 def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """(3,) lowest and highest coordinates of the surfaces that do not shine."""
+    """Return lowest and highest coordinates, (3,), of the surfaces that do not shine."""
     boxes = [shape.bbox() for shape in scene.shapes() if not shape.is_emitter()]
     corners = np.array([[box.min, box.max] for box in boxes if box.valid()]).reshape(-1, 2, 3)
     if not len(corners):
@@ -221,7 +212,7 @@ def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 class CaptureCamera:
-    """Takes pictures of a scene with one Mitsuba sensor that is moved around."""
+    """A Mitsuba sensor that is moved around to take images of a scene."""
 
     def __init__(self, scene: mi.Scene, settings: CaptureSettings) -> None:
         self._scene, self._settings = scene, settings
@@ -256,8 +247,8 @@ class CaptureCamera:
         self._parameters = mi.traverse(self._sensor)
         self._fov = settings.fov
 
-    def picture(self, view: CaptureView) -> np.ndarray:
-        """(H, W, 4) uint8: straight alpha, colour in display space."""
+    def image(self, view: CaptureView) -> np.ndarray:
+        """Return (H, W, 4) uint8: straight alpha, colour in display space."""
         linear = self.linear(view)
         if not np.isfinite(linear).all():
             y, x = np.argwhere(~np.isfinite(linear).all(axis=2))[0]
@@ -265,7 +256,7 @@ class CaptureCamera:
         return encode(linear)
 
     def linear(self, view: CaptureView) -> np.ndarray:
-        """(H, W, 4) float64: radiance times alpha, and alpha."""
+        """Return (H, W, 4) float64: radiance times alpha, and alpha."""
         to_world = view.pose @ OPENGL_TO_MITSUBA
         self._parameters["to_world"] = mi.Transform4f(to_world)
         if view.fov != self._fov:
@@ -278,33 +269,21 @@ class CaptureCamera:
         entropy = [self._settings.seed, SPLITS.index(view.split), view.index]
         seeds = np.random.SeedSequence(entropy).generate_state(len(counts))
         total = np.zeros((height, width, 4))
-        with _only_errors_logged():
+        settings = {"sensor": self._sensor, "integrator": self._integrator}
+        level = mi.logger().log_level()
+        # Mitsuba would warn in each pass that its sampler rounds the number of paths up.
+        mi.logger().set_log_level(mi.LogLevel.Error)
+        try:
             for count, seed in zip(counts, seeds, strict=True):
-                image = mi.render(
-                    self._scene,
-                    sensor=self._sensor,
-                    integrator=self._integrator,
-                    seed=int(seed),
-                    spp=count,
-                )
+                image = mi.render(self._scene, seed=int(seed), spp=count, **settings)
                 total += count * np.array(image, np.float64)
+        finally:
+            mi.logger().set_log_level(level)
         return total / spp
 
 
-@contextmanager
-def _only_errors_logged() -> Iterator[None]:
-    """Mitsuba would say for each pass that its sampler rounds the number of paths up."""
-    logger = mi.logger()
-    level = logger.log_level()
-    logger.set_log_level(mi.LogLevel.Error)
-    try:
-        yield
-    finally:
-        logger.set_log_level(level)
-
-
 def encode(linear: np.ndarray) -> np.ndarray:
-    """(H, W, 4) uint8 straight sRGB and alpha, from premultiplied linear radiance and alpha.
+    """Return (H, W, 4) uint8 straight sRGB and alpha, from premultiplied linear radiance and alpha.
 
     Light beyond white is cut off. Where alpha rounds to zero the colour is black, not noise.
     """
@@ -317,79 +296,27 @@ def encode(linear: np.ndarray) -> np.ndarray:
 
 
 def lit_part(rgba: np.ndarray) -> float:
-    """Of the covered pixels of (..., 4) uint8: the part that is not black; 0 without any."""
+    """Return the part of the covered pixels of (..., 4) uint8 that is not black; 0 without any."""
     covered = rgba[..., 3] > 0
-    lit = covered & (rgba[..., :3].max(axis=-1) > DARK)
+    lit = covered & (rgba[..., :3].max(axis=-1) > MAX_BLACK)
     return float(lit.sum() / max(1, covered.sum()))
 
 
-SIGHT_RAYS = 64
-"""Through each picture, along both sides: what falls between them is smaller than a fit can use."""
-
-
 def require_sight(scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView]) -> None:
-    """Raise :class:`UserError` where no training view sees a surface, of which points are wanted.
-
-    Before pictures are taken: it would be found out after all of them.
-    """
+    """Raise :class:`UserError` where no training view sees a surface, and points are wanted."""
     if not settings.points:
         return
-    train = [view for view in views if view.split == "train"]
     steps = (np.arange(SIGHT_RAYS) + 0.5) / SIGHT_RAYS
     spots = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * settings.size
-    for view in train:
+    for view in views:
         rays = view.pose[:3, 3], view_rays(view, spots, settings)
-        if first_hits(scene, *rays, settings.hides_lights)[1].any():
+        if view.split == "train" and first_hits(scene, *rays, settings.hides_lights)[1].any():
             return
     raise UserError("the cameras see nothing of the scene: give --target and --distance")
 
 
-def visible_points(
-    scene: mi.Scene, settings: CaptureSettings, views: list[CaptureView], out: Path
-) -> tuple[np.ndarray, np.ndarray]:
-    """First hits of random rays: positions (N, 3) float32 world, colours (N, 3) uint8.
-
-    Each training view has the same share of ``settings.points``, spread evenly over what is
-    covered of its picture; the colour is that of the pixel in the written picture. None (N = 0)
-    where the few paths of a pixel met nothing.
-    """
-    train = [view for view in views if view.split == "train"]
-    positions, colors = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)]
-    for number, view in enumerate(train):
-        share = (number + 1) * settings.points // len(train) - number * settings.points // len(
-            train
-        )
-        rng = np.random.default_rng([settings.seed, len(SPLITS), view.index])
-        picture = _taken(picture_path(out, view), settings).reshape(-1, 4)
-        weights = picture[:, 3].astype(np.float64)
-        if not weights.any():
-            continue
-        # At the edge of a surface a ray can miss it, so draw more than are kept.
-        pixels = rng.choice(len(picture), 2 * share + 64, p=weights / weights.sum())
-        rows, columns = np.divmod(pixels, settings.size[0])
-        spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
-        rays = view.pose[:3, 3], view_rays(view, spots, settings)
-        hits, valid = first_hits(scene, *rays, settings.hides_lights)
-        positions.append(hits[valid][:share])
-        colors.append(to_uint8(picture[pixels[valid], :3])[:share])
-    return np.concatenate(positions), np.concatenate(colors)
-
-
-def _taken(path: Path, settings: CaptureSettings) -> np.ndarray:
-    """(H, W, 4) float32: a picture of this capture, as it was written."""
-    picture = read_image(path)
-    width, height = settings.size
-    if picture.shape != (height, width, 4):
-        raise UserError(
-            f"{path}: must be an RGBA picture of {width} x {height} px of this capture, got "
-            f"{picture.shape[1]} x {picture.shape[0]} with {picture.shape[2]} channels; remove it, "
-            "and the same command takes it again"
-        )
-    return picture
-
-
 def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -> np.ndarray:
-    """(N, 3): unit directions, world, through (N, 2) places x, y in px of a picture."""
+    """Return unit directions (N, 3), world, through places x, y (N, 2) of an image, px."""
     width, height = settings.size
     focal = 0.5 * width / math.tan(0.5 * view.fov)
     offset = (spots - np.array([width / 2, height / 2])) / focal
@@ -401,7 +328,7 @@ def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -
 def first_hits(
     scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, past_lamps: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) float32 world, where rays meet a surface; (N,) bool if any.
+    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool.
 
     past_lamps: whether surfaces that shine do not count.
     """

@@ -23,8 +23,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, Valid
 from pydantic_core import ErrorDetails
 
 from drgs.cameras.axes import between_opencv_and_opengl
-from drgs.config.section import expectation
 from drgs.config.schema import DataConfig
+from drgs.config.section import expectation
 from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.core.registry import HOW_TO_INSTALL

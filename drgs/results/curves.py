@@ -19,19 +19,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SMOOTHING_PARTS = 50
-"""The smooth line of a curve is a running mean over this part of all rows."""
+SMOOTHING_PARTS = 50  # the smooth line of a curve is a running mean over this part of all rows
 
 NUM_PANELS = 6
-"""Of a fit: see :func:`panels_of`."""
 
-PAGE_DPI = 160
-"""Of a curve in the page, 3.7 inches wide: what fine screens can show."""
-
-
-def write_curves(path: Path, history: FitHistory) -> None:
-    """Write a picture of all curves."""
-    write_figure(path, draw_curves(history, LIGHT))
+PAGE_DPI = 160  # resolution of a curve in the page, 3.7 inches wide, for fine screens
 
 
 @dataclass(frozen=True)
@@ -47,24 +39,12 @@ class Theme:
 
 
 LIGHT = Theme(
-    paper="#ffffff",
-    ink="#1d2330",
-    faint="#e3e6ec",
-    raw="#b9cdf0",
-    line="#1f5fd0",
-    others=("#2b8a57", "#c2543a", "#8b5cb8"),
+    "#ffffff", "#1d2330", "#e3e6ec", "#b9cdf0", "#1f5fd0", ("#2b8a57", "#c2543a", "#8b5cb8")
 )
-
 
 DARK = Theme(
-    paper="#1a1e27",
-    ink="#d8dde8",
-    faint="#333a48",
-    raw="#34507f",
-    line="#7fb0ff",
-    others=("#6fca98", "#f0937b", "#c3a2ea"),
+    "#1a1e27", "#d8dde8", "#333a48", "#34507f", "#7fb0ff", ("#6fca98", "#f0937b", "#c3a2ea")
 )
-
 
 THEMES = (LIGHT, DARK)
 
@@ -86,7 +66,7 @@ class Panel:
 
 
 def panels_of(history: FitHistory) -> list[Panel]:
-    """The six curves."""
+    """Return the six curves."""
 
     def column(name: str) -> np.ndarray:
         return np.array([getattr(row, name) for row in history.rows], np.float64)
@@ -110,31 +90,29 @@ def panels_of(history: FitHistory) -> list[Panel]:
 
 
 def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """By what was done, iterations and sums from then on; without what was never done."""
-    changes = history.density
-    x = np.array([0, *(change.iteration for change in changes)], np.float64)
+    """Return iterations and sums of the changes so far, by kind of change, if there are any."""
+    changes, curves = history.density, {}
+    x = [0, *(change.iteration for change in changes)]
+    x.append(history.rows[-1].iteration if history.rows else x[-1])
     columns = {"added": "num_added", "removed": "pruned", "relocated": "relocated"}
-    sums = {
-        name: np.cumsum([0, *(getattr(change, key) for change in changes)])
-        for name, key in columns.items()
-    }
-    last = max([row.iteration for row in history.rows[-1:]], default=x[-1])
-    return {
-        name: (np.append(x, last), np.append(y, y[-1])) for name, y in sums.items() if y[-1] > 0
-    }
+    for name, column in columns.items():
+        y = np.cumsum([0, *(getattr(change, column) for change in changes), 0])
+        if y[-1] > 0:
+            curves[name] = np.array(x, np.float64), y
+    return curves
 
 
-def draw_curves(history: FitHistory, theme: Theme) -> Figure:
-    """A matplotlib figure of all panels."""
-    figure = new_figure(11, 6, paper=theme.paper)
+def write_curves(path: Path, history: FitHistory) -> None:
+    """Write an image of all curves."""
+    figure = new_figure(11, 6, paper=LIGHT.paper)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     for axis, panel in zip(figure.subplots(2, 3).flat, panels_of(history), strict=True):
-        _draw(axis, panel, theme)
-    return figure
+        _draw(axis, panel, LIGHT)
+    write_figure(path, figure)
 
 
 def draw_curve(panel: Panel, theme: Theme) -> Figure:
-    """A matplotlib figure of one panel, for the page, where there may be no room for two."""
+    """Return a matplotlib figure of one panel, for the page."""
     figure = new_figure(3.7, 2.8, paper=theme.paper, dpi=PAGE_DPI)
     _draw(figure.subplots(), panel, theme)
     return figure
@@ -165,7 +143,7 @@ def _draw(axis: Axes, panel: Panel, theme: Theme) -> None:
 
 
 def _running_mean(values: np.ndarray) -> np.ndarray:
-    """Centred, over a 50th of all rows; narrower at the ends."""
+    """Return a centred mean over a 50th of all rows, narrower at the ends."""
     reach = len(values) // (2 * SMOOTHING_PARTS)
     total = np.concatenate([[0.0], np.cumsum(values)])
     index = np.arange(len(values))

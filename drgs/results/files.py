@@ -2,74 +2,30 @@
 
 from __future__ import annotations
 
-CONFIG = "config.yml"
-"""Every value of the configuration; it says whose folder it is."""
-
-CHECKPOINT = "checkpoint.npz"
-"""While the fit runs: see :mod:`drgs.training.checkpoint`."""
-
+CONFIG = "config.yml"  # every value of the configuration; marks whose folder it is
+CHECKPOINT = "checkpoint.npz"  # while the fit runs: see :mod:`drgs.training.checkpoint`
 GAUSSIANS = "point_cloud.ply"
-
-GAUSSIANS_FOR_VIEWERS = "point_cloud_viewers.ply"
-"""For viewers that know nothing of the approximations that the others are rendered with."""
-
+GAUSSIANS_FOR_VIEWERS = "point_cloud_viewers.ply"  # for viewers without our approximations
 HISTORY = "history.csv"
-DENSITY = "density.csv"
-"""What changed the population, and how; there is none where nothing did."""
-
+DENSITY = "density.csv"  # changes of the population, if there are any
 CURVES = "curves.png"
 ORBIT = "orbit.webp"
 ORBIT_GIF = "orbit.gif"
 REPORT = "report.html"
-
-VIEWER = "viewer.html"
-"""The Gaussians, to walk around in; there is none where it would be too large."""
-
-RENDERS = "renders"
-"""A folder for each split that was measured, with a picture for each of its views."""
-
-SIDE_BY_SIDE = "side_by_side"
-"""The same, with the photograph and the difference beside the picture."""
-
-CAMERAS = "cameras.json"
-"""Refined cameras of the training views."""
-
-VIEWS = "views.json"
-"""Cameras of the training views as the data has them: what an orbit needs."""
-
-COLORS = "colors.json"
-"""Colour transforms of the training views."""
-
-BUDGET_PLAN = "plan.txt"
-"""What was planned for a budget of time, and why."""
-
-TENSORBOARD = "tensorboard"
-"""A folder, with ``--tensorboard``."""
-
-EVENTS = f"{TENSORBOARD}/events.out.tfevents.fit"
-"""The history as TensorBoard reads it, which knows its files by the word in the middle."""
-
-METRICS = "metrics.json"
-"""Written when everything else is there."""
+VIEWER = "viewer.html"  # the Gaussians, to walk around in, unless it would be too large
+RENDERS = "renders"  # a folder for each split, with an image of each view
+SIDE_BY_SIDE = "side_by_side"  # the same, with the photograph and the difference beside the image
+CAMERAS = "cameras.json"  # refined cameras of the training views
+VIEWS = "views.json"  # cameras of the training views as the data has them, for orbits
+COLORS = "colors.json"  # colour transforms of the training views
+BUDGET_PLAN = "plan.txt"  # the plan for a budget of time, with reasons
+TENSORBOARD = "tensorboard"  # a folder, with ``--tensorboard``
+EVENTS = f"{TENSORBOARD}/events.out.tfevents.fit"  # TensorBoard finds the word in the middle
+METRICS = "metrics.json"  # written last
 
 RESULTS = (
-    CAMERAS,
-    CHECKPOINT,
-    COLORS,
-    CURVES,
-    DENSITY,
-    HISTORY,
-    METRICS,
-    ORBIT_GIF,
-    ORBIT,
-    BUDGET_PLAN,
-    GAUSSIANS,
-    GAUSSIANS_FOR_VIEWERS,
-    RENDERS,
-    REPORT,
-    SIDE_BY_SIDE,
-    TENSORBOARD,
-    VIEWER,
-    VIEWS,
+    *(CAMERAS, CHECKPOINT, COLORS, CURVES, DENSITY, HISTORY, METRICS, ORBIT_GIF, ORBIT),
+    *(BUDGET_PLAN, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, RENDERS, REPORT, SIDE_BY_SIDE, TENSORBOARD),
+    *(VIEWER, VIEWS),
 )
 """All of them but ``config.yml``."""

@@ -1,16 +1,15 @@
 """The output folder of a fit: one folder, one run, and no result is lost by accident.
 
-A folder belongs to the run whose ``config.yml`` it holds. A fit takes a folder that is missing or
-empty, or that holds an unfinished run of the same configuration, which it continues; it never
+A folder belongs to the run whose ``config.yml`` it contains. A fit takes a folder that is missing
+or empty, or that contains an unfinished run of the same configuration, which it continues. It never
 writes over results, nor over anything else that no fit has written.
 """
 
 from __future__ import annotations
 
-import html
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import yaml
@@ -27,7 +26,6 @@ from drgs.results.files import (
     EVENTS,
     METRICS,
     RENDERS,
-    REPORT,
     RESULTS,
     SIDE_BY_SIDE,
     TENSORBOARD,
@@ -35,129 +33,104 @@ from drgs.results.files import (
 
 COMMAND = "fit"
 
-MAX_BYTES = 1 << 28
-"""Of a report."""
+MAX_CONFIG_BYTES = 1 << 28
 
-FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)
-"""Of pictures, in folders named after splits, and of TensorBoard; the other results are files."""
+FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)  # results that are folders; the others are files
 
 SECTIONS = {"data", "init", "model", "optimizer", "loss", "densify", "output", "iterations", "seed"}
-"""That every version has written into ``config.yml``."""
+"""Keys of every ``config.yml`` that a fit has written."""
 
-FOUND_AGAIN = ("data.path", "init.point_cloud")
-"""Values that are also kept relative to the folder."""
+DATA_PATHS = ("data.path", "init.point_cloud")
+"""Values that are also recorded relative to the folder."""
 
 
 def claim_output_folder(folder: Path, config: FitConfig, pictures: Sequence[str] = ()) -> None:
     """Make ``folder`` (absolute or relative to the current one) the output folder of a run.
 
-    Creates it, with its parents, and writes ``config.yml``; what else it holds stays as it is.
-    pictures: names that :func:`pictures_of` gave.
+    Creates it, with its parents, and writes ``config.yml``; what else it contains stays as it is.
+    pictures: names from :func:`pictures_of`.
 
     Raises :class:`UserError` as :func:`check_output_folder`, and where it cannot be written.
     """
-    _make_folder(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unusable(folder, error) from error
     check_output_folder(folder, config, pictures)
-    _take(folder, config, pictures)
+    continue_run(folder, config, pictures)
 
 
 def check_output_folder(folder: Path, config: FitConfig, pictures: Sequence[str] = ()) -> None:
-    """Raise :class:`UserError` where ``folder`` cannot become the output folder of a run.
-
-    That is where it holds results of another run, or files of others; nothing is written.
-    """
-    if not os.path.lexists(folder) or not (present := _visible_names(folder)):
+    """Raise :class:`UserError` for a folder with results of another run, or files of others."""
+    if not (present := _visible_names(folder)):
         return
     if CONFIG not in present:
         raise UserError(
             f"{folder}: the output folder must be new or empty, got one that holds "
             f"{listed(present)}; choose another with --out"
         )
-    record, is_own = FolderRecord(folder, COMMAND), _belongs_to(folder, config)
-    is_run, is_written = record.exists or CHECKPOINT in present, _may_be_replaced(folder / CONFIG)
-    if not is_written and (not is_run or (present == [CONFIG] and not is_own)):
+    record, differences = FolderRecord(folder, COMMAND), _differences_of_run(folder, config)
+    is_run, is_config_alone = record.exists or CHECKPOINT in present, present == [CONFIG]
+    if not _is_written_by_fit(folder / CONFIG) and (
+        not is_run or (is_config_alone and differences)
+    ):
         raise UserError(
             f"{folder / CONFIG}: would be replaced, and was not written by a fit, or changed "
             "since; choose another folder with --out"
         )
-    if present != [CONFIG] and not is_own:
+    if differences and not is_config_alone:
         raise UserError(
-            f"{folder}: already holds {_which_run(folder, config)}; choose another folder with "
+            f"{folder}: already holds another run, {differences}; choose another folder with "
             f"--out, continue that run with --resume {folder}, or replace it with --overwrite"
         )
-    record.check(_names(pictures), earlier=_names(pictures))
+    record.check(_file_names(pictures), earlier=_file_names(pictures))
 
 
 def continue_run(folder: Path, config: FitConfig, pictures: Sequence[str] = ()) -> None:
-    """Take the run that ``folder`` holds up again; config: its own, with where the data is now.
+    """Continue the run in ``folder``; config: its own, with the present paths of its data.
 
     Raises :class:`UserError` where files of others would be replaced.
     """
-    FolderRecord(folder, COMMAND).check(_names(pictures), earlier=_names(pictures))
-    _take(folder, config, pictures)
+    record, names = FolderRecord(folder, COMMAND), _file_names(pictures)
+    record.check(names, earlier=names)
+    remove_stale_temporaries(folder)
+    paths = {
+        key: os.path.relpath(path, folder.resolve())
+        for key, path in _data_paths(config).items()
+        if path is not None
+    }
+    write_run_config(folder, config)
+    record.claim(names, paths, earlier=names)
 
 
 def seal_run(folder: Path) -> None:
-    """Note that all results are written."""
+    """Record that all results are written."""
     FolderRecord(folder, COMMAND).seal()
 
 
 def pictures_of(split: str, views: Sequence[str]) -> list[str]:
-    """The pictures of a split with views of these names, relative to the folder."""
+    """Return the images of a split with views of these names, relative to the folder."""
     return [f"{kind}/{split}/{view}.png" for kind in (RENDERS, SIDE_BY_SIDE) for view in views]
 
 
-def _take(folder: Path, config: FitConfig, pictures: Sequence[str]) -> None:
-    remove_stale_temporaries(folder)
-    record, paths = FolderRecord(folder, COMMAND), {}
-    for key, path in _paths(config).items():
-        if path is not None:
-            paths[key] = os.path.relpath(path, folder.resolve())
-    write_run_config(folder, config)
-    names = _names(pictures)
-    record.claim(names, paths, earlier=names)
-
-
-def _names(pictures: Sequence[str]) -> list[str]:
-    """Files that a fit writes, but for ``config.yml``, which shows by itself who wrote it."""
-    return [*(name for name in RESULTS if name not in FOLDERS), EVENTS, *pictures]
-
-
 def write_run_config(folder: Path, config: FitConfig) -> None:
-    """Write ``config.yml``, unless it says just that, or somebody else has changed it."""
+    """Write ``config.yml``, unless it has these values, or the user has changed it."""
     path = folder / CONFIG
-    if _may_be_replaced(path):
+    if _is_written_by_fit(path):
         dump_config(config, path)
-    elif not _says(path, config):
+        return
+    try:
+        is_same = load_config(path) == config
+    except UserError:
+        is_same = False
+    if not is_same:
         note = f"{path}: was changed since the fit wrote it, and stays as it is"
         warnings.warn(UserNote(note), stacklevel=2)
 
 
-def _says(path: Path, config: FitConfig) -> bool:
-    try:
-        return load_config(path) == config
-    except UserError:
-        return False
-
-
-def _may_be_replaced(path: Path) -> bool:
-    """Whether nothing but :func:`dump_config` writes such a file; an empty one holds nothing."""
-    if not os.path.lexists(path):
-        return True
-    try:
-        if path.stat().st_size == 0:
-            return True
-        load_config(path)  # of a bounded size, without aliases
-        text = read_text(path, "configuration", MAX_BYTES)
-    except (UserError, OSError):
-        return False
-    values = yaml.safe_load(text)
-    return set(values) >= SECTIONS and yaml.safe_dump(values, sort_keys=False) == text
-
-
 def require_no_run(folder: Path) -> None:
-    """Raise :class:`UserError` where ``folder`` holds a run: for one that cannot be continued."""
-    if os.path.lexists(folder) and (names := _visible_names(folder)):
+    """Raise :class:`UserError` for a folder with a run, where that cannot be continued."""
+    if names := _visible_names(folder):
         raise UserError(
             f"{folder}: must be new or empty for a fit with --budget, got one that holds "
             f"{listed(names)}; choose another with --out, go on with --resume {folder}, or "
@@ -166,19 +139,19 @@ def require_no_run(folder: Path) -> None:
 
 
 def has_results(folder: Path) -> bool:
-    """Whether the run that ``folder`` holds has ended, with all of its results."""
+    """Return whether the run in ``folder`` has ended, with all of its results."""
     return (folder / METRICS).is_file()
 
 
 def is_finished(folder: Path, config: FitConfig) -> bool:
-    """Whether ``folder`` holds the whole result of this very configuration."""
-    return has_results(folder) and _belongs_to(folder, config)
+    """Return whether ``folder`` contains the whole result of this very configuration."""
+    return has_results(folder) and not _differences_of_run(folder, config)
 
 
 def load_run_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
-    """The configuration of the run that ``folder`` holds; overrides: see :func:`load_config`.
+    """Load the configuration of the run in ``folder``; overrides: see :func:`load_config`.
 
-    Raises :class:`UserError` where it holds none.
+    Raises :class:`UserError` where there is none.
     """
     if not os.path.isfile(folder / CONFIG):
         what = "has no" if os.path.isdir(folder) else "does not exist, and so has no"
@@ -187,9 +160,9 @@ def load_run_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
 
 
 def load_moved_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
-    """The configuration of the run that ``folder`` holds, with paths to where its data is now.
+    """Load the configuration of the run in ``folder``, with the present paths of its data.
 
-    overrides: see :func:`load_config`; a start point that lay within the data has moved with it.
+    overrides: see :func:`load_config`; a start point within the data has moved with it.
     """
     before = load_run_config(folder)
     config = found_again(folder, load_run_config(folder, overrides))
@@ -199,50 +172,65 @@ def load_moved_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
     return changed(config, {"init.point_cloud": config.data.path / cloud.relative_to(data)})
 
 
-def found_again(folder: Path, config: FitConfig, keys: Sequence[str] = FOUND_AGAIN) -> FitConfig:
-    """A run's configuration with paths to where its data is now; keys: which of FOUND_AGAIN.
+def found_again(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PATHS) -> FitConfig:
+    """Return a run's configuration with the present paths of its data; keys: of DATA_PATHS.
 
-    A path that is no longer there is looked for where it was relative to the folder: both may have
-    been moved together. What is found is noted, and what is not stays as it is.
+    A path that does not exist is looked for at its recorded place relative to the folder, as both
+    may have been moved together. A :class:`UserNote` names what is found; the rest stays.
     """
-    changes = {}
-    for key, path in _paths(config).items():
-        if key not in keys or path is None or os.path.exists(path):
+    changes, recorded = {}, FolderRecord(folder, COMMAND).paths
+    for key, path in _data_paths(config).items():
+        if key not in keys or key not in recorded or path is None or os.path.exists(path):
             continue
-        relative = FolderRecord(folder, COMMAND).paths.get(key)
-        if relative is None and config.output.dir is not None:  # of a version without records
-            relative = os.path.relpath(path, config.output.dir)
-        found = None if relative is None else Path(os.path.normpath(folder.resolve() / relative))
-        if found is not None and found.exists():
+        found = Path(os.path.normpath(folder.resolve() / recorded[key]))
+        if found.exists():
             changes[key] = str(found)
             note = f"{key}: {path} is not there any more; taken from {found}"
             warnings.warn(UserNote(note), stacklevel=2)
     return changed(config, changes) if changes else config
 
 
-def _paths(config: FitConfig) -> dict[str, Path | None]:
-    """The values of FOUND_AGAIN."""
-    sections = (key.split(".") for key in FOUND_AGAIN)
-    values = (getattr(getattr(config, section), name) for section, name in sections)
-    return dict(zip(FOUND_AGAIN, values, strict=True))
+def remove_run(folder: Path, pictures: Sequence[str] = ()) -> None:
+    """Remove the run in ``folder``, if any, to make room for another.
 
+    ``metrics.json`` goes first and ``config.yml`` last: an interrupted removal leaves the folder of
+    an unfinished run. pictures: of the coming run.
 
-def check_replaceable(folder: Path, pictures: Sequence[str] = ()) -> None:
-    """Raise :class:`UserError` where ``folder`` holds more than a run.
-
-    pictures: those of the coming run, of which an earlier one may have left some.
+    Raises :class:`UserError`, with nothing removed, where ``folder`` contains more than a run.
     """
-    if not os.path.lexists(folder) or not (names := _visible_names(folder)):
-        return
-    load_run_config(folder)
+    names = _visible_names(folder)
     record, files = FolderRecord(folder, COMMAND), list(_files(folder))
-    strangers = sorted(set(names) - {CONFIG, *RESULTS})
+    if names:
+        load_run_config(folder)
+        _refuse_strangers(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, pictures)
+    elif not os.path.lexists(folder):
+        return
+    remove_stale_temporaries(folder)
+    try:
+        for name in [METRICS, *files, CONFIG] if names else []:
+            (folder / name).unlink(missing_ok=True)
+        for kind in FOLDERS:
+            for path, _, _ in os.walk(folder / kind, topdown=False):
+                os.rmdir(path)
+        record.remove()
+    except OSError as error:
+        raise UserError(f"{error.filename}: cannot be removed: {why_refused(error)}") from error
+
+
+def _refuse_strangers(
+    folder: Path,
+    record: FolderRecord,
+    strangers: list[str],
+    files: list[str],
+    pictures: Sequence[str],
+) -> None:
+    """Raise :class:`UserError` for files that no fit has written, and the names ``strangers``."""
     if record.exists:
         strangers += record.strangers(files)
     else:
-        known = {*_names(pictures), *_listed_in_report(folder)}
-        strangers += [name for name in files if name not in known or _is_other(folder / name)]
-    if not _may_be_replaced(folder / CONFIG):
+        known = set(_file_names(pictures))
+        strangers += [n for n in files if n not in known or not _is_file(folder / n)]
+    if not _is_written_by_fit(folder / CONFIG):
         strangers.append(CONFIG)
     if strangers:
         raise UserError(
@@ -251,109 +239,79 @@ def check_replaceable(folder: Path, pictures: Sequence[str] = ()) -> None:
         )
 
 
-def remove_run(folder: Path, pictures: Sequence[str] = ()) -> None:
-    """Remove the run that ``folder`` holds, if any, to make room for another.
-
-    ``metrics.json`` goes first and ``config.yml`` last: interrupted, the folder is still known for
-    what it is, and not for finished.
-
-    Raises :class:`UserError`, with nothing removed, as :func:`check_replaceable`.
-    """
-    check_replaceable(folder, pictures)
-    if not os.path.lexists(folder):
-        return
-    remove_stale_temporaries(folder)
-    files = [METRICS, *_files(folder), CONFIG] if _visible_names(folder) else []
-    try:
-        for name in files:
-            (folder / name).unlink(missing_ok=True)
-        for kind in FOLDERS:
-            for path, _, _ in os.walk(folder / kind, topdown=False):
-                os.rmdir(path)
-        FolderRecord(folder, COMMAND).remove()
-    except OSError as error:
-        raise UserError(f"{error.filename}: cannot be removed: {why_refused(error)}") from error
-
-
 def _files(folder: Path) -> Iterator[str]:
-    """Names of the results that are there, and of everything in the folders among them."""
+    """Yield the names of the results that are there, and of everything in FOLDERS."""
     for name in RESULTS:
-        if name not in FOLDERS or _is_other(folder / name, Path.is_dir):
-            if os.path.lexists(folder / name):
+        path = folder / name
+        if name not in FOLDERS or path.is_symlink() or not path.is_dir():
+            if os.path.lexists(path):
                 yield name
             continue
-        for path, folders, files in os.walk(folder / name):
+        for inside, folders, files in os.walk(path):
             folders.sort()
-            inside = Path(path).relative_to(folder)
             kept = (file for file in sorted(files) if not is_temporary(file))
-            yield from ((inside / file).as_posix() for file in kept)
+            yield from ((Path(inside).relative_to(folder) / file).as_posix() for file in kept)
 
 
-def _is_other(path: Path, is_kind: Callable[[Path], bool] = Path.is_file) -> bool:
-    """Whether it is something else than what it should be: a file, or what ``is_kind`` says."""
-    return path.is_symlink() or not is_kind(path)
-
-
-def _listed_in_report(folder: Path) -> set[str]:
-    """The pictures of a run of a version without records: its report lists their views."""
-    if not (folder / REPORT).is_file():
-        return set()
-    page = read_text(folder / REPORT, "report", MAX_BYTES)
-    pictures = (name for name in _files(folder) if name.endswith(".png"))
-    return {name for name in pictures if f"<th>{html.escape(Path(name).stem)}</th>" in page}
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"{folder}: cannot be the output folder: {why_refused(error)} (--out)"
-        ) from error
+def _file_names(pictures: Sequence[str]) -> list[str]:
+    """Return the files that a fit writes, but for ``config.yml``: its content tells its writer."""
+    return [*(name for name in RESULTS if name not in FOLDERS), EVENTS, *pictures]
 
 
 def _visible_names(folder: Path) -> list[str]:
-    """What it holds, but for hidden files: a desktop's, or temporary ones of a killed run."""
+    """Return the content of a folder without hidden files: a desktop's, or temporary ones."""
+    if not os.path.lexists(folder):
+        return []
     try:
         return sorted(name for name in os.listdir(folder) if not name.startswith("."))
     except OSError as error:
-        raise UserError(
-            f"{folder}: cannot be the output folder: {why_refused(error)} (--out)"
-        ) from error
+        raise _unusable(folder, error) from error
 
 
-def _belongs_to(folder: Path, config: FitConfig) -> bool:
+def _unusable(folder: Path, error: OSError) -> UserError:
+    return UserError(f"{folder}: cannot be the output folder: {why_refused(error)} (--out)")
+
+
+def _is_file(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
+
+
+def _is_written_by_fit(path: Path) -> bool:
+    """Return whether a file is missing, empty, or just as :func:`dump_config` writes it."""
+    if not os.path.lexists(path):
+        return True
     try:
-        earlier = _earlier_config(folder)
-    except UserError:
+        if path.stat().st_size == 0:
+            return True
+        load_config(path)  # of a bounded size, without aliases
+        text = read_text(path, "configuration", MAX_CONFIG_BYTES)
+    except (UserError, OSError):
         return False
-    return not _what_differs(earlier, config)
+    values = yaml.safe_load(text)
+    return set(values) >= SECTIONS and yaml.safe_dump(values, sort_keys=False) == text
 
 
-def _earlier_config(folder: Path) -> FitConfig:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserNote)
-        return found_again(folder, load_run_config(folder))
+def _data_paths(config: FitConfig) -> dict[str, Path | None]:
+    return {"data.path": config.data.path, "init.point_cloud": config.init.point_cloud}
 
 
-def _which_run(folder: Path, config: FitConfig) -> str:
-    """The other run that ``folder`` holds, compared with ``config``."""
+def _differences_of_run(folder: Path, config: FitConfig) -> str:
+    """Return in words how the run in ``folder`` differs from that of ``config``; empty: it is it.
+
+    Values that one of them leaves to the dataset are taken from the other.
+    """
     try:
-        earlier = _earlier_config(folder)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserNote)
+            run = found_again(folder, load_run_config(folder))
     except UserError:
-        return f"another run, with a {CONFIG} that is not readable"
-    return f"another run, which differs in {listed(_what_differs(earlier, config))}"
-
-
-def _what_differs(earlier: FitConfig, config: FitConfig) -> list[str]:
-    """What one of them leaves to the dataset, the other has from there."""
-    theirs, ours = decided_as(earlier, config), decided_as(config, earlier)
-    return _differences(_values(theirs), _values(ours))
-
-
-def _values(config: FitConfig) -> dict[str, object]:
-    """What decides a result: everything but the section ``output``."""
-    return config.model_dump(mode="json", exclude={"output"})
+        return f"with a {CONFIG} that is not readable"
+    theirs, ours = (
+        each.model_dump(mode="json", exclude={"output"})
+        for each in (decided_as(run, config), decided_as(config, run))
+    )
+    differences = _differences(theirs, ours)
+    return f"which differs in {listed(differences)}" if differences else ""
 
 
 def _differences(theirs: object, ours: object, key: str = "") -> list[str]:

@@ -38,7 +38,7 @@ class DensityReport:
 
 @dataclass(frozen=True, kw_only=True)
 class DensityRow(DensityReport):
-    """One line of ``density.csv``: what the strategy did after an iteration."""
+    """One line of ``density.csv``: changes after an iteration."""
 
     iteration: int  # the first is 1
 
@@ -64,7 +64,7 @@ def write_history(path: Path, history: Sequence[HistoryRow]) -> None:
 
 
 def write_density(path: Path, changes: Sequence[DensityRow]) -> None:
-    """Write ``density.csv``, or nothing where there are no changes."""
+    """Write ``density.csv`` if there are changes."""
     if changes:
         rows = [[getattr(change, name) for name in DENSITY_COLUMNS] for change in changes]
         _write_table(path, DENSITY_COLUMNS, rows)
@@ -75,3 +75,20 @@ def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[obj
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(rows)
+
+
+def summarize_density(strategy: str, changes: Sequence[DensityRow]) -> str | None:
+    """Return in one line how the population changed; None: it has not.
+
+    strategy: ``densify.strategy``.
+    """
+    if not changes:
+        return None
+    first, end = changes[0], changes[-1].num_gaussians
+    start = first.num_gaussians - first.num_added + first.pruned
+    counts = []
+    for name in ("cloned", "split", "relocated", "pruned", "refused"):
+        total = sum(getattr(change, name) for change in changes)
+        if total or name in ("pruned", "refused"):
+            counts.append(f"{total:,} {name}")
+    return f"{strategy}: {start:,} \u2192 {end:,} Gaussians; {', '.join(counts)}"

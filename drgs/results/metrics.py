@@ -21,7 +21,7 @@ WINDOW /= WINDOW.sum()
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over views of what one view's picture scores."""
+    """Mean scores over views."""
 
     psnr: float  # dB
     ssim: float
@@ -29,7 +29,7 @@ class Quality:
 
 
 class SplitMetrics(TypedDict):
-    """Of the views that were measured, in ``metrics.json``."""
+    """Means over the measured views, in ``metrics.json``."""
 
     psnr: float  # dB
     ssim: float
@@ -38,7 +38,7 @@ class SplitMetrics(TypedDict):
 
 
 class FitMetrics(TypedDict):
-    """What ``metrics.json`` holds of a fit."""
+    """The content of a fit's ``metrics.json``."""
 
     iterations: int
     num_gaussians: int
@@ -81,7 +81,6 @@ def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
 
 
 def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarray:
-    """(H, W): of one channel."""
     if mask is not None:
         counts = np.asarray(mask)
         x, y = x * counts, y * counts
@@ -112,7 +111,7 @@ def mean_of(scores: Sequence[tuple[float, float]]) -> Quality:
 
 
 def _mean(values: np.ndarray, mask: ArrayLike | None) -> float:
-    """Over the pixels that count; NaN if none does."""
+    """Return the mean over the pixels that count; NaN if none does."""
     return np.mean(values) if mask is None else np.mean(values[np.asarray(mask) > 0])
 
 

@@ -1,4 +1,4 @@
-"""Cameras that a fit has refined: written beside it, applied to its dataset."""
+"""Cameras in a fit's folder: refined ones, and those of the data; both as ``transforms.json``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text
 from drgs.core.origin import WORLD, Origin
 from drgs.datasets.transforms import CLOSE, MAX_BYTES
-from drgs.datasets.types import Dataset, Motion, View, Viewpoint
+from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.folder import load_run_config
@@ -29,13 +29,13 @@ MODELS = {
 
 @dataclass(frozen=True)
 class LensChange:
-    """What the lens that all cameras share is found to be, beside what the data says."""
+    """The refinement of the lens that all cameras share."""
 
     focal: tuple[float, float] = (1.0, 1.0)  # factors of fx and fy
-    principal: tuple[float, float] = (0.0, 0.0)  # of the picture's width and height
+    principal: tuple[float, float] = (0.0, 0.0)  # shift, in widths and heights of the image
 
-    def of(self, view: View) -> View:
-        """A view with this lens."""
+    def apply(self, view: View) -> View:
+        """Return the view with this lens."""
         return replace(
             view,
             fx=view.fx * self.focal[0],
@@ -46,7 +46,7 @@ class LensChange:
 
 
 def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
-    """A dataset with the cameras that a fit in ``folder`` has refined; as it is where none were."""
+    """Return a dataset with the refined cameras in ``folder``; unchanged if there are none."""
     path = folder / CAMERAS
     if not path.is_file():
         return dataset
@@ -56,24 +56,19 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
         poses = {f["file_path"]: _opencv_pose(f["transform_matrix"]) for f in found["frames"]}
         for pose in poses.values():
             pose[:3, 3] -= dataset.origin
-        train = [replace(view, camera_to_world=poses[view.name]) for view in dataset.train]
+        train = [change.apply(_with_pose(view, poses[view.name])) for view in dataset.train]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
             f"{path}: must hold the refined cameras of all training views, as the fit wrote them: "
             f"{one_line(error)}; remove it to use the dataset's own"
         ) from None
-    moved = zip(train, dataset.train, strict=True)
-    train = [replace(new, motion=_moved_motion(old, new.camera_to_world)) for new, old in moved]
-    return replace(
-        dataset, train=tuple(map(change.of, train)), test=tuple(map(change.of, dataset.test))
-    )
+    return replace(dataset, train=tuple(train), test=tuple(map(change.apply, dataset.test)))
 
 
 def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
-    """The training cameras as the fit in ``folder`` has refined them; None: it has not.
+    """Return the training cameras as the fit in ``folder`` has refined them; None: it has not.
 
-    origin: what their positions are to be relative to, world. Raises :class:`UserError` as
-    ``read_viewpoints``.
+    origin: of their positions, world. Raises :class:`UserError` as ``read_viewpoints``.
     """
     path = folder / CAMERAS
     if not path.is_file() or not load_run_config(folder).cameras.optimise:
@@ -82,10 +77,9 @@ def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
 
 
 def training_cameras(folder: Path, origin: Origin) -> list[Viewpoint] | None:
-    """The training cameras of the fit in ``folder``, refined if it has refined them.
+    """Return the training cameras of the fit in ``folder``, refined or not; None: there are none.
 
-    origin: what their positions are to be relative to, world. None: it has left none. Raises
-    :class:`UserError` as ``read_viewpoints``.
+    See :func:`refined_viewpoints`.
     """
     if (refined := refined_viewpoints(folder, origin)) is not None:
         return refined
@@ -100,18 +94,19 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
     return between_opencv_and_opengl(np.array(rows, np.float64).reshape(4, 4))
 
 
-def _moved_motion(view: View, camera_to_world: np.ndarray) -> Motion | None:
-    """Both poses of a camera that moves are moved alike."""
-    if view.motion is None:
-        return None
-    between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
-    return replace(view.motion, close_to_world=camera_to_world @ between)
+def _with_pose(view: View, camera_to_world: np.ndarray) -> View:
+    """Return the view with another pose; both poses of a moving camera are moved alike."""
+    motion = view.motion
+    if motion is not None:
+        between = np.linalg.solve(view.camera_to_world, motion.close_to_world)
+        motion = replace(motion, close_to_world=camera_to_world @ between)
+    return replace(view, camera_to_world=camera_to_world, motion=motion)
 
 
 def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
-    """The cameras of views in the layout of ``transforms.json``, in world coordinates.
+    """Return cameras in the layout of ``transforms.json``, in world coordinates.
 
-    origin: what the views' positions are relative to, world; recorded where it is not the world's.
+    origin: of the views' positions, world; recorded where it is not the world's.
     """
     recorded = {"origin": list(origin)} if origin != WORLD else {}
     frames = [
@@ -128,14 +123,14 @@ def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
 
 
 def write_views(path: Path, dataset: Dataset) -> None:
-    """Write the cameras of the training views, as the data has them."""
+    """Write the cameras of the training views as the data has them."""
     with atomic_path(path) as temporary:
         content = cameras_json(dataset.train, dataset.origin)
         temporary.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _lens_and_motion(view: View) -> dict[str, object]:
-    """What ``transforms.json`` says of a camera besides its pose and intrinsics."""
+    """Return the values of a camera in ``transforms.json`` besides pose and intrinsics."""
     values: dict[str, object] = {}
     if view.lens is not None:
         model = MODELS.get(view.lens.kind, view.lens.kind)

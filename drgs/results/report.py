@@ -1,7 +1,6 @@
-"""What a fit shows of itself: comparisons, curves, an orbit, and a page that holds all of it.
+"""The report of a fit: comparisons, curves, an orbit, and a page with all of it.
 
-The fit command calls :func:`write_pictures` and :func:`write_results` at its end. Everything comes
-from what the fit has: its scene, its history, the test views. One picture is held at a time.
+A fit calls :func:`write_pictures` and :func:`write_results` at its end.
 """
 
 from __future__ import annotations
@@ -34,14 +33,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
 from drgs.io.pictures import encode, write_animation, write_png
-from drgs.results.curves import (
-    NUM_PANELS,
-    THEMES,
-    Panel,
-    draw_curve,
-    panels_of,
-    write_curves,
-)
+from drgs.results.curves import NUM_PANELS, THEMES, Panel, draw_curve, panels_of, write_curves
 from drgs.results.files import (
     CURVES,
     GAUSSIANS,
@@ -52,54 +44,42 @@ from drgs.results.files import (
     SIDE_BY_SIDE,
     VIEWER,
 )
-from drgs.results.history import FitHistory
+from drgs.results.history import FitHistory, summarize_density
 from drgs.results.metrics import FitMetrics, psnr, ssim
-from drgs.results.population import story_of
 from drgs.results.viewer import Shown, seconds_of_page, write_viewer
 
 DIFFERENCE_GAIN = 5.0
-"""Of difference pictures, 0.5 + gain (fitted - truth): saturates at 10 % of the range."""
+"""Gain of difference images, 0.5 + gain (fitted - truth): they saturate at 10 % of the range."""
 
-GAP = 4
-"""px between the pictures of a comparison, white."""
+GAP = 4  # px between the images of a comparison, white
 
 ORBIT_FRAMES = 60
 
-PANEL_WIDTH = 360
-"""px: of each of the three pictures of a comparison in the page, at most."""
+PANEL_WIDTH = 360  # px: largest width of an image of a comparison in the page
 
 PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
-"""Lossy coding leaves a haze around what stands before a white background."""
-
-PAGE = "page.html"
-"""Of this package: the page, with ``$names`` for what :func:`write_report` fills in."""
+"""Lossy coding leaves a haze around objects before a white background."""
 
 TRIED_SECONDS = 0.2
-"""For which a view is tried out at least: one picture of a few milliseconds says little."""
+"""Least time for which a view is tried out: one image of a few milliseconds tells little."""
 
-FILES_SECONDS = 0.3
-"""Gaussians, histories and the rest of the files: measured with 50,000 Gaussians."""
-
+FILES_SECONDS = 0.3  # time of the other files, measured with 50,000 Gaussians
 
 Render = Callable[[tuple[View, ...]], Iterable[np.ndarray]]
-"""Pictures (H, W, 3) of views as fitted, display space, one after the other."""
+"""Yields images (H, W, 3) of views as fitted, display space."""
 
 
 class Score(NamedTuple):
-    """What one picture scores against its photograph."""
+    """Scores of an image against its photograph."""
 
     psnr: float  # dB
     ssim: float
 
 
 def write_pictures(
-    out: Path,
-    dataset: Dataset,
-    render: Render,
-    with_renders: bool,
-    with_comparisons: bool,
+    out: Path, dataset: Dataset, render: Render, with_renders: bool, with_comparisons: bool
 ) -> list[Score]:
-    """Score the test views, and write what is asked for of ``renders/`` and ``side_by_side/``."""
+    """Score the test views, and write ``renders/`` and ``side_by_side/`` if wanted."""
     scores, split = [], dataset.test_split
     for view, image in zip(dataset.test, render(dataset.test), strict=True):
         if with_renders:
@@ -112,12 +92,12 @@ def write_pictures(
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What a fit has found."""
+    """The result of a fit."""
 
     scene: mi.Scene  # renders ``gaussians``, in display space
     gaussians: Gaussians
     render: Render
-    shown: Shown  # on the page to walk around in
+    shown: Shown  # in ``viewer.html``
 
 
 def write_results(
@@ -130,19 +110,20 @@ def write_results(
 ) -> None:
     """Write ``curves.png``, ``orbit.webp`` and ``.gif``, ``viewer.html``, ``report.html``.
 
-    scores: of the test views, in their order; history: as of ``history.csv`` and ``density.csv``;
-    metrics: as of ``metrics.json``.
+    scores: of the test views, in their order.
     """
     write_curves(out / CURVES, history)
-    write_orbit(out / ORBIT, fitted.scene, dataset, fitted.gaussians)
+    orbit = orbit_of_views(dataset.train, fitted.gaussians)
+    size, fov = orbit_size(dataset.train), field_of_view(dataset.train)
+    cameras = orbit.viewpoints(ORBIT_FRAMES, *size, fov)
+    write_animation(out / ORBIT, render_views(fitted.scene, cameras))
     write_viewer(out, dataset, fitted.shown)
-    orbit = (out / ORBIT).read_bytes()
-    title = out.resolve().name
-    write_report(out / REPORT, title, dataset, fitted.render, scores, history, metrics, orbit)
+    animation, title = (out / ORBIT).read_bytes(), out.resolve().name
+    write_report(out / REPORT, title, dataset, fitted.render, scores, history, metrics, animation)
 
 
 class Seconds(NamedTuple):
-    """What is behind the iterations."""
+    """Times after the iterations."""
 
     measuring: float  # the test views, once
     renders: float  # ``renders/``
@@ -152,13 +133,12 @@ class Seconds(NamedTuple):
 def seconds_of_results(
     scene: mi.Scene, dataset: Dataset, num_gaussians: int, sh_degree: int
 ) -> Seconds:
-    """About what results will take without curves: one test view is tried out.
+    """Estimate the time of the results without curves by trying out one test view.
 
-    num_gaussians, sh_degree: of what there will be in the end.
+    num_gaussians, sh_degree: of the final Gaussians.
     """
-    # The first time, kernels and libraries are loaded.
-    _, first = (_seconds_of_view(scene, dataset.test[0]) for _ in range(2))
-    tried = [first]
+    _seconds_of_view(scene, dataset.test[0])  # loads kernels and libraries
+    tried = [_seconds_of_view(scene, dataset.test[0])]
     while sum(map(sum, tried)) < TRIED_SECONDS:
         tried.append(_seconds_of_view(scene, dataset.test[0]))
     rendered, scored, written, compared, encoded = np.median(tried, axis=0).tolist()
@@ -174,50 +154,45 @@ def seconds_of_results(
 
 
 def _seconds_of_view(scene: mi.Scene, view: View) -> tuple[float, ...]:
-    """To render it, to score it, to write it and its comparison, and to code an orbit's frame."""
-    clock = [time.perf_counter()]
+    """Time rendering, scoring, writing, comparing, and encoding for an orbit."""
+    start = time.perf_counter()
     (image,) = render_views(scene, (view,))
-    clock.append(time.perf_counter())
-    score(image, view)
-    clock.append(time.perf_counter())
-    encode(image, "png")
-    clock.append(time.perf_counter())
-    encode(side_by_side(image, view), "png")
-    clock.append(time.perf_counter())
-    encode(image, "webp", **PANEL_QUALITY)
-    clock.append(time.perf_counter())
+    clock = [start, time.perf_counter()]
+    for step in (
+        lambda: score(image, view),
+        lambda: encode(image, "png"),
+        lambda: encode(side_by_side(image, view), "png"),
+        lambda: encode(image, "webp", **PANEL_QUALITY),
+    ):
+        step()
+        clock.append(time.perf_counter())
     return tuple(later - earlier for earlier, later in pairwise(clock))
 
 
 def seconds_of_curves() -> float:
-    """What curves will take, in the page and in ``curves.png``: two are tried out."""
+    """Estimate the time of all curves, in the page and in ``curves.png``, by trying out two."""
     x = np.linspace(1.0, 100.0, 1000)
     log, linear = (Panel("", x, x, scale=scale, noisy=True) for scale in ("log", "linear"))
     _seconds_of_curve(log)  # loads libraries and fonts
     # A third of the curves are logarithmic, whose labels take longer.
-    return (
-        NUM_PANELS
-        * (_seconds_of_curve(log) + 2 * _seconds_of_curve(linear))
-        / 3
-        * (1 + len(THEMES))
-    )
+    mean = (_seconds_of_curve(log) + 2 * _seconds_of_curve(linear)) / 3
+    return NUM_PANELS * mean * (1 + len(THEMES))
 
 
 def _seconds_of_curve(panel: Panel) -> float:
-    """For one theme."""
     start = time.perf_counter()
     _data_uri(pixels_of(draw_curve(panel, THEMES[0])), lossless=True)
     return time.perf_counter() - start
 
 
 def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
-    """(H, 3 W + 2 gaps, 3): fitted, truth, 0.5 + 5 (fitted - truth)."""
+    """Return (H, 3 W + 2 gaps, 3): fitted, truth, 0.5 + 5 (fitted - truth)."""
     gap = np.ones((len(image), GAP, 3), np.float32)
     return np.concatenate([image, gap, view.image, gap, difference(image, view)], axis=1)
 
 
 def difference(image: np.ndarray, view: View) -> np.ndarray:
-    """0.5 + 5 (fitted - truth), clipped; 0.5 where pixels do not count."""
+    """Return 0.5 + 5 (fitted - truth), clipped; 0.5 where pixels do not count."""
     values = image - view.image
     if view.mask is not None:
         values = values * view.mask[..., None]
@@ -225,18 +200,9 @@ def difference(image: np.ndarray, view: View) -> np.ndarray:
 
 
 def score(image: np.ndarray, view: View) -> Score:
-    """Of a picture (H, W, 3) of ``view``, display space."""
+    """Score an image (H, W, 3) of ``view``, display space."""
     photograph = np.asarray(view.image)
     return Score(psnr(image, photograph, view.mask), ssim(image, photograph, view.mask))
-
-
-def write_orbit(path: Path, scene: mi.Scene, dataset: Dataset, gaussians: Gaussians) -> None:
-    """Write an animation around what the training cameras look at: ``path`` (WebP) and a GIF."""
-    orbit = orbit_of_views(dataset.train, gaussians)
-    cameras = orbit.viewpoints(
-        ORBIT_FRAMES, *orbit_size(dataset.train), field_of_view(dataset.train)
-    )
-    write_animation(path, render_views(scene, cameras))
 
 
 def write_report(
@@ -249,15 +215,13 @@ def write_report(
     metrics: FitMetrics,
     orbit: bytes,
 ) -> None:
-    """Write one HTML file with everything in it, which needs no network and no other file.
+    """Write one HTML file, which needs no network; only its links lead to files beside it.
 
-    Only its links to the Gaussians, and to the page to walk around in if it is there, lead out, to
-    files beside it. scores: of the test views, in their order; metrics: as of ``metrics.json``;
-    orbit: the bytes of an animated WebP.
+    scores: of the test views, in their order; orbit: the bytes of an animated WebP.
     """
-    chosen = choose_views([score.psnr for score in scores])
-    template = Template(resources.files("drgs.results").joinpath(PAGE).read_text("utf-8"))
-    page = template.substitute(
+    chosen, has_viewer = choose_views([s.psnr for s in scores]), path.with_name(VIEWER).is_file()
+    template = resources.files("drgs.results").joinpath("page.html").read_text("utf-8")
+    page = Template(template).substitute(
         title=html.escape(title),
         description=html.escape(dataset.description),
         tiles="".join(_tile(*tile) for tile in _headline(metrics)),
@@ -267,7 +231,7 @@ def write_report(
         still=_data_uri(_first_frame(orbit), lossless=True),
         gaussians=GAUSSIANS,
         viewers=_viewers(metrics),
-        walk=_LINK_TO_VIEWER if path.with_name(VIEWER).is_file() else "",
+        walk=f'<a href="{VIEWER}">Walk around in it</a>. ' if has_viewer else "",
         command=html.escape(metrics["command"]),
         comparisons="".join(
             _comparison(dataset, render, label, index, scores[index]) for label, index in chosen
@@ -286,7 +250,7 @@ def write_report(
 
 
 def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
-    """(label, index) of the best, the median and the worst of the views; of all if they are few."""
+    """Return (label, index) of the best, the median and the worst view; of all if they are few."""
     order = sorted(range(len(scores)), key=lambda index: -scores[index])
     if len(order) < 3:
         return [("View", index) for index in order]
@@ -294,7 +258,7 @@ def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
 
 
 def _headline(metrics: FitMetrics) -> list[tuple[str, str, str]]:
-    """(value, unit, label) of the four numbers at the top."""
+    """Return (value, unit, label) of the four numbers at the top."""
     test = metrics["test"]
     return [
         (f"{test['psnr']:.2f}", "dB", f"PSNR, mean of {test['num_views']} {test['split']} views"),
@@ -309,11 +273,11 @@ def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[t
     names = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "numpy": "NumPy", "python": "Python"}
     names["llvm"] = "LLVM"
     speed = metrics["iterations"] / max(metrics["wall_s"], 1e-9)
-    story = story_of(metrics["config"]["densify"]["strategy"], history.density)
+    population = summarize_density(metrics["config"]["densify"]["strategy"], history.density)
     return [
         ("Training views", f"{len(dataset.train)}"),
         ("Test views", f"{len(dataset.test)} (split {dataset.test_split})"),
-        *([] if story is None else [("Population", story)]),
+        *([] if population is None else [("Population", population)]),
         ("Iterations per second", f"{speed:.1f}"),
         ("Processor", f"{metrics['processor']}, {metrics['threads']} threads"),
         ("Date", f"{datetime.fromisoformat(metrics['date']):%Y-%m-%d %H:%M (UTC%z)}"),
@@ -323,11 +287,8 @@ def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[t
     ]
 
 
-_LINK_TO_VIEWER = f'<a href="{VIEWER}">Walk around in it</a>. '
-
-
 def _viewers(metrics: FitMetrics) -> str:
-    """What splat viewers are to open, as HTML."""
+    """Return which file splat viewers can open, as HTML."""
     if "viewers" not in metrics:
         return "splat viewers read it"
     link = f'<a href="{GAUSSIANS_FOR_VIEWERS}" download>{GAUSSIANS_FOR_VIEWERS}</a>'
@@ -338,7 +299,7 @@ def _viewers(metrics: FitMetrics) -> str:
 
 
 def duration(seconds: float) -> str:
-    """``9 min 51 s``."""
+    """Return a text such as ``9 min 51 s``."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
@@ -346,40 +307,27 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _comparison(
-    dataset: Dataset,
-    render: Render,
-    label: str,
-    index: int,
-    score: Score,
-) -> str:
+def _comparison(dataset: Dataset, render: Render, label: str, index: int, score: Score) -> str:
     view = dataset.test[index]
     (image,) = render((view,))
-    panels = {
-        "Fitted": image,
-        _truth(dataset): view.image,
-        "Difference": difference(image, view),
-    }
+    panels = {"Fitted": image, _truth(dataset): view.image, "Difference": difference(image, view)}
     pictures = "".join(
         f'<div><img alt="{name} {html.escape(view.name)}" '
         f'src="{_data_uri(downscale(np.clip(picture, 0, 1), PANEL_WIDTH), **PANEL_QUALITY)}">'
         f"<span>{name}</span></div>"
         for name, picture in panels.items()
     )
-    caption = (
-        f"<b>{label}: {html.escape(view.name)}</b> PSNR {_decibels(score.psnr)}, "
-        f"SSIM {score.ssim:.4f}"
-    )
+    psnr = f"{score.psnr:.2f} dB" if math.isfinite(score.psnr) else "infinite"
+    caption = f"<b>{label}: {html.escape(view.name)}</b> PSNR {psnr}, SSIM {score.ssim:.4f}"
     return f'<figure><figcaption>{caption}</figcaption><div class="three">{pictures}</div></figure>'
 
 
 def _truth(dataset: Dataset) -> str:
-    """What fitted pictures are compared with: a renderer's pictures are no photographs."""
     return "Reference" if dataset.rendered else "Photograph"
 
 
 def _curve(panel: Panel) -> str:
-    """For a light and a dark page."""
+    """Return a curve for a light and a dark page."""
     light, dark = (
         _data_uri(pixels_of(draw_curve(panel, theme)), lossless=True) for theme in THEMES
     )
@@ -390,13 +338,8 @@ def _curve(panel: Panel) -> str:
 
 
 def _first_frame(animation: bytes) -> np.ndarray:
-    """(H, W, 3) uint8."""
     with Image.open(io.BytesIO(animation)) as image:
         return np.asarray(image.convert("RGB"))
-
-
-def _decibels(value: float) -> str:
-    return f"{value:.2f} dB" if math.isfinite(value) else "infinite"
 
 
 def _tile(value: str, unit: str, label: str) -> str:

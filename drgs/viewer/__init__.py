@@ -1,8 +1,6 @@
-"""Fits and Gaussians that somebody looks at while a process renders them.
+"""Pages in a browser that show Gaussians, or a fit that runs, rendered live by this process.
 
-May import ``training`` and what that may import.
-
-What is asked for (``optics``, ``frames``), when it is rendered (``wishes``, ``pace``,
-``spectators``) and what may be done to a fit (``watching``) know nothing of a browser. ``server``
-and the two pages are what viser needs.
+May import ``training`` and what that may import. ``frames`` renders, ``scheduler`` decides when and
+how large; neither knows a browser. ``controls``, ``page`` and ``training_viewer`` are the pages,
+which ``server`` serves with viser.
 """

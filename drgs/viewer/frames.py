@@ -1,14 +1,14 @@
-"""One picture for somebody who looks on: what is asked for, and what renders it.
+"""Frames for viewer clients: what one shows, through which lens, and how it is rendered.
 
-A :class:`FrameRequest` is plain data, which any thread may make. :class:`LiveScene` renders it, by
-the integrator ``splats`` like every other picture; only the thread that Dr.Jit runs in may ask it.
+A :class:`FrameRequest` is plain data, which any thread may make. :class:`LiveScene` renders it with
+the integrator ``splats``; only the thread that Dr.Jit runs in may call it.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,62 +17,78 @@ import mitsuba as mi
 import numpy as np
 from matplotlib import colormaps
 
+from drgs.cameras.axes import OPENCV_TO_MITSUBA
+from drgs.cameras.lens import LENSES
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.config.schema import ModelConfig
+from drgs.datasets.types import Viewpoint
+from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.scene import make_scene
+from drgs.integrator.scene import NEAR_CLIP, film_of, make_scene, make_sensors
 from drgs.results.metrics import psnr
-from drgs.viewer.optics import Eye, Optics, Pinhole
 
-MOST_SCENES = 2
-"""That are kept, each with a copy of the Gaussians: the picture called ``error`` needs two."""
-
-BACKDROP = 0.12
-"""Grey behind depths, normals and opacities, where nothing is."""
-
-SEEN = 0.5
-"""Opacity from which a pixel's depth counts for the range of colours."""
-
-DEPTH_RANGE = (2, 98)
-"""Percentiles of the seen pixels' depths that get the ends of the colour map."""
+MAX_SCENES = 2  # scenes kept, each with a copy of the Gaussians: ``error`` needs two
+BACKDROP = 0.12  # grey behind depths, normals and opacities
+MIN_DEPTH_ALPHA = 0.5  # opacity from which a pixel's depth counts for the range of colours
+DEPTH_RANGE = (2, 98)  # percentiles of these depths at the ends of the colour map
 
 ERROR_GAIN = 5.0
-"""Of the differences that are shown, around grey."""
 
-UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
-MOST_ACCURATE = {"order": "pixel", "order_window": 16, **UNCUT}
-"""What the picture called ``error`` compares with, beside the most accurate projection that
-knows the lens. Filter and harmonics are the model's own."""
+MOST_ACCURATE = {"order": "pixel", "order_window": 16, "alpha_cut": 0.0, "transmittance_stop": 0.0}
+"""Approximations of the image that ``error`` compares with, beside the projection that is the most
+accurate for the lens. Filter and harmonics are the model's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewerCamera:
+    """The camera of a viewer client. All lenses show the middle of the image equally large."""
+
+    camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
+    fov: float  # degrees, vertical
+    distance: float  # scene units, along the axis, to what the camera turns about
+
+    def viewpoint(self, width: int, height: int) -> Viewpoint:
+        """Return the pinhole camera of this field of view, with an image of this size (px)."""
+        half = math.tan(math.radians(self.fov) / 2) * width / height
+        return pinhole(
+            "eye", self.camera_to_world, width, height, 2 * math.degrees(math.atan(half))
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRequest:
-    """A picture that somebody wants to see."""
+    """A frame to render."""
 
-    eye: Eye
+    camera: ViewerCamera
     width: int  # px
     height: int  # px
-    optics: Optics = field(default_factory=Pinhole)
-    shows: str = "color"  # one of SHOWN
+    lens: str = "pinhole"  # name in VIEWER_LENSES
+    lens_numbers: Mapping[str, float] = field(default_factory=dict)
+    shows: str = "color"  # name in SHOWN
     approximations: Approximations | None = None  # None: those that the Gaussians were fitted with
 
     def smaller(self, divisor: int) -> FrameRequest:
-        """The same with a ``divisor``-th of the pixels along either side."""
+        """Return the same request with both sides divided by ``divisor``."""
         width, height = (max(1, round(side / divisor)) for side in (self.width, self.height))
         return replace(self, width=width, height=height)
+
+    def sensor(self) -> mi.Sensor:
+        """Return Mitsuba's sensor, whose film is RGB with a box filter."""
+        make_sensor = VIEWER_LENSES[self.lens].make_sensor
+        return make_sensor(self.camera, self.width, self.height, **self.lens_numbers)
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A picture that was asked for."""
+    """A rendered frame."""
 
     pixels: np.ndarray  # (H, W, 3) uint8, display space
-    seconds: float  # that rendering took, the transfer to the host included
-    note: str = ""  # what the colours mean, where they are not those of the scene
+    seconds: float  # of rendering and the transfer to the host
+    note: str = ""  # meaning of the colours, where they are not those of the scene
 
 
 class LiveScene:
-    """Gaussians that are shown with one setting and then with another."""
+    """Gaussians that are shown with changing approximations."""
 
     def __init__(
         self,
@@ -81,70 +97,67 @@ class LiveScene:
         background: tuple[float, float, float] | Path,
         **settings: object,
     ) -> None:
-        """As :func:`drgs.integrator.scene.make_scene` has them."""
+        """Take the arguments of :func:`drgs.integrator.scene.make_scene`."""
         self._gaussians, self._model, self._background = gaussians, model, background
         self._settings = settings
         self._scenes: dict[tuple[str, Approximations], mi.Scene] = {}
 
     @property
     def approximations(self) -> Approximations:
-        """Those that the Gaussians were fitted with."""
+        """The approximations that the Gaussians were fitted with."""
         return self._model.approximations
 
     def frame(self, request: FrameRequest) -> Frame:
-        """Render what is asked for.
+        """Render a frame.
 
         Raises :class:`drgs.core.errors.UserError` for settings that do not go together, such as an
         exact projection through a lens that bends rays.
         """
         return SHOWN[request.shows](self, request)
 
-    def picture(self, request: FrameRequest, aovs: str = "") -> tuple[np.ndarray, float]:
-        """Float32 (H, W, 3 + channels of ``aovs``), display space, and the seconds that it took."""
+    def image(self, request: FrameRequest, aovs: str = "") -> tuple[np.ndarray, float]:
+        """Return (H, W, 3 + channels of ``aovs``) float32, display space, and the seconds taken."""
         scene = self._scene(aovs, request.approximations or self.approximations)
         start = time.perf_counter()
-        sensor = request.optics.sensor(request.eye, request.width, request.height)
         with dr.suspend_grad():
-            # Not by mi.render, which says of an error only that there was one.
-            picture = np.array(scene.integrator().render(scene, sensor, spp=1))
-        return picture, time.perf_counter() - start
+            # mi.render would hide the reason of an error.
+            image = np.array(scene.integrator().render(scene, request.sensor(), spp=1))
+        return image, time.perf_counter() - start
 
     def _scene(self, aovs: str, approximations: Approximations) -> mi.Scene:
         key = aovs, approximations
         scene = self._scenes.pop(key, None)
         if scene is None:
             values = {name: getattr(approximations, name) for name in DECLARED}
-            model, settings = self._model.model_copy(update=values), dict(self._settings)
-            if aovs:
-                settings["aovs"] = aovs
+            settings = self._settings | ({"aovs": aovs} if aovs else {})
+            model = self._model.model_copy(update=values)
             scene = make_scene(self._gaussians, model, self._background, **settings)
-        self._scenes[key] = scene  # the last one is the one used last
-        while len(self._scenes) > MOST_SCENES:
+        self._scenes[key] = scene  # in the order of their last use
+        while len(self._scenes) > MAX_SCENES:
             del self._scenes[next(iter(self._scenes))]
         return scene
 
 
 # ----------------------------------------------------------------------------------------------
-# What can be shown
+# What a frame shows
 # ----------------------------------------------------------------------------------------------
 
 
 def _color(scene: LiveScene, request: FrameRequest) -> Frame:
-    picture, seconds = scene.picture(request)
-    return Frame(to_bytes(picture), seconds)
+    image, seconds = scene.image(request)
+    return Frame(to_bytes(image), seconds)
 
 
 def _opacity(scene: LiveScene, request: FrameRequest) -> Frame:
-    picture, seconds = scene.picture(request, "alpha:alpha")
-    return Frame(to_bytes(np.repeat(picture[:, :, 3:4], 3, axis=2)), seconds)
+    image, seconds = scene.image(request, "alpha:alpha")
+    return Frame(to_bytes(np.repeat(image[:, :, 3:4], 3, axis=2)), seconds)
 
 
 def _depth(scene: LiveScene, request: FrameRequest) -> Frame:
-    """Near is red, far is blue."""
-    picture, seconds = scene.picture(request, "depth:depth, alpha:alpha")
-    depth, alpha = picture[:, :, 3], picture[:, :, 4]
+    image, seconds = scene.image(request, "depth:depth, alpha:alpha")
+    depth, alpha = image[:, :, 3], image[:, :, 4]
     depth = depth / np.maximum(alpha, 1e-6)
-    seen = depth[alpha >= SEEN]
+    seen = depth[alpha >= MIN_DEPTH_ALPHA]
     if not len(seen):
         return Frame(to_bytes(np.full((*depth.shape, 3), BACKDROP)), seconds, "nothing is seen")
     near, far = (float(end) for end in np.percentile(seen, DEPTH_RANGE))
@@ -154,23 +167,23 @@ def _depth(scene: LiveScene, request: FrameRequest) -> Frame:
 
 
 def _normals(scene: LiveScene, request: FrameRequest) -> Frame:
-    picture, seconds = scene.picture(request, "normal:normal, alpha:alpha")
-    normal, alpha = picture[:, :, 3:6], picture[:, :, 6]
+    image, seconds = scene.image(request, "normal:normal, alpha:alpha")
+    normal, alpha = image[:, :, 3:6], image[:, :, 6]
     length = np.linalg.norm(normal, axis=2, keepdims=True)
     colors = 0.5 + 0.5 * normal / np.maximum(length, 1e-9)
     return Frame(over_backdrop(colors, alpha), seconds, "x, y, z of the world as red, green, blue")
 
 
 def _error(scene: LiveScene, request: FrameRequest) -> Frame:
-    """The seconds are those of the picture whose error is shown."""
-    picture, seconds = scene.picture(request)
+    image, seconds = scene.image(request)
     given = request.approximations or scene.approximations
-    best = replace(given, projection=request.optics.most_accurate, **MOST_ACCURATE)
-    accurate, slowly = scene.picture(replace(request, approximations=best))
-    apart = psnr(picture, accurate)
-    far = "the same as" if math.isinf(apart) else f"PSNR {apart:.1f} dB to"
-    note = f"{far} the most accurate picture, which took {1e3 * slowly:.0f} ms"
-    return Frame(to_bytes(0.5 + ERROR_GAIN * (picture - accurate)), seconds, note)
+    projection = VIEWER_LENSES[request.lens].most_accurate
+    best = replace(given, projection=projection, **MOST_ACCURATE)
+    accurate, accurate_seconds = scene.image(replace(request, approximations=best))
+    distance = psnr(image, accurate)
+    compared = "the same as" if math.isinf(distance) else f"PSNR {distance:.1f} dB to"
+    note = f"{compared} the most accurate picture, which took {1e3 * accurate_seconds:.0f} ms"
+    return Frame(to_bytes(0.5 + ERROR_GAIN * (image - accurate)), seconds, note)
 
 
 SHOWN: dict[str, Callable[[LiveScene, FrameRequest], Frame]] = {
@@ -180,17 +193,103 @@ SHOWN: dict[str, Callable[[LiveScene, FrameRequest], Frame]] = {
     "opacity": _opacity,
     "error": _error,
 }
-"""By name: what a picture can show. ``error`` is 0.5 + 5 times the difference from the most
-accurate picture, in display space."""
+"""Contents of a frame by name. ``error`` is 0.5 + 5 times the difference from the most accurate
+image, in display space."""
 
 
-def to_bytes(picture: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 of the first three channels, clamped to [0, 1]; no number is black."""
-    picture = np.nan_to_num(np.clip(picture[:, :, :3], 0, 1), nan=0.0)
-    return np.round(picture * 255).astype(np.uint8)
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Return (H, W, 3) uint8 of the first three channels, clamped to [0, 1]; NaN is black."""
+    image = np.nan_to_num(np.clip(image[:, :, :3], 0, 1), nan=0.0)
+    return np.round(image * 255).astype(np.uint8)
 
 
 def over_backdrop(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: colours (H, W, 3) as opaque as ``alpha`` (H, W) over :data:`BACKDROP`."""
+    """Return (H, W, 3) uint8: colours (H, W, 3) with ``alpha`` (H, W) over :data:`BACKDROP`."""
     alpha = alpha[:, :, None]
     return to_bytes(alpha * colors + (1 - alpha) * BACKDROP)
+
+
+# ----------------------------------------------------------------------------------------------
+# Lenses
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ViewerLens:
+    """A lens that viewer clients can choose."""
+
+    make_sensor: Callable[..., mi.Sensor]  # of a ViewerCamera, width, height (px) and the numbers
+    numbers: tuple[str, ...] = ()  # names of those that have a control
+    most_accurate: str = "exact"  # projection: ``exact`` needs straight rays through one point
+
+
+def _pinhole(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
+    (sensor,) = make_sensors([camera.viewpoint(width, height)])
+    return sensor
+
+
+def _opencv(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
+    lens = LENSES.get("opencv").value.from_coefficients(**coefficients)
+    (sensor,) = make_sensors([replace(camera.viewpoint(width, height), lens=lens)])
+    return sensor
+
+
+def _fisheye(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
+    """Return a sensor whose film is as high as the field of view, where nothing is distorted."""
+    lens = LENSES.get("fisheye").value.from_coefficients(**coefficients)
+    focal = height / math.radians(camera.fov)
+    view = replace(camera.viewpoint(width, height), fx=focal, fy=focal, lens=lens)
+    (sensor,) = make_sensors([view])
+    return sensor
+
+
+def _orthographic(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
+    half_height = camera.distance * math.tan(math.radians(camera.fov) / 2)
+    half_width = half_height * width / height
+    # Mitsuba's film is two units of the sensor's own wide.
+    scale = np.diag([half_width, half_width, 1.0, 1.0])
+    return _mitsuba_sensor(camera, width, height, scale, type="orthographic")
+
+
+def _thin_lens(
+    camera: ViewerCamera, width: int, height: int, aperture: float, focus: float = 1.0
+) -> mi.Sensor:
+    """Return a thin lens; aperture: radius; both in units of the distance to the target."""
+    if aperture == 0:  # Mitsuba would warn of each frame
+        return _pinhole(camera, width, height)
+    return _mitsuba_sensor(
+        camera,
+        width,
+        height,
+        np.eye(4),
+        type="thinlens",
+        fov=camera.fov,
+        fov_axis="y",
+        aperture_radius=aperture * camera.distance,
+        focus_distance=focus * camera.distance,
+    )
+
+
+def _mitsuba_sensor(
+    camera: ViewerCamera, width: int, height: int, scale: np.ndarray, **settings: object
+) -> mi.Sensor:
+    """Return a sensor of Mitsuba's; scale: (4, 4), of its axes."""
+    to_world = camera.camera_to_world @ OPENCV_TO_MITSUBA @ scale
+    return mi.load_dict(
+        {
+            "to_world": mi.ScalarTransform4f(to_world),
+            "near_clip": NEAR_CLIP,
+            "sampler": {"type": "independent", "sample_count": 1},
+            "film": film_of(width, height),
+            **settings,
+        }
+    )
+
+
+VIEWER_LENSES = {
+    "pinhole": ViewerLens(_pinhole),
+    "opencv": ViewerLens(_opencv, ("k1", "k2"), most_accurate="unscented"),
+    "fisheye": ViewerLens(_fisheye, ("k1", "k2"), most_accurate="unscented"),
+    "orthographic": ViewerLens(_orthographic, most_accurate="ewa"),
+    "thin lens": ViewerLens(_thin_lens, ("aperture", "focus")),
+}

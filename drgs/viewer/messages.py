@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 from viser import infra
 from websockets.asyncio.server import ServerConnection
@@ -17,14 +18,11 @@ from websockets.asyncio.server import ServerConnection
 if TYPE_CHECKING:
     import asyncio
 
-MAX_MESSAGE_BYTES = 1 << 16
-"""A page's own messages have less than 1 KB."""
-
-MAX_CONNECTIONS = 64
-"""At a time: file descriptors remain for the command itself."""
+MAX_MESSAGE_BYTES = 1 << 16  # a page's own messages have less than 1 KB
+MAX_CONNECTIONS = 64  # at a time: file descriptors remain for the command itself
 
 Coordinate = Annotated[float, Meta(ge=-1e15, le=1e15)]
-"""Squares are finite in single precision. A NaN passes: see :func:`_is_finite`."""
+"""Squares are finite in single precision. A NaN passes, and is checked for below."""
 
 Side = Annotated[float, Meta(ge=0, le=100_000)]  # px
 
@@ -44,16 +42,9 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, tag_field="type"):
     image_height: Side
     image_width: Side
 
-    def is_valid(self, control: Callable[[str], Any]) -> bool:
-        """Return whether the camera has a place and a direction; ``control`` is not needed."""
-        del control
-        numbers = *self.wxyz, *self.position, *self.look_at, *self.up_direction
-        others = self.fov, self.near, self.far, self.image_height, self.image_width
-        return _is_finite(*numbers, *others) and 0.9 < math.hypot(*self.wxyz) < 1.1
-
 
 class SceneNodeClickMessage(msgspec.Struct, tag=True, tag_field="type"):
-    """A click on a training camera."""
+    """A click on a training camera; viser ignores an unknown name."""
 
     name: str
     instance_index: int | None
@@ -62,11 +53,6 @@ class SceneNodeClickMessage(msgspec.Struct, tag=True, tag_field="type"):
     screen_pos: tuple[Coordinate, Coordinate]
     modifier: str | None
     owner: str = ""
-
-    def is_valid(self, control: Callable[[str], Any]) -> bool:
-        """Return True: only the name is used, and viser ignores one that it does not know."""
-        del control
-        return True
 
 
 class NewValue(msgspec.Struct, forbid_unknown_fields=True):
@@ -81,27 +67,28 @@ class GuiUpdateMessage(msgspec.Struct, tag=True, tag_field="type"):
     uuid: str
     updates: NewValue
 
-    def is_valid(self, control: Callable[[str], Any]) -> bool:
-        """Return whether the control offers the value."""
-        return offers(control(self.uuid), self.updates.value)
-
 
 DECODER = msgspec.msgpack.Decoder(ViewerCameraMessage | SceneNodeClickMessage | GuiUpdateMessage)
 
 
-def is_valid(message: bytes | str, control: Callable[[str], Any]) -> bool:
+def is_valid(data: bytes | str, control: Callable[[str], Any]) -> bool:
     """Return whether a message is one that a page sends, with values that the page offers.
 
-    control: the control with a uuid, among those that all clients share; None for any other.
+    control: returns the control with a uuid, among those that all clients share, or None.
     """
-    if not isinstance(message, bytes):
+    if not isinstance(data, bytes):
         return False
     try:
-        is_offered = DECODER.decode(message).is_valid(control)
-        infra.Message.deserialize(message)  # where it raises, viser would end the connection
+        message = DECODER.decode(data)
+        infra.Message.deserialize(data)  # where it raises, viser would end the connection
     except (msgspec.MsgspecError, ValueError, RecursionError, KeyError, TypeError):
         return False
-    return is_offered
+    if isinstance(message, GuiUpdateMessage):
+        return offers(control(message.uuid), message.updates.value)
+    if isinstance(message, ViewerCameraMessage):
+        numbers = np.hstack(msgspec.structs.astuple(message))
+        return bool(np.isfinite(numbers).all()) and 0.9 < math.hypot(*message.wxyz) < 1.1
+    return True
 
 
 def offers(control: Any, value: bool | float | str) -> bool:
@@ -111,7 +98,7 @@ def offers(control: Any, value: bool | float | str) -> bool:
     if hasattr(control, "options"):
         return value in control.options
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not hasattr(control, "min") or not is_number or not _is_finite(value):
+    if not hasattr(control, "min") or not is_number or not math.isfinite(value):
         return False
     low, high = control.min, control.max
     return (low is None or value >= low) and (high is None or value <= high)
@@ -150,7 +137,3 @@ class PageConnection(ServerConnection):
         while not is_valid(message := await super().recv(decode), self._control):
             pass
         return message
-
-
-def _is_finite(*numbers: float) -> bool:
-    return all(map(math.isfinite, numbers))

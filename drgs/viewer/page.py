@@ -1,7 +1,6 @@
-"""A page with a picture that follows the camera of whoever has opened it.
+"""A page with an image that follows the camera of each client.
 
-Between viser and :class:`drgs.viewer.requests.Wishes`. What is called by the server's threads reads
-the controls and leaves requests; pictures come from the thread that renders.
+Server threads read the controls and queue requests; images come from the thread that renders.
 """
 
 from __future__ import annotations
@@ -19,112 +18,96 @@ from drgs.core.errors import UserError, one_line
 from drgs.datasets.orbits import up_of
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import focus_of, look_at
-from drgs.viewer.controls import LookControls
-from drgs.viewer.frames import Frame, FrameRequest
-from drgs.viewer.optics import Eye
-from drgs.viewer.requests import Wishes
-from drgs.viewer.scheduler import Screen
+from drgs.viewer.controls import CameraControls, event_handler
+from drgs.viewer.frames import Frame, FrameRequest, ViewerCamera
+from drgs.viewer.scheduler import RenderRequests
 
 if TYPE_CHECKING:
     import viser
 
-JPEG_QUALITY = {False: 70, True: 92}
-"""Of pictures of a moving camera, and of whole ones."""
-
-MOST_FRUSTUMS = 200
-"""Training cameras that are drawn, spread over all of them."""
-
-FRUSTUM_SIZE = 0.04
-"""Of the distance from the first camera to what is looked at."""
-
-
-MOST_FOV = 150.0
-"""Degrees, vertical."""
+JPEG_QUALITY = {False: 70, True: 92}  # quality of images of a moving camera, and of whole ones
+MAX_FRUSTUMS = 200  # training cameras that are drawn, spread over all of them
+FRUSTUM_SIZE = 0.04  # size of a frustum in distances from the first camera to its target
 
 
 @dataclass(frozen=True, eq=False)
 class StartView:
-    """Where the camera of a page stands when it is opened."""
+    """The camera of a page when it is opened."""
 
-    eye: Eye
+    camera: ViewerCamera
     up: np.ndarray  # (3,) unit, world
 
     @staticmethod
-    def of(views: Sequence[Viewpoint], middle: np.ndarray | None = None) -> StartView:
-        """The first of the cameras of a capture, which turns about what all of them look at.
+    def from_views(views: Sequence[Viewpoint], middle: np.ndarray | None = None) -> StartView:
+        """Return the first camera of a capture, which turns about what all of them look at.
 
-        middle: (3,) world, what that is where their axes meet nowhere; None: not known.
+        middle: (3,) world, the target of cameras whose axes meet nowhere; None: not known.
         """
         first = views[0]
         try:
-            focus, _ = focus_of(views)
-            distance = float((focus - first.center) @ first.camera_to_world[:3, 2])
+            target, _ = focus_of(views)
         except UserError:  # their axes meet nowhere
-            offset = np.zeros(3) if middle is None else middle - first.center
-            distance = float(offset @ first.camera_to_world[:3, 2])
+            target = first.center if middle is None else middle
+        distance = float((target - first.center) @ first.camera_to_world[:3, 2])
         if not distance > 0:
             spread = np.ptp([view.center for view in views], axis=0).max()
             distance = float(spread) or 1.0
         fov = 2 * math.degrees(math.atan(0.5 * first.height / first.fy))
-        return StartView(Eye(first.camera_to_world, fov, distance), up_of(views))
+        return StartView(ViewerCamera(first.camera_to_world, fov, distance), up_of(views))
 
     def from_farther(self, factor: float) -> StartView:
-        """From behind, at ``factor`` times the distance."""
-        eye, pose = self.eye, self.eye.camera_to_world.copy()
-        pose[:3, 3] -= (factor - 1) * eye.distance * pose[:3, 2]
-        return replace(self, eye=Eye(pose, eye.fov, factor * eye.distance))
+        """Return the view from behind, at ``factor`` times the distance."""
+        camera, pose = self.camera, self.camera.camera_to_world.copy()
+        pose[:3, 3] -= (factor - 1) * camera.distance * pose[:3, 2]
+        return replace(self, camera=ViewerCamera(pose, camera.fov, factor * camera.distance))
 
     def upright(self, up: np.ndarray) -> StartView:
-        """From the same place, with another direction upright; up: (3,) world, any length.
+        """Return the view with another up direction; up: (3,) world, any length.
 
-        Raises :class:`UserError` where that is how the camera looks, or zero.
+        Raises :class:`UserError` if it is zero or along the camera's axis.
         """
-        eye, place = self.eye, self.eye.camera_to_world[:3, 3]
-        pose = look_at(place, place + eye.distance * eye.camera_to_world[:3, 2], up)
-        return StartView(replace(eye, camera_to_world=pose), up / np.linalg.norm(up))
+        camera, position = self.camera, self.camera.camera_to_world[:3, 3]
+        pose = look_at(position, position + camera.distance * camera.camera_to_world[:3, 2], up)
+        return StartView(replace(camera, camera_to_world=pose), up / np.linalg.norm(up))
 
 
-class Page(Screen):
-    """What is common to a fit's page and to a viewer's."""
+class Page:
+    """A page that shows Gaussians; the base of a fit's."""
 
     def __init__(
         self,
         server: viser.ViserServer,
-        wishes: Wishes,
+        requests: RenderRequests,
         start: StartView,
         fitted: Approximations,
     ) -> None:
         """fitted: the approximations that the Gaussians were fitted with."""
-        self.server, self.wishes = server, wishes
+        self.server, self.requests = server, requests
         self._texts: dict[int, viser.GuiMarkdownHandle] = {}
         self._frustums: list[viser.CameraFrustumHandle] = []
-        self._as_fitted: dict[int, tuple[object, float]] = {}  # by client: of what, and ms
-        self._fitted, self._distance = fitted, start.eye.distance
-        pose, camera = start.eye.camera_to_world, server.initial_camera
+        self._as_fitted: dict[int, tuple[object, float]] = {}  # what each client saw, and ms
+        self._fitted, self._distance = fitted, start.camera.distance
+        pose, camera = start.camera.camera_to_world, server.initial_camera
         server.scene.set_up_direction(tuple(start.up))
         camera.position = tuple(pose[:3, 3])
-        camera.look_at = tuple(pose[:3, 3] + start.eye.distance * pose[:3, 2])
+        camera.look_at = tuple(pose[:3, 3] + self._distance * pose[:3, 2])
         camera.up = tuple(start.up)
-        camera.fov = math.radians(start.eye.fov)
-        camera.near, camera.far = 1e-3 * start.eye.distance, 1e3 * start.eye.distance
+        camera.fov = math.radians(start.camera.fov)
+        camera.near, camera.far = 1e-3 * self._distance, 1e3 * self._distance
         self.add_controls()
         with server.gui.add_folder("Looking"):
-            self._angle = server.gui.add_slider(
-                "Angle of view", 5.0, MOST_FOV, 0.5, round(min(MOST_FOV, start.eye.fov), 1)
-            )
-            self._angle.on_update(self._turn_lens)
-            self.controls = LookControls(server.gui, fitted, self.ask_again)
-        server.on_client_connect(self._welcome)
-        server.on_client_disconnect(self._part)
+            self.controls = CameraControls(server.gui, fitted, start.camera.fov, self.update)
+        server.on_client_connect(self._connect)
+        server.on_client_disconnect(self._disconnect)
 
     def add_controls(self) -> None:
-        """What a page has above the controls of looking."""
+        """Add what a page has above the controls of its camera."""
 
     def add_cameras(self, views: Sequence[Viewpoint], visible: bool) -> None:
-        """Draw cameras, through which one looks with a click, and a box that hides them."""
-        chosen = np.linspace(0, len(views) - 1, min(MOST_FRUSTUMS, len(views))).round().astype(int)
+        """Draw cameras, through which a click looks, and a box that hides them."""
+        chosen = np.linspace(0, len(views) - 1, min(MAX_FRUSTUMS, len(views))).round().astype(int)
         self._cameras = self.server.gui.add_checkbox("Cameras", visible)
-        self._cameras.on_update(self._show_frustums)
+        self._cameras.on_update(event_handler(self._show_frustums))
         for view in (views[index] for index in chosen):
             frustum = self.server.scene.add_camera_frustum(
                 f"/cameras/{view.name}",
@@ -134,21 +117,21 @@ class Page(Screen):
                 thickness=1.0,
                 thickness_units="screen",
                 color=(240, 150, 40),
-                wxyz=_wxyz_of(view.camera_to_world),
+                wxyz=Rotation.from_matrix(view.camera_to_world[:3, :3]).as_quat(scalar_first=True),
                 position=tuple(view.center),
                 visible=visible,
             )
-            frustum.on_click(self._looker_through(view))
+            frustum.on_click(self._look_through(view))
             self._frustums.append(frustum)
 
-    def ask_again(self) -> None:
-        """With what the controls say now, of everybody's camera."""
-        self._place_frustums()
+    def update(self) -> None:
+        """Queue a request for each client, after a control has changed."""
+        self._show_frustums()
         for client in self.server.get_clients().values():
-            self._ask(client)
+            self._follow(client)
 
     def show(self, client: int, request: FrameRequest, frame: Frame, is_whole: bool) -> None:
-        """See :class:`Screen`; where the browser was closed meanwhile, nothing happens."""
+        """Show a frame to a client, unless it has gone; is_whole: it is as large as requested."""
         handle = self.server.get_clients().get(client)
         if handle is None:
             return
@@ -157,87 +140,52 @@ class Page(Screen):
         )
         handle.flush()
         if is_whole:
-            self._say(client, self._described(client, request, frame))
+            self._set_text(client, self._describe(client, request, frame))
 
     def refuse(self, client: int, reason: str) -> None:
-        """See :class:`Screen`."""
-        self._say(client, f"**No picture:** {one_line(reason)}")
+        """Show in one line why there is no frame."""
+        self._set_text(client, f"**No picture:** {one_line(reason)}")
 
-    def _described(self, client: int, request: FrameRequest, frame: Frame) -> str:
-        """How long a picture took, and what its colours mean."""
+    def _describe(self, client: int, request: FrameRequest, frame: Frame) -> str:
+        """Return how long an image took, and what its colours mean."""
         took, size = 1e3 * frame.seconds, (request.width, request.height)
         text = f"**{took:.0f} ms** for {size[0]}×{size[1]}"
-        of = (*size, request.shows, request.optics, request.eye.camera_to_world.tobytes())
+        pose = request.camera.camera_to_world.tobytes()
+        shown = (*size, request.shows, request.lens, request.lens_numbers, pose)
         if request.approximations in (None, self._fitted):
-            self._as_fitted[client] = of, took
-        elif self._as_fitted.get(client, (None, 0.0))[0] == of:
+            self._as_fitted[client] = shown, took
+        elif self._as_fitted.get(client, (None, 0.0))[0] == shown:
             text += f"; as fitted {self._as_fitted[client][1]:.0f} ms"
         return f"{text}\n\n{frame.note}" if frame.note else text
 
-    def _say(self, client: int, text: str) -> None:
+    def _set_text(self, client: int, text: str) -> None:
         if (handle := self._texts.get(client)) is not None:
             handle.content = text
 
-    def _ask(self, client: viser.ClientHandle) -> None:
-        """Leave a request for what this camera sees."""
-        try:
-            looking = self.controls.looking
-        except ValueError as error:
-            self.refuse(client.client_id, str(error))
-            return
-        camera = client.camera
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
-        pose[:3, 3] = camera.position
-        fov = math.degrees(camera.fov) if looking.fisheye_angle is None else looking.fisheye_angle
-        distance = float(np.linalg.norm(camera.look_at - camera.position))
-        size = max(1, camera.image_width), max(1, camera.image_height)
-        scale = min(1.0, looking.max_side / max(size))
-        width, height = (max(1, round(scale * side)) for side in size)
-        eye, shows = Eye(pose, fov, distance), looking.shows
-        request = FrameRequest(eye, width, height, looking.optics, shows, looking.approximations)
-        self.wishes.ask(client.client_id, request)
-
-    async def _welcome(self, client: viser.ClientHandle) -> None:
+    async def _connect(self, client: viser.ClientHandle) -> None:
         self._texts[client.client_id] = client.gui.add_markdown("…", order=1e6)
-
-        @client.camera.on_update
-        async def _(camera: object) -> None:
-            del camera
-            self._follow(client)
-
+        client.camera.on_update(event_handler(lambda: self._follow(client)))
         self._follow(client)
 
-    def _follow(self, client: viser.ClientHandle) -> None:
-        """The angle of view is that of the window's shorter side, whatever its shape becomes."""
-        camera = client.camera
-        upright = max(1.0, camera.image_height / max(camera.image_width, 1))
-        half = upright * math.tan(math.radians(self._angle.value) / 2)
-        camera.fov = min(2 * math.atan(half), math.radians(MOST_FOV))
-        self._ask(client)
-
-    async def _part(self, client: viser.ClientHandle) -> None:
-        self.wishes.leave(client.client_id)
+    async def _disconnect(self, client: viser.ClientHandle) -> None:
+        self.requests.remove(client.client_id)
         self._texts.pop(client.client_id, None)
         self._as_fitted.pop(client.client_id, None)
 
-    async def _turn_lens(self, event: object) -> None:
-        del event
-        for client in self.server.get_clients().values():
-            self._follow(client)
+    def _follow(self, client: viser.ClientHandle) -> None:
+        """Queue a request for what a client's camera sees."""
+        client.camera.fov = self.controls.fov(client.camera)
+        try:
+            self.requests.put(client.client_id, self.controls.request(client.camera))
+        except ValueError as error:
+            self.refuse(client.client_id, str(error))
 
-    async def _show_frustums(self, event: object) -> None:
-        del event
-        self._place_frustums()
+    def _show_frustums(self) -> None:
+        """Show the frustums where they lie on the image: browsers draw them through a pinhole."""
+        for frustum in self._frustums:
+            frustum.visible = self._cameras.value and self.controls.is_straight
 
-    def _place_frustums(self) -> None:
-        """Where the browser's lines would not lie on what is rendered, there are none."""
-        if self._frustums:
-            visible = self._cameras.value and self.controls.keeps_lines
-            for frustum in self._frustums:
-                frustum.visible = visible
-
-    def _looker_through(self, view: Viewpoint) -> Callable[..., Coroutine]:
+    def _look_through(self, view: Viewpoint) -> Callable[..., Coroutine]:
         async def look_through(event: viser.SceneNodePointerEvent) -> None:
             camera = event.client.camera
             with event.client.atomic():
@@ -245,7 +193,3 @@ class Page(Screen):
                 camera.look_at = tuple(view.center + self._distance * view.camera_to_world[:3, 2])
 
         return look_through
-
-
-def _wxyz_of(pose: np.ndarray) -> np.ndarray:
-    return Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)

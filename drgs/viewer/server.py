@@ -1,6 +1,6 @@
 """The web server of a page, on this machine: viser, silenced and kept from the network.
 
-Imported when somebody wants to look on; viser is of the extra ``viewer``.
+Imported for a page only; viser is of the extra ``viewer``.
 """
 
 from __future__ import annotations
@@ -24,33 +24,26 @@ from websockets.asyncio.server import Request, Response, ServerConnection
 from drgs.core.errors import UserError, UserNote, one_line
 from drgs.viewer.messages import MAX_MESSAGE_BYTES, PageConnection
 
-ADDRESS = "127.0.0.1"
-"""Where only this machine reaches it."""
+ADDRESS = "127.0.0.1"  # only this machine reaches it
 
 LOOPBACK = (ADDRESS, "localhost", "::1")
 
-PORT = 8080
-"""The first that is tried."""
-
-PORTS = 20
-"""That are tried, unless one is asked for."""
+FIRST_PORTS = range(8080, 8100)  # tried one after the other, unless a port is given
 
 
 class LocalServer(viser.ViserServer):
-    """viser's, which anybody's browser could otherwise ask to publish what it shows."""
+    """viser's server, which clients cannot ask to publish what it shows."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """No address outside of this machine."""
-        del verbose
+        """Return None: there is no address outside of this machine."""
         return None
 
 
 @contextmanager
 def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterator[LocalServer]:
-    """A server within the block; its page is empty.
+    """Run a server with an empty page within the block.
 
-    port: None for the first free one from :data:`PORT` on. options: what the user calls address and
-    port, for messages.
+    port: None for a free one. options: names of address and port on the command line.
 
     Raises :class:`UserError` where it cannot listen there.
     """
@@ -61,7 +54,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
 
     with _silent(), _guarded(address, control):
         server = LocalServer(address, port, verbose=False)
-    server.get_event_loop().set_exception_handler(_NoteOnce())
+    server.get_event_loop().set_exception_handler(_note_errors_once())
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     try:
         with warnings.catch_warnings():
@@ -74,7 +67,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
 
 
 def url(server: LocalServer) -> str:
-    """What to open in a browser."""
+    """Return the address to open in a browser."""
     host, port = server.get_host(), server.get_port()
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname()
@@ -82,35 +75,28 @@ def url(server: LocalServer) -> str:
 
 
 def free_port(address: str, port: int | None, options: tuple[str, str]) -> int:
-    """``port``, or a free one if that is None; see :func:`serving`.
+    """Return ``port``, or a free one if that is None; see :func:`serving`.
 
     viser itself would wait for ever at an address that is not there.
     """
-    try:
-        family, kind, protocol, _, _ = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)[0]
-    except (OSError, UnicodeError):
-        raise UserError(
-            f"{options[0]}: must be an address of this machine, such as {ADDRESS}, got {address}"
-        ) from None
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
     reason = ""
-    for candidate in [port] if port is not None else [*range(PORT, PORT + PORTS), 0]:
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((address, candidate))
+    for candidate in [port] if port is not None else [*FIRST_PORTS, 0]:
+        try:
+            with socket.create_server((address, candidate), family=family) as probe:
                 return probe.getsockname()[1]
-            except OSError as error:
-                reason = error.strerror or str(error)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
     named = f"{options[0]} {address}" if port is None else f"{options[1]} {port}"
     raise UserError(f"{named}: cannot listen at {address}: {reason}; choose another")
 
 
 def is_own(headers: Mapping[str, str], address: str) -> bool:
-    """Whether a request (RFC 6455, section 4.1) comes from the page of the server at ``address``.
+    """Return whether a request (RFC 6455, section 4.1) comes from the page of this server.
 
-    Browsers let any page connect to a WebSocket of this machine, and say in ``Origin`` which page
-    that is. A name of somebody else's that leads to this machine is in ``Host``: a server that only
-    this machine reaches goes by none.
+    Browsers let any page connect to a WebSocket of this machine; ``Origin`` is that page. ``Host``
+    contains a foreign name that leads to this machine: a server that only this machine reaches has
+    none.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     name = urlsplit(f"//{host}").hostname
@@ -133,10 +119,10 @@ def _refusal(request: Request, address: str) -> str:
 
 @contextmanager
 def _guarded(address: str, control: Callable[[str], Any]) -> Iterator[None]:
-    """Within the block, servers that viser starts serve only valid requests and messages.
+    """Let servers that viser starts within the block serve only valid requests and messages.
 
-    viser has no setting for it. control: see :func:`drgs.viewer.messages.is_valid`. The logger
-    prints nothing: websockets would print a traceback for each connection that breaks.
+    viser has no setting for it. control: see :func:`drgs.viewer.messages.is_valid`. The logger is
+    silent: websockets would print a traceback for each connection that breaks.
     """
     serve = websockets.asyncio.server.serve
     connection_type = partial(PageConnection, control=control, connections=set())
@@ -159,26 +145,24 @@ def _guarded(address: str, control: Callable[[str], Any]) -> Iterator[None]:
         websockets.asyncio.server.serve = serve
 
 
-class _NoteOnce:
-    """Exception handler of an event loop: one line for each type of error."""
+def _note_errors_once() -> Callable[[asyncio.AbstractEventLoop, dict[str, Any]], None]:
+    """Return an event loop's exception handler that notes each type of error in one line."""
+    noted = set()
 
-    def __init__(self) -> None:
-        self._noted: set[str] = set()
-
-    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Note the error."""
-        del loop
+    def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
         kind = type(error).__name__
-        if kind not in self._noted:
-            self._noted.add(kind)
+        if kind not in noted:
+            noted.add(kind)
             reason = context["message"] if error is None else f"{kind}: {error}"
             warnings.warn(UserNote(f"the viewer's page: {one_line(reason)}"), stacklevel=1)
+
+    return handle
 
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Within the block, nothing is printed by rich: viser frames where it listens, and its end."""
+    """Silence rich within the block: viser prints its address and its end."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:

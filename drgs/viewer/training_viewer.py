@@ -1,4 +1,4 @@
-"""A fit that somebody watches: pictures, pause and end, between two of its iterations.
+"""A page that shows a fit while it runs: frames, progress, pause and end, between two iterations.
 
 What is rendered changes nothing that the coming iterations depend on: a fit that was watched has
 the bytes of one that was not.
@@ -7,116 +7,214 @@ the bytes of one that was not.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import drjit as dr
+import numpy as np
 
 from drgs.datasets.types import Dataset
-from drgs.training.loop import History, Iteration, StopCriterion
+from drgs.results.history import HistoryRow
+from drgs.training.loop import History, Iteration, StopCriterion, smoothed
 from drgs.training.trainer import Trainer
+from drgs.viewer.controls import event_handler
 from drgs.viewer.frames import LiveScene
-from drgs.viewer.requests import Wishes
-from drgs.viewer.scheduler import Screen, Spectators
+from drgs.viewer.page import Page, StartView
+from drgs.viewer.scheduler import RenderRequests, RenderScheduler
 
-REFRESH_SECONDS = 1.0
-"""Between two pictures of a camera that is still, at least."""
+if TYPE_CHECKING:
+    import viser
 
-REFRESH_SHARE = 0.05
-"""Of the time, at most, for pictures of a camera that is still."""
+REFRESH_SECONDS = 1.0  # shortest time between two frames of a camera that is still
+REFRESH_SHARE = 0.05  # largest part of the time for frames of a camera that is still
+PROGRESS_SECONDS = 0.5  # time between two reports of progress, where a client reads them
+WAIT_SECONDS = 0.1  # time until a pause notices Ctrl-C
+MAX_POINTS = 300  # points of a curve
+ROOM = 1.1  # iterations that curves have room for, in those that are expected once this has changed
 
-SAID_SECONDS = 0.5
-"""Between two reports of where the fit is, where somebody is there to read them."""
+STEP_BACK = 1.25
+"""Distance of the first camera in that of a training camera, so that these are in the image."""
 
-WAIT_SECONDS = 0.1
-"""In a pause, until Ctrl-C is noticed."""
+Curve = tuple[np.ndarray, np.ndarray]
+"""Iterations and values, each (n,)."""
 
-
-class FitScreen(Screen, Protocol):
-    """Where a fit is shown."""
-
-    def tell(self, trainer: Trainer, history: History, total: int) -> None:
-        """Say where the fit is; total: iterations in all. Waits for nothing."""
-
-    def tell_end(self, iterations: int) -> None:
-        """Say that there are no more iterations, and that results are being written."""
+CURVES = {
+    "training views": {"stroke": "#7fb0ff", "width": 2, "points": {"show": False}},
+    "test views": {"stroke": "#f0937b", "width": 2, "points": {"show": True}},
+}
+"""Lines by title."""
 
 
-class UntilEnded:
-    """A fit ends as ``criterion`` decides, or when a viewer client ends it.
+class EarlyStop:
+    """Ends a fit as ``criterion`` decides, or when a viewer client ends it."""
 
-    Its configuration then says what was done.
-    """
-
-    def __init__(self, criterion: StopCriterion, wishes: Wishes) -> None:
-        self._criterion, self._wishes = criterion, wishes
+    def __init__(self, criterion: StopCriterion, requests: RenderRequests) -> None:
+        self._criterion, self._requests = criterion, requests
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """Whether there is another iteration; if not by request, revises the configuration."""
+        """See :class:`StopCriterion`; an end by request revises the configuration."""
         done = trainer.iteration
-        if self._wishes.ended and 0 < done < trainer.config.iterations:
+        if self._requests.ended and 0 < done < trainer.config.iterations:
             trainer.reschedule(done, trainer.config.densify.stop)
             return False
         return self._criterion.should_continue(trainer)
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """Iterations in all."""
+        """See :class:`StopCriterion`."""
         return self._criterion.num_iterations(trainer)
 
 
-class Watching:
-    """Serves those who look on at a fit: see ``drgs.training.loop.Observer``."""
+class TrainingViewer:
+    """Serves viewer clients during a fit: see :class:`drgs.training.loop.Observer`."""
 
     def __init__(
-        self, wishes: Wishes, screen: FitScreen, dataset: Dataset, criterion: StopCriterion
+        self,
+        requests: RenderRequests,
+        page: TrainingPage,
+        dataset: Dataset,
+        criterion: StopCriterion,
     ) -> None:
-        self._wishes, self._screen, self._criterion = wishes, screen, criterion
+        self._requests, self._page, self._criterion = requests, page, criterion
         self._background = dataset.background
-        self._spectators = Spectators(wishes, screen, _refreshed_after)
-        self._scene: tuple[int, LiveScene] | None = None  # and the iteration that it is of
-        self._said = 0.0  # when, by time.monotonic
-        self._of_fit = 0.0  # seconds of the fit's own, waited for here
+        self._scheduler = RenderScheduler(requests, page.show, page.refuse, _refresh_after)
+        self._scene: LiveScene | None = None
+        self._progress_at = 0.0  # by time.monotonic
+        self._fit_s = 0.0  # seconds of the fit's own, waited for here
 
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Render what is due, and wait where the fit is to pause.
-
-        The history's clock stands still meanwhile.
-        """
-        start, self._of_fit = time.perf_counter(), 0.0
-        is_due = self._wishes.asked and time.monotonic() - self._said >= SAID_SECONDS
+        """Render what is due, and wait while the fit is paused; its clock stands still."""
+        start, self._fit_s = time.perf_counter(), 0.0
+        now = time.monotonic()
+        is_due = self._requests.pending and now - self._progress_at >= PROGRESS_SECONDS
         if history.rows and (is_due or done.is_last):
-            self._tell(trainer, history)
+            self._progress_at = now
+            self._page.show_progress(trainer, history, self._criterion.num_iterations(trainer))
         self._serve(trainer)
-        while self._wishes.paused and not (self._wishes.ended or done.is_last or stops()):
+        while self._requests.paused and not (self._requests.ended or done.is_last or stops()):
             if not self._serve(trainer):
-                self._wishes.wait(WAIT_SECONDS)
-        self._scene = None  # what it holds of the Gaussians would keep memory
-        history.leave_out(time.perf_counter() - start - self._of_fit)
+                self._requests.wait(WAIT_SECONDS)
+        self._scene = None  # what it keeps of the Gaussians would keep memory
+        history.leave_out(time.perf_counter() - start - self._fit_s)
         if done.is_last:
-            self._screen.tell_end(trainer.iteration)
-
-    def _tell(self, trainer: Trainer, history: History) -> None:
-        self._said = time.monotonic()
-        self._screen.tell(trainer, history, self._criterion.num_iterations(trainer))
+            self._page.show_end(trainer.iteration)
 
     def _serve(self, trainer: Trainer) -> bool:
-        return self._spectators.serve(lambda: self._scene_of(trainer))
+        return self._scheduler.serve(lambda: self._live_scene(trainer))
 
-    def _scene_of(self, trainer: Trainer) -> LiveScene:
-        """The Gaussians as they are after the last iteration."""
-        if self._scene is None or self._scene[0] != trainer.iteration:
+    def _live_scene(self, trainer: Trainer) -> LiveScene:
+        """Return a scene with the Gaussians as they are after the last iteration."""
+        if self._scene is None:
             start = time.perf_counter()
             dr.sync_thread()  # the iteration's kernels may still be running
-            self._of_fit += time.perf_counter() - start
+            self._fit_s += time.perf_counter() - start
             trainer.sync_scene()
             gaussians = dr.detach(trainer.integrator.gaussians)
             model, degree = trainer.config.model, trainer.sh_degree
-            scene = LiveScene(gaussians, model, self._background, sh_degree=degree)
-            self._scene = trainer.iteration, scene
-        return self._scene[1]
+            self._scene = LiveScene(gaussians, model, self._background, sh_degree=degree)
+        return self._scene
 
 
-def _refreshed_after(seconds: float) -> float:
+class TrainingPage(Page):
+    """The page of a fit."""
+
+    def add_controls(self) -> None:
+        """Add progress, buttons and a curve."""
+        gui = self.server.gui
+        self._status = gui.add_markdown("The first iterations compile kernels …")
+        self._bar = gui.add_progress_bar(0.0)
+        self._pause = gui.add_button("Pause", icon="player-pause")
+        self._end = gui.add_button("End and write results", icon="flag", color="gray")
+        self._pause.on_click(event_handler(self._toggle_pause))
+        self._end.on_click(self._confirm_end)
+        self._charts: list[viser.GuiUplotHandle] = []
+        self._room = 0  # iterations that they have room for
+        self._folder = gui.add_folder("PSNR [dB]")
+
+    def show_progress(self, trainer: Trainer, history: History, total: int) -> None:
+        """Show the progress without waiting for anything; total: iterations in all."""
+        last, done = history.rows[-1], trainer.iteration
+        psnr = smoothed([row.psnr for row in history.rows])
+        self._status.content = (
+            f"**{done:,}** of {total:,} iterations, {last.iteration / max(last.wall_s, 1e-9):.1f} "
+            f"a second\n\nPSNR {psnr[-1]:.2f} dB of training views, "
+            f"{trainer.num_gaussians:,} Gaussians"
+        )
+        self._bar.value = min(100.0, 100.0 * done / max(total, 1))
+        curves = psnr_curves(history.rows)
+        if not self._room / ROOM**2 <= total <= self._room:
+            # A plan may revise the total twice a second: not each time are the charts drawn again.
+            self._room = round(ROOM * total) if self._charts else total
+            self._draw(curves)
+        for chart, curve in zip(self._charts, curves, strict=True):
+            chart.data, chart.visible = curve, len(curve[0]) > 0
+
+    def show_end(self, iterations: int) -> None:
+        """Show that there are no more iterations, and that results are being written."""
+        self._status.content = f"**{iterations:,} iterations are done;** results are being written."
+        self._bar.value = 100.0
+        self._pause.disabled = self._end.disabled = True
+
+    def _draw(self, curves: list[Curve]) -> None:
+        """Draw charts anew: viser's own range follows what was shown, and it knows no gaps."""
+        for chart in self._charts:
+            chart.remove()
+        with self._folder:
+            self._charts = [
+                self.server.gui.add_uplot(
+                    curve,
+                    ({"label": "iteration"}, {"label": "dB", **line}),
+                    title=title,
+                    aspect=2.4,
+                    visible=len(curve[0]) > 0,
+                    scales={"x": {"time": False, "range": (0, self._room)}},
+                    legend={"show": False},
+                )
+                for (title, line), curve in zip(CURVES.items(), curves, strict=True)
+            ]
+
+    def _toggle_pause(self) -> None:
+        paused = not self.requests.paused
+        self.requests.pause(paused)
+        self._pause.label = "Go on" if paused else "Pause"
+        self._pause.icon = "player-play" if paused else "player-pause"
+
+    async def _confirm_end(self, event: viser.GuiEvent) -> None:
+        gui = event.client.gui
+        with gui.add_modal("End the fit here?") as modal:
+            gui.add_markdown("The results are those of a fit of as many iterations as are done.")
+            end = gui.add_button("End it", color="red")
+            stay = gui.add_button("Go on", color="gray")
+        for button in (end, stay):
+            button.on_click(event_handler(modal.close))
+        end.on_click(event_handler(self._end_fit))
+
+    def _end_fit(self) -> None:
+        self._pause.disabled = self._end.disabled = True
+        self.requests.end()
+
+
+def watch(
+    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, criterion: StopCriterion
+) -> tuple[TrainingViewer, StopCriterion]:
+    """Show a fit on the server's page; return the observer that serves it, and its criterion."""
+    requests, start = RenderRequests(), StartView.from_views(dataset.train).from_farther(STEP_BACK)
+    criterion = EarlyStop(criterion, requests)
+    page = TrainingPage(server, requests, start, trainer.config.model.approximations)
+    page.add_cameras(dataset.train, visible=True)
+    return TrainingViewer(requests, page, dataset, criterion), criterion
+
+
+def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:
+    """Return the PSNR of training views, smoothed, and of test views, where it was measured."""
+    kept = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).round().astype(int))
+    iterations = np.array([row.iteration for row in rows], np.float64)
+    training = smoothed([row.psnr for row in rows])
+    measured = [(row.iteration, row.test_psnr) for row in rows if row.test_psnr is not None]
+    test = np.array(measured, np.float64).reshape(-1, 2).T
+    return [(iterations[kept], training[kept]), (test[0], test[1])]
+
+
+def _refresh_after(seconds: float) -> float:
     return max(REFRESH_SECONDS, seconds / REFRESH_SHARE)

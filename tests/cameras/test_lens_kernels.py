@@ -54,8 +54,8 @@ from drgs.splatting.projection import ewa
         ({"k5": 0.5}, {"k4": 0.0, "k5": 0.5}),
         ({"p2": 0.5}, {"p1": 0.0, "p2": 0.5}),
         (
-            dict(zip(RadialTangential.names, (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
-            dict(zip(RadialTangential.names, (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
+            dict(zip(RadialTangential.coefficient_names(), (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
+            dict(zip(RadialTangential.coefficient_names(), (1, 2, 3, 4, 5, 6, 7, 8), strict=True)),
         ),
     ],
 )
@@ -86,8 +86,8 @@ def test_a_fisheye_leaves_out_what_is_not_given():
         ({"p2": 0.0}, {"p1": 0.0, "p2": 0.0}),
         ({"k1": 0.5, "sx1": 0.25}, {"k1": 0.5, "sx1": 0.25, "sy1": 0.0}),
         (
-            dict(zip(KernelThinPrism.names, range(1, 9), strict=True)),
-            dict(zip(KernelThinPrism.names, range(1, 9), strict=True)),
+            dict(zip(KernelThinPrism.coefficient_names(), range(1, 9), strict=True)),
+            dict(zip(KernelThinPrism.coefficient_names(), range(1, 9), strict=True)),
         ),
     ],
 )

@@ -61,7 +61,7 @@ def test_cornells_box_is_photographed_from_inside():
     assert np.abs(centers(scene, settings)).max() < 1
     camera = CaptureCamera(scene, settings)
     for view in camera_placement.views_of(scene, settings):
-        picture = camera.picture(view)
+        picture = camera.image(view)
         assert lit_part(picture) > 0.8
         # Its front is open, and a picture may look through it.
         assert (picture[:, :, 3] > 0).mean() > 0.15

@@ -19,10 +19,9 @@ from conftest import REPOSITORY
 from support.commands import assert_refused
 
 from drgs.capture import __main__ as capture
-from drgs.capture import camera_placement, path_tracing
+from drgs.capture import camera_placement, dataset, path_tracing
 from drgs.capture.path_tracing import CaptureSettings
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
 from drgs.io.ply import read_points
 
@@ -220,7 +219,7 @@ def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
     scene = path_tracing.load_scene(ball)
     target, distance = camera_placement.target_and_distance(scene, settings)
     view = camera_placement.views_around(settings, target, distance)[60]
-    rgba = path_tracing.CaptureCamera(scene, settings).picture(view) / 255
+    rgba = path_tracing.CaptureCamera(scene, settings).image(view) / 255
     composited = rgba[:, :, :3] * rgba[:, :, 3:] + 1 - rgba[:, :, 3:]
 
     look_at = mi.ScalarTransform4f().look_at(
@@ -282,7 +281,8 @@ def test_each_view_contributes_its_share_of_the_points_it_sees(ball, captured):
     views = camera_placement.views_around(
         settings, *camera_placement.target_and_distance(scene, settings)
     )
-    positions, _ = path_tracing.visible_points(scene, settings, views, captured)
+    folder = dataset.CaptureFolder(captured, ball, settings, lambda: None)
+    positions, _ = folder.visible_points(scene, views)
     for number in range(6):
         seen = positions[100 * number : 100 * (number + 1)]
         towards = views[number].pose[:3, 3] - CENTER
@@ -331,7 +331,7 @@ def test_another_seed_gives_other_pictures(ball, captured, tmp_path):
 
 def test_a_folder_that_another_capture_writes_to_is_refused(ball, captured, tmp_path, monkeypatch):
     out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
-    write_png, refused = capture.write_png, []
+    write_png, refused = dataset.write_png, []
 
     def write_while_another_begins(path, picture):
         if not refused:
@@ -339,7 +339,7 @@ def test_a_folder_that_another_capture_writes_to_is_refused(ball, captured, tmp_
             assert_refused(capture.main, ball, "--out", out, *SMALL, folder=out, message=message)
         write_png(path, picture)
 
-    monkeypatch.setattr(capture, "write_png", write_while_another_begins)
+    monkeypatch.setattr(dataset, "write_png", write_while_another_begins)
     run(ball, out, *SMALL)
     assert refused and contents(out) == contents(captured)
 
@@ -347,15 +347,15 @@ def test_a_folder_that_another_capture_writes_to_is_refused(ball, captured, tmp_
 def test_interrupted_capture_continues_to_the_same_bytes(
     ball, captured, tmp_path, monkeypatch, capsys
 ):
-    picture, calls = path_tracing.CaptureCamera.picture, []
+    image, calls = path_tracing.CaptureCamera.image, []
 
     def interrupted(self, view):
         calls.append(view)
         if len(calls) == 4:
             raise KeyboardInterrupt
-        return picture(self, view)
+        return image(self, view)
 
-    monkeypatch.setattr(path_tracing.CaptureCamera, "picture", interrupted)
+    monkeypatch.setattr(path_tracing.CaptureCamera, "image", interrupted)
     with pytest.raises(SystemExit) as stop:
         run(ball, tmp_path / "out", *SMALL)
     assert stop.value.code == 130
@@ -403,19 +403,19 @@ def test_wrong_scenes_are_refused_in_one_line(tmp_path, capsys, name, text, mess
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"views": 0}, "views must be between 1 and 100,000, got 0"),
-        ({"test_views": -1}, "test_views must be between 0 and 100,000, got -1"),
-        ({"size": (0, 9)}, "size must be at least 1 x 1 and at most 16,777,216 px in all"),
-        ({"fov": 3.2}, "fov must be between 0 and pi (radians), got 3.2"),
-        ({"fov": math.nan}, "fov must be between 0 and pi"),
-        ({"distance": -1.0}, "distance must be > 0, got -1"),
-        ({"target": (0.0, math.inf, 0.0)}, "target must be finite"),
+        (["--views", 0], "--views: must be a whole number >= 1, got 0"),
+        (["--test-views", -1], "--test-views: must be a whole number >= 0, got -1"),
+        (["--size", 0, 9], "--size: must be a whole number >= 1, got 0"),
+        (["--fov", 181], "--fov: must be between 0 and 180 degrees, got 181"),
+        (["--fov", "nan"], "--fov: must be a finite number, got nan"),
+        (["--distance", -1], "distance must be > 0, got -1"),
+        (["--target", 0, "inf", 0], "--target: must be a finite number, got inf"),
     ],
 )
-def test_wrong_numbers_are_refused(options, message):
-    with pytest.raises(UserError) as error:
-        CaptureSettings(**options)
-    assert message in str(error.value)
+def test_wrong_numbers_are_refused(ball, tmp_path, options, message):
+    assert_refused(
+        capture.main, ball, "--out", tmp_path / "out", *options, folder=tmp_path, message=message
+    )
 
 
 def refusal(scene, out, *options):
@@ -459,10 +459,10 @@ def test_a_changed_neighbour_of_a_python_scene_is_another_scene(tmp_path):
     helper = write(tmp_path, "capture_test_neighbour.py", "SIZE = 1")
     path = write(tmp_path, "s.py", "import capture_test_neighbour\n" + CUBE)
     path_tracing.load_scene(path)
-    before = capture.fingerprint(path)
-    assert capture.fingerprint(path) == before
+    before = dataset.fingerprint(path)
+    assert dataset.fingerprint(path) == before
     helper.write_text("SIZE = 2")
-    assert capture.fingerprint(path) != before
+    assert dataset.fingerprint(path) != before
 
 
 def test_the_command_runs_as_a_module(ball, tmp_path):
@@ -493,7 +493,7 @@ def test_shipped_scene_is_in_the_picture_and_has_hundreds_of_parts():
     for view in camera_placement.views_around(
         settings, *camera_placement.target_and_distance(scene, settings)
     )[:8]:
-        alpha = camera.picture(view)[:, :, 3]
+        alpha = camera.image(view)[:, :, 3]
         assert not alpha[[0, -1]].any()
         assert not alpha[:, [0, -1]].any()
         assert (alpha == 255).mean() > 0.1

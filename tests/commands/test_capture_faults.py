@@ -132,7 +132,7 @@ def test_a_full_disk_is_said_in_one_line_and_the_capture_goes_on(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--size", 10**9, 10**9], "size must be at least 1 x 1 and at most 16,777,216 px"),
+        (["--size", 10**9, 10**9], "size must be at most 16,777,216 px"),
         (["--size", 10**20, 1], "--size: must be at most 2,147,483,647"),
         (["--points", 10**9], "--points: must be at most 5,000,000"),
         (["--views", 10**9], "--views: must be at most 100,000"),

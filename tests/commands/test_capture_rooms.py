@@ -12,6 +12,7 @@ from support.render_command import write_scene
 
 from drgs import fit
 from drgs.capture import __main__ as capture
+from drgs.capture import dataset
 from drgs.capture.path_tracing import lit_part
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
@@ -114,11 +115,11 @@ def test_pictures_that_are_mostly_empty_are_warned_of_in_one_line(cornell, tmp_p
 
 def test_the_first_pictures_are_spread_over_all():
     """Else those near the horizon would decide whether a warning is due."""
-    order = capture.spread_first(list(range(125)))
+    order = dataset.spread_first(list(range(125)))
     assert order[:10] == list(range(0, 120, 12))
     assert sorted(order) == list(range(125))
     for count in (0, 1, 9, 10, 11, 19):
-        assert sorted(capture.spread_first(list(range(count)))) == list(range(count))
+        assert sorted(dataset.spread_first(list(range(count)))) == list(range(count))
 
 
 def test_ranges_of_azimuth_and_elevation_keep_before_the_open_side(cornell, tmp_path):

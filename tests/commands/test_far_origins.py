@@ -28,6 +28,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import VIEWS
+from drgs.results.model import load_model
 from drgs.results.refined_cameras import write_views
 
 PLACE = np.array([4.2e6, 1.7e5, -4.78e6])
@@ -82,7 +83,7 @@ def test_cameras_of_a_file_and_by_hand_are_in_world_coordinates(far, tmp_path):
 
 def test_the_page_starts_at_the_training_cameras(far):
     args = view_arguments(far)
-    model = view.model_of(args)
+    model = load_model(far)
     for camera, expected in zip(view.cameras_of(args, model), make_dataset().train, strict=True):
         np.testing.assert_allclose(
             camera.center + model.gaussians.origin, expected.center + PLACE, rtol=0, atol=1e-6

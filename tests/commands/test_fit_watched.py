@@ -19,30 +19,32 @@ from support.small_capture import HEIGHT, WIDTH, pose_around
 
 from drgs import fit
 from drgs.training import fit_folder
-from drgs.viewer import fit_page
-from drgs.viewer.frames import FrameRequest
-from drgs.viewer.optics import Eye
-from drgs.viewer.requests import Wishes
-from drgs.viewer.training_viewer import UntilEnded, Watching
+from drgs.viewer import training_viewer
+from drgs.viewer.frames import FrameRequest, ViewerCamera
+from drgs.viewer.scheduler import RenderRequests
+from drgs.viewer.training_viewer import EarlyStop, TrainingViewer
 
-EYE = Eye(pose_around(0.4, 0.3), 40.0, 4.0)
+EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
 
 
 class Screen:
     """Somebody who asks for more with each picture, and for an end at an iteration."""
 
-    def __init__(self, wishes, end_at):
-        self.wishes, self.end_at, self.shown = wishes, end_at, 0
+    def __init__(self, queue, end_at):
+        self.queue, self.end_at, self.shown = queue, end_at, 0
 
     def show(self, client, request, frame, is_whole):
         self.shown += 1
-        self.wishes.ask(1, FrameRequest(EYE, WIDTH, HEIGHT + self.shown % 2))
+        self.queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT + self.shown % 2))
 
-    def tell(self, trainer, history, total):
+    def show_progress(self, trainer, history, total):
         if trainer.iteration == self.end_at:
-            self.wishes.end()
+            self.queue.end()
 
-    def tell_end(self, iterations):
+    def refuse(self, client, reason):
+        raise AssertionError(reason)
+
+    def show_end(self, iterations):
         self.iterations = iterations
 
 
@@ -58,19 +60,19 @@ def looked_on(monkeypatch):
     server.serving, server.url, server.ADDRESS = serving, lambda _: "http://here", "127.0.0.1"
     monkeypatch.setitem(sys.modules, "drgs.viewer.server", server)
     monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
-    monkeypatch.setattr("drgs.viewer.training_viewer.SAID_SECONDS", 0.0)
+    monkeypatch.setattr("drgs.viewer.training_viewer.PROGRESS_SECONDS", 0.0)
 
     def look_on(end_at=None):
         screens = []
 
         def watch(server, trainer, dataset, length):
-            wishes = Wishes()
-            screens.append(Screen(wishes, end_at))
-            wishes.ask(1, FrameRequest(EYE, WIDTH, HEIGHT))
-            length = UntilEnded(length, wishes)
-            return Watching(wishes, screens[0], dataset, length), length
+            queue = RenderRequests()
+            screens.append(Screen(queue, end_at))
+            queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT))
+            length = EarlyStop(length, queue)
+            return TrainingViewer(queue, screens[0], dataset, length), length
 
-        monkeypatch.setattr(fit_page, "watch", watch)
+        monkeypatch.setattr(training_viewer, "watch", watch)
         return screens
 
     without_pictures(monkeypatch)
@@ -157,7 +159,7 @@ def test_a_port_that_is_taken_and_an_address_of_another_machine_are_refused(tmp_
         assert_fit_refused(config, "--view", "--view-port", port, folder=tmp_path, message=message)
     for address, message in (
         ("192.0.2.1", "--view-address 192.0.2.1: cannot listen at 192.0.2.1"),
-        ("no address", "--view-address: must be an address of this machine"),
+        ("no address", "--view-address no address: cannot listen at no address"),
     ):
         arguments = (config, "--view", "--view-address", address)
         assert_fit_refused(*arguments, folder=tmp_path, message=message)

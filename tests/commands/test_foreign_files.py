@@ -119,16 +119,6 @@ def test_pictures_that_an_interrupted_command_left_are_rendered_again(
     assert contents(out) == contents(expected)
 
 
-@pytest.mark.parametrize("ways", [["orbit"], ["split", "orbit"]])
-def test_a_folder_that_an_earlier_version_rendered_is_its_own(fitted, tmp_path, ways):
-    out = fitted.parent / "data" / "renders"
-    for way in ways:
-        assert_ends_well(render.main, fitted, *VIEWS[way], "--out", out)
-    (out / ".drgs-render.json").unlink()
-    for way in ways:
-        assert_ends_well(render.main, fitted, *VIEWS[way], "--background", "black", "--out", out)
-
-
 @pytest.mark.parametrize("metrics", ["[", "[]", '{"split": "test"}', "7"])
 def test_other_metrics_are_somebody_elses(fitted, tmp_path, metrics):
     (tmp_path / "out").mkdir()

@@ -1,24 +1,19 @@
 """Configurations that leave values to the data, where no fit has decided on them."""
 
-import argparse
-
 from conftest import REPOSITORY
 
-from drgs import render
 from drgs.config.changes import changed, is_open
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.results.files import METRICS
 from drgs.results.folder import claim_output_folder, is_finished
+from drgs.results.model import load_open_config
 
 PHOTOS = REPOSITORY / "scenes" / "photos.yml"
 
 
 def test_the_background_of_renderings_is_that_of_a_fit_to_the_photographs(photographs):
-    args = argparse.Namespace(
-        what=photographs, scene=PHOTOS, data=str(photographs), set=None, background=None
-    )
-    config = render._load_config(PHOTOS, args)
+    config = load_open_config(PHOTOS, [f"data.path={photographs}"], None)
     assert config.data.background_rgb == (0, 0, 0)
     assert config.model.near == 0.2  # a twenty-fifth of 4.1, to one digit
     assert not is_open(config) and is_open(load_config(PHOTOS))

@@ -35,7 +35,11 @@ def fails(capsys, *arguments):
         ("config.yml", [], "must be a file of Gaussians (.compressed.ply, .glb, .ply,"),
         ("point_cloud.ply", [], "say what to render: --orbit N"),
         ("point_cloud.ply", ["--split", "test"], "needs photographs"),
-        ("point_cloud.ply", ["--orbit", "2", "--data", "x"], "--data: needs --scene"),
+        (
+            "point_cloud.ply",
+            ["--orbit", "2", "--data", "x"],
+            "--orbit but without --scene",
+        ),
         (
             "point_cloud.ply",
             ["--orbit", "0"],
@@ -44,8 +48,12 @@ def fails(capsys, *arguments):
         ("point_cloud.ply", ["--orbit", "2", "--up", "0", "0", "0"], "up must not be zero"),
         ("point_cloud.ply", ["--orbit", "2", "--variant", "scalar_rgb"], "--variant: must be"),
         ("", ["--orbit", "2", "--split", "test"], "--split: not allowed with argument --orbit"),
-        ("", ["--orbit", "2", "--up", "0", "0", "1"], "--up: is not used here"),
-        ("", ["--size", "8", "8"], "--size: is not used with --split"),
+        (
+            "",
+            ["--orbit", "2", "--up", "0", "0", "1"],
+            "--orbit, where it follows",
+        ),
+        ("", ["--size", "8", "8"], "--size: is not used with Gaussians and --split"),
         ("", ["--origin", "0", "0", "0"], "must not be zero or parallel"),
         ("", ["--origin", "0", "0", "nan"], "--origin: must be a finite number, got nan"),
         ("", ["--origin", "3", "0", "0", "--fov", "180"], "--fov: must be between 0 and 180"),
@@ -59,7 +67,7 @@ def fails(capsys, *arguments):
         ("", ["--camera", "nowhere.json", "--size", "8", "8"], "nowhere.json: cannot read"),
         ("", ["--data", "nowhere"], "data.path: there is no folder"),
         ("", ["--set", "data.imagesize=3"], "did you mean data.image_size?"),
-        ("", ["-D", "model=x.ply"], "--define: is for the parameters of a Mitsuba scene (.xml)"),
+        ("", ["-D", "model=x.ply"], "--define: is not used with Gaussians"),
     ],
 )
 def test_user_errors_are_one_line_and_write_nothing(
@@ -146,7 +154,8 @@ def test_options_for_gaussians_are_refused_with_a_scene(tmp_path, capsys):
 def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word):
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     message = fails(capsys, path, "-D", word, "--out", tmp_path / "out")
-    assert message.startswith(f"argument --define/-D: must be NAME=VALUE, got {word}")
+    assert message.startswith("argument --define/-D: must be NAME=VALUE")
+    assert f"got {word}" in message
 
 
 @pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
@@ -155,10 +164,8 @@ def test_parameters_that_mitsubas_loader_has_itself_are_refused(tmp_path, capsys
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     path.write_text(path.read_text().replace("model.ply", f"${name}"))
     message = fails(capsys, path, "-D", f"{name}=model.ply", "--out", tmp_path / "out")
-    assert (
-        message.startswith(f"argument --define/-D: the name {name} is taken")
-        and "rename" in message
-    )
+    assert message.startswith("argument --define/-D: must be NAME=VALUE with a name other than")
+    assert "taken by Mitsuba's loader" in message
 
 
 def test_parameters_that_a_scene_file_does_not_have_are_refused(tmp_path, capsys):

@@ -13,7 +13,9 @@ from support.small_capture import FOCUS, RADIUS, make_dataset
 from drgs import view
 from drgs.cli.commands import CommandParser
 from drgs.core.errors import UserError
+from drgs.render import parse_background
 from drgs.results.files import CAMERAS, VIEWS
+from drgs.results.model import load_model
 from drgs.results.refined_cameras import write_views
 from drgs.viewer.page import StartView
 
@@ -22,6 +24,10 @@ def parsed(*arguments):
     parser = CommandParser()
     view.add_arguments(parser)
     return parser.parse_args([str(argument) for argument in arguments])
+
+
+def model_of(args):
+    return load_model(args.what, background=parse_background(args.background))
 
 
 @pytest.mark.parametrize("refined", [False, True])
@@ -36,7 +42,7 @@ def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path, refined):
     write_views(run / VIEWS, few)
     write_views(run / CAMERAS, others)
     args = parsed(run)
-    model = view.model_of(args)
+    model = model_of(args)
     assert model.background == (1.0, 1.0, 1.0)  # of its configuration
     cameras = view.cameras_of(args, model)
     for camera, expected in zip(cameras, (others if refined else few).train, strict=True):
@@ -45,24 +51,24 @@ def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path, refined):
 
 def test_a_file_alone_is_seen_whole(fit):
     args = parsed(fit / "point_cloud.ply", "--background", "0.5", "0.25", "0")
-    model = view.model_of(args)
+    model = model_of(args)
     assert model.background == (0.5, 0.25, 0.0)
     (camera,) = view.cameras_of(args, model)
     middle = camera.K @ (camera.viewmat @ [*FOCUS, 1])[:3]
     assert np.abs(middle[:2] / middle[2] - 200).max() < 60  # px of 400
     assert 0.3 * RADIUS < np.linalg.norm(camera.center - FOCUS) < 2 * RADIUS
     middle = np.median(model.gaussians.numpy().means, axis=0)
-    distance = StartView.of([camera], middle).eye.distance
+    distance = StartView.from_views([camera], middle).camera.distance
     assert distance == pytest.approx(np.linalg.norm(camera.center - middle), rel=0.2)
 
 
 @pytest.mark.parametrize("name", ["", "point_cloud.ply"])
 def test_what_is_up_can_be_said(fit, name):
     args = parsed(fit / name, "--up", "0", "-2", "0")
-    model = view.model_of(args)
+    model = model_of(args)
     start = view.start_of(args, model, view.cameras_of(args, model))
     assert np.array_equal(start.up, [0, -1, 0])
-    right, down, forward = start.eye.camera_to_world[:3, :3].T
+    right, down, forward = start.camera.camera_to_world[:3, :3].T
     assert abs(right @ start.up) < 1e-9 and down @ start.up < 0
     along = [str(-x) for x in forward]
     for up in (along, ["0", "0", "0"]):

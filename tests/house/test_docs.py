@@ -110,7 +110,7 @@ def loaded(plugin) -> list[mi.Object]:
     }
     lenses = (RadialTangential, ThinPrismFisheye)
     return [
-        mi.load_dict({**common, "lens": lens.kind, **dict.fromkeys(lens.names, 0.0)})
+        mi.load_dict({**common, "lens": lens.kind, **dict.fromkeys(lens.coefficient_names(), 0.0)})
         for lens in lenses
     ]
 

@@ -163,20 +163,6 @@ def test_what_effects_write_is_a_result(tmp_path, config, name):
     assert os.listdir(tmp_path) == []
 
 
-def test_pictures_of_a_version_without_records_are_those_that_its_report_lists(finished, config):
-    """Also where the coming fit has other views."""
-    (finished / ".drgs-fit.json").unlink()
-    (finished / "report.html").write_text("<tr><th>r_0</th><td>9.87</td></tr>")
-    before = contents(finished)
-    message = refusal(remove_run, finished)
-    assert "got renders/test/r_1.png, side_by_side/test/r_1.png; move that away" in message
-    assert contents(finished) == before
-    with (finished / "report.html").open("a") as report:
-        report.write("<tr><th>r_1</th><td>9.87</td></tr>")
-    remove_run(finished)
-    assert os.listdir(finished) == []
-
-
 def test_a_folder_in_the_place_of_a_result_is_not_removed(finished):
     for recorded in (True, False):
         if not recorded:

@@ -21,9 +21,8 @@ from drgs.datasets.orbits import orbit_of_views
 from drgs.datasets.viewpoints import field_of_view
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
-from drgs.results.history import DensityRow, HistoryRow
+from drgs.results.history import DensityRow, HistoryRow, summarize_density
 from drgs.results.metrics import ssim
-from drgs.results.population import story_of
 from drgs.results.viewer import Shown
 
 KINDS = ("still", "moving")
@@ -248,12 +247,12 @@ def test_the_population_is_shown_with_what_was_added_and_removed_so_far(tmp_path
 
 
 def test_the_story_names_what_was_done_and_always_what_was_refused():
-    assert story_of("adc", []) is None
-    assert story_of("adc", CHANGES) == (
+    assert summarize_density("adc", []) is None
+    assert summarize_density("adc", CHANGES) == (
         "adc: 1,000 \u2192 2,400 Gaussians; 410 cloned, 1,200 split, 210 pruned, 3 refused"
     )
     relocated = [DensityRow(iteration=8, num_gaussians=50, relocated=9)]
-    assert story_of("mcmc", relocated) == (
+    assert summarize_density("mcmc", relocated) == (
         "mcmc: 50 \u2192 50 Gaussians; 9 relocated, 0 pruned, 0 refused"
     )
 

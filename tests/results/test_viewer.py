@@ -215,20 +215,20 @@ def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
     viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
     size = (folder / "viewer.html").stat().st_size
     (folder / "viewer.html").unlink()
-    monkeypatch.setattr(viewer, "MOST_BYTES", size - 1)
+    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size - 1)
     with pytest.warns(
         UserNote, match=r"blobs/viewer\.html: not written, .*export .* --format html"
     ):
         viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
     assert list(folder.iterdir()) == []
-    monkeypatch.setattr(viewer, "MOST_BYTES", size)
+    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size)
     viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
     assert (folder / "viewer.html").stat().st_size == size
 
 
 def test_what_is_too_large_by_its_number_alone_is_not_built(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "viewer_page", None)
-    monkeypatch.setattr(viewer, "MOST_BYTES", viewer.least_bytes(30, blobs().sh_degree) - 1)
+    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.least_bytes(30, blobs().sh_degree) - 1)
     with pytest.warns(UserNote, match=r"not written, as it would have at least 0 MB"):
         viewer.write_viewer(tmp_path, make_dataset(), Shown(blobs(), OWN))
     assert list(tmp_path.iterdir()) == []
@@ -241,7 +241,7 @@ def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(standpoi
     counts = 256, 256 * 12
     one, twelve = (len(page_of(gaussians_within_ranges(n, sh_degree), standpoint)) for n in counts)
     least = viewer.least_bytes(counts[1] - counts[0], sh_degree)
-    assert least <= twelve - one <= 1.01 * (least / viewer.LEAST_SHARE + 11 * 72 * 4 / 3)
+    assert least <= twelve - one <= 1.01 * (least / viewer.MIN_GZIP_RATIO + 11 * 72 * 4 / 3)
 
 
 def test_a_page_in_the_current_folder_is_named_after_it(tmp_path, monkeypatch):

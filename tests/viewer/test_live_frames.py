@@ -11,12 +11,18 @@ from drgs.config.approximations import Approximations
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.integrator.scene import make_scene, render_views
-from drgs.viewer.controls import LENSES
-from drgs.viewer.frames import BACKDROP, MOST_ACCURATE, SHOWN, FrameRequest, LiveScene
-from drgs.viewer.optics import Eye, FisheyeLens, OpenCVLens, Orthographic, Pinhole, ThinLens
+from drgs.viewer.frames import (
+    BACKDROP,
+    MOST_ACCURATE,
+    SHOWN,
+    VIEWER_LENSES,
+    FrameRequest,
+    LiveScene,
+    ViewerCamera,
+)
 
 WHITE = (1.0, 1.0, 1.0)
-EYE = Eye(pose_around(0.4, 0.3), 40.0, RADIUS)
+EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, RADIUS)
 REQUEST = FrameRequest(EYE, 48, 32)
 
 
@@ -96,26 +102,20 @@ def test_the_error_is_the_difference_from_the_most_accurate_picture(scene):
 def test_what_no_kernel_can_do_is_refused_in_words(scene):
     values = Approximations(**{**vars(scene.approximations), "projection": "exact"})
     with pytest.raises(UserError, match="exact"):
-        scene.frame(replace(REQUEST, optics=FisheyeLens(), approximations=values))
+        scene.frame(replace(REQUEST, lens="fisheye", approximations=values))
 
 
-THROUGH = {
-    "pinhole": Pinhole(),
-    "opencv": OpenCVLens({"k1": 0.1}),
-    "fisheye": FisheyeLens({"k1": 0.1}),
-    "orthographic": Orthographic(),
-    "thin lens": ThinLens(0.03),
-}
+NUMBERS = {"opencv": {"k1": 0.1}, "fisheye": {"k1": 0.1}, "thin lens": {"aperture": 0.03}}
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", VIEWER_LENSES)
 def test_everything_is_shown_through_every_lens(scene, lens):
     """But for the projection ``exact``, which only pinholes and thin lenses have."""
-    optics, refused = THROUGH[lens], set()
+    numbers, refused = NUMBERS.get(lens, {}), set()
     for projection, order in (("ewa", "center"), ("unscented", "pixel"), ("exact", "pixel")):
         approximations = replace(scene.approximations, projection=projection, order=order)
         for shows in SHOWN:
-            request = FrameRequest(EYE, 12, 8, optics, shows, approximations)
+            request = FrameRequest(EYE, 12, 8, lens, numbers, shows, approximations)
             try:
                 assert scene.frame(request).pixels.shape == (8, 12, 3)
             except UserError:
@@ -126,12 +126,12 @@ def test_everything_is_shown_through_every_lens(scene, lens):
 def test_the_error_through_parallel_rays_is_that_of_the_order():
     """Of ``ewa``, which is exact there: with the most accurate order there is none."""
     scene = LiveScene(blobs(), ModelConfig(**MOST_ACCURATE), WHITE)
-    parallel = replace(REQUEST, optics=Orthographic(), shows="error")
+    parallel = replace(REQUEST, lens="orthographic", shows="error")
     assert (scene.frame(parallel).pixels == 128).all()
-    assert (scene.frame(replace(parallel, optics=Pinhole())).pixels != 128).any()
+    assert (scene.frame(replace(parallel, lens="pinhole")).pixels != 128).any()
 
 
 def test_nothing_to_see_has_no_depth(scene):
-    away = Eye(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
-    frame = scene.frame(replace(REQUEST, eye=away, shows="depth"))
+    away = ViewerCamera(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
+    frame = scene.frame(replace(REQUEST, camera=away, shows="depth"))
     assert frame.note == "nothing is seen" and np.ptp(frame.pixels) == 0

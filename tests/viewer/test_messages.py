@@ -33,11 +33,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 
 from drgs.config.approximations import Approximations
 from drgs.training.loop import AllIterations, History, iterations
-from drgs.viewer.fit_page import FitPage, watch
 from drgs.viewer.messages import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, is_valid, offers
 from drgs.viewer.page import StartView
-from drgs.viewer.requests import Wishes
+from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.server import serving
+from drgs.viewer.training_viewer import TrainingPage, watch
 
 STOPPING = ("Pause", "End and write results")
 """Buttons that any client may press."""
@@ -103,7 +103,9 @@ def test_a_camera_has_finite_numbers_and_a_direction():
 
 
 def test_a_thousand_invalid_messages_change_nothing_and_print_nothing(server, capfd):
-    FitPage(server, Wishes(), StartView.of(true_dataset().train), Approximations())
+    TrainingPage(
+        server, RenderRequests(), StartView.from_views(true_dataset().train), Approximations()
+    )
     uuids = uuids_that_stop_nothing(server)
     before = {uuid: control.value for uuid, control in controls_of(server).items()}
     callbacks = {uuid: len(c._impl.update_cb) for uuid, c in controls_of(server).items()}
@@ -223,8 +225,8 @@ def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
         pass
     watching, length = watch(server, watched, dataset, AllIterations())
     served, history = [], History()
-    show = watching._screen.show
-    watching._screen.show = lambda *frame: (served.append(frame), show(*frame))
+    show = watching._scheduler.show
+    watching._scheduler.show = lambda *frame: (served.append(frame), show(*frame))
     uuids, is_over = uuids_that_stop_nothing(server), threading.Event()
 
     def attack():

@@ -18,13 +18,12 @@ from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.training.loop import History, HistoryRow
-from drgs.viewer.controls import LENSES, SWITCHED
-from drgs.viewer.fit_page import MOST_POINTS, FitPage, curves_of
-from drgs.viewer.frames import SHOWN, Frame
-from drgs.viewer.optics import FisheyeLens, OpenCVLens, Orthographic, Pinhole, ThinLens
+from drgs.viewer.controls import CONTROLLED
+from drgs.viewer.frames import SHOWN, VIEWER_LENSES, Frame
 from drgs.viewer.page import Page, StartView
-from drgs.viewer.requests import Wishes
+from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.server import free_port, is_own, serving, url
+from drgs.viewer.training_viewer import MAX_POINTS, TrainingPage, psnr_curves
 
 FITTED = Approximations(low_pass=0.1, antialiased=True, extent=3.5)
 
@@ -42,7 +41,7 @@ def server():
 
 @pytest.fixture
 def page(server):
-    return Page(server, Wishes(), StartView.of(make_dataset().train), FITTED)
+    return Page(server, RenderRequests(), StartView.from_views(make_dataset().train), FITTED)
 
 
 def client(width=1600, height=900, pose=None):
@@ -63,32 +62,33 @@ def client(width=1600, height=900, pose=None):
 
 
 def asked(page, **camera):
-    page._ask(client(**camera))
-    return page.wishes.asked[7].request
+    page.controls._angle.value = 50
+    page._follow(client(**camera))
+    return page.requests.pending[7].request
 
 
 def test_the_first_look_is_that_of_the_first_training_camera_at_what_all_look_at():
     views = make_dataset().train
-    start = StartView.of(views)
-    assert start.eye.camera_to_world is views[0].camera_to_world
-    assert start.eye.distance == pytest.approx(RADIUS)
+    start = StartView.from_views(views)
+    assert start.camera.camera_to_world is views[0].camera_to_world
+    assert start.camera.distance == pytest.approx(RADIUS)
     assert start.up == pytest.approx([0, 0, 1], abs=1e-9)
-    seen = start.eye.viewpoint(32, 24)
+    seen = start.camera.viewpoint(32, 24)
     assert pytest.approx(views[0].K) == seen.K
-    farther = start.from_farther(1.5).eye
+    farther = start.from_farther(1.5).camera
     pose = farther.camera_to_world
     assert farther.distance == pytest.approx(1.5 * RADIUS)
     assert pose[:3, 3] + farther.distance * pose[:3, 2] == pytest.approx(FOCUS)
-    alone = StartView.of(views[:1])  # a camera alone looks at nothing
-    assert alone.eye.distance > 0
+    alone = StartView.from_views(views[:1])  # a camera alone looks at nothing
+    assert alone.camera.distance > 0
 
 
 def test_a_browsers_camera_becomes_a_request(page):
     request = asked(page)
-    assert request.eye.camera_to_world == pytest.approx(pose_around(0.7, 0.2))
-    assert request.eye.fov == pytest.approx(50) and request.eye.distance == pytest.approx(2.5)
+    assert request.camera.camera_to_world == pytest.approx(pose_around(0.7, 0.2))
+    assert request.camera.fov == pytest.approx(50) and request.camera.distance == pytest.approx(2.5)
     assert (request.width, request.height) == (1280, 720)  # of 1600 x 900, at most 1280
-    assert request.shows == "color" and request.optics == Pinhole()
+    assert request.shows == "color" and request.lens == "pinhole"
     assert request.approximations == FITTED
     request = asked(page, width=300, height=200)
     assert (request.width, request.height) == (300, 200)
@@ -101,19 +101,19 @@ def test_every_control_is_in_the_request(page):
     assert request.shows == "depth" and (request.width, request.height) == (640, 360)
     controls._numbers["k1"].value = -0.2
     lenses = {
-        "opencv": OpenCVLens({"k1": -0.2, "k2": 0.0}),
-        "fisheye": FisheyeLens({"k1": -0.2, "k2": 0.0}),
-        "orthographic": Orthographic(),
-        "thin lens": ThinLens(aperture=0.03, focus=1.0),
-        "pinhole": Pinhole(),
+        "opencv": {"k1": -0.2, "k2": 0.0},
+        "fisheye": {"k1": -0.2, "k2": 0.0},
+        "orthographic": {},
+        "thin lens": {"aperture": 0.03, "focus": 1.0},
+        "pinhole": {},
     }
-    assert lenses.keys() == LENSES.keys()
-    for name, optics in lenses.items():
+    assert lenses.keys() == VIEWER_LENSES.keys()
+    for name, numbers in lenses.items():
         controls._lens.value = name
         request = asked(page)
-        assert request.optics == optics
-        assert request.eye.fov == pytest.approx(90 if name == "fisheye" else 50)
-    for name in SWITCHED:
+        assert (request.lens, request.lens_numbers) == (name, numbers)
+        assert request.camera.fov == pytest.approx(90 if name == "fisheye" else 50)
+    for name in CONTROLLED:
         declared, value = DECLARED[name], getattr(FITTED, name)
         other = not value if declared.kind is bool else 2
         other = next((word for word in declared.words if word != value), other)
@@ -131,22 +131,20 @@ def test_times_are_compared_with_those_of_the_same_picture_as_fitted(page):
     ]
     request = asked(page)
     other = replace(request, approximations=switched)
-    assert page._described(7, request, frames[0]) == "**20 ms** for 1280×720"
-    assert page._described(7, other, frames[1]).startswith(
-        "**50 ms** for 1280×720; as fitted 20 ms"
-    )
-    assert page._described(7, other, frames[1]).endswith("\n\nx")
-    elsewhere = replace(other, eye=replace(other.eye, camera_to_world=pose_around(0.1, 0.1)))
+    assert page._describe(7, request, frames[0]) == "**20 ms** for 1280×720"
+    assert page._describe(7, other, frames[1]).startswith("**50 ms** for 1280×720; as fitted 20 ms")
+    assert page._describe(7, other, frames[1]).endswith("\n\nx")
+    elsewhere = replace(other, camera=replace(other.camera, camera_to_world=pose_around(0.1, 0.1)))
     for changed in (replace(other, width=640), replace(other, shows="depth"), elsewhere):
-        assert "as fitted" not in page._described(7, changed, frames[1])
+        assert "as fitted" not in page._describe(7, changed, frames[1])
 
 
 def test_a_number_beyond_its_limits_is_said_and_asked_for_by_nobody(page):
     page._texts[7] = SimpleNamespace(content="")
     page.controls._values["alpha_cut"].value = 1.0
-    page._ask(client())
+    page._follow(client())
     assert "alpha_cut must be from 0 to below 1" in page._texts[7].content
-    assert not page.wishes.asked
+    assert not page.requests.pending
 
 
 def test_the_server_is_at_the_address_that_is_printed_and_prints_nothing(server, capfd):
@@ -198,7 +196,7 @@ def test_nothing_is_said_of_pictures_for_a_browser_that_was_closed():
 def test_the_page_of_a_fit_follows_its_history(server):
     dataset = plain_dataset()
     trainer = make_trainer(dataset, iterations=40)
-    page = FitPage(server, Wishes(), StartView.of(dataset.train), FITTED)
+    page = TrainingPage(server, RenderRequests(), StartView.from_views(dataset.train), FITTED)
     page.add_cameras(dataset.train, visible=True)
     assert len(page._frustums) == len(dataset.train)
     trainer.iteration = 12
@@ -207,18 +205,18 @@ def test_the_page_of_a_fit_follows_its_history(server):
         HistoryRow(10, 0.1, 20.0, 25, 1e-3, 0.5),
         HistoryRow(12, 0.1, 30.0, 25, 1e-3, 1.0),
     ]
-    page.tell(trainer, history, 40)
+    page.show_progress(trainer, history, 40)
     assert "**12** of 40 iterations, 12.0 a second" in page._status.content
     assert "PSNR 21.00 dB" in page._status.content  # nine tenths of the past
     assert page._bar.value == 30
     charts, drawn = page._charts, []
     for total in (39, 41, 42, 43, 40, 30):  # revised: now and then there are others
-        page.tell(trainer, history, total)
+        page.show_progress(trainer, history, total)
         drawn.append(page._charts is not charts)
         charts = page._charts
         assert total <= page._room < 1.3 * total
     assert drawn == [False, True, False, False, False, True]
-    page.tell_end(12)
+    page.show_end(12)
     assert page._pause.disabled and page._end.disabled
 
 
@@ -227,13 +225,13 @@ def test_curves_have_few_points_their_ends_and_the_measurements():
         HistoryRow(k, 0.1, 20.0, 25, 1e-3, 0.1, 25.0 if k % 400 == 0 else None)
         for k in range(1, 1001)
     ]
-    (x, y), (at, test) = curves_of(rows)
-    assert len(x) == MOST_POINTS and x[0] == 1 and x[-1] == 1000
+    (x, y), (at, test) = psnr_curves(rows)
+    assert len(x) == MAX_POINTS and x[0] == 1 and x[-1] == 1000
     assert y == pytest.approx(20)
     step = [replace(row, psnr=30.0 if row.iteration > 1 else 20.0) for row in rows[:20]]
-    assert curves_of(step)[0][1] == pytest.approx(30 - 10 * 0.9 ** np.arange(20))
+    assert psnr_curves(step)[0][1] == pytest.approx(30 - 10 * 0.9 ** np.arange(20))
     assert list(at) == [400, 800] and list(test) == [25, 25]
-    assert [len(curve[0]) for curve in curves_of(rows[:3])] == [3, 0]
+    assert [len(curve[0]) for curve in psnr_curves(rows[:3])] == [3, 0]
 
 
 def test_everything_that_can_be_shown_is_offered(page):

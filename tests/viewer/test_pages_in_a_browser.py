@@ -21,6 +21,7 @@ from support.fit_command import write_scene
 from drgs import view
 from drgs.datasets.viewpoints import FIELD_OF_VIEW
 from drgs.integrator.scene import render_views
+from drgs.results.model import load_model
 
 browsers = pytest.importorskip("support.browser", reason="needs POSIX", exc_type=ImportError)
 
@@ -97,8 +98,8 @@ def assert_clean(page, address: str) -> None:
 def expected_view(run: Path, width: int, height: int) -> np.ndarray:
     """What ``drgs.render`` shows of the camera that a page begins with."""
     mi.set_variant("llvm_ad_rgb")
-    args = argparse.Namespace(what=run, background=None, up=None)
-    model = view.model_of(args)
+    args = argparse.Namespace(what=run, up=None)
+    model = load_model(run)
     (camera,) = view.cameras_of(args, model)
     # As wide as high, at least: on a phone the window is narrower than the camera's picture.
     focal = 0.5 * min(width, height) / math.tan(math.radians(FIELD_OF_VIEW) / 2)

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.viewer import requests, scheduler
-from drgs.viewer.frames import Frame, FrameRequest
-from drgs.viewer.optics import Eye
-from drgs.viewer.requests import Wishes
-from drgs.viewer.scheduler import MOVING_SECONDS, STILL_SECONDS, Pace, Spectators
+from drgs.viewer import scheduler
+from drgs.viewer.frames import Frame, FrameRequest, ViewerCamera
+from drgs.viewer.scheduler import (
+    MOVING_SECONDS,
+    STILL_SECONDS,
+    AdaptiveResolution,
+    RenderRequests,
+    RenderScheduler,
+)
 
-REQUEST = FrameRequest(Eye(np.eye(4), 40.0, 1.0), 800, 600)
+REQUEST = FrameRequest(ViewerCamera(np.eye(4), 40.0, 1.0), 800, 600)
 
 
 class Clock(SimpleNamespace):
@@ -28,7 +32,6 @@ class Clock(SimpleNamespace):
 def clock(monkeypatch):
     clock = Clock()
     monkeypatch.setattr(scheduler, "time", clock)
-    monkeypatch.setattr(requests, "time", clock)
     return clock
 
 
@@ -54,9 +57,9 @@ class Stage:
         self.refused.append((client, reason))
 
 
-def make(clock, seconds_a_pixel=0.0, refreshed_after=None):
-    stage, left = Stage(clock, seconds_a_pixel), Wishes()
-    return stage, left, Spectators(left, stage, refreshed_after)
+def make(clock, seconds_a_pixel=0.0, refresh_after=None):
+    stage, left = Stage(clock, seconds_a_pixel), RenderRequests()
+    return stage, left, RenderScheduler(left, stage.show, stage.refuse, refresh_after)
 
 
 def served(them, stage):
@@ -66,7 +69,7 @@ def served(them, stage):
 def test_a_moving_camera_gets_small_pictures_and_a_still_one_the_whole(clock):
     stage, left, them = make(clock)
     assert not served(them, stage)
-    left.ask(1, REQUEST)
+    left.put(1, REQUEST)
     assert served(them, stage) and not served(them, stage)
     assert stage.shown == [(1, 400, False)]
     clock.now += STILL_SECONDS
@@ -80,14 +83,14 @@ def test_pictures_of_a_moving_camera_keep_to_their_time(clock):
     """At 1 microsecond a pixel the whole takes 0.48 s: a third of either side is in time."""
     stage, left, them = make(clock, 1e-6)
     for _ in range(8):
-        left.ask(1, REQUEST)
+        left.put(1, REQUEST)
         assert served(them, stage)
     widths = [width for _, width, _ in stage.shown]
     assert widths == [400] + 7 * [267]
     assert 800 * 600 / 4 * 1e-6 > MOVING_SECONDS > 800 * 600 / 9 * 1e-6
     stage.seconds_a_pixel = 1e-8
     for _ in range(3):
-        left.ask(1, REQUEST)
+        left.put(1, REQUEST)
         assert served(them, stage)
     assert [width for _, width, _ in stage.shown][-2:] == [400, 800]
 
@@ -95,12 +98,12 @@ def test_pictures_of_a_moving_camera_keep_to_their_time(clock):
 def test_a_still_camera_gets_larger_pictures_step_by_step_until_it_moves(clock):
     stage, left, them = make(clock, 3e-6)
     for _ in range(6):
-        left.ask(1, REQUEST)
+        left.put(1, REQUEST)
         served(them, stage)
     assert stage.shown[-1] == (1, 133, False)  # a sixth
     clock.now += STILL_SECONDS
     assert served(them, stage) and stage.shown[-1] == (1, 267, False)
-    left.ask(1, REQUEST)
+    left.put(1, REQUEST)
     assert served(them, stage) and stage.shown[-1] == (1, 133, False)
     clock.now += STILL_SECONDS
     assert served(them, stage) and served(them, stage) and not served(them, stage)
@@ -108,17 +111,17 @@ def test_a_still_camera_gets_larger_pictures_step_by_step_until_it_moves(clock):
 
 
 def test_small_windows_are_not_made_smaller_than_one_can_see():
-    pace = Pace()
+    resolution = AdaptiveResolution()
     for _ in range(9):
-        pace.took(1, 10.0)
-    assert pace.divisor(REQUEST) == 8
-    assert pace.divisor(FrameRequest(REQUEST.eye, 300, 130)) == 2
-    assert pace.divisor(FrameRequest(REQUEST.eye, 300, 20)) == 1
+        resolution.update(1, 10.0)
+    assert resolution.divisor(REQUEST) == 8
+    assert resolution.divisor(FrameRequest(REQUEST.camera, 300, 130)) == 2
+    assert resolution.divisor(FrameRequest(REQUEST.camera, 300, 20)) == 1
 
 
 def test_what_changes_by_itself_is_rendered_again_after_a_while(clock):
     stage, left, them = make(clock, 1e-6, lambda seconds: 10 * seconds)
-    left.ask(1, REQUEST)
+    left.put(1, REQUEST)
     served(them, stage)
     clock.now += STILL_SECONDS
     served(them, stage)
@@ -132,19 +135,19 @@ def test_what_changes_by_itself_is_rendered_again_after_a_while(clock):
 def test_everybody_is_served_in_turn_and_who_has_left_is_not(clock):
     stage, left, them = make(clock, 1e-7)
     for client in (3, 1, 2):
-        left.ask(client, REQUEST)
+        left.put(client, REQUEST)
     assert all(served(them, stage) for _ in range(3))
     assert sorted(client for client, *_ in stage.shown) == [1, 2, 3]
     for client in (1, 2, 3):
-        left.ask(client, REQUEST)
-    left.leave(2)
+        left.put(client, REQUEST)
+    left.remove(2)
     assert served(them, stage) and served(them, stage) and not served(them, stage)
     assert sorted(client for client, *_ in stage.shown[3:]) == [1, 3]
 
 
 def test_what_cannot_be_rendered_is_said_once(clock):
     stage, left, them = make(clock)
-    left.ask(1, FrameRequest(REQUEST.eye, 800, 600, shows="nonsense"))
+    left.put(1, FrameRequest(REQUEST.camera, 800, 600, shows="nonsense"))
     assert served(them, stage)
     clock.now += 10
     assert not served(them, stage)
@@ -162,8 +165,8 @@ def test_a_request_that_cannot_be_rendered_is_a_line_on_its_page_and_others_are_
         return frame(request)
 
     stage.frame = fail
-    left.ask(1, FrameRequest(REQUEST.eye, 3, 3))
-    left.ask(2, REQUEST)
+    left.put(1, FrameRequest(REQUEST.camera, 3, 3))
+    left.put(2, REQUEST)
     assert served(them, stage) and served(them, stage) and not served(them, stage)
     assert stage.refused == [(1, "calibrated: fx must be positive here")]
     assert [client for client, *_ in stage.shown] == [2]

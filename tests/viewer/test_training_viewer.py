@@ -19,12 +19,11 @@ from drgs.config.approximations import Approximations
 from drgs.integrator.scene import make_scene, render_views
 from drgs.training.loop import AllIterations, History, iterations
 from drgs.training.trainer import Trainer
-from drgs.viewer.frames import SHOWN, FrameRequest
-from drgs.viewer.optics import Eye, FisheyeLens, ThinLens
-from drgs.viewer.requests import Wishes
-from drgs.viewer.training_viewer import UntilEnded, Watching
+from drgs.viewer.frames import SHOWN, FrameRequest, ViewerCamera
+from drgs.viewer.scheduler import RenderRequests
+from drgs.viewer.training_viewer import EarlyStop, TrainingViewer
 
-EYE = Eye(pose_around(0.4, 0.3), 40.0, 4.0)
+EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
 
 EVERYTHING = {
     "iterations": 12,
@@ -60,21 +59,21 @@ class Screen:
     def refuse(self, client, reason):
         raise AssertionError(reason)
 
-    def tell(self, trainer, history, total):
+    def show_progress(self, trainer, history, total):
         self.told.append((trainer.iteration, total))
 
-    def tell_end(self, iterations):
+    def show_end(self, iterations):
         self.ended = iterations
 
 
-def run(trainer, wishes=None, dataset=None, before=lambda iteration: None, stops=lambda: False):
-    """A whole fit, watched if there are wishes; before: is called before those are served."""
+def run(trainer, queue=None, dataset=None, before=lambda iteration: None, stops=lambda: False):
+    """A whole fit, watched if there are queue; before: is called before those are served."""
     screen, length, history = Screen(), AllIterations(), History()
-    if wishes is not None:
-        length = UntilEnded(length, wishes)
-        watching = Watching(wishes, screen, dataset, length)
+    if queue is not None:
+        length = EarlyStop(length, queue)
+        watching = TrainingViewer(queue, screen, dataset, length)
     for done in iterations(trainer, history, length):
-        if wishes is not None:
+        if queue is not None:
             before(done.report.iteration)
             watching.after(trainer, history, done, stops)
     return screen, history
@@ -83,19 +82,20 @@ def run(trainer, wishes=None, dataset=None, before=lambda iteration: None, stops
 def requests():
     """One for each iteration: everything that can be shown, through several lenses."""
     for k in range(100):
-        eye = Eye(pose_around(0.1 * k, 0.3), 40.0, 4.0)
-        optics = {"optics": (FisheyeLens(), ThinLens(0.05))[k % 2]} if k % 3 == 2 else {}
+        eye = ViewerCamera(pose_around(0.1 * k, 0.3), 40.0, 4.0)
+        lenses = {"lens": "fisheye"}, {"lens": "thin lens", "lens_numbers": {"aperture": 0.05}}
+        lens = lenses[k % 2] if k % 3 == 2 else {}
         approximations = Approximations(order="pixel") if k % 4 == 3 else None
         shows = list(SHOWN)[k % len(SHOWN)]
-        yield FrameRequest(eye, 40, 30, shows=shows, approximations=approximations, **optics)
+        yield FrameRequest(eye, 40, 30, shows=shows, approximations=approximations, **lens)
 
 
 def test_a_watched_fit_has_the_bytes_of_one_that_is_not():
-    dataset, wishes, asked = true_dataset(), Wishes(), requests()
+    dataset, queue, asked = true_dataset(), RenderRequests(), requests()
     alone = make_trainer(dataset, **EVERYTHING)
     run(alone)
     watched = make_trainer(dataset, **EVERYTHING)
-    screen, _ = run(watched, wishes, dataset, lambda _: wishes.ask(1, next(asked)))
+    screen, _ = run(watched, queue, dataset, lambda _: queue.put(1, next(asked)))
     assert len(screen.frames) >= 12
     assert len({frame.tobytes() for frame in screen.frames}) >= 12
     assert alone.num_gaussians != disturbed_blobs().num_gaussians
@@ -105,14 +105,14 @@ def test_a_watched_fit_has_the_bytes_of_one_that_is_not():
 
 
 def test_what_is_shown_is_the_fit_as_it_is_after_the_iteration():
-    dataset, wishes, stale = plain_dataset(), Wishes(), []
+    dataset, queue, stale = plain_dataset(), RenderRequests(), []
     trainer, view = make_trainer(dataset, iterations=5), EYE.viewpoint(WIDTH, HEIGHT)
 
     def ask(iteration):
         stale.extend(render_views(trainer.scene, [view]))  # before the step's result is there
-        wishes.ask(1, FrameRequest(EYE, WIDTH, HEIGHT))
+        queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT))
 
-    screen, _ = run(trainer, wishes, dataset, ask)
+    screen, _ = run(trainer, queue, dataset, ask)
     (expected,) = render_views(make_scene_of(trainer), [view])
     assert np.array_equal(screen.frames[-1], np.round(255 * expected))
     assert not np.array_equal(screen.frames[-1], np.round(255 * stale[-1]))
@@ -126,10 +126,10 @@ def make_scene_of(trainer):
 @pytest.mark.parametrize("end_at", [1, 5, 8])
 def test_an_early_end_is_a_fit_of_so_many_iterations(end_at):
     """And its configuration, fitted again from the start, gives its bytes."""
-    dataset, wishes = true_dataset(), Wishes()
+    dataset, queue = true_dataset(), RenderRequests()
     trainer = make_trainer(dataset, **EVERYTHING)
     screen, history = run(
-        trainer, wishes, dataset, lambda iteration: iteration == end_at and wishes.end()
+        trainer, queue, dataset, lambda iteration: iteration == end_at and queue.end()
     )
     done = trainer.iteration
     # The request came when this iteration's end was already decided.
@@ -142,18 +142,18 @@ def test_an_early_end_is_a_fit_of_so_many_iterations(end_at):
 
 
 def test_an_end_asked_for_too_early_or_too_late_changes_nothing():
-    dataset, wishes = plain_dataset(), Wishes()
-    wishes.end()
+    dataset, queue = plain_dataset(), RenderRequests()
+    queue.end()
     trainer = make_trainer(dataset, iterations=3)
-    assert UntilEnded(AllIterations(), wishes).should_continue(trainer)  # nothing is fitted yet
+    assert EarlyStop(AllIterations(), queue).should_continue(trainer)  # nothing is fitted yet
     config = config_of(iterations=3)
-    wishes = Wishes()
-    run(trainer, wishes, dataset, lambda iteration: iteration == 3 and wishes.end())
+    queue = RenderRequests()
+    run(trainer, queue, dataset, lambda iteration: iteration == 3 and queue.end())
     assert trainer.iteration == 3 and trainer.config.iterations == config.iterations
 
 
 def test_a_pause_holds_the_fit_and_its_clock_and_shows_what_is_asked_for():
-    dataset, wishes, during = plain_dataset(), Wishes(), []
+    dataset, queue, during = plain_dataset(), RenderRequests(), []
     trainer = make_trainer(dataset, iterations=4)
 
     class Watcher(Screen):
@@ -164,16 +164,16 @@ def test_a_pause_holds_the_fit_and_its_clock_and_shows_what_is_asked_for():
             during.append(trainer.iteration)
             time.sleep(0.1)
             if len(during) < 5:
-                wishes.ask(1, FrameRequest(EYE, 8 + len(during), 8))
+                queue.put(1, FrameRequest(EYE, 8 + len(during), 8))
             else:
-                wishes.pause(False)
+                queue.pause(False)
 
     screen, history = Watcher(), History()
-    watching = Watching(wishes, screen, dataset, AllIterations())
+    watching = TrainingViewer(queue, screen, dataset, AllIterations())
     for done in iterations(trainer, history, AllIterations()):
         if done.report.iteration == 2:
-            wishes.pause(True)
-            wishes.ask(1, FrameRequest(EYE, 8, 8))
+            queue.pause(True)
+            queue.put(1, FrameRequest(EYE, 8, 8))
             before = history.wall_s
             watching.after(trainer, history, done, lambda: False)
             assert history.wall_s - before < 0.2  # of at least 0.5 s
@@ -185,9 +185,9 @@ def test_a_pause_holds_the_fit_and_its_clock_and_shows_what_is_asked_for():
 def test_ctrl_c_and_an_early_end_are_heard_in_a_pause():
     dataset = plain_dataset()
     for end in (False, True):
-        wishes, trainer = Wishes(), make_trainer(dataset, iterations=3)
-        wishes.pause(True)
+        queue, trainer = RenderRequests(), make_trainer(dataset, iterations=3)
+        queue.pause(True)
         if end:
-            wishes.end()
-        run(trainer, wishes, dataset, stops=lambda end=end: not end)
+            queue.end()
+        run(trainer, queue, dataset, stops=lambda end=end: not end)
         assert trainer.iteration == (1 if end else 3)

@@ -177,7 +177,7 @@ class CameraRefinement(OptimisedEffect):
 
     def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
         """Return the views with the refined lens; their poses are known no better than before."""
-        return tuple(map(self.lens_change.of, views))
+        return tuple(map(self.lens_change.apply, views))
 
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""

@@ -1,0 +1,151 @@
+"""Gaussians with the settings to render them: of a file alone, or of a fit's folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from drgs.config.approximations import said_by
+from drgs.config.changes import is_open
+from drgs.config.load import load_config
+from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
+from drgs.core.errors import UserError
+from drgs.datasets import Dataset, load_dataset
+from drgs.datasets.orbits import near_plane_of
+from drgs.datasets.types import Viewpoint
+from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.defaults import resolve_defaults
+from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
+from drgs.integrator.summary import described, summary_of_views
+from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
+from drgs.results.folder import found_again
+from drgs.results.images import ImageFolder
+from drgs.results.refined_cameras import refined_dataset
+
+Background = tuple[float, float, float] | Path
+"""Display space; or a file with an image."""
+
+Render = Callable[..., Iterator[np.ndarray]]
+"""Yields images (H, W, 3) of a scene and views: ``render_views``, or several processes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Gaussians, and how they are rendered."""
+
+    gaussians: Gaussians
+    settings: ModelConfig
+    background: Background
+    config: FitConfig | None  # names the dataset
+    ignored: str = ""  # effects that are not simulated: see the plugin
+    folder: Path | None = None  # of the file, perhaps with refined cameras
+    from_header: Collection[str] = ()  # names of the settings that the file has decided
+    render: Render = render_views
+
+    def scene(self) -> mi.Scene:
+        """Return a Mitsuba scene that renders in display space."""
+        settings = {"ignore": self.ignored} if self.ignored else {}
+        return make_scene(self.gaussians, self.settings, self.background, **settings)
+
+    def images(
+        self, views: Sequence[Viewpoint], folder: ImageFolder, others: Sequence[str], remedy: str
+    ) -> Iterator[np.ndarray]:
+        """Return images (H, W, 3) of the views, after a summary of what is simulated in them.
+
+        A PNG file for each, and ``others``, may be written into ``folder``. remedy: for images that
+        are too large.
+        """
+        check_sizes(views, remedy)
+        if "distortion" not in self.ignored:
+            check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
+        scene = self.scene()
+        summary = summary_of_views(scene.integrator().state, views, self.from_header)
+        print(described(summary), flush=True)
+        names = [*(f"{view.name}.png" for view in views), *others]
+        return folder.claim(names, self.render(scene, views))
+
+    def dataset(self, option: str) -> Dataset:
+        """Return the photographs, without which ``option`` is impossible."""
+        if self.config is None:
+            raise UserError(
+                f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
+            )
+        dataset = load_dataset(self.config.data_for_rendering, sections=self.config.extensions)
+        dataset = dataset.relative_to(self.gaussians.origin)
+        if self.folder is None or not (path := self.folder / CAMERAS).is_file():
+            return dataset
+        if not self.config.cameras.optimise:
+            print(
+                f"cameras: as the dataset has them; those of {path} are used with "
+                "--set cameras.optimise=true"
+            )
+            return dataset
+        print(f"cameras: as refined, from {path}")
+        return refined_dataset(dataset, self.folder)
+
+
+def load_model(
+    what: Path,
+    scene: Path | None = None,
+    overrides: Sequence[str] = (),
+    background: Background | None = None,
+    ignored: Sequence[str] = (),
+    render: Render = render_views,
+) -> Model:
+    """Load a file of Gaussians or the output folder of a fit.
+
+    scene: a configuration file; None: that of the folder, if it is one. overrides: of its values,
+    KEY=VALUE. background: None: the configuration's; black without one.
+    """
+    path, config_path = what, scene
+    if what.is_dir():
+        for name in (CONFIG, GAUSSIANS):
+            if not (what / name).is_file():
+                raise UserError(
+                    f"{what}: must be the output folder of a fit that has ended, but there is no "
+                    f"{name} in it"
+                )
+        config_path, path = scene or what / CONFIG, what / GAUSSIANS
+    config = None if config_path is None else load_open_config(config_path, overrides, background)
+    if what.is_dir() and scene is None:
+        config = found_again(what, config, ("data.path",))
+    gaussians = Gaussians.load(path)
+    if config is not None:
+        settings, default_background = config.model, config.data.background_rgb
+    else:
+        settings = ModelConfig(near=near_plane_of(gaussians)).of_file()
+        default_background = NAMED_COLORS["black"]
+    # The user decides first; a configuration may only name the photographs.
+    given = {override.partition("=")[0].strip() for override in overrides}
+    header = (gaussians.rendered_with or {}).items()
+    values = said_by(str(path), {k: v for k, v in header if not given & {"model", f"model.{k}"}})
+    return Model(
+        gaussians,
+        settings.model_copy(update=values),
+        default_background if background is None else background,
+        config,
+        ", ".join(ignored),
+        path.parent,
+        tuple(values),
+        render,
+    )
+
+
+def load_open_config(
+    path: Path, overrides: Sequence[str], background: Background | None
+) -> FitConfig:
+    """Load a configuration, and complete one that leaves values to the data."""
+    if background is not None and not isinstance(background, Path):
+        # Photographs with alpha are composited over it as well.
+        overrides = [*overrides, f"data.background={list(background)}"]
+    config = load_config(path, overrides)
+    config = config.model_copy(update={"model": config.model.of_file()})
+    if not is_open(config):
+        return config
+    return resolve_defaults(
+        config, load_dataset(config.data_for_rendering, sections=config.extensions)
+    )
