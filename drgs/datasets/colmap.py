@@ -134,10 +134,8 @@ def _images_and_files(
     names = [image.name for image in images]
     below = picture_folder(config, model)
 
-    def where(index: int) -> str:
-        return f"{folder}: image {one_line(names[index], 100)}"
-
-    found = find_files(below, folder, names, PHOTOGRAPHS, where, notes)
+    places = [f"{folder}: image {one_line(name, 100)}" for name in names]
+    found = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
     images = [image for image in images if image.name in found]
     return images, [found[image.name] for image in images]
 
