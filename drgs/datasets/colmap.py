@@ -28,7 +28,7 @@ from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, 
 from drgs.io.pictures import MAX_SIDE, read_header
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where COLMAP's models lie in the folders of datasets."""
+"""Folders of COLMAP's models in datasets."""
 
 WORKSPACES = ("", "dense/0", "dense")
 """Folders of that kind in COLMAP's automatic reconstruction, with their photographs."""

@@ -29,7 +29,7 @@ IMAGE_SUFFIXES = frozenset(
 )
 
 IMAGE_FOLDERS = ("images", "input", "photos", "rgb")
-"""Where converters expect photographs, or put them."""
+"""Folders in which converters expect or put photographs."""
 
 _IMAGE_FOLDER = re.compile(rf"(?:{'|'.join(IMAGE_FOLDERS)})(?:_[0-9]+)?")
 
@@ -123,7 +123,7 @@ def find_files(
 
 
 class _FileFinder:
-    """The files below a folder; each folder is listed once, when a name is not right."""
+    """Files below a folder; each folder is listed once, when a name is not right."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._listing = folder, cache(_listing)

@@ -17,7 +17,7 @@ from drgs.datasets.types import Dataset, Viewpoint
 from drgs.datasets.viewpoints import focus_of
 
 KEEP_OUT = 0.25
-"""Of the distance to what the cameras look at: no starting point is nearer to a camera."""
+"""Share of the distance to what the cameras look at: no starting point is nearer to a camera."""
 
 FAR_SHARE, FARTHEST = 0.5, 10.0
 """Share of starting points behind what is looked at, and how far they go, in distances to it."""
