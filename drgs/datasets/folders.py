@@ -64,11 +64,10 @@ def find_reader(
             f"data.path: cannot open the folder {config.path}: {error.strerror}"
         ) from None
     is_auto = config.type == "auto"
-    candidates = (
-        [READERS.get(config.type, "data.type")]
-        if not is_auto
-        else [*map(READERS.get, READERS.shipped), *READERS.installed()]
-    )
+    if is_auto:
+        candidates = [*map(READERS.get, READERS.shipped), *READERS.installed()]
+    else:
+        candidates = [READERS.get(config.type, "data.type")]
     for extension in candidates:
         reader = extension.value.from_config(section_of(extension, sections))
         if not is_auto or reader.recognizes(config.path, names):
