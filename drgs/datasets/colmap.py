@@ -28,7 +28,7 @@ from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, 
 from drgs.io.pictures import MAX_SIDE, read_header
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where COLMAP's models lie in the folders of datasets."""
+"""Folders of COLMAP's models in datasets."""
 
 WORKSPACES = ("", "dense/0", "dense")
 """Folders of that kind in COLMAP's automatic reconstruction, with their photographs."""
@@ -134,10 +134,8 @@ def _images_and_files(
     names = [image.name for image in images]
     below = picture_folder(config, model)
 
-    def where(index: int) -> str:
-        return f"{folder}: image {one_line(names[index], 100)}"
-
-    found = find_files(below, folder, names, PHOTOGRAPHS, where, notes)
+    places = [f"{folder}: image {one_line(name, 100)}" for name in names]
+    found = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
     images = [image for image in images if image.name in found]
     return images, [found[image.name] for image in images]
 

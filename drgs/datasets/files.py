@@ -14,7 +14,7 @@ import os
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,7 +29,7 @@ IMAGE_SUFFIXES = frozenset(
 )
 
 IMAGE_FOLDERS = ("images", "input", "photos", "rgb")
-"""Where converters expect photographs, or put them."""
+"""Folders in which converters expect or put photographs."""
 
 _IMAGE_FOLDER = re.compile(rf"(?:{'|'.join(IMAGE_FOLDERS)})(?:_[0-9]+)?")
 
@@ -84,14 +84,14 @@ def find_files(
     source: Path,
     names: Sequence[str],
     kind: FileKind,
-    where: Callable[[int], str],
+    places: Sequence[str],
     notes: list[str],
 ) -> dict[str, Path]:
     """Return the files below ``folder`` that are there, by their names.
 
     Each is the file of that name (or with ``.png`` added), or the only one of nearly that name; no
     file is taken for two names. notes: one is added on names that differ, and one on missing files;
-    source: begins them; where: the place in ``source`` of the name at an index.
+    source: begins them; places: of the names in ``source``.
 
     Raises :class:`UserError` where fewer than half were found, or only one of several.
     """
@@ -114,7 +114,7 @@ def find_files(
         enough = max(LEAST_SHARE * len(names), LEAST_LEFT)
         if kind.is_needed and len(names) - len(missing) < enough:
             raise UserError(
-                f"{where(missing[0])}: there is no image {one_line(folder / names[missing[0]])} "
+                f"{places[missing[0]]}: there is no image {one_line(folder / names[missing[0]])} "
                 f"(or with .png added); {kind.remedy}; not there: {count}"
             )
         shown = listed([one_line(names[index], 100) for index in missing])
@@ -123,7 +123,7 @@ def find_files(
 
 
 class _FileFinder:
-    """The files below a folder; each folder is listed once, when a name is not right."""
+    """Files below a folder; each folder is listed once, when a name is not right."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._listing = folder, cache(_listing)

@@ -23,7 +23,7 @@ FILE_NAMES = {"image": "the picture", "mask": "the mask", "depth": "the depth"}
 
 
 class ViewPrint(BaseModel):
-    """The fingerprint of a view."""
+    """Fingerprint of a view."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -66,7 +66,7 @@ class ViewPrint(BaseModel):
 
 
 class Fingerprint(BaseModel):
-    """The fingerprint of a dataset, with views in its order."""
+    """Fingerprint of a dataset, with views in its order."""
 
     model_config = ConfigDict(frozen=True)
 

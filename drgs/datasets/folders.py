@@ -21,11 +21,11 @@ from drgs.datasets.reader import DatasetReader
 from drgs.io.pictures import image_size
 
 MAX_PIXELS = 600_000
-"""Of an image that is fitted, as 894 x 671. The width of larger ones is divided by the smallest
-whole number that brings them there, and rounded down."""
+"""Pixels of an image that is fitted, as 894 x 671. The width of larger ones is divided by the
+smallest whole number that brings them there, and rounded down."""
 
 ITERATIONS = {"nerf_synthetic": 4500, "nerfstudio": 4000, "colmap": 4000}
-"""By layout, as ``scenes/lego.yml`` and ``scenes/photos.yml`` have them."""
+"""Iterations by layout, as ``scenes/lego.yml`` and ``scenes/photos.yml`` have them."""
 
 NAMES = {
     "nerf_synthetic": "cut-out pictures in the layout of NeRF-synthetic",
@@ -64,11 +64,10 @@ def find_reader(
             f"data.path: cannot open the folder {config.path}: {error.strerror}"
         ) from None
     is_auto = config.type == "auto"
-    candidates = (
-        [READERS.get(config.type, "data.type")]
-        if not is_auto
-        else [*map(READERS.get, READERS.shipped), *READERS.installed()]
-    )
+    if is_auto:
+        candidates = [*map(READERS.get, READERS.shipped), *READERS.installed()]
+    else:
+        candidates = [READERS.get(config.type, "data.type")]
     for extension in candidates:
         reader = extension.value.from_config(section_of(extension, sections))
         if not is_auto or reader.recognizes(config.path, names):

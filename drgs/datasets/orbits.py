@@ -15,7 +15,7 @@ from drgs.datasets.viewpoints import focus_of, look_at, pinhole, shown
 from drgs.gaussians.parameters import Gaussians
 
 ELEVATION, MAX_ELEVATION = math.radians(30), math.radians(80)
-"""Of an orbit around Gaussians whose cameras are unknown; and of any: beyond, it spins in place."""
+"""Elevation of an orbit without cameras; and of any orbit, which would spin in place beyond."""
 
 SCALE_LIMITS = np.finfo(np.float32).tiny, 1e9
 """Scene units: distances that are taken from standard deviations."""

@@ -87,17 +87,32 @@ WITHOUT_EFFECT = frozenset(
 CLOSE = "transform_matrix_close"
 """A frame's camera pose when the shutter closed; ``transform_matrix``: when it opened."""
 
-IMAGE = FileKind("photographs", remedy="put them there, or take their frames out of the file")
-MASK = FileKind(
-    "masks", "their photographs are left out", "put them there, or set data.ignore_masks"
+FILES = {
+    "image": (
+        "file_path",
+        FileKind("photographs", remedy="put them there, or take their frames out of the file"),
+    ),
+    "mask": (
+        "mask_path",
+        FileKind(
+            *("masks", "their photographs are left out"),
+            "put them there, or set data.ignore_masks",
+        ),
+    ),
+    "depth": (
+        "depth_file_path",
+        FileKind(
+            *("files of depth", "their photographs have no depth"),
+            "put them there, or set data.ignore_depth",
+            suffixes=frozenset(),
+        ),
+    ),
+}
+"""Files of frames: their keys and kinds."""
+
+POINT_CLOUD = FileKind(
+    "point cloud", "the fit starts without", suffixes=frozenset(), is_needed=False
 )
-DEPTH = FileKind(
-    "files of depth",
-    "their photographs have no depth",
-    "put them there, or set data.ignore_depth",
-    frozenset(),
-)
-POINT_CLOUD = FileKind("point cloud", "the fit starts without", "", frozenset(), is_needed=False)
 
 
 # Content of a file
@@ -321,39 +336,31 @@ def _show(value: object) -> str:
 def frames_with_files(config: DataConfig, meta: TransformsFile, notes: list[str]) -> list[Frame]:
     """Return the frames whose files are there, with the paths of those that are not ignored.
 
-    notes: on files that are taken under another name, and on missing ones, are added here.
+    A frame without its depth stays. notes: on files that are taken under another name, and on
+    missing ones, are added here.
 
     Raises :class:`UserError` where fewer than half of the files of a kind are there.
     """
     if nameless := [frame for frame in meta.frames if frame.values.file_path is None]:
         raise UserError(f"{nameless[0].where('file_path')} is missing")
-    frames = _with_files(config.path, meta.frames, "image", "file_path", IMAGE, notes)
-    if not config.ignore_masks:
-        frames = _with_files(config.path, frames, "mask", "mask_path", MASK, notes)
-    if not config.ignore_depth:
-        frames = _with_files(config.path, frames, "depth", "depth_file_path", DEPTH, notes)
+    ignored = {"mask": config.ignore_masks, "depth": config.ignore_depth}
+    frames = list(meta.frames)
+    for what, (key, kind) in FILES.items():
+        naming = [frame for frame in frames if getattr(frame.values, key) is not None]
+        if ignored.get(what) or not naming:
+            continue
+        names = [getattr(frame.values, key) for frame in naming]
+        places = [frame.where(key) for frame in naming]
+        found = find_files(config.path, meta.path, names, kind, places, notes)
+        kept = []
+        for frame in frames:
+            name = getattr(frame.values, key)
+            if name in found:
+                kept.append(replace(frame, files={**frame.files, what: found[name]}))
+            elif name is None or what == "depth":
+                kept.append(frame)
+        frames = kept
     return frames
-
-
-def _with_files(
-    folder: Path, frames: Sequence[Frame], what: str, key: str, kind: FileKind, notes: list[str]
-) -> list[Frame]:
-    """Return frames with a file of this kind, and others where they name or need none."""
-    naming = [frame for frame in frames if getattr(frame.values, key) is not None]
-    if not naming:
-        return list(frames)
-    names = [getattr(frame.values, key) for frame in naming]
-    found = find_files(
-        folder, frames[0].path, names, kind, lambda index: naming[index].where(key), notes
-    )
-    kept = []
-    for frame in frames:
-        name = getattr(frame.values, key)
-        if name in found:
-            kept.append(replace(frame, files={**frame.files, what: found[name]}))
-        elif name is None or what == "depth":
-            kept.append(frame)
-    return kept
 
 
 def find_point_cloud(config: DataConfig, meta: TransformsFile, notes: list[str]) -> Path | None:
@@ -361,7 +368,7 @@ def find_point_cloud(config: DataConfig, meta: TransformsFile, notes: list[str])
     if meta.point_cloud is None or config.ignore_points:
         return None
     names = [meta.point_cloud]
-    found = find_files(config.path, meta.path, names, POINT_CLOUD, lambda _: "", notes)
+    found = find_files(config.path, meta.path, names, POINT_CLOUD, ["ply_file_path"], notes)
     return found.get(meta.point_cloud)
 
 

@@ -1,7 +1,6 @@
-"""Projection of world points to a view's image, before there is anything to render.
+"""Projection of world points to a view's image, of a million start points in hundreds of views.
 
-For start points, of which a million are looked at in hundreds of pictures. No matrix products,
-whose rounding depends on how many threads a library of linear algebra has.
+Without matrix products, whose rounding depends on the number of threads of linear algebra.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ Columns = Sequence[np.ndarray]
 
 
 def is_projectable(view: Viewpoint) -> bool:
-    """Return whether a point has one place in the picture: its camera stands still."""
+    """Return whether a point has one place in the image: its camera stands still."""
     return view.motion is None
 
 
 def to_camera(view: Viewpoint, points: Columns, dtype: type = np.float64) -> list[np.ndarray]:
-    """Points in the camera's axes (x right, y down, z forward), scene units.
+    """Return points in the camera's axes (x right, y down, z forward), scene units.
 
     points: world, float64; dtype: of the result. It is enough to have offsets from the camera in
     single precision, wherever both are.

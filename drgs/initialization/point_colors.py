@@ -1,10 +1,9 @@
-"""Colours of points from the pictures that see them.
+"""Colours of points from the images that show them.
 
-A picture sees a point if no other point is clearly nearer to its camera at about the same place: in
-a picture of depths (a z-buffer) whose pixels are as wide as the points are apart. Points on a
-surface that turns away from the camera hide each other there, so that pictures count that look onto
-it. Of the colours that a point has in its pictures, the middle half is averaged: the rest may be a
-highlight, or what hides the point.
+An image shows a point if no other point is clearly nearer to its camera at about the same place: in
+a z-buffer whose pixels are as wide as the points are apart. On a surface that turns away from the
+camera, points hide each other there, so that images count that look onto it. Of a point's colours
+in its images, the middle half is averaged: the rest may be highlights, or what hides the point.
 """
 
 from __future__ import annotations
@@ -18,42 +17,42 @@ from drgs.core.environment import denormals_kept
 from drgs.datasets.types import View
 from drgs.initialization.film import is_projectable, to_camera, to_film
 
-MOST_VIEWS, LEAST_VIEWS = 60, 8
-"""Whose pictures are looked at: most points are seen by a third of them."""
+MAX_VIEWS, MIN_VIEWS = 60, 8
+"""Numbers of views whose images are read: most points are seen by a third of them."""
 
-MOST_BYTES = 1 << 27
-"""Of colours that are kept at once: of a million points, fewer views are looked at."""
+MAX_BYTES = 1 << 27
+"""Memory for colours: of a million points, fewer views are read."""
 
 PIXEL, BEHIND = 1.5, 1.5
-"""Of the points' distance to each other: a pixel of the depths, and how far behind what is nearest
-in there a point is still seen. In smaller pixels, points are seen through gaps of a surface."""
+"""Width of a pixel of the z-buffer, and distance behind its depth of points that are seen, in
+distances of the points. In smaller pixels, points are seen through gaps of a surface."""
 
 OPAQUE = 0.5
-"""Alpha: what is less opaque has mostly the colour of what is behind it."""
+"""Least alpha: less opaque pixels have mostly the colour of what is behind them."""
 
 SORTED_AT_ONCE = 1 << 13
 """Points."""
 
 
-def colors_from_pictures(
+def colors_from_images(
     points: np.ndarray,
     spacing: np.ndarray,
     views: Sequence[View],
     background: tuple[float, float, float],
 ) -> np.ndarray | None:
-    """(N, 3) float32, display space 0..1; None: no picture shows any of the points.
+    """(N, 3) float32, display space 0..1; None: no image shows any of the points.
 
-    points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: what the
-    pictures were composited over, display space. A point that no picture sees gets the colour of
-    the nearest one that is seen.
+    points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: of
+    the composited images, display space. A point that no image shows gets the colour of the nearest
+    one that is shown.
     """
     views = [view for view in views if is_projectable(view)]
-    most = max(LEAST_VIEWS, min(MOST_VIEWS, MOST_BYTES // (12 * len(points))))
+    most = max(MIN_VIEWS, min(MAX_VIEWS, MAX_BYTES // (12 * len(points))))
     views = views[:: -(-len(views) // most) or 1]
     samples = np.full((len(views), len(points), 3), np.inf, np.float32)
     columns = [np.ascontiguousarray(c, np.float64) for c in np.asarray(points).T]
     for view, sample in zip(views, samples, strict=True):
-        rows, colors = _seen(view, columns, spacing, background)
+        rows, colors = _shown(view, columns, spacing, background)
         sample[rows] = colors
     colors = np.concatenate(
         [_middle(samples[:, k : k + SORTED_AT_ONCE]) for k in range(0, len(points), SORTED_AT_ONCE)]
@@ -68,13 +67,13 @@ def colors_from_pictures(
     return colors
 
 
-def _seen(
+def _shown(
     view: View,
     columns: Sequence[np.ndarray],
     spacing: np.ndarray,
     background: tuple[float, float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (indices) that the picture shows opaque, and their colours (M, 3) float32, 0..1."""
+    """Return indices of points that the image shows, and their colours (M, 3) float32, 0..1."""
     u, v, depth = to_film(view, to_camera(view, columns))
     on_film = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     rows = np.flatnonzero(on_film)

@@ -207,10 +207,10 @@ def _random_points(config: FitConfig, dataset: Dataset) -> Start:
 
 def _colored(start: Start, dataset: Dataset) -> Start:
     """Return the start with the colours of the images, if they show any of the points."""
-    from drgs.initialization.point_colors import colors_from_pictures
+    from drgs.initialization.point_colors import colors_from_images
 
     spacing = np.sqrt(mean_squared_neighbour_distance(start.means))
-    colors = colors_from_pictures(start.means, spacing, dataset.train, dataset.background)
+    colors = colors_from_images(start.means, spacing, dataset.train, dataset.background)
     if colors is None:
         return start
     return replace(start, colors=colors, description=f"{start.description}, coloured")

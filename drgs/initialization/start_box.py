@@ -17,7 +17,7 @@ from drgs.datasets.types import Dataset, Viewpoint
 from drgs.datasets.viewpoints import focus_of
 
 KEEP_OUT = 0.25
-"""Of the distance to what the cameras look at: no starting point is nearer to a camera."""
+"""Share of the distance to what the cameras look at: no starting point is nearer to a camera."""
 
 FAR_SHARE, FARTHEST = 0.5, 10.0
 """Share of starting points behind what is looked at, and how far they go, in distances to it."""
@@ -70,6 +70,8 @@ class Box:
 def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
     """Return the box of the random points of a start; None: :func:`points_in_view`.
 
+    The layout's box, where the cameras are about as far away from it as those of the reference.
+
     Raises :class:`UserError` for a given one (``init.half_extent``) that the cameras do not see.
     """
     if init.half_extent is not None:
@@ -78,8 +80,17 @@ def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
         return box
     if dataset.start_half_extent is None:
         return None
-    if is_of_the_reference(dataset):
-        return Box(-np.array(dataset.origin), dataset.start_half_extent)
+    reference = Box(-np.array(dataset.origin), dataset.start_half_extent)
+    if not dataset.train:
+        return reference
+    try:
+        focus, distance = focus_of(dataset.train)
+    except UserError:  # nothing is known that would be better
+        return reference
+    seen = distance * _half_width(dataset.train)
+    is_near = np.abs(focus - reference.center).max() <= reference.half_extent
+    if is_near and FILL_RANGE[0] <= reference.half_extent / seen <= FILL_RANGE[1]:
+        return reference
     return box_looked_at(dataset.train)
 
 
@@ -87,20 +98,6 @@ def box_looked_at(views: Sequence[Viewpoint]) -> Box:
     """Return a box nearly as wide as the views at the cameras' focus, as the reference's is."""
     focus, distance = focus_of(views)
     return Box(focus, REFERENCE_FILL * distance * _half_width(views))
-
-
-def is_of_the_reference(dataset: Dataset) -> bool:
-    """Return whether the layout has a start box, for cameras about as far away as these."""
-    half_extent = dataset.start_half_extent
-    if half_extent is None or not dataset.train:
-        return half_extent is not None
-    try:
-        focus, distance = focus_of(dataset.train)
-    except UserError:  # nothing is known that would be better
-        return True
-    fill = half_extent / (distance * _half_width(dataset.train))
-    off = np.abs(focus + dataset.origin).max()
-    return bool(FILL_RANGE[0] <= fill <= FILL_RANGE[1] and off <= half_extent)
 
 
 def _half_width(views: Sequence[Viewpoint]) -> float:
@@ -122,7 +119,7 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
     kept = np.empty((0, 3))
     for _ in range(MAX_BATCHES):
         points = focus + distance * _near_and_far(count, rng)
-        seen = in_view(points, views) & _clear_of(points, views, KEEP_OUT * distance)
+        seen = _are_seen(points, views, KEEP_OUT * distance)
         kept = np.concatenate([kept, points[seen]])
         if len(kept) >= count:
             return kept[:count]
@@ -141,12 +138,14 @@ def _near_and_far(count: int, rng: np.random.Generator) -> np.ndarray:
     return points
 
 
-def in_view(points: np.ndarray, views: Sequence[Viewpoint]) -> np.ndarray:
-    """(N,) bool: whether points (N, 3) are inside at least one image."""
-    seen = np.zeros(len(points), bool)
+def _are_seen(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
+    """(N,) bool: whether points (N, 3) are in an image, and ``keep_out`` from every camera."""
+    seen, clear = np.zeros(len(points), bool), np.ones(len(points), bool)
     for view in views:
+        offsets = points - view.center
         seen |= _in_image(points, view)
-    return seen
+        clear &= np.einsum("ni,ni->n", offsets, offsets) >= keep_out**2
+    return seen & clear
 
 
 def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndarray:
@@ -157,15 +156,6 @@ def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndar
     left, right = 0.5 * (1 - part), 0.5 * (1 + part)
     inside = (u >= left * view.width * z) & (u <= right * view.width * z)
     return inside & (z > 0) & (v >= left * view.height * z) & (v <= right * view.height * z)
-
-
-def _clear_of(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
-    """(N,) bool: whether points are at least ``keep_out`` from every camera."""
-    clear = np.ones(len(points), bool)
-    for view in views:
-        offsets = points - view.center
-        clear &= np.einsum("ni,ni->n", offsets, offsets) >= keep_out**2
-    return clear
 
 
 # Checks of given boxes and point clouds

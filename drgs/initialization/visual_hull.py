@@ -84,12 +84,12 @@ def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
 
     A pixel that a mask leaves out is not known to be empty, and so is part of the silhouette.
     """
-    views = [v for v in looked_at(views) if v.alpha is not None and is_projectable(v)]
+    views = [v for v in thinned(views) if v.alpha is not None and is_projectable(v)]
     return [_silhouette(view) for view in views]
 
 
-def looked_at(views: Sequence[View]) -> Sequence[View]:
-    """All of them, or every n-th of many."""
+def thinned(views: Sequence[View]) -> Sequence[View]:
+    """Return all views, or every n-th of many."""
     return views[:: -(-len(views) // MAX_VIEWS) or 1]
 
 
@@ -123,7 +123,7 @@ def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
     """Return whether the alpha of nearly all ``views`` cuts out what is to be fitted."""
-    wanted = LEAST_MASKED * len(looked_at(views))
+    wanted = LEAST_MASKED * len(thinned(views))
     return num_transparent(silhouettes) >= max(LEAST_VIEWS, wanted)
 
 

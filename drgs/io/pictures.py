@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 MAX_PIXELS, PIXEL_BYTES = 1 << 26, 16
-"""Of an image, as 8192 x 8192: 0.8 GB once decoded to float32; and memory for a pixel while it is
-decoded and copied."""
+"""Pixels of an image, as 8192 x 8192: 0.8 GB once decoded to float32; and memory for a pixel while
+it is decoded and copied."""
 
 MAX_SIDE = 2**24
 """px: in a larger image, float32 does not resolve pixels."""
 
 MAX_BYTES = 1 << 30
-"""Of a file: twice what so many pixels of 64 bits take when they are not compressed."""
+"""Size of a file: twice what so many pixels of 64 bits take when they are not compressed."""
 
 BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
 """Bits of a channel, by Pillow's modes that are read. ``I`` has 32, but is what some versions of
@@ -69,7 +69,7 @@ MAX_WEBP_SIDE = 16_383
 """px: the largest width and height that the format can express."""
 
 MAX_FRAMES_BYTES = 2 << 30
-"""Of all frames of an animation, which are held until it is written."""
+"""Memory for all frames of an animation, which are held until it is written."""
 
 FRAME_MS = 70
 """Duration of a frame: 60 frames turn once in 4.2 s. A multiple of GIF's unit of 10 ms."""

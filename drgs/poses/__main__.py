@@ -1,16 +1,8 @@
 """``python -m drgs.poses FOLDER``: find out where photographs were taken.
 
 Runs COLMAP's structure from motion on the photographs in FOLDER/images, or in FOLDER itself, and
-writes its model to FOLDER/sparse/0. ``drgs fit FOLDER`` takes it from there.
-
-Photographs are of something that does not move, from many places around it or along it, each
-showing most of what its neighbours show. Where FOLDER/masks holds pictures ``a.jpg.png``, or
-``a.png``, of the photographs ``a.jpg``, what is black in them is left out of the search.
-
-Files in FOLDER/sparse/0 that this command has not written stay; where they are in its way, it does
-not begin. Of two runs in one folder, the second is refused.
-
-Needs pycolmap, which the extra ``colmap`` installs.
+writes its model to FOLDER/sparse/0, which ``drgs fit FOLDER`` reads. Images in FOLDER/masks leave
+parts of photographs out. Needs pycolmap, which the extra ``colmap`` installs.
 """
 
 from __future__ import annotations
@@ -36,8 +28,8 @@ from drgs.poses.structure_from_motion import (
     place,
 )
 
-MOST_NAMED = 5
-"""Photographs without a camera that are named."""
+MAX_NAMES = 5
+"""Photographs without a camera, and cameras, that are named."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -81,18 +73,18 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Find cameras, write them, and say how many there are."""
+    """Run the command."""
     started = time.perf_counter()
     search = Search(args.camera_model, args.compare, args.share)
-    with _Steps() as steps:
-        placed = place(args.folder, search, args.overwrite, steps.update)
+    with ExitStack() as stack:
+        placed = place(args.folder, search, args.overwrite, _Steps(stack).update)
     print(description_of(placed, search))
     print(f"written: {args.folder / 'sparse' / '0'} in {time.perf_counter() - started:.0f} s")
     print(f"continue with: {fit_command(args.folder)}")
 
 
 def fit_command(folder: Path) -> str:
-    """What to type next; other cameras that lie there would be taken first."""
+    """Return the command that fits the folder with its new model."""
     words = ["drgs", "fit", str(folder)]
     if find_reader(DataConfig(path=folder))[0] != "colmap":
         words += ["--set", "data.type=colmap"]
@@ -100,15 +92,15 @@ def fit_command(folder: Path) -> str:
 
 
 def description_of(placed: Placed, search: Search) -> str:
-    """What was found, and how to find more, as text."""
+    """Describe the result, and how to place more photographs."""
     count, total = len(placed.names), len(placed.names) + len(placed.missing)
     lines = [
         f"{count} of {total} photographs placed, mean reprojection error {placed.error:.2f} px, "
         f"{placed.num_points:,} points",
-        *(f"camera: {camera}" for camera in placed.cameras[:MOST_NAMED]),
+        *(f"camera: {camera}" for camera in placed.cameras[:MAX_NAMES]),
     ]
     if placed.missing:
-        lines.append(f"without a camera: {listed(placed.missing, MOST_NAMED)}")
+        lines.append(f"without a camera: {listed(placed.missing, MAX_NAMES)}")
         others = placed.num_models - 1
         if others:
             lines.append(f"smaller models that do not hang together with this one: {others}")
@@ -122,14 +114,8 @@ def description_of(placed: Placed, search: Search) -> str:
 class _Steps:
     """A progress bar for each of several steps, one after the other."""
 
-    def __init__(self) -> None:
-        self._stack, self._what, self._most = ExitStack(), "", 0
-
-    def __enter__(self) -> _Steps:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack, self._what, self._most = stack, "", 0
 
     def update(self, what: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` are done of what is counted."""

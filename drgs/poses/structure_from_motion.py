@@ -47,8 +47,8 @@ ALL_PAIRS = 100
 """Most photographs of which every two are compared by default."""
 
 NEIGHBOURS, STRIDE = 10, 8
-"""Of more photographs: each is compared with so many that follow it by name and those at distances
-of powers of two, and every so many-th with each other."""
+"""Pairs of more photographs: each with so many that follow it by name and those at distances of
+powers of two, and every so many-th with each other."""
 
 PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64
 """Per call of COLMAP, which uses all cores within one."""
@@ -62,7 +62,7 @@ LEAST_PLACED = 3
 COMMAND = "poses"
 
 MODEL_FILES = ("cameras.bin", "frames.bin", "points3D.bin", "rigs.bin", "images.bin")
-"""In the order in which they are put in place: without the last there is no model."""
+"""Files in the order in which they are put in place: without the last there is no model."""
 
 TEMPORARY = ".drgs-poses-"
 """Beginning of the names of temporary folders."""
@@ -70,7 +70,7 @@ TEMPORARY = ".drgs-poses-"
 SEED = 0
 
 REMEDY = "if memory or the disk is full, free some of it, or take fewer or smaller photographs"
-"""Where COLMAP gives up: it does not always tell the reason."""
+"""Remedy where COLMAP gives up, which does not always tell the reason."""
 
 Watch = Callable[[str, int, int], None]
 """Takes the name of what is counted, the number done, and the total."""

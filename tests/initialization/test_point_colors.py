@@ -8,7 +8,7 @@ from support.bodies import WHITE, box, colors_at, directions_to, pictures_of, sp
 
 from drgs.datasets.types import Motion
 from drgs.initialization import point_colors
-from drgs.initialization.point_colors import colors_from_pictures
+from drgs.initialization.point_colors import colors_from_images
 
 COUNT = 1000
 
@@ -26,7 +26,7 @@ def on_the_ball(radius=0.8):
 
 def test_points_have_the_colours_of_the_surface(ball):
     points, spacing = on_the_ball()
-    colors = colors_from_pictures(points, spacing, ball, WHITE)
+    colors = colors_from_images(points, spacing, ball, WHITE)
     assert colors.shape == (COUNT, 3) and colors.dtype == np.float32
     # A pixel is 0.045 wide, over which a colour changes by up to 0.027; some are seen obliquely.
     errors = np.abs(colors - colors_at(points))
@@ -37,8 +37,8 @@ def test_what_is_behind_transparent_pixels_does_not_show(ball):
     """Whatever it is: pictures over another background give the same colours."""
     points, spacing = on_the_ball()
     black = pictures_of(sphere(0.8), 16, background=(0.0, 0.0, 0.0))
-    expected = colors_from_pictures(points, spacing, ball, WHITE)
-    actual = colors_from_pictures(points, spacing, black, (0.0, 0.0, 0.0))
+    expected = colors_from_images(points, spacing, ball, WHITE)
+    actual = colors_from_images(points, spacing, black, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
@@ -56,7 +56,7 @@ def test_a_point_does_not_get_the_colour_of_what_hides_it():
         [np.column_stack([np.full(1600, x), y.ravel(), z.ravel()]) for x in (1.0, 1.1)]
     )
     both = np.concatenate([points, on_wall])
-    colors = colors_from_pictures(both, np.full(len(both), spacing[0]), views, WHITE)
+    colors = colors_from_images(both, np.full(len(both), spacing[0]), views, WHITE)
     assert (colors[:COUNT, 1] > colors[:COUNT, 0]).mean() > 0.99
     assert (colors[COUNT:, 0] > colors[COUNT:, 1]).mean() > 0.99
 
@@ -64,7 +64,7 @@ def test_a_point_does_not_get_the_colour_of_what_hides_it():
 def test_a_picture_that_shows_something_else_does_not_matter(ball):
     points, spacing = on_the_ball()
     wrong = replace(ball[0], image=np.zeros_like(ball[0].image), alpha=np.ones_like(ball[0].alpha))
-    colors = colors_from_pictures(points, spacing, [wrong, *ball[1:], *ball[1:]], WHITE)
+    colors = colors_from_images(points, spacing, [wrong, *ball[1:], *ball[1:]], WHITE)
     assert np.abs(colors - colors_at(points)).mean() < 0.02
 
 
@@ -72,17 +72,17 @@ def test_pixels_that_a_mask_leaves_out_are_not_looked_at(ball):
     points, spacing = on_the_ball()
     nothing = np.zeros((64, 64), np.float32)
     masked = [replace(view, image=0 * view.image, mask=nothing) for view in ball]
-    expected = colors_from_pictures(points, spacing, ball, WHITE)
-    actual = colors_from_pictures(points, spacing, [*masked[:3], *ball], WHITE)
+    expected = colors_from_images(points, spacing, ball, WHITE)
+    actual = colors_from_images(points, spacing, [*masked[:3], *ball], WHITE)
     np.testing.assert_array_equal(actual, expected)
-    assert colors_from_pictures(points, spacing, masked, WHITE) is None
+    assert colors_from_images(points, spacing, masked, WHITE) is None
 
 
 def test_a_point_that_no_picture_sees_is_coloured_as_the_nearest_that_one_does(ball):
     points, spacing = on_the_ball()
     aside = 30 * points[::50] + [0, 0, 0.1]
     both, wide = np.concatenate([points, aside]), np.append(spacing, spacing[::50])
-    colors = colors_from_pictures(both, wide, ball, WHITE)
+    colors = colors_from_images(both, wide, ball, WHITE)
     seen = colors[:COUNT]
     for point, color in zip(aside, colors[COUNT:], strict=True):
         nearest = np.argmin(((points - point) ** 2).sum(axis=1))
@@ -91,21 +91,21 @@ def test_a_point_that_no_picture_sees_is_coloured_as_the_nearest_that_one_does(b
 
 def test_nothing_is_known_where_no_picture_shows_a_point(ball):
     points, spacing = on_the_ball()
-    assert colors_from_pictures(100 + points, spacing, ball, WHITE) is None
-    assert colors_from_pictures(points, spacing, [], WHITE) is None
+    assert colors_from_images(100 + points, spacing, ball, WHITE) is None
+    assert colors_from_images(points, spacing, [], WHITE) is None
     moving = [replace(view, motion=Motion(np.eye(4), "global")) for view in ball]
-    assert colors_from_pictures(points, spacing, moving, WHITE) is None
+    assert colors_from_images(points, spacing, moving, WHITE) is None
 
 
 def test_of_very_many_points_few_views_are_looked_at(ball, monkeypatch):
-    monkeypatch.setattr(point_colors, "MOST_BYTES", 12 * COUNT * 9)
+    monkeypatch.setattr(point_colors, "MAX_BYTES", 12 * COUNT * 9)
     looked_at = []
-    seen = point_colors._seen
+    seen = point_colors._shown
     monkeypatch.setattr(
-        point_colors, "_seen", lambda view, *rest: looked_at.append(view.name) or seen(view, *rest)
+        point_colors, "_shown", lambda view, *rest: looked_at.append(view.name) or seen(view, *rest)
     )
     points, spacing = on_the_ball()
-    colors = colors_from_pictures(points, spacing, ball, WHITE)
+    colors = colors_from_images(points, spacing, ball, WHITE)
     assert looked_at == [f"v{number}" for number in range(0, 16, 2)]
     assert np.abs(colors - colors_at(points)).mean() < 0.02
 
