@@ -48,7 +48,6 @@ class EventLog:
         self._writer.flush()
 
     def close(self) -> None:
-        """Close the file."""
         self._writer.close()
 
     def after(

@@ -142,7 +142,6 @@ class PhotometricLoss(Loss):
 
     @classmethod
     def from_config(cls, config: FitConfig, section: None) -> PhotometricLoss:
-        """Return the loss of the section ``loss``."""
         del section
         return cls(config.loss.dssim_weight)
 

@@ -36,7 +36,6 @@ class DepthSupervision(TrainingEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> DepthSupervision:
-        """Return the effect of a fit."""
         del section
         return cls(config.loss.depth_weight, dataset.extent)
 
