@@ -54,7 +54,6 @@ class EventLog:
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
         """Write the last row, if the iteration has one; the history's clock stands still."""
-        del trainer, stops
         if done.row is not None:
             start = time.perf_counter()
             self._write(history.rows[-1], history)  # with what was measured since

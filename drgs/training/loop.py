@@ -194,7 +194,6 @@ class HeldOutQuality:
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        del stops
         config = trainer.config
         is_row = done.row is not None and config.output.report
         if is_row and measurement_is_due(history.rows, config.iterations):

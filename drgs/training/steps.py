@@ -210,7 +210,6 @@ class WholeGradients:
         self._sums: Mapping[str, Any] = {}
 
     def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
-        del place
         self._views = views
 
     def own_views(self) -> Sequence[StepView]:
@@ -221,7 +220,6 @@ class WholeGradients:
         self._sums = {name: last.weighted_sums(plane) for name, plane in weights.items()}
 
     def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
-        del names
         last = self.integrator.last
         return [ViewGradients(last.means2d_grad, last.visible, self._sums, last.first_nonfinite)]
 
@@ -229,5 +227,4 @@ class WholeGradients:
         return list(losses.values())
 
     def share(self, view: StepView, value: Any) -> Any:
-        del view
         return value

@@ -48,7 +48,6 @@ class AdaptiveDensityControl(DensityStrategy):
     def from_config(
         cls, config: FitConfig, dataset: Dataset | None, section: None
     ) -> AdaptiveDensityControl:
-        del section
         is_white = dataset is not None and tuple(dataset.background) == (1.0, 1.0, 1.0)
         return cls(config.densify, is_white)
 

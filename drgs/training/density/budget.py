@@ -71,7 +71,6 @@ class GrowthToNumber(DensityStrategy):
     def from_config(
         cls, config: FitConfig, dataset: Dataset | None, section: None
     ) -> GrowthToNumber:
-        del dataset, section
         return cls(config.densify, config.coarse or ())
 
     def begin(self, population: Population) -> None:
@@ -88,7 +87,6 @@ class GrowthToNumber(DensityStrategy):
         return self.is_due(iteration) and (iteration - 1) // every * every <= last_change
 
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
-        del iteration
         return {"errors": absolute_errors}
 
     def update_statistics(self, step: StepInfo) -> None:
@@ -154,7 +152,6 @@ class GrowthToNumber(DensityStrategy):
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the number that the population grows to."""
-        del iterations
         return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
 
 

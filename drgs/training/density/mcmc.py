@@ -52,7 +52,6 @@ class MarkovChain(DensityStrategy):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> MarkovChain:
-        del dataset, section
         return cls(config.densify)
 
     def begin(self, population: Population) -> None:
@@ -145,7 +144,6 @@ class MarkovChain(DensityStrategy):
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the cap, or the number at the start."""
-        del iterations
         return max(start, self.cap)
 
 

@@ -72,7 +72,6 @@ class Pruning(DensityStrategy):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Pruning:
-        del dataset, section
         return cls(config)
 
     def __init__(self, config: FitConfig) -> None:
@@ -105,7 +104,6 @@ class Importance(Pruning):
         return self.phase.contains(iteration)
 
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
-        del iteration
         return {"coverage": _ones}
 
     def update_statistics(self, step: StepInfo) -> None:
@@ -199,6 +197,5 @@ def keep_best(population: Population, scores: np.ndarray, count: int) -> Density
 
 
 def _ones(image: Any, photograph: Any) -> Any:
-    del photograph
     height, width, _ = image.shape
     return dr.opaque(type(image.array), 1, height * width)

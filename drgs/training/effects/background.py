@@ -39,7 +39,6 @@ class RandomBackground(TrainingEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> RandomBackground:
-        del section
         if any(view.alpha is None for view in dataset.train):
             raise UserError(
                 "data.random_background: the photographs must be transparent where the background "
@@ -77,6 +76,5 @@ class RandomBackground(TrainingEffect):
         view.replacement = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
 
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
-        del derivatives
         set_background(fit.integrator, self.background)
         view.replacement = None

@@ -55,7 +55,6 @@ class CameraRefinement(OptimisedEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> CameraRefinement:
-        del section
         return cls(config.cameras, len(dataset.train), dataset.extent)
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:

@@ -41,7 +41,6 @@ class ColorCorrection(OptimisedEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> ColorCorrection:
-        del section
         return cls(config.colors, len(dataset.train))
 
     def __init__(self, config: ColorConfig, num_views: int) -> None:
@@ -61,7 +60,6 @@ class ColorCorrection(OptimisedEffect):
         return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
-        del fit
         self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
@@ -72,7 +70,6 @@ class ColorCorrection(OptimisedEffect):
 
     def penalties(self, view: TrainingView) -> Iterator[Any]:
         """Yield the mean square by which the transform differs from the identity."""
-        del view
         difference = self.matrix - from_host(mi.Float, IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 

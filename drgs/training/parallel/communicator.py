@@ -42,7 +42,6 @@ class SingleProcess:
 
     def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
         """Copy the numbers: ``sent`` and ``received`` are arrays, or lists that begin with one."""
-        del root
         sent, received = (b[0] if isinstance(b, list) else b for b in (sent, received))
         received[:] = sent
 
