@@ -43,7 +43,6 @@ def _follow_variants() -> None:
 
 
 def _on_variant(old: str | None, new: str | None) -> None:
-    del old
     if new is None:
         return
     import drgs.plugins

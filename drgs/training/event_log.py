@@ -48,14 +48,12 @@ class EventLog:
         self._writer.flush()
 
     def close(self) -> None:
-        """Close the file."""
         self._writer.close()
 
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
         """Write the last row, if the iteration has one; the history's clock stands still."""
-        del trainer, stops
         if done.row is not None:
             start = time.perf_counter()
             self._write(history.rows[-1], history)  # with what was measured since

@@ -71,11 +71,14 @@ class GradientWatch:
         self._iterations.clear()
 
 
-def check_values(iteration: int, values: Mapping[str, Any], first_row: int = 0) -> None:
+def check_values(
+    iteration: int, values: Mapping[str, Any], first_row: int = 0, views: Sequence[str] = ()
+) -> None:
     """Raise :class:`NonFiniteError` for the first value that is not finite; waits for the device.
 
-    values: arrays by name, a row for each Gaussian; first_row: the number of the first row. A
-    Gaussian that is not finite may no longer be seen, so that no gradient is at fault.
+    values: arrays by name, a row for each Gaussian; first_row: the number of the first row. Or, if
+    views are named, a row for each of these, or one for all. What is not finite may no longer be
+    seen, so that no gradient is at fault.
     """
     for name, array in values.items():
         on_device = not isinstance(array, np.ndarray)
@@ -85,24 +88,9 @@ def check_values(iteration: int, values: Mapping[str, Any], first_row: int = 0) 
         if (first := _first_fault(host)) is not None:
             row, value = first
             message = f"after iteration {iteration}: {name} is {value} in row {first_row + row}"
+            if views:
+                message += f" (view {views[row]})" if len(host) > 1 else " (all views)"
             raise NonFiniteError(message, iteration)
-
-
-def check_view_values(
-    iteration: int, values: Mapping[str, np.ndarray], views: Sequence[str]
-) -> None:
-    """Raise :class:`NonFiniteError` for the first number of a view that is not finite.
-
-    values: arrays by name, a row for each of the training views, whose names are ``views``, or one
-    row for all.
-    """
-    for name, array in values.items():
-        if (first := _first_fault(array)) is not None:
-            row, value = first
-            view = f"view {views[row]}" if len(array) > 1 else "all views"
-            raise NonFiniteError(
-                f"after iteration {iteration}: {name} is {value} in row {row} ({view})", iteration
-            )
 
 
 def _first_fault(array: np.ndarray) -> tuple[int, float] | None:

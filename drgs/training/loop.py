@@ -115,11 +115,9 @@ class AllIterations:
     """Ends a fit after the number of iterations of its configuration."""
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """Return whether iterations are left."""
         return trainer.iteration < trainer.config.iterations
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """Return the number of iterations of the configuration."""
         return trainer.config.iterations
 
 
@@ -131,7 +129,6 @@ class RootDecides:
     comm: Communicator
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """Return the decision of rank 0."""
         before, continues = trainer.config, True
         if self.comm.is_root:
             continues = self.criterion.should_continue(trainer)
@@ -143,7 +140,6 @@ class RootDecides:
         return bool(continues)
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """Return what this rank's criterion expects."""
         return self.criterion.num_iterations(trainer)
 
 
@@ -198,8 +194,6 @@ class HeldOutQuality:
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Measure where that is due, if there is to be a report."""
-        del stops
         config = trainer.config
         is_row = done.row is not None and config.output.report
         if is_row and measurement_is_due(history.rows, config.iterations):

@@ -85,7 +85,6 @@ class Loss:
     @classmethod
     def from_config(cls, config: FitConfig, section: Any) -> Loss:
         """Return the loss of a fit; section: see ``TrainingEffect.from_config``."""
-        del config
         return cls() if section is None else cls(section)
 
     def __call__(self, image: Any, target: Target) -> Any:
@@ -110,12 +109,10 @@ class LossTerm:
     @classmethod
     def from_config(cls, config: FitConfig, section: Any) -> LossTerm:
         """Return the term of a fit; section: see ``TrainingEffect.from_config``."""
-        del config
         return cls() if section is None else cls(section)
 
     def of_image(self, image: Any, target: Target) -> Any:
         """Return a ``Float`` of one value, or None; see :class:`Loss` for the arguments."""
-        del image, target
 
     def of_gaussians(self, parameters: Mapping[str, Any], num_rows: int) -> Any:
         """Return a ``Float`` of one value, or None.
@@ -124,7 +121,6 @@ class LossTerm:
         processes fit, each has some of the rows: a sum over them, divided by ``num_rows``, is
         right for any number of processes.
         """
-        del parameters, num_rows
 
 
 @LOSSES.register("photometric")
@@ -142,8 +138,6 @@ class PhotometricLoss(Loss):
 
     @classmethod
     def from_config(cls, config: FitConfig, section: None) -> PhotometricLoss:
-        """Return the loss of the section ``loss``."""
-        del section
         return cls(config.loss.dssim_weight)
 
     def __post_init__(self) -> None:

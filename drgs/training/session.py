@@ -71,8 +71,6 @@ class ProgressLine:
     def after(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Draw the last row of the history."""
-        del history, stops
         if (row := done.row) is not None:
             self._psnr = smoother(self._psnr, row.psnr)
             status = f"loss {row.loss:.4f}  PSNR {self._psnr:5.2f} dB  "

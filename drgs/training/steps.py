@@ -210,30 +210,21 @@ class WholeGradients:
         self._sums: Mapping[str, Any] = {}
 
     def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
-        """Begin a step."""
-        del place
         self._views = views
 
     def own_views(self) -> Sequence[StepView]:
-        """Return the views that this process renders: all."""
         return self._views
 
     def end_view(self, weights: Mapping[str, Any]) -> None:
-        """End the backward pass of a view; weights: planes for weighted sums, by name."""
         last = self.integrator.last
         self._sums = {name: last.weighted_sums(plane) for name, plane in weights.items()}
 
     def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
-        """Return what is known of the view."""
-        del names
         last = self.integrator.last
         return [ViewGradients(last.means2d_grad, last.visible, self._sums, last.first_nonfinite)]
 
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
-        """Return the losses of all views, by place in the step."""
         return list(losses.values())
 
     def share(self, view: StepView, value: Any) -> Any:
-        """Return an array of the process that renders a view."""
-        del view
         return value

@@ -37,12 +37,7 @@ from drgs.training.effects.base import (
     integrator_settings,
     training_effects,
 )
-from drgs.training.finite_checks import (
-    GradientWatch,
-    WatchedIteration,
-    check_values,
-    check_view_values,
-)
+from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.memory import Share, room_for_targets
 from drgs.training.optimizer import (
@@ -326,7 +321,7 @@ class Trainer:
         return plan_step(iteration, self.config, self.rates, self.stages)
 
     def fit_state(self) -> FitState:
-        """Return what effects may know after the last step."""
+        """Return the state for effects after the last step."""
         return self._fit_state(self.last_step, self.iteration)
 
     def _fit_state(self, step: Step, iteration: int) -> FitState:
@@ -415,10 +410,7 @@ class Trainer:
         self.comm.collective(self.watch.check)
 
     def check(self) -> None:
-        """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for the device.
-
-        Called before anything that saves, returns or edits the state.
-        """
+        """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for it."""
         self.comm.collective(self._check_own)
 
     def _check_own(self) -> None:
@@ -427,7 +419,7 @@ class Trainer:
         check_values(self.iteration, self.parameters, first_row)
         check_values(self.iteration, self.density.state(), first_row)
         of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
-        check_view_values(self.iteration, of_views, [view.name for view in self.views])
+        check_values(self.iteration, of_views, views=[view.name for view in self.views])
 
     def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
         """Return a trainer with the same photographs, and copies of the given effects and loss.
@@ -453,9 +445,8 @@ class Trainer:
     def reschedule(self, iterations: int, densify_stop: int) -> None:
         """End the fit, and changes of the population, at other iterations that are ahead.
 
-        The fit so far is that of a configuration which, from the start, is as this one is now.
-
-        Raises ValueError where it would not be.
+        The configuration becomes one which would have given the fit so far. Raises ValueError where
+        there is none.
         """
         config, now = self.config, self.iteration
         if densify_stop != config.densify.stop and now >= min(densify_stop, config.densify.stop):

@@ -48,19 +48,15 @@ class AdaptiveDensityControl(DensityStrategy):
     def from_config(
         cls, config: FitConfig, dataset: Dataset | None, section: None
     ) -> AdaptiveDensityControl:
-        """Return the strategy of the section ``densify``."""
-        del section
         is_white = dataset is not None and tuple(dataset.background) == (1.0, 1.0, 1.0)
         return cls(config.densify, is_white)
 
     def begin(self, population: Population) -> None:
-        """Start with the statistics of no views."""
         float_type = type(population.value("means").array)
         self.gradient_norms = dr.zeros(float_type, population.num_local_rows)
         self.views = dr.zeros(float_type, population.num_local_rows)
 
     def needs_statistics(self, iteration: int) -> bool:
-        """Return whether gradients can still lead to a change."""
         return iteration < self.config.stop
 
     def update_statistics(self, step: StepInfo) -> None:
@@ -79,7 +75,6 @@ class AdaptiveDensityControl(DensityStrategy):
         dr.eval(self.gradient_norms, self.views)
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether the population changes, or opacities are reset."""
         return self.densifies(iteration) or self.resets(iteration)
 
     def densifies(self, iteration: int) -> bool:
@@ -156,11 +151,9 @@ class AdaptiveDensityControl(DensityStrategy):
         population.replace("logit_opacities", dr.select(logits > ceiling, ceiling, logits))
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the statistics."""
         return {"gradient_norms": np.array(self.gradient_norms), "views": np.array(self.views)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue with the statistics of :meth:`state`."""
         float_type = type(self.views)
         self.gradient_norms = from_host(float_type, state["gradient_norms"])
         self.views = from_host(float_type, state["views"])

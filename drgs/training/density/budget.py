@@ -71,12 +71,9 @@ class GrowthToNumber(DensityStrategy):
     def from_config(
         cls, config: FitConfig, dataset: Dataset | None, section: None
     ) -> GrowthToNumber:
-        """Return the strategy of the section ``densify``."""
-        del dataset, section
         return cls(config.densify, config.coarse or ())
 
     def begin(self, population: Population) -> None:
-        """Start with the errors of no views."""
         float_type = type(population.value("means").array)
         self.first = self.first or population.num_rows
         self.errors = dr.zeros(float_type, population.num_local_rows)
@@ -90,17 +87,13 @@ class GrowthToNumber(DensityStrategy):
         return self.is_due(iteration) and (iteration - 1) // every * every <= last_change
 
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
-        """Return the absolute errors of the pixels."""
-        del iteration
         return {"errors": absolute_errors}
 
     def update_statistics(self, step: StepInfo) -> None:
-        """Add the errors of one more view."""
         self.errors = self.errors + step.weighted_sums["errors"]
         dr.eval(self.errors)
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether the population changes after this iteration."""
         config = self.config
         turn = iteration % config.every == 0 or iteration == config.stop
         return config.start < iteration <= config.stop and turn
@@ -151,17 +144,14 @@ class GrowthToNumber(DensityStrategy):
         return self.first + round((final - self.first) * math.sqrt(u) / r ** (2 - u))
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the errors, and the number at the start."""
         return {"errors": np.array(self.errors), "first": np.array(self.first)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue with :meth:`state`."""
         self.errors = from_host(type(self.errors), state["errors"])
         self.first = int(state["first"])
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the number that the population grows to."""
-        del iterations
         return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
 
 

@@ -52,12 +52,9 @@ class MarkovChain(DensityStrategy):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> MarkovChain:
-        """Return the strategy of the section ``densify``."""
-        del dataset, section
         return cls(config.densify)
 
     def begin(self, population: Population) -> None:
-        """Note the scene's extent, in which noise and scales are measured."""
         self.extent = population.extent
 
     @property
@@ -102,7 +99,6 @@ class MarkovChain(DensityStrategy):
         population.set_values("means", type(means)(dr.ravel(moved), means.shape))
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether an iteration between start and stop is a multiple of ``every``."""
         config = self.config
         return config.start < iteration < config.stop and iteration % config.every == 0
 
@@ -148,7 +144,6 @@ class MarkovChain(DensityStrategy):
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the cap, or the number at the start."""
-        del iterations
         return max(start, self.cap)
 
 

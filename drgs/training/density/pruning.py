@@ -72,8 +72,6 @@ class Pruning(DensityStrategy):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Pruning:
-        """Return the phase of the section ``densify.prune``."""
-        del dataset, section
         return cls(config)
 
     def __init__(self, config: FitConfig) -> None:
@@ -82,7 +80,6 @@ class Pruning(DensityStrategy):
         self.num_before = 0  # Gaussians, at the first change
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether Gaussians are removed after this iteration."""
         return self.phase.is_due(iteration)
 
 
@@ -100,21 +97,16 @@ class Importance(Pruning):
     scores: Any = None  # (N,) Float
 
     def begin(self, population: Population) -> None:
-        """Start with the scores of no images."""
         float_type = type(population.value("means").array)
         self.scores = dr.zeros(float_type, population.num_local_rows)
 
     def needs_statistics(self, iteration: int) -> bool:
-        """Return whether the iteration is in the phase."""
         return self.phase.contains(iteration)
 
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
-        """Return ones: all pixels count alike."""
-        del iteration
         return {"coverage": _ones}
 
     def update_statistics(self, step: StepInfo) -> None:
-        """Add the weights of an image."""
         self.scores = self.scores + step.weighted_sums["coverage"]
         dr.eval(self.scores)
 
@@ -133,11 +125,9 @@ class Importance(Pruning):
         return report
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the scores so far."""
         return {"pruned_from": np.array(self.num_before), "weights": np.array(self.scores)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`."""
         self.num_before = int(state["pruned_from"])
         self.scores = from_host(type(self.scores), state["weights"])
 
@@ -153,13 +143,11 @@ class NaturalSelection(Pruning):
     num_left = 0  # Gaussians after the last change
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
-        """Return a higher rate of opacities from the first change until the last."""
         phase = self.phase
         under_pressure = self.num_left > phase.to and phase.contains(iteration)
         return {"logit_opacities": self.prune.opacity_rate if under_pressure else 1.0}
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether Gaussians are removed: until few enough are left."""
         is_over = 0 < self.num_left <= self.phase.to
         return super().is_due(iteration) and not is_over
 
@@ -190,11 +178,9 @@ class NaturalSelection(Pruning):
         return keep_best(population, logits, count)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return numbers of Gaussians."""
         return {"pruned_from": np.array(self.num_before), "pruned_to": np.array(self.num_left)}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`."""
         self.num_before, self.num_left = int(state["pruned_from"]), int(state["pruned_to"])
 
 
@@ -211,6 +197,5 @@ def keep_best(population: Population, scores: np.ndarray, count: int) -> Density
 
 
 def _ones(image: Any, photograph: Any) -> Any:
-    del photograph
     height, width, _ = image.shape
     return dr.opaque(type(image.array), 1, height * width)

@@ -55,21 +55,17 @@ class Phases(DensityStrategy):
         return [name for phase in self.phases for name in phase.by_row]
 
     def begin(self, population: Population) -> None:
-        """Begin all phases."""
         for phase in self.phases:
             phase.begin(population)
 
     def needs_statistics(self, iteration: int) -> bool:
-        """Return whether any phase does."""
         return any(phase.needs_statistics(iteration) for phase in self.phases)
 
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
-        """Return the planes of the phases that need statistics."""
         needed = [phase for phase in self.phases if phase.needs_statistics(iteration)]
         return {k: v for phase in needed for k, v in phase.pixel_weights(iteration).items()}
 
     def update_statistics(self, step: StepInfo) -> None:
-        """Update the phases that need statistics."""
         for phase in self.phases:
             if phase.needs_statistics(step.iteration):
                 phase.update_statistics(step)
@@ -79,7 +75,6 @@ class Phases(DensityStrategy):
         return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
-        """Return the products of the factors of all phases."""
         product: dict[str, float] = {}
         for phase in self.phases:
             for name, factor in phase.rate_factors(iteration).items():
@@ -87,12 +82,10 @@ class Phases(DensityStrategy):
         return product
 
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
-        """Let the phases change values, one after the other."""
         for phase in self.phases:
             phase.perturb(population, iteration, means_lr)
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether any phase is."""
         return any(phase.is_due(iteration) for phase in self.phases)
 
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
@@ -108,11 +101,9 @@ class Phases(DensityStrategy):
         return total
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the states of all phases."""
         return {name: v for phase in self.phases for name, v in phase.state().items()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore each phase from its entries in ``state``."""
         for phase in self.phases:
             phase.restore(state)
 

@@ -139,7 +139,6 @@ class Population:
 
         terms: over the rows of this process; compute: computes them from parameters by name.
         """
-        del compute
         return [dr.detach(term) for term in terms]
 
     def gather_gaussians(self, local: Gaussians) -> Gaussians:
@@ -150,14 +149,12 @@ class Population:
         self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
     ) -> dict[str, np.ndarray]:
         """Return a trainer's state with all rows, from that of this process."""
-        del is_by_row
         return state
 
     def scatter_state(
         self, state: Mapping[str, np.ndarray], is_by_row: Callable[[str], bool]
     ) -> Mapping[str, np.ndarray]:
         """Return the part of a whole state that this process has."""
-        del is_by_row
         return state
 
 
@@ -191,7 +188,6 @@ class DensityStrategy(Protocol):
         configuration, or the model's defaults; by default the only argument of the class. None:
         the strategy has no section. dataset: None where only :meth:`max_num_gaussians` is called.
         """
-        del config, dataset
         return cls() if section is None else cls(section)
 
     by_row: Sequence[str] = ()
@@ -206,11 +202,9 @@ class DensityStrategy(Protocol):
 
         Called before the first iteration, and when others have changed the rows.
         """
-        del population
 
     def needs_statistics(self, iteration: int) -> bool:
         """Return whether :meth:`update_statistics` is called for this iteration."""
-        del iteration
         return False
 
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
@@ -219,19 +213,16 @@ class DensityStrategy(Protocol):
         ``StepInfo.weighted_sums`` has, for each Gaussian, the sum over pixels of the plane times
         the Gaussian's weight there: alpha times transmittance.
         """
-        del iteration
         return {}
 
     def update_statistics(self, step: StepInfo) -> None:
         """Add an iteration to the statistics, after its optimizer step."""
-        del step
 
     def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
         """Yield terms of the loss, Float of one value each.
 
         parameters: raw values by name, with derivatives, of ``num_rows`` Gaussians or of some.
         """
-        del parameters, num_rows
         yield from ()
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
@@ -239,7 +230,6 @@ class DensityStrategy(Protocol):
 
         A parameter that is named in one iteration is named in all.
         """
-        del iteration
         return {}
 
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
@@ -247,7 +237,6 @@ class DensityStrategy(Protocol):
 
         means_lr: the step's rate of the means, world units.
         """
-        del population, iteration, means_lr
 
     def is_due(self, iteration: int) -> bool:
         """Return whether :meth:`refine` is called after this iteration.
@@ -255,12 +244,10 @@ class DensityStrategy(Protocol):
         It is called after :meth:`update_statistics` and :meth:`perturb`, when all is known to be
         finite.
         """
-        del iteration
         return False
 
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Change rows or values; None: it was no change of the population."""
-        del population, iteration
 
     def state(self) -> dict[str, np.ndarray]:
         """Return finite arrays by name: with a row for each Gaussian here, or a number."""
@@ -268,12 +255,10 @@ class DensityStrategy(Protocol):
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from :meth:`state`, where :meth:`begin` was called; other names are ignored."""
-        del state
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the most Gaussians of a fit of so many iterations that starts with ``start``.
 
         Called for an estimate, without :meth:`begin`.
         """
-        del iterations
         return start

@@ -39,8 +39,6 @@ class RandomBackground(TrainingEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> RandomBackground:
-        """Return the effect of a fit."""
-        del section
         if any(view.alpha is None for view in dataset.train):
             raise UserError(
                 "data.random_background: the photographs must be transparent where the background "
@@ -65,7 +63,6 @@ class RandomBackground(TrainingEffect):
         return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
-        """Put a colour behind the splats and behind the photograph."""
         rng = np.random.default_rng([self.seed, STREAM, fit.iteration])
         color = rng.uniform(size=3)
         set_background(fit.integrator, color)
@@ -79,7 +76,5 @@ class RandomBackground(TrainingEffect):
         view.replacement = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
 
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
-        """Put the dataset's background back."""
-        del derivatives
         set_background(fit.integrator, self.background)
         view.replacement = None

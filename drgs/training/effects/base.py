@@ -54,7 +54,6 @@ class TrainingEffect(Protocol):
 
         Called for effects of installed packages whose section the configuration contains.
         """
-        del config, dataset
         return True
 
     @classmethod
@@ -64,7 +63,6 @@ class TrainingEffect(Protocol):
         section: the section that the effect has registered, with the values of the configuration;
         by default the only argument of the class. None: the effect has no section.
         """
-        del config, dataset
         return cls() if section is None else cls(section)
 
     name = ""  # of its part of a checkpoint, and of its uploads
@@ -75,11 +73,9 @@ class TrainingEffect(Protocol):
 
     def upload(self, view: View) -> Any:
         """Return what the effect needs of a view, on the device: see ``TrainingView.uploads``."""
-        del view
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
         """Return the photograph (H, W, 3) that a rendering is compared with."""
-        del view
         return image
 
     def place(self, view: TrainingView) -> None:
@@ -93,12 +89,10 @@ class TrainingEffect(Protocol):
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
         """Return the image that is compared with the photograph, from the rendered one."""
-        del view
         return image
 
     def penalties(self, view: TrainingView) -> Iterator[Any]:
         """Yield terms of the loss, Float of one value each; called after :meth:`adjust`."""
-        del view
         yield from ()
 
     def leaves(self, view: TrainingView) -> dict[str, Any]:
@@ -106,7 +100,6 @@ class TrainingEffect(Protocol):
 
         Where several processes fit, each knows the numbers of all views.
         """
-        del view
         return {}
 
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
@@ -131,7 +124,6 @@ class TrainingEffect(Protocol):
 
     def numbers_of(self, view: TrainingView) -> dict[str, Any]:
         """Return the optimised numbers of a view: Float by name, without derivatives."""
-        del view
         return {}
 
     def values(self) -> dict[str, np.ndarray]:

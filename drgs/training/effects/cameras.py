@@ -55,8 +55,6 @@ class CameraRefinement(OptimisedEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> CameraRefinement:
-        """Return the effect of a fit."""
-        del section
         return cls(config.cameras, len(dataset.train), dataset.extent)
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
@@ -87,7 +85,6 @@ class CameraRefinement(OptimisedEffect):
         return start
 
     def before(self, fit: FitState, view: TrainingView) -> None:
-        """Put the sensor where its camera is now."""
         # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
         self.numbers[view.index] = numbers = dr.detach(self._camera_of(view))
         if self._begun(fit):
@@ -98,11 +95,9 @@ class CameraRefinement(OptimisedEffect):
         return fit.iterations_of_step[0] > self.first
 
     def place(self, view: TrainingView) -> None:
-        """Put the sensor where its camera is now."""
         _put(view.sensor, dr.detach(self._camera_of(view)))
 
     def leaves(self, view: TrainingView) -> dict[str, Any]:
-        """Return the numbers of the view's sensor."""
         return self.numbers[view.index]
 
     def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:

@@ -41,8 +41,6 @@ class ColorCorrection(OptimisedEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> ColorCorrection:
-        """Return the effect of a fit."""
-        del section
         return cls(config.colors, len(dataset.train))
 
     def __init__(self, config: ColorConfig, num_views: int) -> None:
@@ -62,8 +60,6 @@ class ColorCorrection(OptimisedEffect):
         return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
-        """Compute the view's transform."""
-        del fit
         self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
@@ -74,7 +70,6 @@ class ColorCorrection(OptimisedEffect):
 
     def penalties(self, view: TrainingView) -> Iterator[Any]:
         """Yield the mean square by which the transform differs from the identity."""
-        del view
         difference = self.matrix - from_host(mi.Float, IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
@@ -93,11 +88,9 @@ class ColorCorrection(OptimisedEffect):
         return matrices.reshape(-1, 3, 4)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return numbers and moments."""
         return {**super().state(), "common": np.array(self.common)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`."""
         super().restore(state)
         self.common = from_host(mi.Float, state["common"])
 

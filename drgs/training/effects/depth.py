@@ -36,8 +36,6 @@ class DepthSupervision(TrainingEffect):
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> DepthSupervision:
-        """Return the effect of a fit."""
-        del section
         return cls(config.loss.depth_weight, dataset.extent)
 
     def __init__(self, weight: float, extent: float) -> None:
@@ -59,7 +57,6 @@ class DepthSupervision(TrainingEffect):
 
     def adjust(self, image: Any, view: TrainingView) -> Any:
         """Return the colours; depth and alpha are kept for the penalty."""
-        del view
         image, self.depths = split(image, 3)
         return image
 

@@ -29,7 +29,6 @@ class Masks(TrainingEffect):
         return as_tensor(np.repeat(np.asarray(view.mask)[:, :, None], 3, axis=2))
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
-        """Return the photograph without what the mask leaves out."""
         return image if view.mask is None else image * np.asarray(view.mask)[:, :, None]
 
     def adjust(self, image: Any, view: TrainingView) -> Any:

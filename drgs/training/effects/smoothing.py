@@ -26,7 +26,6 @@ class TrainingSmoothing(TrainingEffect):
         self.filter: mi.Float | None = None
 
     def begin(self, fit: FitState) -> None:
-        """Compute the filter anew where the means have moved, or are others."""
         is_due = any(iteration % EVERY == 1 for iteration in fit.iterations_of_step)
         if self.filter is None or fit.begins_stage or is_due:
             self.filter = _smoothing(fit)
@@ -37,15 +36,12 @@ class TrainingSmoothing(TrainingEffect):
         fit.integrator.smoothing = _smoothing(fit)
 
     def repopulated(self, fit: FitState) -> None:
-        """Drop the filter, which has other rows."""
         self.filter = fit.integrator.smoothing = None
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the filter, if there is one."""
         return {} if self.filter is None else {"filter": np.array(self.filter)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`."""
         self.filter = mi.Float(state["filter"]) if "filter" in state else None
 
 

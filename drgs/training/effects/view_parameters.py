@@ -77,21 +77,16 @@ class OptimisedEffect(TrainingEffect):
     parameters: ViewParameters
 
     def leaves(self, view: TrainingView) -> dict[str, mi.Float]:
-        """Return the numbers of a view, with derivatives enabled."""
         return self.parameters.leaves(view.index)
 
     def numbers_of(self, view: TrainingView) -> dict[str, mi.Float]:
-        """Return the numbers of a view."""
         return self.parameters.numbers(view.index)
 
     def values(self) -> dict[str, np.ndarray]:
-        """Return numbers and moments of all views."""
         return self.parameters.values()
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return numbers, moments and step counts."""
         return self.parameters.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`."""
         self.parameters.restore(state)

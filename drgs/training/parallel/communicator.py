@@ -32,11 +32,9 @@ class SingleProcess:
     """The used part of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
 
     def Get_rank(self) -> int:
-        """Return 0."""
         return 0
 
     def Get_size(self) -> int:
-        """Return 1."""
         return 1
 
     def Ibcast(self, array: np.ndarray, root: int) -> None:
@@ -44,7 +42,6 @@ class SingleProcess:
 
     def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
         """Copy the numbers: ``sent`` and ``received`` are arrays, or lists that begin with one."""
-        del root
         sent, received = (b[0] if isinstance(b, list) else b for b in (sent, received))
         received[:] = sent
 

@@ -112,28 +112,22 @@ class ShardedPopulation(Population):
 
     @property
     def num_rows(self) -> int:
-        """The number of Gaussians of all processes."""
         return self.shard.total
 
     @property
     def first_row(self) -> int:
-        """The number of the first row of this process."""
         return self.shard.local.start
 
     def gather(self, values: Any) -> np.ndarray:
-        """Return the values of all rows: see :class:`Population`."""
         return self.comm.all_gather_rows(np.array(values)).astype(np.float64)
 
     def local(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the rows of this process."""
         return values[self.shard.local]
 
     def row_numbers(self) -> Any:
-        """Return the numbers of the rows of this process: UInt32."""
         return super().row_numbers() + dr.opaque(self._index_type, self.first_row)
 
     def take(self, rows: Any) -> dict[str, Any]:
-        """Return copies of some of all rows, of every parameter by name."""
         wanted = np.array(rows)
         owners = self.shard.owners(wanted)
         place = np.argsort(owners, kind="stable")
@@ -147,7 +141,6 @@ class ShardedPopulation(Population):
         return taken
 
     def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
-        """Keep some of all rows in the order given and append others: see :class:`Population`."""
         kept, optimizer = np.array(keep), self.optimizer
         num_appended = 0 if append is None else append["means"].shape[0]
         after = replace(self.shard, total=len(kept) + num_appended)
