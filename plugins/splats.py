@@ -20,7 +20,7 @@ from drgs.core.errors import PluginError, UnsupportedError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
-from drgs.integrator.properties import check_object, nested_integrators, only_one, read_state
+from drgs.integrator.properties import check_object, nested_integrators, read_state
 from drgs.integrator.state import BackwardResult
 from drgs.splatting.rendering import ProjectionStage
 
@@ -75,7 +75,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.state = read_state(
             props,
             {name: one.state.own for name, one in self.objects.items()},
-            only_one([v for k, v in nested.items() if k not in self.objects]),
+            [v for k, v in nested.items() if k not in self.objects],
         )
         self.last: BackwardResult | None = None
         self._lock = threading.RLock()  # of the cache, and of what a rendering leaves in the film

@@ -154,11 +154,6 @@ class SplatsState:
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
     @property
-    def feature_widths(self) -> dict[str, int]:
-        """Columns of features, by name."""
-        return feature_widths(self.objects)
-
-    @property
     def has_smoothing(self) -> bool:
         """True if Gaussians have a smoothing filter, be it ignored."""
         return any(one.gaussians.smoothing is not None for one in self.objects.values())
@@ -214,7 +209,7 @@ class SplatsState:
 
     def channels_of(self, kind: str) -> Sequence[int | str]:
         """Return the suffixes of an AOV's channels."""
-        return AOVS[kind] if kind in AOVS else range(self.feature_widths[kind])
+        return AOVS[kind] if kind in AOVS else range(feature_widths(self.objects)[kind])
 
     def check_columns(self) -> None:
         """Raise PluginError for AOVs of too many channels."""
@@ -271,7 +266,8 @@ class SplatsState:
         shapes = ellipsoids_in(scene)
         cache.has_ellipsoids = bool(shapes)
         with dr.resume_grad():
-            is_alone = not shapes and not set(self.turns) - {""} and not self._is_placed
+            is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
+            is_alone = not (shapes or set(self.turns) - {""} or self.nested_objects or is_moved)
             parts = [] if is_alone else self.parts(shapes)
         cache.gathered = None if is_alone else _gather_parts(parts, cache.gathered)
         gaussians = self.unshaded_gaussians
@@ -282,11 +278,6 @@ class SplatsState:
                 "ellipsoidsmesh"
             )
         check_degree(self.sh_degree, gaussians)
-
-    @property
-    def _is_placed(self) -> bool:
-        is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
-        return bool(self.nested_objects) or is_moved
 
     def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
         """Return Gaussians of objects and shapes, attached, in the order of rendering."""
