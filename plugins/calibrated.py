@@ -117,6 +117,10 @@ class CalibratedSensor(mi.Sensor):
     def far_clip(self) -> float:
         return self.far
 
+    def to_string(self) -> str:
+        lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
+        return f"CalibratedSensor[\n  lens = {lens},\n  film = {self.film()}\n]"
+
     def camera_parameters(self) -> list[str]:
         moves = ["to_world_close"] if self.to_world_close is not None else []
         return ["to_world", *moves, "fx", "fy", "cx", "cy", *self.coefficients]
