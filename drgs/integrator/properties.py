@@ -64,8 +64,6 @@ def positive(default: float) -> Property:
 def integer(default: int | None, least: int, most: int = MAX_INT) -> Property:
     """Declare an integer from ``least`` to ``most``."""
     expected = f"an integer from {least} to {most}"
-    if most == MAX_INT:
-        expected = f"an integer of at least {least}"
     return Property(int, default, expected, lambda v: least <= v <= most)
 
 
