@@ -100,11 +100,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             callback.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Check that the parameters still fit together, and forget a frame of former ones.
-
-        The frame's key does not tell that an array was written in place through a view, which
-        is what ``SceneParameters.set_dirty`` announces.
-        """
+        """Check that parameters fit together; forget frames, also if written in place."""
         if keys != ["background"]:
             self.forget_frames()
         self.state.parameters_changed(keys, self._is_object)

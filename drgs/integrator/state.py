@@ -57,11 +57,7 @@ class BackwardResult:
 
 @dataclass(frozen=True, eq=False)
 class Cached:
-    """A value, and everything that it depends on.
-
-    Holding the arrays keeps the indices of their variables from being reused: equal indices mean
-    equal values.
-    """
+    """A value with all that it depends on, held so that indices of variables are not reused."""
 
     value: Any
     settings: tuple[object, ...]  # compared by ==
