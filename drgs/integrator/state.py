@@ -298,10 +298,11 @@ class SplatsState:
             self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
             return
         own = self.own.gaussians
-        for name in PARAMETER_NAMES:
-            accumulate(getattr(own, name), getattr(gradients, name))
-        for name, gradient in (gradients.features or {}).items():
-            accumulate(own.features[name], gradient)
+        pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
+        pairs += [(own.features[name], d) for name, d in (gradients.features or {}).items()]
+        for parameter, gradient in pairs:
+            if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
+                dr.accum_grad(parameter, gradient)
 
     def tangents(self, scene: mi.Scene) -> Gaussians:
         """Return derivatives of :attr:`gaussians` along those set on the parameters."""
@@ -339,12 +340,6 @@ def feature_of(kind: str) -> rendering.Feature:
     from drgs.effects.compose import NamedFeature, normal_features
 
     return normal_features if kind == "normal" else NamedFeature(kind)
-
-
-def accumulate(parameter: Any, gradient: Any) -> None:
-    """Add to a parameter's gradient, if it has one."""
-    if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
-        dr.accum_grad(parameter, gradient)
 
 
 def _gather_parts(parts: Sequence[Part], last: Gathered | None) -> Gathered:
