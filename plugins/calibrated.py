@@ -117,6 +117,14 @@ class CalibratedSensor(mi.Sensor):
     def far_clip(self) -> float:
         return self.far
 
+    def to_string(self) -> str:
+        lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
+        return (
+            f"CalibratedSensor[\n  fx = {self.fx}, fy = {self.fy},\n  cx = {self.cx}, "
+            f"cy = {self.cy},\n  lens = {lens},\n  to_world = {self.m_to_world},\n"
+            f"  film = {self.film()}\n]"
+        )
+
     def camera_parameters(self) -> list[str]:
         moves = ["to_world_close"] if self.to_world_close is not None else []
         return ["to_world", *moves, "fx", "fy", "cx", "cy", *self.coefficients]

@@ -20,7 +20,7 @@ from drgs.core.errors import PluginError, UnsupportedError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
-from drgs.integrator.properties import check_object, nested_integrators, only_one, read_state
+from drgs.integrator.properties import check_object, nested_integrators, read_state
 from drgs.integrator.state import BackwardResult
 from drgs.splatting.rendering import ProjectionStage
 
@@ -75,7 +75,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.state = read_state(
             props,
             {name: one.state.own for name, one in self.objects.items()},
-            only_one([v for k, v in nested.items() if k not in self.objects]),
+            [v for k, v in nested.items() if k not in self.objects],
         )
         self.last: BackwardResult | None = None
         self._lock = threading.RLock()  # of the cache, and of what a rendering leaves in the film
@@ -100,11 +100,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             callback.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Check that the parameters still fit together, and forget a frame of former ones.
-
-        The frame's key does not tell that an array was written in place through a view, which
-        is what ``SceneParameters.set_dirty`` announces.
-        """
+        """Check that parameters fit together; forget frames, also if written in place."""
         if keys != ["background"]:
             self.forget_frames()
         self.state.parameters_changed(keys, self._is_object)

@@ -144,11 +144,7 @@ FARTHEST = 4.0
 
 @dataclass(frozen=True)
 class PixelLists:
-    """Of each micro-tile, the sorted entries that touch it, front to back.
-
-    An *item* is a pair of an entry and a micro-tile. Items are made splat by splat, so that those
-    of a splat are together, and then sorted.
-    """
+    """Sorted entries of each micro-tile, front to back. An *item* is a pair of the two."""
 
     entries: Any  # UInt32 (items,): place in the lists -> sorted entry
     order: Any  # UInt32 (items,): place in the lists -> item as made

@@ -437,11 +437,7 @@ def _sum_items(
 
 
 def _add_product(high: Any, low: Any, a: Any, b: Any) -> tuple[Any, Any]:
-    """high + low + a b, to twice the precision.
-
-    The errors of a product and of a sum are numbers of the same precision (Dekker 1971; Knuth,
-    "The Art of Computer Programming", volume 2, section 4.2.2).
-    """
+    """Return high + low + a b to twice the precision (Dekker 1971; Knuth, TAOCP 2, 4.2.2)."""
     product = a * b
     rest = dr.fma(a, b, -product)
     total = high + product

@@ -18,12 +18,7 @@ from drgs.splatting.rendering import Pipeline
 
 
 def with_effects(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pipeline:
-    """Return ``pipeline`` with the effects that the Gaussians and the camera need.
-
-    An aperture blurs and dims splats; a smoothing filter widens Gaussians before they are
-    projected. A camera that moves needs nothing here: its shutter is an object that
-    :meth:`drgs.cameras.camera.Camera.seeing` asks.
-    """
+    """Return ``pipeline`` with the effects that the Gaussians and the camera need."""
     if camera.aperture is not None:
         from drgs.effects.defocus import Defocused, DimmedFalloff
 

@@ -43,11 +43,7 @@ class Defocused:
 
 @dataclass(frozen=True)
 class DimmedFalloff(GaussianFalloff):
-    """A falloff whose splats end where they would without dimming.
-
-    *Geometry* is that of the falloff, then the base-2 logarithm of the dimming. It has no
-    derivatives: the cut is a decision.
-    """
+    """Falloff whose splats end as if undimmed; geometry: then the base-2 logarithm of dimming."""
 
     of: GaussianFalloff
 

@@ -81,11 +81,7 @@ class CenterSamples:
 
 
 def develop_pixels(film: mi.Film, channels: Channels, aovs: Sequence[str]) -> mi.TensorXf:
-    """Put the channels into ``film`` as one block of the whole image, and develop it.
-
-    A film reconstructs an image from blocks without filtering them again, so the picture is
-    exact whatever the film's filter.
-    """
+    """Put the channels into ``film`` as one block, which is not filtered again, and develop it."""
     weight = dr.ones(mi.Float, dr.width(channels[0]))
     size = film.crop_size()
     columns = with_weight(film, channels, weight)

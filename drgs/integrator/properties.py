@@ -64,8 +64,6 @@ def positive(default: float) -> Property:
 def integer(default: int | None, least: int, most: int = MAX_INT) -> Property:
     """Declare an integer from ``least`` to ``most``."""
     expected = f"an integer from {least} to {most}"
-    if most == MAX_INT:
-        expected = f"an integer of at least {least}"
     return Property(int, default, expected, lambda v: least <= v <= most)
 
 
@@ -158,9 +156,13 @@ UNNAMED = "_arg_"
 
 
 def read_state(
-    props: mi.Properties, objects: Mapping[str, SplatObject], nested: mi.Integrator | None
+    props: mi.Properties, objects: Mapping[str, SplatObject], nested: Sequence[mi.Integrator]
 ) -> SplatsState:
-    """Return the state of ``splats``; objects: nested ones, nested: the integrator of surfaces."""
+    """Return the state of ``splats``; objects: nested ones, nested: the other integrators."""
+    if len(nested) > 1:
+        raise PluginError(
+            f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
+        )
     gaussians, file = load_gaussians(props), str(props.get("filename", ""))
     said = {n: v for n, v in (gaussians.rendered_with or {}).items() if n not in props}
     own = SplatObject(gaussians, _to_world(props), "to_world" in props, file, said_by(file, said))
@@ -175,7 +177,7 @@ def read_state(
         nested_objects=dict(objects),
         turns=_turns_of_shapes(props),
         background=_background(props),
-        nested=nested,
+        nested=next(iter(nested), None),
         default_degree=max(one.gaussians.sh_degree for one in every.values()),
         given_degree=settings.pop("sh_degree"),
         approximations=Approximations(**{**header, **read(props, given)}),
@@ -228,7 +230,8 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
     elif given or features or "to_world" in props:
         gaussians = replace(_gaussians_of_tensors(props, given), features=features)
     else:
-        return _no_gaussians()
+        shapes = [(0, 3), (0, 4), (0, 3), (0,), (0, 1, 3), (0, 0, 3)]
+        return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes)).to(mi.TensorXf)
     check_shapes(gaussians)
     return gaussians
 
@@ -243,17 +246,12 @@ def _gaussians_of_tensors(props: mi.Properties, given: Sequence[str]) -> Gaussia
     values = {name: _tensor(props, name) for name in given}
     if "shN" not in given:
         values["shN"] = dr.zeros(mi.TensorXf, (next(iter(values["means"].shape), 0), 0, 3))
-    for name in ("logit_opacities", "smoothing"):
-        if name in values:
-            values[name] = _column(name, values[name])
+    for name in {"logit_opacities", "smoothing"} & set(given):
+        shape = values[name].shape
+        if math.prod(shape[1:]) != 1:
+            raise PluginError(f"splats: {name} must have the shape (N), got {tuple(shape)}")
+        values[name] = mi.Float(values[name].array)
     return Gaussians(**values)
-
-
-def _no_gaussians() -> Gaussians:
-    shapes = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3)}
-    shapes |= {"sh0": (0, 1, 3), "shN": (0, 0, 3)}
-    tensors = {name: dr.zeros(mi.TensorXf, shape) for name, shape in shapes.items()}
-    return Gaussians(**tensors, logit_opacities=mi.Float())
 
 
 def _loaded(path: str) -> Gaussians:
@@ -276,12 +274,6 @@ def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     if not dr.is_jit_v(value):  # of the host, as is what a property set makes of three numbers
         value = np.array(value, np.float32)
     return mi.TensorXf(value)
-
-
-def _column(name: str, tensor: mi.TensorXf) -> mi.Float:
-    if math.prod(tensor.shape[1:]) != 1:
-        raise PluginError(f"splats: {name} must have the shape (N), got {tuple(tensor.shape)}")
-    return mi.Float(tensor.array)
 
 
 def _to_world(props: mi.Properties) -> mi.AffineTransform4f:
@@ -374,15 +366,6 @@ def nested_integrators(props: mi.Properties) -> dict[str, mi.Integrator]:
             )
         nested[(value.id() or name) if name.startswith(UNNAMED) else name] = value
     return nested
-
-
-def only_one(nested: Sequence[mi.Integrator]) -> mi.Integrator | None:
-    """Return the integrator of surfaces, if there is one."""
-    if len(nested) > 1:
-        raise PluginError(
-            f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
-        )
-    return nested[0] if nested else None
 
 
 def check_object(name: str, given: Sequence[str]) -> None:

@@ -97,25 +97,24 @@ class RayTransport:
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
         del sample
-        found = self.splats.composite_segment(segment)
-        coverage = 1 - found.transmittance
-        return decode(mi.Color3f(found.color), dr.select(is_open, 1, coverage)), coverage
+        color, T = self.splats.composite_segment(segment)
+        return decode(mi.Color3f(color), dr.select(is_open, 1, 1 - T)), 1 - T
 
     def _sampled(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
         seed, n = dr.reinterpret_array(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
-        drawn = self.splats.sampled(segment, seed, n)
+        drawn, exist, T = self.splats.sampled(segment, seed, n)
         colors = [
             dr.select(is_open & ~exists, 0, mi.Color3f(color))
-            for color, exists in zip(drawn.colors, drawn.exist, strict=True)
+            for color, exists in zip(drawn, exist, strict=True)
         ]
         s1, s2, s3 = (sum(color**k for color in colors) for k in (1, 2, 3))
         mean = s1 / n
         square = (s1 * s1 - s2) / (n * (n - 1))
         cube = (s1 * s1 * s1 - 3 * s1 * s2 + 2 * s3) / (n * (n - 1) * (n - 2))
         a, b, c = DECODING
-        coverage = 1 - drawn.transmittance
+        coverage = 1 - T
         whole = dr.select(is_open, 1, coverage)
         return whole * (a * mean + b * square + c * cube), coverage
 

@@ -57,11 +57,7 @@ class BackwardResult:
 
 @dataclass(frozen=True, eq=False)
 class Cached:
-    """A value, and everything that it depends on.
-
-    Holding the arrays keeps the indices of their variables from being reused: equal indices mean
-    equal values.
-    """
+    """A value with all that it depends on, held so that indices of variables are not reused."""
 
     value: Any
     settings: tuple[object, ...]  # compared by ==
@@ -154,11 +150,6 @@ class SplatsState:
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
     @property
-    def feature_widths(self) -> dict[str, int]:
-        """Columns of features, by name."""
-        return feature_widths(self.objects)
-
-    @property
     def has_smoothing(self) -> bool:
         """True if Gaussians have a smoothing filter, be it ignored."""
         return any(one.gaussians.smoothing is not None for one in self.objects.values())
@@ -214,7 +205,7 @@ class SplatsState:
 
     def channels_of(self, kind: str) -> Sequence[int | str]:
         """Return the suffixes of an AOV's channels."""
-        return AOVS[kind] if kind in AOVS else range(self.feature_widths[kind])
+        return AOVS[kind] if kind in AOVS else range(feature_widths(self.objects)[kind])
 
     def check_columns(self) -> None:
         """Raise PluginError for AOVs of too many channels."""
@@ -271,7 +262,8 @@ class SplatsState:
         shapes = ellipsoids_in(scene)
         cache.has_ellipsoids = bool(shapes)
         with dr.resume_grad():
-            is_alone = not shapes and not set(self.turns) - {""} and not self._is_placed
+            is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
+            is_alone = not (shapes or set(self.turns) - {""} or self.nested_objects or is_moved)
             parts = [] if is_alone else self.parts(shapes)
         cache.gathered = None if is_alone else _gather_parts(parts, cache.gathered)
         gaussians = self.unshaded_gaussians
@@ -282,11 +274,6 @@ class SplatsState:
                 "ellipsoidsmesh"
             )
         check_degree(self.sh_degree, gaussians)
-
-    @property
-    def _is_placed(self) -> bool:
-        is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
-        return bool(self.nested_objects) or is_moved
 
     def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
         """Return Gaussians of objects and shapes, attached, in the order of rendering."""
@@ -311,10 +298,11 @@ class SplatsState:
             self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
             return
         own = self.own.gaussians
-        for name in PARAMETER_NAMES:
-            accumulate(getattr(own, name), getattr(gradients, name))
-        for name, gradient in (gradients.features or {}).items():
-            accumulate(own.features[name], gradient)
+        pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
+        pairs += [(own.features[name], d) for name, d in (gradients.features or {}).items()]
+        for parameter, gradient in pairs:
+            if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
+                dr.accum_grad(parameter, gradient)
 
     def tangents(self, scene: mi.Scene) -> Gaussians:
         """Return derivatives of :attr:`gaussians` along those set on the parameters."""
@@ -352,12 +340,6 @@ def feature_of(kind: str) -> rendering.Feature:
     from drgs.effects.compose import NamedFeature, normal_features
 
     return normal_features if kind == "normal" else NamedFeature(kind)
-
-
-def accumulate(parameter: Any, gradient: Any) -> None:
-    """Add to a parameter's gradient, if it has one."""
-    if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
-        dr.accum_grad(parameter, gradient)
 
 
 def _gather_parts(parts: Sequence[Part], last: Gathered | None) -> Gathered:

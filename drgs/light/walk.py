@@ -60,23 +60,6 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class SegmentRadiance:
-    """Composited splats of segments."""
-
-    color: Any  # Array3f, display space: sum of w_i c_i
-    transmittance: Any  # Float
-
-
-@dataclass(frozen=True)
-class Sampled:
-    """Estimates of what segments pass. The colours are independent of all others."""
-
-    colors: list[Any]  # Array3f, display space: of independent draws, with w_i / (1 - T)
-    exist: list[Any]  # Bool, independent, of each draw: true with the probability 1 - T
-    transmittance: Any  # Float: T on average
-
-
-@dataclass(frozen=True)
 class RaySplats:
     """Gaussians as rays meet them."""
 
@@ -116,8 +99,11 @@ class RaySplats:
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
 
-    def composite_segment(self, segment: Segment) -> SegmentRadiance:
-        """Composite the splats along segments, in the order of their peaks."""
+    def composite_segment(self, segment: Segment) -> tuple[Any, Any]:
+        """Composite the splats along segments, in the order of their peaks.
+
+        Return the sum of w_i c_i, Array3f, display space, and the transmittance, Float.
+        """
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
         basis = sh_basis(walk.direction, self.sh_degree)
@@ -140,9 +126,9 @@ class RaySplats:
             cond=lambda at, last, T, color: (T > 0) & walk.goes_on(at),
             body=body,
         )
-        return SegmentRadiance(t.Array3f(color), dr.abs(T))
+        return t.Array3f(color), dr.abs(T)
 
-    def sampled(self, segment: Segment, seed: Any, count: int) -> Sampled:
+    def sampled(self, segment: Segment, seed: Any, count: int) -> tuple[list[Any], list[Any], Any]:
         """Draw ``count`` splats that segments show, with their weights.
 
         A splat lets light pass with the probability 1 - alpha; the first that does not is drawn
@@ -151,7 +137,9 @@ class RaySplats:
         order: a later splat of the list that does not, either, replaces the last one if it is
         nearer. See :class:`_Draw` for when none does.
 
-        seed: UInt32, of each ray; count: at least 1.
+        seed: UInt32, of each ray; count: at least 1. Return colours of independent draws, Array3f,
+        display space; of each whether it exists, Bool, independent of them, with the probability
+        1 - T; and an estimate of T, which is independent of the colours.
         """
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
@@ -202,7 +190,7 @@ class RaySplats:
             powers = dr.fma(powers, coverage, 1)
         T = dr.select(_farthest(draws) < dr.inf, 0, 1 / powers)
         exist = [one.is_stopped for one in draws]
-        return Sampled([t.Array3f(color) for color in found], exist, T)
+        return [t.Array3f(color) for color in found], exist, T
 
     def _color(self, row: Any, basis: list[Any], active: Any) -> list[Any]:
         t = types_of(self.shapes.Float)

@@ -13,7 +13,7 @@ from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 
-KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
+KINDS = {bool: "bool", int: "int", float: "float", str: "string"}
 
 
 @pytest.fixture(autouse=True)
@@ -22,19 +22,19 @@ def variant():
 
 
 def row(name) -> str:
-    """Of the plugin's table: the property ``name``, its kind and its text, without line breaks."""
-    documentation = (REPOSITORY / "plugins" / "splats.py").read_text()
-    (found,) = re.findall(rf"     \* - {name}\n(.*?)\n\n", documentation, re.DOTALL)
-    return " ".join(found.split())
+    """The kind and the text of the property ``name`` in the table of docs/mitsuba.md."""
+    page = (REPOSITORY / "docs" / "mitsuba.md").read_text()
+    (found,) = re.findall(rf"^\| `{name}` \| (.*) \|$", page, re.MULTILINE)
+    return found
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_the_plugin_documents_what_is_declared(name):
+def test_the_page_of_splats_documents_what_is_declared(name):
     declared = DECLARED[name]
-    text = row(name).replace("``", "")
-    assert text.startswith(f"- {KINDS[declared.kind]} - {declared.description} (Default: ")
+    text = row(name).replace("`", "")
+    assert text.startswith(f"{KINDS[declared.kind]} | {declared.description} (Default: ")
     for word in declared.words:
-        assert f"``{word}``:" in row(name)
+        assert f"`{word}`:" in row(name)
 
 
 @pytest.mark.parametrize("name", DECLARED)

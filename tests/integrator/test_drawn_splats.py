@@ -103,11 +103,11 @@ def assert_mean(values, expected, missed):
 def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
     """The same polynomial decodes both, which is sRGB's curve within its distance."""
     light = fog.light(num_samples)
-    seen = light.splats.composite_segment(segments(1))
-    coverage = 1 - rows(seen.transmittance)[:, None]
-    color = rows(seen.color) / np.maximum(coverage, 1e-9)
+    seen, T = map(rows, light.splats.composite_segment(segments(1)))
+    coverage = 1 - T[:, None]
+    color = seen / np.maximum(coverage, 1e-9)
     assert coverage.max() > fog.opacity / 2
-    for is_open, expected in ((False, coverage * decode(color)), (True, decode(rows(seen.color)))):
+    for is_open, expected in ((False, coverage * decode(color)), (True, decode(seen))):
         which = dr.full(mi.Bool, is_open, RAYS * PATHS)
         drawn, covered = map(rows, light._sampled(segments(PATHS), which, samples()))
         assert_mean(covered, coverage, missed(coverage))
@@ -118,7 +118,7 @@ def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
 
 def test_roulette_lets_as_much_light_through_to_an_emitter():
     light = Fog(40, 0.12, True).light(4)
-    T = rows(light.splats.composite_segment(segments(1)).transmittance)[:, None]
+    T = rows(light.splats.composite_segment(segments(1))[1])[:, None]
     assert T.min() < ROULETTE / 2 and T.max() > ROULETTE, T
     found = segments(PATHS)
     ray = mi.Ray3f(mi.Point3f(found.origin), found.direction)

@@ -69,11 +69,11 @@ PROGRAMS = {
     ),
     "splatpath's type": (
         "mi.load_dict({'type': 'splatpath', 'max_depth': 'a'})",
-        "splatpath: max_depth must be an integer of at least -1, got 'a'",
+        "splatpath: max_depth must be an integer from -1 to 2147483647, got 'a'",
     ),
     "splatpath's value": (
         "mi.load_dict({'type': 'splatpath', 'max_depth': -5})",
-        "splatpath: max_depth must be an integer of at least -1, got -5",
+        "splatpath: max_depth must be an integer from -1 to 2147483647, got -5",
     ),
     "calibrated": ("mi.load_dict({'type': 'calibrated', 'fx': -3.0})", "calibrated: fx must be"),
     "inside aov": (

@@ -391,7 +391,7 @@ def test_two_nested_integrators_are_refused():
 
 @pytest.mark.parametrize("value", [-1, 1.5, True])
 def test_counts_of_samples_that_are_none_are_refused(value):
-    with pytest.raises(RuntimeError, match="nested_spp must be an integer of at least 0"):
+    with pytest.raises(RuntimeError, match="nested_spp must be an integer from 0 to"):
         load(SCENE, nested_spp=value)
 
 

@@ -109,9 +109,7 @@ def condition(gaussians: splatting.Gaussians, rays: Rays) -> float:
 
 
 def let_through(gaussians: splatting.Gaussians, rays: Rays, precision) -> np.ndarray:
-    return rows(
-        splats_of(gaussians, precision).composite_segment(rays.segments(precision)).transmittance
-    )
+    return rows(splats_of(gaussians, precision).composite_segment(rays.segments(precision))[1])
 
 
 CLOUDS = [range(104), pytest.param(range(104, 1000), marks=pytest.mark.slow)]

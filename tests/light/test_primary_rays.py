@@ -93,8 +93,8 @@ def pass_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
     splats = RaySplats.of(device, gaussians.sh_degree, cutoffs or Cutoffs())
     types, count = types_of(precision.Float), len(rays[0])
     far, active = dr.full(types.Float, dr.inf, count), dr.full(types.Bool, True, count)
-    passed = splats.composite_segment(Segment(*map(precision.vectors, rays), far, active))
-    planes = np.column_stack([rows(passed.transmittance), rows(passed.color)])
+    color, T = splats.composite_segment(Segment(*map(precision.vectors, rays), far, active))
+    planes = np.column_stack([rows(T), rows(color)])
     return planes.reshape(view.height, view.width, 4)
 
 

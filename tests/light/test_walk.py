@@ -50,9 +50,9 @@ def random_rays(count, seed=1) -> Rays:
 
 
 def passed(splats, rays, precision):
-    found = splats.composite_segment(rays.segments(precision))
+    color, passed = splats.composite_segment(rays.segments(precision))
     transmittance = splats.transmittance(rays.segments(precision), precision.array([1e-4]))
-    return rows(found.color), rows(found.transmittance), rows(transmittance)
+    return rows(color), rows(passed), rows(transmittance)
 
 
 TOLERANCE = {np.float64: 1e-11, np.float32: 2e-4}
