@@ -206,7 +206,7 @@ class Gaussians:
         return replace(self, **tensors, features=features)
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
-        from drgs.gaussians.similarity import rotate_gaussians, to_float32
+        from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
         parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)
         names = ("means", "quats", "shN")

@@ -20,8 +20,8 @@ import numpy as np
 from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.rotation import sh_rotation_generators, sh_rotation_matrices
 from drgs.gaussians.sh import num_coefficients
-from drgs.gaussians.similarity import sh_rotation_generators, sh_rotation_matrices
 
 
 class Part(Protocol):

@@ -5,7 +5,7 @@ Imported when a scene has such objects. A ``to_world`` x' = k R x + t makes of a
     mean' = k R mean + t    quat' = q_R quat    log_scale' = log_scale + ln k
     smoothing' = k smoothing    shN' = D(R) shN
 
-with D the rotation of spherical harmonics (:mod:`drgs.gaussians.similarity`). k and R are those of
+with D the rotation of spherical harmonics (:mod:`drgs.gaussians.rotation`). k and R are those of
 the similarity that is nearest to the matrix, so that each of its twelve numbers has a derivative:
 a change dA of its upper 3 x 3 block A rotates by w and scales by 1 + l, where
 
@@ -32,7 +32,8 @@ import numpy as np
 from drgs.core.arrays import from_host
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.gaussians.similarity import Similarity, left_multiplication_matrix
+from drgs.gaussians.rotation import left_multiplication_matrix
+from drgs.gaussians.similarity import Similarity
 from drgs.integrator.gathering import Turn, columns, interleaved, number_of
 
 TO_WORLD = "to_world"
