@@ -14,8 +14,8 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
 TOLERANCE = 1e-4
-"""Limit of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in ten
-thousand is one. What is left is then taken off: the nearest rotation is used."""
+"""Limit of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in
+ten thousand is one. What is left is then taken off: the nearest rotation is used."""
 
 
 @dataclass(frozen=True)
