@@ -49,5 +49,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """What is there already, and what is imported when it is used."""
+    """List the names that are there, and those that are imported when they are used."""
     return sorted({*globals(), *__all__})

@@ -63,8 +63,8 @@ class Source:
 
 
 Honoured = Callable[[Approximations], frozenset[str]]
-"""Of the approximations that Gaussians were fitted with, by name, those that they are shown with,
-or nearly."""
+"""Function of the approximations that Gaussians were fitted with: the names of those that they are
+shown with, or nearly."""
 
 
 def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""What all commands share: arguments, execution, progress, interrupts, errors.
+"""Parts of all commands: arguments, execution, progress, their ends.
 
 May import ``core``.
 """

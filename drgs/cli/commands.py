@@ -29,7 +29,7 @@ MAX_ERROR = 500
 """Characters of what is wrong with a command line, which may quote all of it."""
 
 MAX_PORT = 65535
-"""Of TCP."""
+"""Largest port of TCP."""
 
 
 class Subcommand(NamedTuple):
@@ -75,7 +75,7 @@ class CommandParser(argparse.ArgumentParser):
     def parse_known_args(
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """As argparse's; called for a subcommand as well, once it has been named."""
+        """Parse as argparse does; called for a subcommand as well, once it has been named."""
         if self._module is not None:
             module, self._module = self._module, None
             import_module(module).add_arguments(self)

@@ -76,25 +76,29 @@ def executing(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
         if not debug:
             yield lambda: None
             return
-        with _range_checks() as reports:
-            yield reports.check
-            reports.check()
+        reports, tracer = _RangeReports(sys.stderr), sys.gettrace()  # debug mode installs its own
+        try:
+            with redirect_stderr(reports), dr.scoped_set_flag(dr.JitFlag.Debug):
+                yield reports.check
+                reports.check()
+        finally:
+            sys.settrace(tracer)
 
 
 @contextmanager
 def _thread_count(count: int | None) -> Iterator[None]:
+    if count is None:
+        yield
+        return
     previous = dr.thread_count()
     try:
-        if count is not None:
+        try:
             dr.set_thread_count(count)
-    except RuntimeError as error:
-        dr.set_thread_count(previous)
-        raise UserError(f"--threads {count}: the system says: {one_line(error)}") from None
-    try:
+        except RuntimeError as error:
+            raise UserError(f"--threads {count}: the system says: {one_line(error)}") from None
         yield
     finally:
-        if count is not None:
-            dr.set_thread_count(previous)
+        dr.set_thread_count(previous)
 
 
 class _RangeReports:
@@ -124,14 +128,3 @@ class _RangeReports:
             raise UserError(
                 f"--debug: {self._reports[0]}; this is a defect of the program: please report it"
             )
-
-
-@contextmanager
-def _range_checks() -> Iterator[_RangeReports]:
-    reports = _RangeReports(sys.stderr)
-    tracer = sys.gettrace()  # debug mode installs its own
-    try:
-        with redirect_stderr(reports), dr.scoped_set_flag(dr.JitFlag.Debug):
-            yield reports
-    finally:
-        sys.settrace(tracer)

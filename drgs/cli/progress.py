@@ -15,7 +15,7 @@ LOG_SECONDS = 10.0
 
 
 def draws_bars(stream: TextIO) -> bool:
-    """Whether ``stream`` is a terminal on which a line can be drawn again.
+    """Return whether ``stream`` is a terminal on which a line can be drawn again.
 
     Not rich's ``is_terminal``, which believes FORCE_COLOR, as notebooks and continuous integration
     set it. What a notebook starts with ``!`` has a terminal that keeps each line ever drawn.

@@ -75,7 +75,7 @@ OPEN_AT_START = (
 
 
 def is_open(config: FitConfig) -> bool:
-    """Whether the dataset has not decided yet what a rendering needs."""
+    """Return whether the dataset has not decided yet what a rendering needs."""
     return any(_value(config, key) is None for key in OPEN)
 
 

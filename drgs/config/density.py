@@ -160,14 +160,14 @@ class PruneConfig(Section):
 
 
 class StopAim(Section):
-    """Where growth heads for after an iteration."""
+    """Target of growth after an iteration."""
 
     after: Count = Field(ge=0, description="The last iteration that is not affected.")
     stop: Count = Field(ge=1, description="What densify.stop was then.")
 
 
 class DensifyConfig(Section):
-    """How the number of Gaussians changes."""
+    """Changes of the number of Gaussians."""
 
     strategy: StrategyName = Field(
         "budget",
@@ -206,7 +206,7 @@ class DensifyConfig(Section):
     prune: PruneConfig = Field(default_factory=PruneConfig)
 
     def stop_seen_from(self, iteration: int) -> int:
-        """What ``stop`` was when this iteration was done."""
+        """Return what ``stop`` was when this iteration was done."""
         aims = [aim.stop for aim in self.stop_aims if aim.after < iteration]
         return aims[-1] if aims else self.stop
 

@@ -40,7 +40,7 @@ Color = str | tuple[float, float, float]
 NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 DEFAULT_BACKGROUND = "white"
-"""Where there are no photographs to ask."""
+"""Background where there are no photographs to ask."""
 
 NEAR_LIMITS = (1e-9, 1e9)
 """Scene units, of near planes."""
@@ -52,7 +52,7 @@ LATEST_DEGREE = 1000
 """Iterations: the reference's schedule, for 30,000."""
 
 DEGREE_SHARE = 1 / 40
-"""Of the iterations, when the degree of the harmonics rises."""
+"""Iterations between rises of the harmonics' degree, in parts of all."""
 
 
 def _color(value: Any) -> Color | None:
@@ -210,7 +210,7 @@ class InitConfig(Section):
 
 
 class _Model(Section):
-    """What of :class:`ModelConfig` stands before the approximations."""
+    """Fields of :class:`ModelConfig` before the approximations."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     sh_increase_every: Count | None = Field(
@@ -255,7 +255,7 @@ _ModelWithApproximations = create_model(
 
 
 class ModelConfig(_ModelWithApproximations):
-    """What is fitted and how it is rendered; with the fields of :class:`Approximations`."""
+    """Model of a fit and how it is rendered; with the fields of :class:`Approximations`."""
 
     smoothing: bool = Field(
         False,
@@ -278,21 +278,19 @@ class ModelConfig(_ModelWithApproximations):
         return REFERENCE_NEAR if self.near is None else self.near
 
     def of_file(self) -> ModelConfig:
-        """What a file of Gaussians is rendered with that says nothing itself: as 3DGS, but for
-        what is given here.
-        """
+        """Return the model for files that specify none: as 3DGS, but for what is given here."""
         usual = {name: DECLARED[name].default for name in FITTED_WITH}
         given = self.model_fields_set
         return self.model_copy(update={k: v for k, v in usual.items() if k not in given})
 
     @property
     def approximations(self) -> Approximations:
-        """Those that are configured."""
+        """The approximations that are configured."""
         return Approximations.of(vars(self))
 
 
 class RateAim(Section):
-    """What a falling rate heads for after an iteration."""
+    """Target of a falling rate after an iteration."""
 
     after: Count = Field(ge=0, description="The last iteration that is not affected.")
     end: Count = Field(ge=1, description="Where the rate would be the last one.")
@@ -413,7 +411,7 @@ class CamerasConfig(Section):
 
 
 class OutputConfig(Section):
-    """What a fit leaves behind."""
+    """Files that a fit leaves behind."""
 
     dir: PathField | None = Field(
         None,
@@ -445,7 +443,7 @@ class CoarseStage(Section):
 
 
 def _is_open(section: BaseModel, name: str) -> bool:
-    """Whether a value of the schedule is to follow from the number of iterations."""
+    """Return whether a value of the schedule follows from the number of iterations."""
     return name not in section.model_fields_set or getattr(section, name) is None
 
 
@@ -521,7 +519,7 @@ class FitConfig(Section):
         return self
 
     def _complete(self, section: str, changes: dict[str, float]) -> None:
-        """Of a model that is frozen once it is validated."""
+        """Set values of a section, which is frozen once it is validated."""
         completed = getattr(self, section).model_copy(update=changes)
         object.__setattr__(self, section, completed)
 

@@ -19,7 +19,7 @@ Rate = Annotated[float, Field(le=10)]
 nothing to everything."""
 
 Weight = Annotated[float, Field(ge=0, le=1e6)]
-"""Of a term of the loss, beside terms of weight 1."""
+"""Weight of a term of the loss, beside terms of weight 1."""
 
 
 class Section(BaseModel):

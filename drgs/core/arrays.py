@@ -64,7 +64,7 @@ def types_of(float_type: type) -> ArrayTypes:
 
 
 def is_float64(float_type: type) -> bool:
-    """Whether ``float_type`` is a double precision array."""
+    """Return whether ``float_type`` is a double precision array."""
     return dr.type_v(float_type) == dr.VarType.Float64
 
 
@@ -183,7 +183,7 @@ class Rows:
 
     @property
     def Float(self) -> type:  # noqa: N802 (it is a type)
-        """That of the numbers."""
+        """Type of the numbers."""
         return type(self.blocks[0])
 
     @staticmethod
@@ -217,7 +217,7 @@ class Rows:
 
 
 def block_widths(width: int) -> tuple[int, ...]:
-    """How many numbers of a row each block of :class:`Rows` has: whole packets, of 8 if possible.
+    """Return the numbers of a row in each block of :class:`Rows`: whole packets, of 8 if possible.
 
     Three numbers are a packet of 4.
     """

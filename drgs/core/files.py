@@ -37,7 +37,7 @@ _REMEDIES = {
 
 
 STEM_BYTES = 200
-"""Of a file's name that is made of another: numbers, suffixes and temporary names follow."""
+"""Bytes of a file's name that is made of another: numbers and suffixes follow."""
 
 
 def shortened(stem: str) -> str:
@@ -49,7 +49,7 @@ def shortened(stem: str) -> str:
 
 
 _SPECIAL = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socket"}
-"""What is no regular file, by the first letter of ``ls -l``."""
+"""Names of irregular files, by the first letter of ``ls -l``."""
 
 
 def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = None) -> IO[bytes]:
@@ -186,7 +186,7 @@ def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file of this name is what :func:`atomic_path` was writing."""
+    """Return whether a file of this name is one that :func:`atomic_path` was writing."""
     return _TEMPORARY_NAME.fullmatch(name) is not None
 
 

@@ -1,4 +1,4 @@
-"""Which libLLVM Dr.Jit compiles with: choosing it, and refusing one that would crash.
+"""The libLLVM that Dr.Jit compiles with: choosing it, and refusing one that would crash.
 
 LLVM 14 to 16 end the whole process as soon as a kernel contains ``dr.minimum``, ``dr.maximum`` or
 ``dr.clip`` ("Cannot select: fminimum"), so the version is checked before any kernel exists.

@@ -28,7 +28,7 @@ def bucket_order(buckets: Any, block_size: int, num_buckets: int) -> Any:
 
 
 def same_variables(tree: Any, other: Any) -> bool:
-    """Whether two PyTrees consist of the same Dr.Jit variables, in the same order.
+    """Return whether two PyTrees consist of the same Dr.Jit variables, in the same order.
 
     Both are held, so that equal indices mean the same variable. Evaluates nothing.
 
@@ -118,7 +118,7 @@ def memory_peak() -> int:
 
 
 def new_rate_cache() -> Any:
-    """What ``drjit.opt.Adam._step`` keeps scaled learning rates in during a step."""
+    """Return the cache of scaled learning rates of ``drjit.opt.Adam._step`` for a step."""
     from drjit.opt import _LRCache
 
     return _LRCache()

@@ -128,29 +128,22 @@ class Gaussians:
             np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)
         )
         num = len(np.atleast_1d(means))
-        coefficients = [(degree + 1) ** 2 for degree in range(4)]
-        is_open = (opacities > 0) & (opacities < 1)
-        for name, holds, expected, got in (
-            ("means", means.shape == (num, 3), "of shape (N, 3)", means.shape),
-            ("quats", quats.shape == (num, 4), f"of shape {(num, 4)}", quats.shape),
-            ("scales", scales.shape == (num, 3), f"of shape {(num, 3)}", scales.shape),
-            ("opacities", opacities.shape == (num,), f"of shape {(num,)}", opacities.shape),
-            (
-                "sh",
-                sh.shape in [(num, count, 3) for count in coefficients],
-                " or ".join(f"of shape {(num, count, 3)}" for count in coefficients),
-                sh.shape,
-            ),
-            ("scales", (scales > 0).all(), "positive", scales.min(initial=np.inf)),
-            (
-                "opacities",
-                is_open.all(),
-                "between 0 and 1",
-                opacities[~is_open].max(initial=-np.inf),
-            ),
-        ):
-            if not holds:
-                raise ValueError(f"Gaussians.from_numpy(): {name} must be {expected}, got {got}")
+        shapes = {
+            "means": (means, [(num, 3)]),
+            "quats": (quats, [(num, 4)]),
+            "scales": (scales, [(num, 3)]),
+            "opacities": (opacities, [(num,)]),
+            "sh": (sh, [(num, (degree + 1) ** 2, 3) for degree in range(4)]),
+        }
+        where = "Gaussians.from_numpy(): "
+        for name, (values, allowed) in shapes.items():
+            if values.shape not in allowed:
+                expected = " or ".join(map(str, allowed))
+                raise ValueError(f"{where}{name} must be of shape {expected}, got {values.shape}")
+        for name, values, most in (("scales", scales, np.inf), ("opacities", opacities, 1)):
+            bad = values[~((values > 0) & (values < most))]
+            if len(bad):
+                raise ValueError(f"{where}{name} must be above 0 and below {most}, got {bad[0]}")
         return Gaussians(
             means=means,
             quats=quats,
@@ -206,7 +199,7 @@ class Gaussians:
         return replace(self, **tensors, features=features)
 
     def _turned(self, rotation: np.ndarray) -> Gaussians:
-        from drgs.gaussians.similarity import rotate_gaussians, to_float32
+        from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
         parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)
         names = ("means", "quats", "shN")

@@ -50,13 +50,13 @@ from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.gaussians.sh import num_coefficients
-from drgs.gaussians.similarity import (
-    Similarity,
+from drgs.gaussians.rotation import (
     left_multiplication_matrix,
     sh_rotation_generators,
     sh_rotation_matrices,
 )
+from drgs.gaussians.sh import num_coefficients
+from drgs.gaussians.similarity import Similarity
 
 TO_WORLD = "to_world"
 

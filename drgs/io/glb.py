@@ -191,13 +191,15 @@ def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]
     means = document.values("POSITION", 3)
     scales = document.values(f"{EXTENSION}:SCALE", 3, 0, expected=NOT_NEGATIVE)
     opacities = document.values(f"{EXTENSION}:OPACITY", 1, 0, 1, "from 0 to 1")
-    harmonics = [document.values(name, 3).astype(np.float32) for name in _harmonics(count)]
+    harmonics = np.stack(
+        [document.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
+    )
     arrays = {
         "quats": np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
         "log_scales": log_scales_from_scales(scales),
         "logit_opacities": logits_from_opacities(opacities[:, 0]),
-        "sh0": harmonics[0][:, None],
-        "shN": np.stack([np.zeros_like(harmonics[0]), *harmonics[1:]], axis=1)[:, 1:],
+        "sh0": harmonics[:, :1],
+        "shN": harmonics[:, 1:],
     }
     arrays["means"], origin = near_means(means + document.translation)
     said = document.rendered_with

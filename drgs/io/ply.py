@@ -83,7 +83,8 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     _require(path, vertex, names, "Gaussians")
     means = _columns(vertex, POSITION, np.float64)
     if vertex.dtype["x"] == np.float64:
-        means, origin = near_means(means)
+        with np.errstate(invalid="ignore", over="ignore"):  # of what is refused later
+            means, origin = near_means(means)
         if origin != WORLD:
             statements |= zip(ORIGIN, origin, strict=True)
     sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)

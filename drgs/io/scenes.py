@@ -35,7 +35,7 @@ def openexr_threads() -> Iterator[None]:
 
 
 def load_scene_file(path: Path, **definitions: str) -> mi.Object:
-    """What an XML file describes; definitions: values for its parameters ($name).
+    """Load what an XML file describes; definitions: values for its parameters ($name).
 
     Raises RuntimeError as Mitsuba does, and :class:`UserError` for what Mitsuba would not survive.
     """
@@ -62,7 +62,7 @@ def load_scene_file(path: Path, **definitions: str) -> mi.Object:
 
 
 def load_scene_dictionary(description: dict[str, object], path: Path) -> mi.Object:
-    """What a dictionary describes, which the file ``path`` gave; raises as the above."""
+    """Load what a dictionary describes, which the file ``path`` gave; raises as the above."""
     config = mi.parser.ParserConfig(mi.variant())
     with openexr_threads():
         _check(mi.parser.parse_dict(config, description).nodes, path)

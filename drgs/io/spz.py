@@ -61,7 +61,7 @@ ANTIALIASED, EXTENSIONS = 1, 2
 
 POSITION_BITS = 24
 FRACTIONAL_BITS = 12
-"""Those of the reference implementation; more where positions would have fewer than
+"""Bits of the reference implementation; more where positions would have fewer than
 :data:`LEAST_BITS` of their own, fewer where they would not fit."""
 
 LEAST_BITS = 16
@@ -70,7 +70,7 @@ COLOR_SCALE = 0.15
 SCALE_STEPS, LOG_SCALE_LOW = 16, -10
 QUATERNION_LEVELS = 511
 SH_STEPS = (4, 8)
-"""Of 256 levels, that coefficients of degree 1, and higher ones, are rounded to. The reference
+"""Steps of 256 levels that coefficients of degree 1, and higher ones, are rounded to. The reference
 implementation's are twice as wide: on ``scenes/lego_mini.yml``, they save 17 % of the file and cost
 0.2 dB more. No steps at all cost 44 % and save 0.1 dB."""
 

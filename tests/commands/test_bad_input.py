@@ -147,7 +147,7 @@ WRONG_INPUTS = {
     "config empty": (write("a.yml", b""), "a.yml: must hold sections"),
     "alias bomb": (
         write("a.yml", b"a: &a [1,1]\nb: &b [*a,*a]\nc: &c [*b,*b]\n"),
-        "a.yml: line 2: not valid YAML: aliases",
+        "a.yml: data is missing: ",
     ),
     "unknown key": (edit_settings(sed=3), "a.yml: unknown key sed; did you mean seed?"),
     "wrong value": (edit_settings(iterations=0), "a.yml: iterations must be >= 1, got 0"),

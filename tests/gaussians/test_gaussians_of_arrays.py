@@ -46,15 +46,15 @@ def test_files_give_back_what_was_saved(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"means": np.zeros((COUNT, 2))}, r"means must be of shape \(N, 3\), got \(7, 2\)"),
-        ({"means": np.zeros((3, COUNT))}, r"means must be of shape \(N, 3\), got \(3, 7\)"),
+        ({"means": np.zeros((COUNT, 2))}, r"means must be of shape \(7, 3\), got \(7, 2\)"),
+        ({"means": np.zeros((3, COUNT))}, r"means must be of shape \(3, 3\), got \(3, 7\)"),
         ({"opacities": np.zeros((COUNT, 1))}, r"opacities must be of shape \(7,\)"),
         (
             {"sh": np.zeros((COUNT, 5, 3))},
             r"sh must be of shape \(7, 1, 3\) or .*, got \(7, 5",
         ),
-        ({"scales": np.zeros((COUNT, 3))}, "scales must be positive, got 0.0"),
-        ({"opacities": np.full(COUNT, 1.5)}, "opacities must be between 0 and 1, got 1.5"),
+        ({"scales": np.zeros((COUNT, 3))}, "scales must be above 0 and below inf, got 0.0"),
+        ({"opacities": np.full(COUNT, 1.5)}, "opacities must be above 0 and below 1, got 1.5"),
     ],
 )
 def test_what_is_no_gaussian_is_refused(changes, message):

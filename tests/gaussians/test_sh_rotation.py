@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.similarity import (
+from drgs.gaussians.rotation import (
     rotate_sh,
     sh_rotation_generators,
     sh_rotation_matrices,

@@ -16,7 +16,8 @@ from support.views import Scene, gradient, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.gaussians.similarity import Similarity, rotate_gaussians
+from drgs.gaussians.rotation import rotate_gaussians
+from drgs.gaussians.similarity import Similarity
 from drgs.reference import splatting as reference
 
 MATRIX = np.eye(4)

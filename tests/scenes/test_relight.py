@@ -12,7 +12,7 @@ from conftest import REPOSITORY
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.similarity import rotate_sh
+from drgs.gaussians.rotation import rotate_sh
 
 SCENES = REPOSITORY / "scenes"
 MODEL = SCENES / "shapes" / "knot.ply"
