@@ -6,7 +6,7 @@ per row K coefficients of red, green, blue). :class:`Conversion` makes raw param
 
     log_scales = ln |scales|    logit_opacities = ln(o / (1 - o))    shN = D sh_coeffs
 
-with D the rotation by which a shape was turned (:mod:`drgs.gaussians.similarity`), as Mitsuba
+with D the rotation by which a shape was turned (:mod:`drgs.gaussians.rotation`), as Mitsuba
 turns centres and quaternions but no coefficients. Derivatives take the way back by gathers alone:
 nothing is added atomically, and they are the same to the last bit in every run.
 
