@@ -394,7 +394,7 @@ def sh_rotation(rotation: mi.Matrix3f, degree: int) -> mi.TensorXf:
     """(K - 1, K - 1): D with c' = D c, the coefficients above degree 0 of a model that is turned.
 
     What was seen in R^T d is then seen in d. Enough directions d determine D: Y(d) D = Y(R^T d).
-    ``drgs.gaussians.similarity`` does the same on the host; here it is differentiated.
+    ``drgs.gaussians.rotation`` does the same on the host; here it is differentiated.
     """
     directions = np.random.default_rng(0).normal(0, 1, (64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -49,10 +49,10 @@ def gigabytes(pixels):
 def test_a_size_that_cannot_be_held_is_refused(model, tmp_path):
     """With what it needs, what there is, and what fits."""
     camera = ("--origin", 0, -4, 1)
-    most = float(f"{8000 / memory.PICTURE_BYTES:.3g}")
+    most = 8 * 10**9 // memory.PICTURE_BYTES
     assert refused(render.main, tmp_path / "out", model, *camera, "--size", 20000, 20000) == (
         f"view camera: 20000 x 20000 px need about {gigabytes(4e8)} of memory, of which 8 GB are "
-        f"available; at most {most:g} million pixels fit; give a smaller --size"
+        f"available; at most {most:,} pixels fit; give a smaller --size"
     )
     line = refused(render.main, tmp_path / "out", model, *camera, "--size", 70000, 70000)
     assert "are too many for Dr.Jit, whose arrays end at 2^32 entries" in line

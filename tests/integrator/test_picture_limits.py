@@ -96,8 +96,8 @@ def test_memory_is_compared_with_what_there_is(monkeypatch):
     monkeypatch.setattr("drgs.core.memory.available_memory", lambda: 10**9)
     scene = load(SCENE.view.sensor(width=4000, height=4000))
     assert refusal(scene, spp=1) == (
-        "splats: 4000 x 4000 px need about 4 GB of memory, of which 1 GB are available; at most 4 "
-        "million pixels fit"
+        "splats: 4000 x 4000 px need about 4 GB of memory, of which 1 GB are available; at most "
+        "4,000,000 pixels fit"
     )
     with pytest.raises(ValueError, match=r"^rasterization\(\): .* 4000 x 4000 px need about 4 GB"):
         rasterized(colors=np.ones((1, 3), np.float32), width=4000, height=4000)
