@@ -61,9 +61,8 @@ from drgs.io.pictures import (
 )
 from drgs.io.scenes import load_scene_file
 from drgs.results.files import CAMERAS, CONFIG, METRICS, ORBIT, ORBIT_GIF
-from drgs.results.images import ImageFolder, open_image_folder
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
-from drgs.results.model import Background, Model, Render, load_model
+from drgs.results.model import Background, ImageFolder, Model, Render, load_model, open_image_folder
 from drgs.results.refined_cameras import training_cameras
 
 DEFAULT_SIZE = (400, 400)  # px, where nothing else decides how large an image is

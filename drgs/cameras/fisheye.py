@@ -13,8 +13,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
-from drgs.cameras.polynomials import (
+from drgs.cameras.distortion import (
     derivative,
     first_root,
     horner,
@@ -23,6 +22,7 @@ from drgs.cameras.polynomials import (
     up_to_the_last,
     usable_coefficients,
 )
+from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
 from drgs.core.arrays import is_float64, types_of
 
 MAX_ANGLE = 0.95 * math.pi

@@ -15,7 +15,17 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
-from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
+from drgs.cameras.distortion import (
+    UNBOUNDED,
+    PlaneDistortion,
+    both_or_none,
+    derivative,
+    largest_squared_radius,
+    polynomial,
+    steepest_fall,
+    up_to_the_last,
+    usable_coefficients,
+)
 from drgs.cameras.lens import (
     LENSES,
     CameraParameters,
@@ -23,14 +33,6 @@ from drgs.cameras.lens import (
     film_coordinates,
     pixel_coordinates,
     with_unseen_on_axis,
-)
-from drgs.cameras.polynomials import (
-    UNBOUNDED,
-    both_or_none,
-    derivative,
-    polynomial,
-    up_to_the_last,
-    usable_coefficients,
 )
 from drgs.core.arrays import types_of
 

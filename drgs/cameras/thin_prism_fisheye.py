@@ -12,16 +12,18 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
-from drgs.cameras.distortion import PlaneDistortion, largest_squared_radius, steepest_fall
-from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
-from drgs.cameras.lens import LENSES, CameraParameters, film_coordinates, pixel_coordinates
-from drgs.cameras.polynomials import (
+from drgs.cameras.distortion import (
+    PlaneDistortion,
     both_or_none,
     derivative,
+    largest_squared_radius,
     polynomial,
+    steepest_fall,
     up_to_the_last,
     usable_coefficients,
 )
+from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
+from drgs.cameras.lens import LENSES, CameraParameters, film_coordinates, pixel_coordinates
 from drgs.core.arrays import types_of
 
 

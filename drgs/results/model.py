@@ -1,10 +1,13 @@
-"""Gaussians with the settings to render them: of a file alone, or of a fit's folder."""
+"""Gaussians with the settings to render them, and the folder into which they are rendered."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -13,7 +16,8 @@ from drgs.config.approximations import said_by
 from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, listed
+from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.orbits import near_plane_of
 from drgs.datasets.types import Viewpoint
@@ -23,7 +27,6 @@ from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_
 from drgs.integrator.summary import described, summary_of_views
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
 from drgs.results.folder import found_again
-from drgs.results.images import ImageFolder
 from drgs.results.refined_cameras import refined_dataset
 
 Background = tuple[float, float, float] | Path
@@ -31,6 +34,60 @@ Background = tuple[float, float, float] | Path
 
 Render = Callable[..., Iterator[np.ndarray]]
 """Yields images (H, W, 3) of a scene and views: ``render_views``, or several processes."""
+
+COMMAND = "render"
+
+PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
+"""Suffixes, in small letters, of a dataset's files."""
+
+Image = TypeVar("Image")
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """The folder that a command renders into; see :func:`open_image_folder`."""
+
+    path: Path
+    keep: Callable[[], object]  # see :func:`drgs.core.folders.sole_writer`
+
+    def claim(self, names: Iterable[str], images: Iterable[Image]) -> Iterator[Image]:
+        """Yield the images after the files ``names`` were claimed for them.
+
+        Raises :class:`UserError`, before the first image is made, where one of these files is there
+        and was not rendered.
+        """
+        names, record = list(names), FolderRecord(self.path, COMMAND)
+        record.check(names)
+        for index, image in enumerate(images):
+            if index == 0:  # there is something to write
+                self.keep()
+                record.claim(names)
+            yield image
+
+    def refuse_photographs(self, dataset: Path) -> None:
+        """Raise :class:`UserError` where the folder contains images of the folder ``dataset``."""
+        if not self.path.is_dir() or not self.path.resolve().is_relative_to(dataset.resolve()):
+            return
+        images = [n for n in sorted(os.listdir(self.path)) if n.lower().endswith(PHOTOGRAPHS)]
+        if photographs := FolderRecord(self.path, COMMAND).strangers(images):
+            raise UserError(
+                f"--out {self.path}: holds pictures of the dataset ({listed(photographs)}); choose "
+                "a folder of its own"
+            )
+
+
+@contextmanager
+def open_image_folder(path: Path) -> Iterator[ImageFolder]:
+    """Render into a folder within the block; then record the images, also after Ctrl-C."""
+    with sole_writer(path) as keep:
+        try:
+            yield ImageFolder(path, keep)
+        finally:
+            with suppress(UserError):  # a full disk: all are still known to be ours
+                record = FolderRecord(path, COMMAND)
+                if record.exists:
+                    keep()  # or it is another command's
+                    record.seal()
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,8 @@ from drgs.datasets.types import Dataset
 from drgs.results.history import HistoryRow
 from drgs.training.loop import History, Iteration, StopCriterion, smoothed
 from drgs.training.trainer import Trainer
-from drgs.viewer.controls import event_handler
 from drgs.viewer.frames import LiveScene
-from drgs.viewer.page import Page, StartView
+from drgs.viewer.page import Page, StartView, event_handler
 from drgs.viewer.scheduler import RenderRequests, RenderScheduler
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from support.lens_scenes import (
 )
 from support.reference_lenses import camera_at_origin, gaussians_at
 
-from drgs.cameras import fisheye, polynomials
+from drgs.cameras import distortion, fisheye
 from drgs.cameras.fisheye import Fisheye as CameraFisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye as CameraThinPrismFisheye
@@ -142,7 +142,7 @@ def test_a_lens_knows_the_slopes_on_its_films_border(precision, name):
     expected = lens.slope_bounds(camera)
     actual = lens_camera(camera, lens, precision).lens.on_film
     if expected is None:
-        expected = [[-polynomials.UNBOUNDED] * 2, [polynomials.UNBOUNDED] * 2]
+        expected = [[-distortion.UNBOUNDED] * 2, [distortion.UNBOUNDED] * 2]
     tolerance = {FLOAT64: 1e-12, FLOAT32: 1e-6}[precision]
     np.testing.assert_allclose([rows(b)[0] for b in actual], expected, rtol=tolerance)
 
@@ -158,7 +158,7 @@ def test_slopes_are_bounded_while_the_lens_reaches_the_whole_border(precision, p
     expected = lens.slope_bounds(camera)
     assert (expected is not None) == (part < np.sqrt(0.5))
     if expected is None:
-        expected = [[-polynomials.UNBOUNDED] * 2, [polynomials.UNBOUNDED] * 2]
+        expected = [[-distortion.UNBOUNDED] * 2, [distortion.UNBOUNDED] * 2]
     # Near the fold the inverse is steep: a rounding of the radius, over sqrt(1 - part^2).
     tolerance = {FLOAT64: 1e-9, FLOAT32: 1e-4}[precision]
     np.testing.assert_allclose([rows(b)[0] for b in bounds], expected, rtol=tolerance)

@@ -28,7 +28,7 @@ from drgs.training.summary import summary_of_fit
 
 MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
-    "cameras.polynomials", "cameras.radial_tangential", "cameras.thin_lens",
+    "cameras.radial_tangential", "cameras.thin_lens",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
     "effects.smoothing", "integrator.splat_transport", "integrator.shadows",
     "integrator.surfaces",
@@ -495,7 +495,6 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "environment": [],
         "distorted": [
             "drgs.cameras.distortion",
-            "drgs.cameras.polynomials",
             "drgs.cameras.radial_tangential",
         ],
         "thin lens": ["drgs.cameras.thin_lens", "drgs.effects.defocus"],

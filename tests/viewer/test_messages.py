@@ -33,10 +33,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 
 from drgs.config.approximations import Approximations
 from drgs.training.loop import AllIterations, History, iterations
-from drgs.viewer.messages import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, is_valid, offers
 from drgs.viewer.page import StartView
 from drgs.viewer.scheduler import RenderRequests
-from drgs.viewer.server import serving
+from drgs.viewer.server import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, is_valid, offers, serving
 from drgs.viewer.training_viewer import TrainingPage, watch
 
 STOPPING = ("Pause", "End and write results")

@@ -18,9 +18,8 @@ from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.training.loop import History, HistoryRow
-from drgs.viewer.controls import CONTROLLED
 from drgs.viewer.frames import SHOWN, VIEWER_LENSES, Frame
-from drgs.viewer.page import Page, StartView
+from drgs.viewer.page import CONTROLLED, Page, StartView
 from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.server import free_port, is_own, serving, url
 from drgs.viewer.training_viewer import MAX_POINTS, TrainingPage, psnr_curves
