@@ -344,7 +344,8 @@ def _direction(words: Sequence[str]) -> np.ndarray:
         up = np.array([float(word) for word in words])
     except ValueError:
         up = np.zeros(0)
-    length = np.linalg.norm(up)
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused
+        length = np.linalg.norm(up)
     if up.shape != (3,) or not 0 < length < np.inf:
         got = one_line(" ".join(words), 60)
         raise UserError(f"--up: must be cameras, or three numbers not all zero, got {got}")
