@@ -361,7 +361,8 @@ def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray 
 def _direction(words: Sequence[str]) -> np.ndarray:
     with suppress(ValueError):
         up = np.array([float(word) for word in words])
-        length = np.linalg.norm(up)
+        with np.errstate(over="ignore"):  # an infinite length is refused
+            length = np.linalg.norm(up)
         if up.shape == (3,) and 0 < length < np.inf:
             return up / length
     got = one_line(" ".join(words), 60)

@@ -57,7 +57,7 @@ class ColmapReader(DatasetReader):
         root, folder = _root_and_model(config.path)
         model = read_model(folder)
         images, files = _images_and_files(config, folder, model, notes)
-        below = picture_folder(config, model)
+        below = image_folder(config, model)
         names = [file.relative_to(below).as_posix() for file in files]
         masks = masks_of(root, names, [] if config.ignore_masks else notes, below)
         frames = []
@@ -132,7 +132,7 @@ def _images_and_files(
         raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
     images = sorted(model.images, key=lambda image: image.name)
     names = [image.name for image in images]
-    below = picture_folder(config, model)
+    below = image_folder(config, model)
 
     places = [f"{folder}: image {one_line(name, 100)}" for name in names]
     found = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
@@ -140,7 +140,7 @@ def _images_and_files(
     return images, [found[image.name] for image in images]
 
 
-def picture_folder(config: DataConfig, model: ColmapModel) -> Path:
+def image_folder(config: DataConfig, model: ColmapModel) -> Path:
     """Return the folder of the photographs that are to be read.
 
     That of ``data.downscale``; without it, the one whose photographs are the smallest that still

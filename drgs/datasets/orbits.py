@@ -103,7 +103,8 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
     up: (3,) world, any length; fov: degrees.
     """
     up = np.asarray(up, np.float64)
-    length = np.linalg.norm(up)
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused
+        length = np.linalg.norm(up)
     if not 0 < length < np.inf:
         raise UserError(f"camera: up must not be zero or infinite, got {shown(up)}")
     focus, spread = _middle(gaussians)

@@ -118,18 +118,6 @@ POINT_CLOUD = FileKind(
 # Content of a file
 
 
-def _angle(value: float) -> float:
-    if not SMALLEST_ANGLE <= value <= LARGEST_ANGLE:
-        raise ValueError(f"must be between {SMALLEST_ANGLE:.2g} and {LARGEST_ANGLE:.4g} (radians)")
-    return value
-
-
-def _coordinate(value: float) -> float:
-    if abs(value) > MAX_COORDINATE:
-        raise ValueError(f"must be at most {MAX_COORDINATE:g} in size (scale the scene down)")
-    return value
-
-
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
     """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
     if [len(row) for row in rows] != [4] * 4:
@@ -162,9 +150,9 @@ def _known_model(model: str) -> str:
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
-Angle = Annotated[Number, AfterValidator(_angle)]
+Angle = Annotated[Number, Field(ge=SMALLEST_ANGLE, le=LARGEST_ANGLE)]
 Text = Annotated[str, Field(min_length=1)]
-Rows = list[list[Annotated[Number, AfterValidator(_coordinate)]]]
+Rows = list[list[Annotated[Number, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]]]
 Pose = Annotated[Rows, AfterValidator(_opencv_pose)]
 Model = Annotated[str, AfterValidator(_known_model)]
 

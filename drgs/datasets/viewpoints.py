@@ -57,9 +57,11 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
                 f"got {shown(place)}; scale the scene down"
             )
     forward = target - origin
-    right = np.cross(forward, up)
-    scale = np.linalg.norm(forward) * np.linalg.norm(up)
-    if not np.linalg.norm(right) > 1e-6 * scale:
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and is refused
+        right = np.cross(forward, up)
+        scale = np.linalg.norm(forward) * np.linalg.norm(up)
+        is_determined = np.linalg.norm(right) > 1e-6 * scale
+    if not is_determined:
         raise UserError(
             f"camera: the direction from origin {shown(origin)} to target {shown(target)} must "
             f"not be zero or parallel to up {shown(up)}"

@@ -111,22 +111,22 @@ class Placed:
     num_models: int  # unconnected ones; the largest is this
 
 
-def pictures_in(folder: Path) -> tuple[Path, list[str]]:
+def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     """Return the folder of photographs, ``folder/images`` or ``folder``, and their names there.
 
     Those that COLMAP does not read are left out, with a :class:`UserNote`. Raises
     :class:`UserError` where there are no others, or one that cannot be fitted.
     """
     below = folder / "images"
-    pictures = below if below.is_dir() else folder
+    photographs = below if below.is_dir() else folder
     try:
-        found = list(pictures.rglob("*") if pictures == below else pictures.iterdir())
+        found = list(photographs.rglob("*") if photographs == below else photographs.iterdir())
     except OSError as error:
         raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
     found = without_masks([p for p in found if is_image(p.name) and p.is_file()])
     found.sort(key=_numeric_order)
     files = [path for path in found if path.suffix.lower() in SUFFIXES]
-    others = listed([path.relative_to(pictures) for path in found if path not in set(files)])
+    others = listed([path.relative_to(photographs) for path in found if path not in set(files)])
     if not files:
         got = f"{others}, which COLMAP does not read; convert them to JPEG" if others else "none"
         if not others and (below := explain_photographs(folder)):
@@ -135,13 +135,13 @@ def pictures_in(folder: Path) -> tuple[Path, list[str]]:
             f"{folder}: must hold photographs, or have them in a folder images, got {got}"
         )
     if others:
-        note = f"{pictures}: left out, as COLMAP does not read them: {others}"
+        note = f"{photographs}: left out, as COLMAP does not read them: {others}"
         warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
         check_readable(file)  # what a fit refuses is refused before hours of work
         if os.fsencode(file) != str(file).encode(errors="replace"):
             raise UserError(f"{file}: COLMAP knows names in UTF-8 only; rename it")
-    return pictures, [file.relative_to(pictures).as_posix() for file in files]
+    return photographs, [file.relative_to(photographs).as_posix() for file in files]
 
 
 def _numeric_order(file: Path) -> list[tuple[int, str]]:
@@ -159,7 +159,7 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     Raises :class:`UserError`, with what to do, where no cameras are found, where a model is there
     that is not to be replaced, and while another process writes to ``folder``.
     """
-    pictures, names = pictures_in(folder)
+    photographs, names = photographs_in(folder)
     model = folder / "sparse" / "0"
     with DeferredInterrupts() as interrupts, sole_writer(folder) as keep:
         _check_free(folder, model, replace)
@@ -170,7 +170,7 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
             parent = next(path for path in (model, *model.parents) if path.is_dir())
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
                 found = run_in_child(
-                    _find, search, pictures, folder, names, Path(temporary),
+                    _find, search, photographs, folder, names, Path(temporary),
                     watch=watch, interrupts=interrupts,
                 )  # fmt: skip
                 _put(Path(temporary, "model"), model)
@@ -180,7 +180,7 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
             raise UserError(f"{model}: cannot write the model: {why_refused(error)}") from None
         except ChildEndedError as error:
             raise UserError(
-                f"{pictures}: structure from motion was ended: {error}; {REMEDY}"
+                f"{photographs}: structure from motion was ended: {error}; {REMEDY}"
             ) from None
     return found
 
@@ -220,14 +220,19 @@ def _put(written: Path, model: Path) -> None:
 
 
 def _find(
-    search: Search, pictures: Path, dataset: Path, names: Sequence[str], folder: Path, watch: Watch
+    search: Search,
+    photographs: Path,
+    dataset: Path,
+    names: Sequence[str],
+    folder: Path,
+    watch: Watch,
 ) -> Placed:
     """Write ``folder/model``: the function of the child process."""
     pycolmap = required("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # errors are reported below
     try:
         found, count = _Reconstruction(
-            pycolmap, folder, pictures, dataset, names, search, watch
+            pycolmap, folder, photographs, dataset, names, search, watch
         ).largest()
         written = folder / "model"
         written.mkdir()
@@ -237,7 +242,7 @@ def _find(
         raise
     except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
         raise UserError(
-            f"{pictures}: structure from motion failed: COLMAP says: {one_line(error, 500)}; "
+            f"{photographs}: structure from motion failed: COLMAP says: {one_line(error, 500)}; "
             f"{REMEDY}"
         ) from None
 
@@ -246,7 +251,7 @@ def _find(
 class _Reconstruction:
     pycolmap: ModuleType
     folder: Path  # for intermediate files
-    pictures: Path
+    photographs: Path
     dataset: Path  # which may have masks
     names: Sequence[str]
     search: Search
@@ -256,7 +261,7 @@ class _Reconstruction:
         """Return the largest reconstruction, and the number of all."""
         if len(self.names) < LEAST_PLACED:
             raise UserError(
-                f"{self.pictures}: at least {LEAST_PLACED} photographs, got {len(self.names)}; "
+                f"{self.photographs}: at least {LEAST_PLACED} photographs, got {len(self.names)}; "
                 "take 30 or more, each showing most of what its neighbours show"
             )
         self._extract()
@@ -264,9 +269,9 @@ class _Reconstruction:
         models = self._map()
         if not models or max(m.num_reg_images() for m in models) < LEAST_PLACED:
             raise UserError(
-                f"{self.pictures}: no cameras were found; take more photographs, neither blurred "
-                "nor of something plain, each showing most of what its neighbours show, while "
-                "walking around (not turning on the spot), or try "
+                f"{self.photographs}: no cameras were found; take more photographs, neither "
+                "blurred nor of something plain, each showing most of what its neighbours show, "
+                "while walking around (not turning on the spot), or try "
                 f"{self.search.others(len(self.names))}"
             )
         return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), len(models)
@@ -299,7 +304,7 @@ class _Reconstruction:
             for chunk in self._chunks("photograph", group, *sizes):
                 pycolmap.extract_features(
                     self.database,
-                    self.pictures,
+                    self.photographs,
                     image_names=chunk,
                     camera_mode=pycolmap.CameraMode.SINGLE,
                     reader_options=reader,
@@ -310,17 +315,17 @@ class _Reconstruction:
 
     def _groups(self) -> list[list[str]]:
         """Return groups of the names of photographs that share a camera."""
-        sizes = sorted({image_size(self.pictures / name) for name in self.names})
+        sizes = sorted({image_size(self.photographs / name) for name in self.names})
         if self.search.share == "one" and len(sizes) > 1:
             (w, h), (other_w, other_h), *_ = sizes
             raise UserError(
-                f"{self.pictures}: photographs that share one camera must have one size, got "
+                f"{self.photographs}: photographs that share one camera must have one size, got "
                 f"{w} x {h} and {other_w} x {other_h} px; use --share alike"
             )
         groups: dict[object, list[str]] = {}
         for name in self.names:
             key = {"one": 0, "each": name}.get(self.search.share)
-            key = _size_and_lens(self.pictures / name) if key is None else key
+            key = _size_and_lens(self.photographs / name) if key is None else key
             groups.setdefault(key, []).append(name)
         return list(groups.values())
 
@@ -330,8 +335,8 @@ class _Reconstruction:
             cameras = {image.name: image.camera_id for image in database.read_all_images()}
         if missing := [name for name in names if name not in cameras]:
             raise UserError(
-                f"{self.pictures / missing[0]}: COLMAP cannot read this photograph, or its mask; "
-                "convert it, or take it away"
+                f"{self.photographs / missing[0]}: COLMAP cannot read this photograph, or its "
+                "mask; convert it, or take it away"
             )
         return cameras[names[0]]
 
@@ -340,14 +345,14 @@ class _Reconstruction:
 
         White for photographs without a mask, which COLMAP would leave out.
         """
-        masks = masks_of(self.dataset, self.names, [], self.pictures)
+        masks = masks_of(self.dataset, self.names, [], self.photographs)
         if not any(masks):
             return None
         folder = self.folder / "masks"
         for name, file in zip(self.names, masks, strict=True):
             target = folder / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
-            size = image_size(self.pictures / name)
+            size = image_size(self.photographs / name)
             write_png(target, np.ones(size[::-1]) if file is None else read_mask(file, size))
         return folder
 
@@ -395,7 +400,7 @@ class _Reconstruction:
 
         found = self.pycolmap.incremental_mapping(
             self.database,
-            self.pictures,
+            self.photographs,
             self.folder / "models",
             options=options,
             initial_image_pair_callback=lambda: count(2),

@@ -29,7 +29,7 @@ from drgs.bench.output import machine, markdown_table
 from drgs.config.schema import FitConfig
 from drgs.core.environment import required
 from drgs.datasets import load_dataset
-from drgs.datasets.colmap import model_folder, picture_folder
+from drgs.datasets.colmap import image_folder, model_folder
 from drgs.datasets.folders import config_for, find_reader
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
@@ -63,7 +63,7 @@ def undistorted(config: FitConfig, folder: Path) -> Path:
     """
     pycolmap = required("pycolmap", "colmap", "undistorting")
     model = model_folder(config.data.path)
-    pictures = picture_folder(config.data, read_model(model))
+    pictures = image_folder(config.data, read_model(model))
     found = pycolmap.Reconstruction(str(model))
     sizes = {}
     for image in found.images.values():

@@ -91,11 +91,11 @@ def test_a_suffix_in_file_path_is_accepted(blender):
         (lambda m: m.pop("camera_angle_x"), "camera_angle_x is missing"),
         (
             lambda m: m.update(camera_angle_x=0),
-            "camera_angle_x must be between 0.0001 and 3.102 (radians), got 0",
+            "camera_angle_x must be >= 9.999999992e-05, got 0",
         ),
         (
             lambda m: m.update(camera_angle_x=1e-5),
-            "camera_angle_x must be between 0.0001 and 3.102 (radians), got 1e-05",
+            "camera_angle_x must be >= 9.999999992e-05, got 1e-05",
         ),
         (
             lambda m: m.update(camera_angle_x=10**400),
@@ -103,7 +103,7 @@ def test_a_suffix_in_file_path_is_accepted(blender):
         ),
         (
             lambda m: m.update(camera_angle_x=40),
-            "camera_angle_x must be between 0.0001 and 3.102 (radians), got 40",
+            "camera_angle_x must be <= 3.101597986, got 40",
         ),
         (
             lambda m: m["frames"][1].pop("file_path"),
@@ -132,8 +132,7 @@ def test_a_suffix_in_file_path_is_accepted(blender):
         ),
         (
             lambda m: m["frames"][1]["transform_matrix"][2].__setitem__(3, -2e9),
-            "frames[1].transform_matrix[2][3] must be at most 1e+09 in size (scale the scene "
-            "down), got -2000000000.0",
+            "frames[1].transform_matrix[2][3] must be >= -1000000000, got -2000000000.0",
         ),
         (
             lambda m: m["frames"][2]["transform_matrix"][0].__setitem__(3, math.nan),

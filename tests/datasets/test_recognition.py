@@ -8,7 +8,7 @@ from support.datasets import refusal
 
 from drgs.core.errors import UserError
 from drgs.datasets.folders import GUIDE
-from drgs.poses.structure_from_motion import pictures_in
+from drgs.poses.structure_from_motion import photographs_in
 
 
 def touch(folder, *names):
@@ -85,7 +85,7 @@ def test_pictures_in_folders_of_the_folder(tmp_path, files, message):
     assert re.search(f"holds photographs .*{pattern}", refusal(tmp_path))
     if "images/b/a.jpg" not in files:
         with pytest.raises(UserError, match=f"got one that holds photographs .*{pattern}"):
-            pictures_in(tmp_path)
+            photographs_in(tmp_path)
 
 
 def test_a_file_in_the_folders_place(tmp_path):

@@ -185,7 +185,7 @@ def test_another_size_keeps_the_field_of_view(tmp_path):
     [
         ({"camera_angle_x": 0.7}, None, "w is missing; give --size"),
         ({}, (8, 8), r"camera_angle_x is missing; or give fl_x"),
-        ({"camera_angle_x": 4.0}, (8, 8), "must be between 0.0001 and 3.102"),
+        ({"camera_angle_x": 4.0}, (8, 8), "camera_angle_x must be <= 3.1015"),
         ({"fl_x": 10}, (8, 8), "w is missing"),
         ({"camera_angle_x": 0.7, "w": -1, "h": 3}, None, "w must be >= 1, got -1"),
     ],

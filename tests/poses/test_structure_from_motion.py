@@ -16,7 +16,7 @@ from drgs.core.child_process import ChildEndedError
 from drgs.core.errors import UserError, UserNote
 from drgs.core.folders import sole_writer
 from drgs.poses import structure_from_motion as sfm
-from drgs.poses.structure_from_motion import Search, pictures_in, place
+from drgs.poses.structure_from_motion import Search, photographs_in, place
 
 NAMES = [f"corner {k}.png" for k in range(7, 14)]  # 10 follows 9, and has a space
 
@@ -337,25 +337,25 @@ def work(folder, names, **search):
 def test_masks_beside_photographs_are_no_photographs(tmp_path):
     for name in ("a.jpg", "a_mask.png", "b.jpg", "b.jpg.mask.png", "face_mask.jpg"):
         Image.new("RGB", (8, 6)).save(tmp_path / name)
-    assert pictures_in(tmp_path)[1] == ["a.jpg", "b.jpg", "face_mask.jpg"]
+    assert photographs_in(tmp_path)[1] == ["a.jpg", "b.jpg", "face_mask.jpg"]
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
     for name in ("2.png", "10.png", "1.JPG", "b/3.png", "notes.txt"):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(tmp_path / "images" / name, format="PNG")
-    pictures, names = pictures_in(tmp_path)
+    pictures, names = photographs_in(tmp_path)
     assert pictures == tmp_path / "images" and names == ["1.JPG", "2.png", "10.png", "b/3.png"]
     (tmp_path / "images" / "10.png").write_bytes(b"not a picture")
     with pytest.raises(UserError, match=r"10\.png: cannot read the image"):
-        pictures_in(tmp_path)
+        photographs_in(tmp_path)
 
 
 def test_a_name_that_colmap_cannot_hold_is_refused(tmp_path):
     Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     (tmp_path / "a.png").rename(tmp_path / "a\udcff.png")
     with pytest.raises(UserError, match=r"COLMAP knows names in UTF-8 only; rename it"):
-        pictures_in(tmp_path)
+        photographs_in(tmp_path)
 
 
 def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
@@ -366,11 +366,11 @@ def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
     with pytest.warns(
         UserNote, match=r"left out, as COLMAP does not read them: a\.heic, b\.DNG, c"
     ):
-        assert pictures_in(tmp_path)[1] == ["a.tif", "b.jpg"]
+        assert photographs_in(tmp_path)[1] == ["a.tif", "b.jpg"]
     (tmp_path / "a.tif").unlink()
     (tmp_path / "b.jpg").unlink()
     with pytest.raises(UserError, match=r"got a\.heic, .*, which COLMAP does not read; convert"):
-        pictures_in(tmp_path)
+        photographs_in(tmp_path)
 
 
 @pytest.mark.parametrize(("mode", "size", "message"), [
@@ -380,7 +380,7 @@ def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
 def test_what_a_fit_refuses_is_refused_before_the_search(tmp_path, mode, size, message):
     Image.new(mode, size).save(tmp_path / "a.tif", compression="group4" if mode == "1" else None)
     with pytest.raises(UserError, match=message):
-        pictures_in(tmp_path)
+        photographs_in(tmp_path)
 
 
 @pytest.mark.parametrize("below", ["sparse", "colmap/sparse/0"])

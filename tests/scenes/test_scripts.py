@@ -24,7 +24,7 @@ def files_of_the_checkout():
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in kept}
 
 
-def pictures_in(folder):
+def photographs_in(folder):
     """In the place of what a script computes."""
     folder.mkdir(parents=True)
     (folder / "target.png").write_text("a picture")
@@ -44,7 +44,7 @@ def script(monkeypatch, tmp_path):
             result = module.Result(np.zeros((4, 4, 3)), 1.0)
             monkeypatch.setattr(module, "measure", lambda *arguments: result)
         if name == "relight":
-            monkeypatch.setattr(module, "relight", lambda *arguments: pictures_in(arguments[-1]))
+            monkeypatch.setattr(module, "relight", lambda *arguments: photographs_in(arguments[-1]))
         if name == "among_surfaces":
             for rows in ("furnace_rows", "shadow_rows"):
                 monkeypatch.setattr(module, rows, lambda *arguments: [])
