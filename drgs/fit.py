@@ -86,6 +86,12 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="TIME",
         help="90s, 5m, 1h30m: plan a fit that is done, results written, after this time",
     )
+    _add_viewing(parser)
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
+
+
+def _add_viewing(parser: CommandParser) -> None:
     group = parser.add_argument_group("looking on", "The result has the same bytes without these.")
     group.add_argument(
         "--view",
@@ -105,8 +111,6 @@ def add_arguments(parser: CommandParser) -> None:
         action="store_true",
         help="write the history for TensorBoard, too (extra: tensorboard)",
     )
-    add_execution_arguments(parser)
-    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -66,7 +66,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Strategy:
-    """What a plan chooses besides the number of iterations."""
+    """A choice of a plan besides the number of iterations."""
 
     name: str  # of its curve
     half_size: float | None = None  # share of the iterations, at the start, with small pictures
@@ -174,7 +174,7 @@ class Plan:
 
     @property
     def reasons(self) -> str:
-        """What was chosen and why, as text."""
+        """The choice and its reasons, as text."""
         coarse = self.config.coarse
         stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in coarse]
         sizes = ", ".join([*stages, "then full size"]) if stages else "full size"

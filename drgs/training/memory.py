@@ -1,4 +1,4 @@
-"""What memory a fit will take at its peak, estimated before it starts, and what is refused.
+"""The peak of memory of a fit, estimated before it starts; fits that would not fit are refused.
 
 The peak is that of an iteration with as many Gaussians as the configuration allows. Entries and
 slots of splats (see ``drgs.splatting``) are counted at the start, where splats are largest, for

@@ -512,7 +512,7 @@ class Trainer:
 
 
 def _step_info(step: Step, view: StepView, gradients: ViewGradients) -> StepInfo:
-    """Return what the strategy of density is told about a view."""
+    """Return the statistics of a view for the strategy of density."""
     means2d_grad = gradients.means2d_grad
     if step.num_averaged > 1:  # it is a part of a mean
         means2d_grad = means2d_grad * step.num_averaged

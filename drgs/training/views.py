@@ -48,7 +48,7 @@ class TrainingView:
 
     @property
     def target(self) -> Target:
-        """What is compared with: the photograph, unless an effect replaces it."""
+        """The photograph that renderings are compared with, unless an effect replaces it."""
         return self.photograph if self.replacement is None else self.replacement
 
     def free(self) -> None:

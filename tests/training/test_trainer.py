@@ -40,14 +40,14 @@ def test_sh_degree_rises_by_one_every_so_many_iterations():
 def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population(monkeypatch):
     """Kernels by hash, as Dr.Jit's caches do: what they hold from other runs does not matter."""
 
-    def random_rows(gradient_norms, **_):
+    def random_rows(strategy, gradient_norms, *_):
         rng = np.random.default_rng(len(gradient_norms))
         kind = rng.choice(["keep", "clone", "split", "prune"], len(gradient_norms))
         rows = {name: np.flatnonzero(kind == name).astype(np.uint32) for name in np.unique(kind)}
         kept = np.flatnonzero((kind == "keep") | (kind == "clone")).astype(np.uint32)
         return adc._ChosenRows(kept, rows["clone"], rows["split"], 0)
 
-    monkeypatch.setattr(adc, "_choose_rows", random_rows)
+    monkeypatch.setattr(adc.AdaptiveDensityControl, "_choose_rows", random_rows)
     trainer = make_trainer(
         model={"sh_degree": 3, "sh_increase_every": 12},
         densify={"start": 3, "stop": 45, "every": 4, "strategy": "adc", "adc": {"reset_every": 8}},

@@ -68,7 +68,7 @@ class PruneSchedule:
 
 
 class Pruning(DensityStrategy):
-    """What the methods have in common."""
+    """A last phase; subclasses choose the Gaussians that are removed."""
 
     @classmethod
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Pruning:

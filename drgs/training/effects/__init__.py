@@ -1,4 +1,1 @@
-"""What takes part in the iterations of a fit when it is called for.
-
-May import what ``training`` may, but nothing of the trainer: see ``base.FitState``.
-"""
+"""Effects of a fit: they may import what ``training`` may, but nothing of the trainer."""

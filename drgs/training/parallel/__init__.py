@@ -1,4 +1,1 @@
-"""One fit, or one set of pictures, on several processes: MPI.
-
-Imported where a command was started by ``mpiexec``, and by nobody else.
-"""
+"""A fit, or a set of images, on several processes: MPI."""
