@@ -12,28 +12,32 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
+
+from drgs.core import types
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class ArrayTypes:
     """The Dr.Jit types of one backend and one floating point precision."""
 
-    Float: type
-    UInt32: type
-    UInt64: type
-    Int32: type
-    Bool: type
-    Array2f: type
-    Array3f: type
-    Array4f: type
-    Array2u: type
-    Array4u: type
-    Matrix3f: type
-    TensorXf: type
+    Float: type[types.Float]
+    UInt32: type[types.UInt32]
+    UInt64: type[types.UInt64]
+    Int32: type[types.Int32]
+    Bool: type[types.Bool]
+    Array2f: type[types.Array2f]
+    Array3f: type[types.Array3f]
+    Array4f: type[types.Array4f]
+    Array2u: type[types.Array2u]
+    Array4u: type[types.Array4u]
+    Matrix3f: type[types.Matrix3f]
+    TensorXf: type[types.TensorXf]
 
 
 @cache
@@ -62,6 +66,11 @@ def types_of(float_type: type) -> ArrayTypes:
 def is_float64(float_type: type) -> bool:
     """Whether ``float_type`` is a double precision array."""
     return dr.type_v(float_type) == dr.VarType.Float64
+
+
+def reinterpret(dtype: type[T], value: dr.ArrayBase) -> T:
+    """Return the same bits as another type of the same size."""
+    return dr.reinterpret_array(dtype, value)
 
 
 def from_host(flat_type: type, values: Any) -> Any:

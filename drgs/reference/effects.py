@@ -75,7 +75,7 @@ VIEW_MARGIN = 0.15
 
 @dataclass(frozen=True)
 class Lens:
-    """How points come to lie on the film. What a lens does not define anew is as with a pinhole.
+    """The mapping of points to the film. Methods that a lens does not define are a pinhole's.
 
     ``points`` are (M, 3) in camera axes (x right, y down, z forward), world units.
     """

@@ -22,7 +22,7 @@ from drgs.reference.splatting import Gaussians
 
 @dataclass(frozen=True)
 class Passed:
-    """What segments pass."""
+    """The radiance and transmittance of segments."""
 
     colors: np.ndarray  # (R, 3) display space, sum of w_i c_i
     transmittances: np.ndarray  # (R,)

@@ -72,7 +72,7 @@ OPEN_CONE = 1e-6
 
 @pydantic.dataclasses.dataclass(frozen=True)
 class ImageModel:
-    """How a picture comes of Gaussians: the defaults are those of 3DGS and ``reference``.
+    """The approximations of an image of Gaussians; the defaults are those of 3DGS.
 
     projection: ``"ewa"``, the affine approximation at the mean; ``"unscented"``, mean and
     covariance of seven projected sigma points; ``"exact"``, the peak along each pixel's ray.

@@ -148,7 +148,7 @@ class Projection:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a camera sees."""
+    """The image of a camera."""
 
     image: np.ndarray  # (H, W, 3) display space, background included
     alpha: np.ndarray  # (H, W) = 1 - transmittance

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from drgs.core.constants import ALPHA_CUT, ALPHA_MAX, NEGLIGIBLE_ALPHA, TRANSMITTANCE_STOP
+from drgs.core.types import Float
 
 
 @dataclass(frozen=True)
 class Cutoffs:
-    """Where a splat, and a pixel, ends. Numbers of the host: each value makes its own kernels.
+    """Limits at which splats and pixels end. Host numbers: each value compiles its own kernels.
 
     None of these decisions is differentiated.
     """
@@ -31,7 +31,7 @@ class Cutoffs:
         """``alpha_cut``; where that is 0, an alpha too small to change any sum."""
         return max(self.alpha_cut, NEGLIGIBLE_ALPHA)
 
-    def log2_floor(self, log2_opacity: Any) -> Any:
+    def log2_floor(self, log2_opacity: Float) -> Float | float:
         """The base-2 logarithm of the smallest alpha of a splat."""
         least = math.log2(self.least_alpha)
         if math.isinf(self.extent):

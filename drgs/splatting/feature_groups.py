@@ -18,6 +18,7 @@ from typing import Any
 
 import drjit as dr
 
+from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.footprint import FeatureGroup
 from drgs.splatting.rasterize import ONE_SAMPLE, Layers, Records, SplatGradients
 from drgs.splatting.tiles import TileBins
@@ -28,7 +29,7 @@ FEATURES_AT_ONCE = {4: 32, 8: 8}
 
 
 def in_groups(order: Any, bins: TileBins) -> Any:
-    """``order``, or one that composites in groups where there are many features.
+    """Return ``order``, or one that composites in groups if there are many features.
 
     Each is a :class:`drgs.splatting.rendering.CenterOrder`.
     """
@@ -43,19 +44,18 @@ class GroupedLayers:
     parts: tuple[Layers, ...]  # of each of them
     count: int  # planes besides the transmittance
 
-    def planes(self) -> list[Any]:
+    def planes(self) -> list[Float]:
         """See :meth:`drgs.splatting.rasterize.Layers.planes`."""
-        planes = [None] * (1 + self.count)
+        planes: dict[int, Float] = {}
         for group, part in zip(self.groups, self.parts, strict=True):
-            planes[0], *own = part.planes()
-            for place, plane in zip(group.planes, own, strict=True):
-                planes[1 + place] = plane
-        return planes
+            places = [0, *(1 + place for place in group.planes)]
+            planes |= zip(places, part.planes(), strict=True)
+        return [planes[place] for place in range(1 + self.count)]
 
 
 @dataclass(frozen=True)
 class InGroups:
-    """Composites in another order, group by group."""
+    """Composite group by group, in the order of another object."""
 
     order: Any  # drgs.splatting.rendering.CenterOrder: of each group
 
@@ -63,7 +63,7 @@ class InGroups:
         """Records of each group."""
         geometry, end = bins.model.falloff.num_geometry, bins.num_features
 
-        def numbers(group: FeatureGroup, rank: Any, active: Any) -> list[Any]:
+        def numbers(group: FeatureGroup, rank: UInt32, active: Bool) -> list[Float]:
             row = bins.rows.load(rank, active)
             features, keys = row[geometry:], row[geometry + end :]
             return row[:geometry] + [features[place] for place in group.stored] + keys
@@ -86,8 +86,8 @@ class InGroups:
         bins: TileBins,
         records: Sequence[Records],
         layers: GroupedLayers,
-        d_features: list[Any],
-        d_transmittance: Any,
+        d_features: list[Float],
+        d_transmittance: Float,
         samples: range = ONE_SAMPLE,
         before: SplatGradients | None = None,
     ) -> SplatGradients:
@@ -97,6 +97,7 @@ class InGroups:
             found = self._adjoint(bins, records, layers, d_features, d_transmittance, sample)
             before = found if before is None else before.plus(found)
             dr.eval(before)
+        assert before is not None, "there is at least one sample"
         return before
 
     def _adjoint(
@@ -104,23 +105,23 @@ class InGroups:
         bins: TileBins,
         records: Sequence[Records],
         layers: GroupedLayers,
-        d_features: list[Any],
-        d_transmittance: Any,
+        d_features: list[Float],
+        d_transmittance: Float,
         samples: range,
     ) -> SplatGradients:
         """Add up the groups' derivatives, of one sample."""
         cotangents = [d_transmittance, *d_features]
         dr.eval(cotangents)  # or each group would have kernels of its own
         zeros = dr.opaque(type(d_transmittance), 0, dr.width(d_transmittance))
-        geometry, features = None, [bins.rows.Float(0)] * bins.num_features
+        zero, falloff = bins.rows.Float(0), bins.model.falloff
+        geometry, features = [zero] * falloff.num_geometry, [zero] * bins.num_features
         for group, own, part in zip(_groups(bins), records, layers.parts, strict=True):
             places = [0, *(1 + place for place in group.planes)]
             d_own, *d_planes = [cotangents[place] for place in places]
             for place in places:  # planes of several groups count once
                 cotangents[place] = zeros
             found = self.order.adjoint(_only(group, bins), own, part, d_planes, d_own, samples)
-            total = zip(geometry or [0] * len(found.geometry), found.geometry, strict=True)
-            geometry = [a + b for a, b in total]
+            geometry = [a + b for a, b in zip(geometry, found.geometry, strict=True)]
             for place, derivative in zip(group.stored, found.features, strict=True):
                 features[place] = features[place] + derivative
             dr.eval(geometry, features)
@@ -147,6 +148,6 @@ def _groups(bins: TileBins) -> tuple[FeatureGroup, ...]:
 
 
 def _only(group: FeatureGroup, bins: TileBins) -> TileBins:
-    """The bins as if there were no other features."""
+    """Return the bins with the features of one group."""
     model = replace(bins.model, features=group.features)
     return replace(bins, num_features=len(group.stored), model=model)

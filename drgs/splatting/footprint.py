@@ -1,4 +1,4 @@
-"""What a splat is at the 16 pixels of a micro-tile: the image model of the kernels.
+"""The footprint of a splat at the 16 pixels of a micro-tile: the image model of the kernels.
 
 A :class:`FootprintModel` holds what tiles and compositing have to agree on, each an object that the
 kernels' Python code calls while Dr.Jit traces it. The classes here are the bases, and the defaults,
@@ -16,14 +16,15 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import FALLOFFS
-from drgs.core.arrays import is_float64, types_of
+from drgs.core.arrays import is_float64, reinterpret, types_of
 from drgs.core.constants import WHITENING_SCALE
+from drgs.core.types import Array2f, Bool, Float
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.projection import Splats2D
@@ -33,7 +34,7 @@ from drgs.splatting.projection import Splats2D
 # ----------------------------------------------------------------------------------------------
 
 
-def exp2_short(x: Any) -> Any:
+def exp2_short(x: Float) -> Float:
     """2^x for float32 x in [-126, 127]; relative error below 2.2e-7.
 
     x = n + f with |f| <= 1/2; 2^f by a minimax polynomial of degree 5 (coefficients from a
@@ -52,11 +53,11 @@ def exp2_short(x: Any) -> Any:
         1.0000000716546822,
     ):
         p = dr.fma(p, f, c)
-    exponent = dr.reinterpret_array(t.Int32, shifted) << 23
-    return dr.reinterpret_array(t.Float, dr.reinterpret_array(t.Int32, p) + exponent)
+    exponent = reinterpret(t.Int32, shifted) << 23
+    return reinterpret(t.Float, reinterpret(t.Int32, p) + exponent)
 
 
-def exp2_function(Float: type) -> Callable[[Any], Any]:
+def exp2_function(Float: type) -> Callable[[Float], Float]:
     """The exponential that compositing uses in this precision."""
     return dr.exp2 if is_float64(Float) else exp2_short
 
@@ -65,11 +66,11 @@ def exp2_function(Float: type) -> Callable[[Any], Any]:
 class Alpha:
     """Alpha at one pixel, with the decisions taken on the way."""
 
-    value: Any  # 0 where the splat is skipped
-    smooth: Any  # Bool: not clamped, so that the derivative flows
+    value: Float  # 0 where the splat is skipped
+    smooth: Bool  # not clamped, so that the derivative flows
 
     @staticmethod
-    def at(log2_alpha: Any, floor: Any, alpha_max: float) -> Alpha:
+    def at(log2_alpha: Float, floor: Float | float, alpha_max: float) -> Alpha:
         """alpha = min(alpha_max, 2^log2_alpha), or 0 where log2_alpha is below ``floor``."""
         # Far below the floor the short exp2 returns garbage; the selection discards it.
         unclamped = exp2_function(type(log2_alpha))(log2_alpha)
@@ -84,53 +85,53 @@ class Alpha:
 
 
 class Positions:
-    """Where in a pixel splats are evaluated. Grids of 16 values are lists of 4 rows of 4."""
+    """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4."""
 
     margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
-    samples: int = 1  # times that each pixel is evaluated
+    samples: ClassVar[int] = 1  # times that each pixel is evaluated
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> Positions:
         """Load what the lanes of one kernel need; the other methods are called of the result."""
         del lanes, grid
         return self
 
-    def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
+    def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
         """Return x and y (px) of the 16 pixels."""
         raise NotImplementedError
 
-    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
+    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
         """Return grids of x and y, from a point of the film to the pixels, px."""
         raise NotImplementedError
 
-    def sum(self, values: list[Any]) -> Any:
+    def sum(self, values: list[Float]) -> Float:
         """Sum 16 values."""
         raise NotImplementedError
 
-    def sum_dx(self, values: list[Any], dx: list) -> Any:
+    def sum_dx(self, values: list[Float], dx: list) -> Float:
         """Sum values times dx, a grid of :meth:`offsets`."""
         raise NotImplementedError
 
-    def sum_dy(self, values: list[Any], dy: list) -> Any:
+    def sum_dy(self, values: list[Float], dy: list) -> Float:
         """Sum values times dy."""
         raise NotImplementedError
 
-    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
+    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         """Sum values times dy^2."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class PixelCenters(Positions):
-    """Every pixel is evaluated at its centre: offsets are shared by rows and columns."""
+    """The pixels' centres: rows and columns share their offsets."""
 
     samples: ClassVar[int] = 1
 
-    def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
+    def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
         """x and y (px) of the 16 pixels."""
         x, y = Float(lanes.x) + 0.5, Float(lanes.y) + 0.5
         return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
 
-    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
+    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
         """Grids of x and y, from a point of the film to the pixels, px."""
         t = types_of(type(x))
         first_x, first_y = t.Float(lanes.x) + 0.5 - x, t.Float(lanes.y) + 0.5 - y
@@ -138,46 +139,46 @@ class PixelCenters(Positions):
         dy = [first_y + j for j in range(MICRO)]
         return [dx] * MICRO, [[d] * MICRO for d in dy]
 
-    def sum(self, values: list[Any]) -> Any:
-        """Of 16 values."""
+    def sum(self, values: list[Float]) -> Float:
+        """Sum 16 values."""
         return total(self._rows(values))
 
-    def sum_dx(self, values: list[Any], dx: list) -> Any:
-        """Of values times dx: dx is shared by a column, so columns are summed first."""
+    def sum_dx(self, values: list[Float], dx: list) -> Float:
+        """Sum values times dx: a column shares dx, so columns are summed first."""
         columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
         return _dot(columns, dx[0])
 
-    def sum_dy(self, values: list[Any], dy: list) -> Any:
-        """Of values times dy, shared by a row."""
+    def sum_dy(self, values: list[Float], dy: list) -> Float:
+        """Sum values times dy, which a row shares."""
         return _dot(self._rows(values), _first_of_rows(dy))
 
-    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
-        """Of values times dy^2."""
+    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
+        """Sum values times dy^2."""
         dy = _first_of_rows(dy)
         return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
 
     @staticmethod
-    def _rows(values: list[Any]) -> list[Any]:
+    def _rows(values: list[Float]) -> list[Float]:
         return [total(values[MICRO * j : MICRO * j + MICRO]) for j in range(MICRO)]
 
 
-def _first_of_rows(rows: list) -> list[Any]:
+def _first_of_rows(rows: list) -> list[Float]:
     return [row[0] for row in rows]
 
 
-def total(values: list[Any]) -> Any:
-    """Pairwise: the shortest chain of dependent additions."""
+def total(values: list[Float]) -> Float:
+    """Sum pairwise: the shortest chain of dependent additions."""
     while len(values) > 1:
         values = [a + b for a, b in zip(values[::2], values[1::2], strict=True)]
     return values[0]
 
 
-def flat_columns(rows: list) -> list[Any]:
+def flat_columns(rows: list) -> list[Float]:
     """The 16 values of 4 rows of 4."""
     return [value for row in rows for value in row]
 
 
-def _dot(a: list[Any], b: list[Any]) -> Any:
+def _dot(a: list[Float], b: list[Float]) -> Float:
     result = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
         result = dr.fma(x, y, result)
@@ -197,10 +198,10 @@ class Footprint:
     dy: list  # grid, px
     u: list  # grid: first component of U d, scaled to base 2
     v: list  # grid: second component
-    log2_alpha: list[Any]  # 16: unclamped
+    log2_alpha: list[Float]  # 16: unclamped
 
 
-Offsets = Callable[[Any, Any], tuple[list, list]]
+Offsets = Callable[[Float, Float], tuple[list, list]]
 """From a point of the film, x and y (px), to grids of offsets from it to the 16 pixels."""
 
 
@@ -219,20 +220,22 @@ class GaussianFalloff:
     num_moments: ClassVar[int] = 6  # sums over pixels, by splat
 
     def for_camera(self, camera: Camera) -> GaussianFalloff:
-        """For one camera: nothing depends on it."""
+        """Return this falloff for one camera; here, nothing depends on it."""
         del camera
         return self
 
-    def geometry(self, splats: Splats2D) -> list[Any]:
+    def geometry(self, splats: Splats2D) -> list[Float]:
         """Columns, one value per Gaussian."""
         p, r, s = splats.whitening * WHITENING_SCALE
         return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
-    def differentiable(self, splats: Splats2D) -> list[Any]:
+    def differentiable(self, splats: Splats2D) -> list[Float]:
         """Return what :meth:`derivatives` are with respect to: as many columns as geometry."""
         return [*splats.means2d, *splats.whitening, splats.opacities]
 
-    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+    def bounds(
+        self, splats: Splats2D, geometry: list[Float], reach: Float
+    ) -> tuple[Array2f, Array2f]:
         """Return centre and half sizes (Array2f, px) of a box around all that shows.
 
         reach: by how much log2_alpha may be below log2_opacity; here, of |U d|^2.
@@ -240,26 +243,26 @@ class GaussianFalloff:
         del geometry
         return splats.means2d, dr.sqrt(2 * math.log(2) * reach * splats.variances)
 
-    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
+    def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
         """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
         del reach
         return geometry[:5]
 
-    def log2_opacity(self, geometry: list[Any]) -> Any:
+    def log2_opacity(self, geometry: list[Float]) -> Float:
         """The base-2 logarithm of the opacity."""
         return geometry[5]
 
-    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
+    def log2_floor(self, geometry: list[Float], cutoffs: Cutoffs) -> Float | float:
         """The base-2 logarithm of the smallest alpha of a splat."""
         return cutoffs.log2_floor(self.log2_opacity(geometry))
 
-    def coordinates(self, geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+    def coordinates(self, geometry: list[Float], x: Float, y: Float) -> tuple[Float, Float]:
         """U d at a point of the film, px."""
         mean_x, mean_y, p, r, s = geometry[:5]
         dx, dy = x - mean_x, y - mean_y
         return dr.fma(p, dx, r * dy), s * dy
 
-    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
+    def footprint(self, geometry: list[Float], offsets_from: Offsets, active: Bool) -> Footprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
         x, y, p, r, s, log2_opacity = geometry
         log2_opacity = dr.select(active, log2_opacity, -dr.inf)
@@ -275,7 +278,9 @@ class GaussianFalloff:
         ]
         return Footprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
 
-    def moments(self, footprint: Footprint, weights: list[Any], positions: Positions) -> list[Any]:
+    def moments(
+        self, footprint: Footprint, weights: list[Float], positions: Positions
+    ) -> list[Float]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
         dx, dy = footprint.dx, footprint.dy
         u = [value for row in footprint.u for value in row]
@@ -289,8 +294,8 @@ class GaussianFalloff:
             positions.sum_dy_dy(weights, dy),
         ]
 
-    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
-        """From moments to the derivatives of mean x, y, p, r, s (unscaled), and opacity.
+    def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
+        """Return the derivatives of mean x, y, p, r, s (unscaled), and opacity, from moments.
 
         log2_alpha = log2_opacity - u^2 - (s dy)^2, u = p dx + r dy, dx = x - mean: hence
         d ln(alpha) / d(anything) = ln(2) * d log2_alpha / d(anything).
@@ -308,14 +313,14 @@ class GaussianFalloff:
             dr.select(w == 0, 0, w * dr.exp2(-log2_opacity)),
         ]
 
-    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
         """Tangents of the geometry, that of the opacity as d ln(opacity)."""
         *others, d_opacity = tangents
         return [*others, d_opacity * dr.exp2(-self.log2_opacity(geometry))]
 
     def tangent(
-        self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
-    ) -> list[Any]:
+        self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
+    ) -> list[Float]:
         """Tangent of ln(alpha) at the 16 pixels."""
         _, _, p, r, s, _ = geometry
         d_x, d_y, d_p, d_r, d_s, d_log_opacity = d_geometry
@@ -382,7 +387,7 @@ class SplatFeatures:
         """Raise UnsupportedError if they depend on the camera but through what is stored."""
 
     def weighing(self) -> SplatFeatures:
-        """What has the weights of compositing as derivatives of the first number that is stored."""
+        """Return features whose derivatives with respect to the first number are weights."""
         return self
 
     def bind(self, lanes: Lanes, positions: Positions) -> SplatFeatures:
@@ -390,26 +395,28 @@ class SplatFeatures:
         del lanes, positions
         return self
 
-    def at(self, stored: list[Any], pixel: int) -> list[Any]:
+    def at(self, stored: list[Float], pixel: int) -> list[Float]:
         """The splat's features at a pixel."""
         del pixel
         return stored
 
-    def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
+    def add(
+        self, planes: list[Float], stored: list[Float], pixel: int, weight: Float
+    ) -> list[Float]:
         """A pixel's ``planes`` with this splat's share; weight: T alpha."""
         features = self.at(stored, pixel)
         return [dr.fma(weight, c, plane) for c, plane in zip(features, planes, strict=True)]
 
-    def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
+    def feature_gradient(self, stored: list[Float], pixel: int, g: list[Float]) -> Float | int:
         """c . g, with the features c at a pixel and the loss's derivatives g there."""
-        result: Any = 0  # there may be no features, but alpha alone
+        result: Float | int = 0  # there may be no features, but alpha alone
         for c, derivative in zip(self.at(stored, pixel), g, strict=True):
             result = dr.fma(c, derivative, result)
         return result
 
     def add_derivatives(
-        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
-    ) -> list[Any]:
+        self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
+    ) -> list[Float]:
         """Return ``totals`` with one pixel's share of the derivatives with respect to ``stored``.
 
         weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
@@ -419,7 +426,7 @@ class SplatFeatures:
             dr.fma(weight, derivative, total) for derivative, total in zip(g, totals, strict=True)
         ]
 
-    def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
+    def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         """Tangents of the features at a pixel."""
         del stored, pixel
         return d_stored
@@ -427,7 +434,7 @@ class SplatFeatures:
 
 @dataclass(frozen=True)
 class FootprintModel:
-    """What tiles and compositing share; see the module's description."""
+    """The footprint of splats, as tiles and compositing see it; see the module's description."""
 
     falloff: GaussianFalloff = field(default_factory=GaussianFalloff)
     positions: Positions = field(default_factory=PixelCenters)
@@ -456,11 +463,11 @@ class FootprintModel:
             cutoffs=self.cutoffs,
         )
 
-    def footprint(self, geometry: list[Any], lanes: Lanes, active: Any) -> Footprint:
+    def footprint(self, geometry: list[Float], lanes: Lanes, active: Bool) -> Footprint:
         """A splat at the pixels of each lane."""
         return self.falloff.footprint(geometry, partial(self.positions.offsets, lanes), active)
 
-    def alphas(self, geometry: list[Any], footprint: Footprint) -> list[Alpha]:
+    def alphas(self, geometry: list[Float], footprint: Footprint) -> list[Alpha]:
         """Alpha at the 16 pixels."""
         floor = self.falloff.log2_floor(geometry, self.cutoffs)
         return [Alpha.at(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]

@@ -1,11 +1,11 @@
-"""How the film is cut: tiles, their micro-tiles, and the lanes of kernels that have one each."""
+"""Tiles of the film, their micro-tiles, and the lanes of kernels: one lane per micro-tile."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from drgs.core.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
+from drgs.core.types import UInt32
 
 MICRO = 4
 """Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
@@ -61,7 +61,7 @@ class TileGrid:
 
     @property
     def cull_margin(self) -> float:
-        """What rounding may take from an exponent (base 2) on this film."""
+        """Largest rounding error of an exponent (base 2) on this film."""
         return CULL_MARGIN + CULL_MARGIN_PER_PX * max(self.width, self.height)
 
 
@@ -69,9 +69,9 @@ class TileGrid:
 class Lanes:
     """One lane per micro-tile, in the order in which Dr.Jit starts them."""
 
-    micro_tile: Any  # UInt32: tile among those of all samples * 16 + micro-tile within the tile
-    micro: Any  # UInt32: micro-tile within the tile
-    tile: Any  # UInt32: on the film
-    sample: Any  # UInt32
-    x: Any  # UInt32: first pixel column
-    y: Any  # UInt32: first pixel row
+    micro_tile: UInt32  # tile among those of all samples * 16 + micro-tile within the tile
+    micro: UInt32  # micro-tile within the tile
+    tile: UInt32  # on the film
+    sample: UInt32
+    x: UInt32  # first pixel column
+    y: UInt32  # first pixel row

@@ -8,17 +8,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 
 from drgs.core.arrays import divide, types_of, with_aligned_stack
+from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, Lanes, TileGrid
 from drgs.splatting.tiles import WORD, TileBins
 
+T = TypeVar("T", Float, UInt32)
 
-def make_lanes(Float: type, grid: TileGrid, order: Any = None, tiles: range | None = None) -> Lanes:
-    """Lanes such that neighbours in time are far apart on the film.
+
+def make_lanes(
+    Float: type, grid: TileGrid, order: UInt32 | None = None, tiles: range | None = None
+) -> Lanes:
+    """Make lanes such that neighbours in time are far apart on the film.
 
     Dr.Jit cuts a small launch into few blocks of consecutive lanes. Tiles are visited with a
     stride near the golden section, so that each block gets its share of the busy centre.
@@ -49,18 +54,18 @@ def make_lanes(Float: type, grid: TileGrid, order: Any = None, tiles: range | No
     )
 
 
-def grouped_by_work(Float: type, grid: TileGrid, work: Any, tiles: range | None = None) -> Lanes:
-    """Those of :func:`make_lanes`, in each block ordered by how many splats they visit, roughly.
+def grouped_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
+    """Make lanes that are ordered, within each block, by roughly their number of splats.
 
-    work: UInt32, of each of those lanes.
+    work: UInt32, the number of splats of each lane of :func:`make_lanes`.
     """
     level = work // 4
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
     return make_lanes(Float, grid, with_aligned_stack(_in_blocks(level)), tiles)
 
 
-def _in_blocks(level: Any) -> Any:
-    """Lanes ordered by level in each block; which of equals comes first is left to chance.
+def _in_blocks(level: UInt32) -> UInt32:
+    """Return the lanes ordered by level in each block; the order of equal lanes is arbitrary.
 
     Nothing depends on it but which lanes share a vector. (The host would wait for the order of
     Dr.Jit's sorting functions, and the device for the host, which has not traced what comes next.)
@@ -94,19 +99,19 @@ def _coprime_stride(count: int) -> int:
 
 @dataclass
 class Cursor:
-    """Walks the set bits of a micro-tile's words: the splats that touch it.
+    """A place among the set bits of a micro-tile's words: the splats that touch it.
 
     Not frozen: Dr.Jit assigns the fields of a loop's state.
     """
 
-    word: Any  # UInt32: bits of the current group that are still to come
-    group: Any  # UInt32: index of the current group of 32 entries
+    word: UInt32  # bits of the current group that are still to come
+    group: UInt32  # index of the current group of 32 entries
 
 
 class Entries:
     """The entries [start, end) of each lane's tile that touch its micro-tile, front to back."""
 
-    def __init__(self, bins: TileBins, lanes: Lanes, end: Any) -> None:
+    def __init__(self, bins: TileBins, lanes: Lanes, end: UInt32) -> None:
         UInt32 = type(lanes.tile)
         self.words, self.micro, self.sample = bins.words, lanes.micro, lanes.sample
         start = dr.gather(UInt32, bins.tile_start, lanes.tile)
@@ -122,12 +127,12 @@ class Entries:
         """The cursor at the first entry."""
         return self._open(self.first, True)
 
-    def pending(self, cursor: Cursor) -> Any:
-        """Whether entries may be left."""
+    def pending(self, cursor: Cursor) -> Bool:
+        """Return lanes that may have entries left."""
         return (cursor.word != 0) | (cursor.group < self.last)
 
     @staticmethod
-    def current(cursor: Cursor) -> tuple[Any, Any]:
+    def current(cursor: Cursor) -> tuple[UInt32, Bool]:
         """The current sorted entry, and whether there is one (a word may be empty).
 
         Where there is none, the index lies between the entries before and those to come.
@@ -139,12 +144,12 @@ class Entries:
         word = cursor.word & (cursor.word - 1)
         return self._go_on(cursor, word, cursor.group + 1, cursor.group < self.last)
 
-    def _go_on(self, cursor: Cursor, word: Any, neighbor: Any, has_neighbor: Any) -> Cursor:
+    def _go_on(self, cursor: Cursor, word: UInt32, neighbor: UInt32, has_neighbor: Bool) -> Cursor:
         used_up = (word == 0) & has_neighbor
         opened = self._open(dr.select(used_up, neighbor, cursor.group), used_up)
         return Cursor(word=dr.select(used_up, opened.word, word), group=opened.group)
 
-    def _open(self, group: Any, active: Any) -> Cursor:
+    def _open(self, group: UInt32, active: Bool | bool) -> Cursor:
         word = dr.gather(type(group), self.words, group * MICROS + self.micro, active)
         word &= dr.select(group == self.first, self.head, 0xFFFFFFFF)
         word &= dr.select(group == self.last, self.tail, 0xFFFFFFFF)
@@ -158,12 +163,12 @@ class EntriesBackToFront(Entries):
         """The cursor at the last entry."""
         return self._open(self.last, True)
 
-    def pending(self, cursor: Cursor) -> Any:
-        """Whether entries may be left."""
+    def pending(self, cursor: Cursor) -> Bool:
+        """Return lanes that may have entries left."""
         return (cursor.word != 0) | (cursor.group > self.first)
 
     @staticmethod
-    def current(cursor: Cursor) -> tuple[Any, Any]:
+    def current(cursor: Cursor) -> tuple[UInt32, Bool]:
         """The current sorted entry, and whether there is one (a word may be empty)."""
         return cursor.group * WORD + _highest_bit(cursor.word), cursor.word != 0
 
@@ -174,10 +179,10 @@ class EntriesBackToFront(Entries):
         return self._go_on(cursor, word, cursor.group - 1, cursor.group > self.first)
 
 
-def count_entries(entries: Entries) -> Any:
-    """How many entries each lane has."""
+def count_entries(entries: Entries) -> UInt32:
+    """Count the entries of each lane."""
 
-    def body(group: Any, count: Any) -> tuple[Any, Any]:
+    def body(group: UInt32, count: UInt32) -> tuple[UInt32, UInt32]:
         return group + 1, count + dr.popcnt(entries._open(group, True).word)
 
     UInt32 = type(entries.first)
@@ -189,19 +194,19 @@ def count_entries(entries: Entries) -> Any:
     return count
 
 
-def _highest_bit(word: Any) -> Any:
+def _highest_bit(word: UInt32) -> UInt32:
     return (WORD - 1) - dr.lzcnt(word)
 
 
-def load_pixels(plane: Any, lanes: Lanes, grid: TileGrid) -> list[Any]:
+def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:
     """The 16 values of a row-major plane of all samples in each micro-tile; 0 off the film."""
     return [
         dr.gather(type(plane), plane, index, inside) for index, inside in pixels_of(lanes, grid)
     ]
 
 
-def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[Any, Any]]:
-    """For the 16 pixels of each micro-tile: row-major index, and whether it is on the film.
+def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:
+    """Return row-major index and on-film mask of the 16 pixels of each micro-tile.
 
     The index is that in a plane of all samples.
     """
@@ -215,7 +220,7 @@ def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[Any, Any]]:
     return pixels
 
 
-def load_lane_row(values: Any, micro_tile: Any, planes: int) -> list[Any]:
+def load_lane_row(values: T, micro_tile: UInt32, planes: int) -> list[T]:
     """The first 16 values of each micro-tile's row of ``planes`` x 16."""
     first = micro_tile * (planes * PIXELS)
     return [dr.gather(type(values), values, first + k) for k in range(PIXELS)]

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -22,6 +22,7 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import load_columns, types_of
 from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
+from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, TensorXf
 from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import normalized, quat_to_rotation
@@ -30,15 +31,15 @@ from drgs.splatting.cutoffs import Cutoffs
 
 @dataclass(frozen=True)
 class RayTerms:
-    """What the peak along a pixel's ray depends on: see ``drgs.accuracy.exact``."""
+    """Parameters of the peak along a pixel's ray: see ``drgs.accuracy.exact``."""
 
-    tilt_x: Any  # Float: how the peak's depth changes across the film, kappa or g / |a_c|
-    tilt_y: Any  # Float
-    spread: Any  # Float: h, of the depth where the place on the film is known
-    scale: Any = None  # Float: 1 / |a_c|, what the whitening is multiplied by; None: 1
+    tilt_x: Float  # how the peak's depth changes across the film, kappa or g / |a_c|
+    tilt_y: Float
+    spread: Float  # h, of the depth where the place on the film is known
+    scale: Float | None = None  # 1 / |a_c|, what the whitening is multiplied by; None: 1
 
-    def numbers(self) -> list[Any]:
-        """Those that there are, Float each."""
+    def numbers(self) -> list[Float]:
+        """All numbers that are set."""
         numbers = [self.tilt_x, self.tilt_y, self.spread]
         return numbers if self.scale is None else [*numbers, self.scale]
 
@@ -54,18 +55,20 @@ class Splats2D:
     a dx^2 + 2 b dx dy + c dy^2 cancels.
     """
 
-    means2d: Any  # Array2f, px
-    whitening: Any  # Array3f (p, r, s), 1 / px
-    depths: Any  # Float, z in the camera, scene units
-    opacities: Any  # Float in (0, 1)
-    colors: Any  # Array3f, display space; or whatever else :func:`project`'s ``color`` gave
-    variances: Any  # Array2f, px^2: diagonal of the projected covariance, low-pass included
-    visible: Any  # Bool: in front of the near plane, above the alpha cut, finite
-    ray: RayTerms | None = None  # only where something asks for them
-    dimming: Any = None  # Float: factor of the opacity, where the camera is out of focus
+    means2d: Array2f  # px
+    whitening: Array3f  # (p, r, s), 1 / px
+    depths: Float  # z in the camera, scene units
+    opacities: Float  # in (0, 1)
+    colors: (
+        Array3f | Sequence[Float]
+    )  # display space; or whatever else :func:`project`'s ``color`` gave
+    variances: Array2f  # px^2: diagonal of the projected covariance, low-pass included
+    visible: Bool  # in front of the near plane, above the alpha cut, finite
+    ray: RayTerms | None = None  # only where something needs them
+    dimming: Float | None = None  # factor of the opacity, where the camera is out of focus
 
     @property
-    def conics(self) -> Any:
+    def conics(self) -> Array3f:
         """Array3f (a, b, c) of the exponent -(a dx^2 + 2 b dx dy + c dy^2) / 2, px^-2."""
         p, r, s = self.whitening
         return type(self.whitening)(p * p, p * r, r * r + s * s)
@@ -73,30 +76,30 @@ class Splats2D:
 
 @dataclass(frozen=True)
 class FilmShape:
-    """What a Gaussian's mean and covariance are on the film."""
+    """The mean and covariance of a Gaussian on the film."""
 
-    means2d: Any  # Array2f, px
-    whitening: Any  # Array3f (p, r, s), 1 / px
-    variances: Any  # Array2f, px^2, low-pass included
-    determinant: Any  # Float, px^2: of the covariance without low-pass, over the variance in y
-    added_determinant: Any  # Float, px^2: what the low-pass adds to it
+    means2d: Array2f  # px
+    whitening: Array3f  # (p, r, s), 1 / px
+    variances: Array2f  # px^2, low-pass included
+    determinant: Float  # px^2: of the covariance without low-pass, over the variance in y
+    added_determinant: Float  # px^2: what the low-pass adds to it
     ray: RayTerms | None = None
-    dimming: Any = None  # Float: factor of the opacity; None: 1
+    dimming: Float | None = None  # factor of the opacity; None: 1
 
-    def root_determinant(self) -> Any:
-        """Float, 1 / px^2: sqrt(det(conic)) at the mean."""
+    def root_determinant(self) -> Float:
+        """The square root of det(conic) at the mean, 1 / px^2."""
         p, _, s = self.whitening
         if self.ray is not None and self.ray.scale is not None:
             p, s = p / self.ray.scale, s / self.ray.scale
         return dr.abs(p * s)
 
 
-Projection = Callable[["GaussianRows", Camera, Any, float], FilmShape]
+Projection = Callable[["GaussianRows", Camera, Array3f, float], FilmShape]
 """From rows, camera, means (Array3f, camera axes) and low-pass (px^2) to shapes on the film."""
 
 
 class ProjectionModel:
-    """A projection as ``model.projection`` of a configuration names it.
+    """A projection that ``model.projection`` of a configuration can name.
 
     A subclass has a :data:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
     """
@@ -105,15 +108,15 @@ class ProjectionModel:
     shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
 
     @staticmethod
-    def shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+    def shape(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float) -> FilmShape:
         """Project; see :data:`Projection`."""
         raise NotImplementedError
 
 
-OpacityRule = Callable[[Any, Any, Any], Any]
+OpacityRule = Callable[[Float, Float, Float], Float]
 """From an opacity and the two determinants of :class:`FilmShape` to an opacity, Float each."""
 
-SplatColor = Callable[["GaussianRows", Any, int], Sequence[Any]]
+SplatColor = Callable[["GaussianRows", Array3f, int], Array3f | Sequence[Float]]
 """From rows, directions in which means are seen (Array3f, world, of any length) and SH degree to
 what is stored of a splat's colour, Float each."""
 
@@ -122,14 +125,14 @@ what is stored of a splat's colour, Float each."""
 class GaussianRows:
     """The parameters of Gaussians as one value per lane and component."""
 
-    means: Any  # Array3f
-    quats: Any  # Array4f, wxyz
-    log_scales: Any  # Array3f
-    logit_opacities: Any  # Float
-    sh: list[Any]  # (degree + 1)^2 Array3f
-    smoothing: Any = None  # Float: see drgs.effects.smoothing; None: there is none
-    dimming: Any = None  # Float: factor of the opacity; None: 1
-    features: Any = None  # by name: list of Float; None: there are none
+    means: Array3f
+    quats: Array4f  # wxyz
+    log_scales: Array3f
+    logit_opacities: Float  #
+    sh: list[Array3f]  # (degree + 1)^2
+    smoothing: Float | None = None  # see drgs.effects.smoothing; None: there is none
+    dimming: Float | None = None  # factor of the opacity; None: 1
+    features: dict[str, list[Float]] | None = None  # by name; None: there are none
 
 
 def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
@@ -138,7 +141,7 @@ def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
     t = types_of(type(flat))
     row, num_rows = dr.arange(t.UInt32, dr.width(flat)), dr.opaque(t.UInt32, dr.width(flat))
 
-    def load(tensor: Any, stride: int, width: int) -> list[Any]:
+    def load(tensor: TensorXf, stride: int, width: int) -> list[Float]:
         return load_columns(dr.detach(tensor).array, row, num_rows, stride, width)
 
     count = 3 * (sh.num_coefficients(sh_degree) - 1)
@@ -207,7 +210,7 @@ def project(
     )
 
 
-def ewa(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
+def ewa(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float) -> FilmShape:
     """The affine approximation of the projection at the mean (Zwicker et al. 2002, section 4).
 
     position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
@@ -225,7 +228,9 @@ class Ewa(ProjectionModel):
     shape = staticmethod(ewa)
 
 
-def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) -> FilmShape:
+def whiten(
+    means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: float
+) -> FilmShape:
     """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
 
     m0, m1: the rows of M, equally many numbers, px.
@@ -249,7 +254,7 @@ def whiten(means2d: Any, m0: Sequence[Any], m1: Sequence[Any], low_pass: float) 
     )
 
 
-def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
     """The inner product of two vectors of the same length."""
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
@@ -257,18 +262,18 @@ def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return total
 
 
-def color_at_mean(rows: GaussianRows, direction: Any, sh_degree: int) -> Any:
+def color_at_mean(rows: GaussianRows, direction: Array3f, sh_degree: int) -> Array3f:
     """The colour (Array3f) in the ``direction`` in which the mean is seen, of any length."""
     return sh.sh_color(rows.sh, normalized(direction), sh_degree)
 
 
-def plain_opacity(opacity: Any, determinant: Any, added_determinant: Any) -> Any:
+def plain_opacity(opacity: Float, determinant: Float, added_determinant: Float) -> Float:
     """The opacity as it is: low-pass filtering makes small splats larger and thus brighter."""
     del determinant, added_determinant
     return opacity
 
 
-def compensated_opacity(opacity: Any, determinant: Any, added_determinant: Any) -> Any:
+def compensated_opacity(opacity: Float, determinant: Float, added_determinant: Float) -> Float:
     """Opacity scaled by sqrt(det without / det with low-pass): the splat's integral is kept.
 
     determinant, added_determinant: Float, of the covariance on the film without low-pass, and what
@@ -285,8 +290,8 @@ def compensated_opacity(opacity: Any, determinant: Any, added_determinant: Any) 
 
 
 def film_axes(
-    rows: GaussianRows, camera: Camera, position: Any, slopes: Any
-) -> tuple[Any, Any, Any]:
+    rows: GaussianRows, camera: Camera, position: Array3f, slopes: list[Float] | None
+) -> tuple[Array3f, Array3f, Array3f]:
     """The half axes of a Gaussian as rows of two matrices: on the film, and in depth.
 
     The first two are those of M = J R_camera R(q) diag(s), px; the third the same for the depth
@@ -294,14 +299,14 @@ def film_axes(
     """
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
 
-    def along(direction: Any) -> Any:
+    def along(direction: Array3f) -> Array3f:
         return (world_from_splat.T @ direction) * scales
 
     m0, m1 = map(along, camera.lens.projection_jacobian(camera, position, slopes))
     return m0, m1, along(camera.lens.depth_direction(camera, position))
 
 
-def world_axes(rows: GaussianRows) -> list[Any]:
+def world_axes(rows: GaussianRows) -> list[Array3f]:
     """The three half axes of a Gaussian, Array3f, world."""
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
     Array3f = types_of(type(rows.logit_opacities)).Array3f
@@ -311,7 +316,7 @@ def world_axes(rows: GaussianRows) -> list[Any]:
     ]
 
 
-def _sigmoid(x: Any) -> Any:
+def _sigmoid(x: Float) -> Float:
     """1 / (1 + e^-x) without overflow for large |x|."""
     # Not dr.abs: its derivative at 0 is 0, and a logit of exactly 0 would never move.
     decayed = dr.exp(dr.select(x >= 0, -x, x))

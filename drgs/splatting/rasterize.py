@@ -48,7 +48,8 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import Rows, divide, quotient, scatter_rows, types_of
+from drgs.core.arrays import Rows, divide, quotient, reinterpret, scatter_rows, types_of
+from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.splatting.footprint import Alpha, SplatFeatures
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
 from drgs.splatting.lanes import (
@@ -77,13 +78,13 @@ from drgs.splatting.tiles import TileBins
 class Layers:
     """The composited image, stored one row per micro-tile of each sample."""
 
-    values: Any  # Float (tiles * 16 * (1 + C) * 16,): row: transmittance, then each plane
-    ends: Any  # UInt32 (tiles * 16 * 16,): sorted entry from which on a pixel composited nothing
-    stop: Any  # UInt32 (tiles * 16,): the largest of them in each micro-tile
+    values: Float  # (tiles * 16 * (1 + C) * 16,): row: transmittance, then each plane
+    ends: UInt32  # (tiles * 16 * 16,): sorted entry from which on a pixel composited nothing
+    stop: UInt32  # (tiles * 16,): the largest of them in each micro-tile
     count: int  # C, planes
     grid: TileGrid
 
-    def planes(self) -> list[Any]:
+    def planes(self) -> list[Float]:
         """1 + C planes in row-major pixel order, Float (samples * H * W,), not evaluated.
 
         The first is T, the transmittance left for the background; then sum_i w_i c_i for each
@@ -102,8 +103,8 @@ class Layers:
         return [dr.gather(t.Float, self.values, index + PIXELS * k) for k in range(1 + self.count)]
 
 
-def composite_step(transmittance: Any, alpha: Any, stop: float) -> tuple[Any, Any, Any]:
-    """Composite one alpha: (weight, next transmittance, whether the pixel goes on).
+def composite_step(transmittance: Float, alpha: Float, stop: float) -> tuple[Float, Float, Bool]:
+    """Composite one alpha; return its weight, the next transmittance, and unfinished pixels.
 
     stop: the last transmittance that a pixel may have.
 
@@ -118,7 +119,7 @@ def composite_step(transmittance: Any, alpha: Any, stop: float) -> tuple[Any, An
 
 @dataclass(frozen=True)
 class Records:
-    """What compositing loads for each sorted entry: its splat's geometry and features.
+    """The rows that compositing loads, one per sorted entry: its splat's geometry and features.
 
     A splat that touches several tiles is stored several times, so that the lanes of a tile read
     memory in order instead of jumping from splat to splat.
@@ -129,8 +130,8 @@ class Records:
     num_features: int
 
     @staticmethod
-    def of(bins: TileBins, numbers: Callable[[Any, Any], list[Any]]) -> Records:
-        """Copies, evaluated, of each rank's ``numbers``, such as those of ``bins.rows.load``.
+    def of(bins: TileBins, numbers: Callable[[UInt32, Bool], list[Float]]) -> Records:
+        """Copy each rank's ``numbers``, such as those of ``bins.rows.load``, and evaluate them.
 
         numbers: given ranks, and which lanes are active. Entries that touch nothing have zeros.
         """
@@ -138,12 +139,12 @@ class Records:
         dr.eval(rows)
         return Records(rows, bins.model.falloff.num_geometry, bins.num_features)
 
-    def load(self, entry: Any, active: Any) -> tuple[list[Any], list[Any]]:
+    def load(self, entry: UInt32, active: Bool) -> tuple[list[Float], list[Float]]:
         """Geometry and features of a sorted entry."""
         numbers = self.rows.load(entry, active)
         return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
 
-    def load_keys(self, entry: Any, active: Any) -> list[Any]:
+    def load_keys(self, entry: UInt32, active: Bool) -> list[Float]:
         """Keys of a sorted entry."""
         return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
 
@@ -166,7 +167,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
     model = bins.model.bind(lanes, bins.grid)
     count = model.features.num_planes(bins.num_features)
 
-    def body(cursor: Cursor, pixels: list, unfinished: Any) -> tuple:
+    def body(cursor: Cursor, pixels: list, unfinished: Bool) -> tuple:
         entry, active = entries.current(cursor)
         geometry, features = records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
@@ -211,16 +212,16 @@ def composite(bins: TileBins, records: Records) -> Layers:
     return layers
 
 
-def any_unfinished(transmittances: list[Any]) -> Any:
-    """Whether a transmittance has no negative sign: the bits that all share tell."""
-    Int = dr.int_array_t(type(transmittances[0]))
-    shared = dr.reinterpret_array(Int, transmittances[0])
+def any_unfinished(transmittances: list[Float]) -> Bool:
+    """Return lanes with a transmittance that is not negative, from the bits that all share."""
+    Int: Any = dr.int_array_t(type(transmittances[0]))
+    shared = reinterpret(Int, transmittances[0])
     for T in transmittances[1:]:
-        shared &= dr.reinterpret_array(Int, T)
+        shared &= reinterpret(Int, T)
     return shared >= 0
 
 
-def largest(values: list[Any]) -> Any:
+def largest(values: list[UInt32]) -> UInt32:
     """The largest of several numbers, lane by lane."""
     result = values[0]
     for v in values[1:]:
@@ -240,24 +241,24 @@ ONE_SAMPLE = range(1)
 class SplatGradients:
     """Derivatives of the loss with respect to the 2D splats, in the order of the Gaussians."""
 
-    geometry: list[Any]  # Float each: mean x, y (per px), p, r, s, opacity, more of the falloff's
-    features: list[Any]  # Float each
+    geometry: list[Float]  # mean x, y (per px), p, r, s, opacity, more of the falloff's
+    features: list[Float]
 
     def plus(self, other: SplatGradients) -> SplatGradients:
-        """The sum."""
+        """Add other derivatives of the same splats."""
         return SplatGradients(
             geometry=[a + b for a, b in zip(self.geometry, other.geometry, strict=True)],
             features=[a + b for a, b in zip(self.features, other.features, strict=True)],
         )
 
     @property
-    def means2d(self) -> Any:
-        """Array2f, loss per px."""
+    def means2d(self) -> Array2f:
+        """Derivatives of the means on the film, loss per px."""
         return types_of(type(self.geometry[0])).Array2f(self.geometry[:2])
 
     @property
-    def opacities(self) -> Any:
-        """Float."""
+    def opacities(self) -> Float:
+        """Derivatives of the opacities."""
         return self.geometry[5]
 
 
@@ -265,12 +266,12 @@ def composite_adjoint(
     bins: TileBins,
     records: Records,
     layers: Layers,
-    d_features: list[Any],
-    d_transmittance: Any,
+    d_features: list[Float],
+    d_transmittance: Float,
     samples: range = ONE_SAMPLE,
     before: SplatGradients | None = None,
 ) -> SplatGradients:
-    """Derivatives with respect to the splats, given those with respect to the planes.
+    """Return derivatives with respect to the splats, given those with respect to the planes.
 
     layers: what :func:`composite` returned for the same bins and records; d_features: C planes
     (samples * H * W,); d_transmittance: plane (samples * H * W,); samples: those of the layers that
@@ -285,7 +286,7 @@ def composite_adjoint(
         partials = _partials(bins, records, layers, slots, d_features, d_transmittance)
         sum_entries(bins, pairs, slots, partials, sums)
 
-    def totals(rank: Any, sample: Any) -> list[Any]:
+    def totals(rank: UInt32, sample: UInt32) -> list[Float]:
         return sum_runs(sums.Float, pairs.first_row, pairs.run(rank, sample), sums.load)
 
     return splat_gradients(bins, totals, len(samples), before)
@@ -296,10 +297,10 @@ def _partials(
     records: Records,
     layers: Layers,
     slots: Slots,
-    d_features: list[Any],
-    d_transmittance: Any,
+    d_features: list[Float],
+    d_transmittance: Float,
 ) -> Rows:
-    """By slot: moments, and derivatives of the features, summed over 16 pixels; evaluated."""
+    """Return, by slot, moments and features' derivatives summed over 16 pixels; evaluated."""
     t, tiles = types_of(bins.rows.Float), slots.band.tiles
     lanes = make_lanes(t.Float, bins.grid, tiles=tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
@@ -316,7 +317,7 @@ def _partials(
 
     # A packet is stored with a branch for each lane, and across branches numbers wait in memory
     # instead of registers. A turn therefore begins with storing what the one before has summed.
-    def body(cursor: Cursor, slot: Any, pixels: list, sums: list, is_summed: Any) -> tuple:
+    def body(cursor: Cursor, slot: UInt32, pixels: list, sums: list, is_summed: Bool) -> tuple:
         partials.store(sums, slot, is_summed)
         entry, active = entries.current(cursor)
         slot = dr.select(active, slot - 1, slot)
@@ -350,13 +351,13 @@ def _partials(
 
 def _adjoint_step(
     alphas: list[Alpha],
-    composited: list[Any],
-    stored: list[Any],
+    composited: list[Bool],
+    stored: list[Float],
     features: SplatFeatures,
-    pixels: list[list[Any]],
-    g: list[list[Any]],
+    pixels: list[list[Float]],
+    g: list[list[Float]],
 ) -> tuple[list, list, list]:
-    """One splat at 16 pixels: T and b before it, d loss / d ln(alpha), d loss / d stored (summed).
+    """Return T and b before a splat at 16 pixels, d loss / d ln(alpha), and d loss / d stored.
 
     composited: whether each pixel was still unfinished; stored: what is stored of the splat, and
     features: what they are at a pixel; pixels: T and b of each, past the splat; g: [plane][pixel]
@@ -379,11 +380,11 @@ def _adjoint_step(
 
 def splat_gradients(
     bins: TileBins,
-    totals: Callable[[Any, Any], list[Any]],
+    totals: Callable[[UInt32, UInt32], list[Float]],
     num_samples: int,
     before: SplatGradients | None,
 ) -> SplatGradients:
-    """From each splat's sums, by rank, to its derivatives, by Gaussian.
+    """Return the derivatives of each splat, by Gaussian, from its sums, by rank.
 
     totals: from ranks and a sample to moments, and derivatives of the features; before: what the
     samples' derivatives are added to, in their order.
@@ -393,12 +394,12 @@ def splat_gradients(
     rank, count = dr.arange(t.UInt32, size), falloff.num_geometry
     geometry = bins.rows.load(rank)[:count]
 
-    def terms(sample: Any) -> list[Any]:
+    def terms(sample: UInt32) -> list[Float]:
         sums = totals(rank, sample)
         columns = falloff.derivatives(geometry, sums[: falloff.num_moments])
         return columns + sums[falloff.num_moments :]
 
-    def add(sample: Any, columns: list[Any]) -> tuple[Any, list[Any]]:
+    def add(sample: UInt32, columns: list[Float]) -> tuple[UInt32, list[Float]]:
         return sample + 1, [total + x for total, x in zip(columns, terms(sample), strict=True)]
 
     if before is None:
@@ -431,7 +432,7 @@ def splat_gradients(
 def composite_tangent(
     bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
 ) -> Layers:
-    """Directional derivatives of the planes along ``tangents`` of the 2D splats.
+    """Return directional derivatives of the planes along ``tangents`` of the 2D splats.
 
     tangents: the same fields as the gradients, holding the direction. Returns the tangents of
     the planes that :func:`composite` made. Not differentiated: the order, the decisions.
@@ -488,11 +489,11 @@ def composite_tangent(
 
 
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
-    """The records' tangents: of the geometry as the falloff wants it, and of the features."""
+    """Return the tangents of the records: geometry, in the falloff's form, and features."""
     t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
 
-    def by_rank(columns: list[Any]) -> list[Any]:
+    def by_rank(columns: list[Float]) -> list[Float]:
         return [dr.gather(t.Float, column, bins.order) for column in columns]
 
     geometry = bins.rows.load(rank)[: bins.model.falloff.num_geometry]

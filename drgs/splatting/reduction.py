@@ -14,12 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import Rows, divide, interleave, repeat_array, types_of
+from drgs.core.types import Array2u, Bool, Float, UInt32
 from drgs.splatting.grid import MICROS
 from drgs.splatting.lanes import Entries
 from drgs.splatting.tiles import WORD, TileBins, transpose_masks
@@ -37,15 +37,15 @@ class CompositedPairs:
     Entries, sorted and unsorted, and ranks are counted on from sample to sample.
     """
 
-    masks: Any  # UInt32 (S * M padded,): sorted -> bit per micro-tile
-    words: Any  # UInt32 (S * M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
-    row: Any  # UInt32 (S * M + 1,): unsorted -> row of sums, or of the next entry that is seen
-    first_row: Any  # UInt32 (S * (N + 1),): rank -> first of its rows; one more for each sample
+    masks: UInt32  # (S * M padded,): sorted -> bit per micro-tile
+    words: UInt32  # (S * M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
+    row: UInt32  # (S * M + 1,): unsorted -> row of sums, or of the next entry that is seen
+    first_row: UInt32  # (S * (N + 1),): rank -> first of its rows; one more for each sample
     samples: range  # of the layers
 
     @staticmethod
-    def of(bins: TileBins, stop: Any, samples: range) -> CompositedPairs:
-        """Those before each micro-tile's ``stop``, see :class:`drgs.splatting.rasterize.Layers`."""
+    def of(bins: TileBins, stop: UInt32, samples: range) -> CompositedPairs:
+        """Find the pairs before each micro-tile's ``stop``; see :class:`.Layers`."""
         t, count = types_of(bins.rows.Float), len(samples)
         padded, num_entries = dr.width(bins.masks), bins.num_entries
         _, entry = divide(dr.arange(t.UInt32, count * padded), padded, count)
@@ -66,20 +66,20 @@ class CompositedPairs:
         dr.eval(words, first_row)
         return CompositedPairs(masks, words, row, first_row, samples)
 
-    def run(self, rank: Any, sample: Any) -> Any:
+    def run(self, rank: UInt32, sample: UInt32) -> UInt32:
         """Return the place of a splat's rows in ``first_row``; sample: number among the samples."""
         num_ranks = dr.width(self.first_row) // len(self.samples)
         return sample * dr.opaque(type(rank), num_ranks) + rank
 
     @property
     def num_rows(self) -> int:
-        """Entries that are seen. Waits for the device."""
+        """Number of entries that are seen; waits for the device."""
         return int(self.row[dr.width(self.row) - 1])
 
 
 @dataclass(frozen=True)
 class Band:
-    """Consecutive tiles, their sorted entries, and how many slots these have."""
+    """Consecutive tiles, their sorted entries, and the number of slots of these."""
 
     tiles: range  # of all samples of the layers
     entries: range  # of all samples of the pairs
@@ -93,7 +93,7 @@ class Band:
 
 
 def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
-    """The film of each sample in bands. The host reads how many slots and entries each tile has."""
+    """Cut the film of each sample into bands; the host reads the slots and entries of each tile."""
     t, count = types_of(bins.rows.Float), len(pairs.samples)
     running = dr.cumsum(dr.popcnt(pairs.masks))
     starts = repeat_array(bins.tile_start, count, dr.width(bins.masks))
@@ -110,15 +110,15 @@ def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
     ]
 
 
-def _without_inner_ends(column: Any, count: int) -> np.ndarray:
-    """Starts of all tiles and the end of the last, of ``count`` columns with an end each."""
+def _without_inner_ends(column: UInt32, count: int) -> np.ndarray:
+    """Return the starts of all tiles and the last end, from ``count`` columns with an end each."""
     columns = np.array(column, np.int64).reshape(count, -1)
     return np.append(columns[:, :-1], columns[-1, -1])
 
 
 @dataclass(frozen=True)
 class Slots:
-    """Where each composited (entry, micro-tile) pair of a band stores its partial derivatives.
+    """Places for the partial derivatives of each composited (entry, micro-tile) pair of a band.
 
     First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
     those of the second ones, and so on: what a lane writes is contiguous. (In the order in which
@@ -126,35 +126,35 @@ class Slots:
     micro-tile's stop have no slot, so that every slot is written exactly once.
     """
 
-    pairs: Any  # UInt32 (groups * 16 * 2,): (group, micro-tile) -> first slot, bits
-    first_group: Any  # UInt32 (1,): of the band
+    pairs: UInt32  # (groups * 16 * 2,): (group, micro-tile) -> first slot, bits
+    first_group: UInt32  # (1,): of the band
     band: Band
     samples: range  # of the pairs
     groups_of_sample: int
 
-    def at(self, group: Any, micro: Any, active: Any = True) -> tuple[Any, Any]:
-        """First slot of a group of entries in a micro-tile, and the word of its composited bits.
+    def at(self, group: UInt32, micro: UInt32, active: Bool | bool = True) -> Array2u:
+        """Return the first slot of a group of entries in a micro-tile, and its composited bits.
 
         group: among those of all samples of the pairs.
         """
         index = (group - self.first_group) * MICROS + micro
         return dr.gather(types_of(type(group)).Array2u, self.pairs, index, active)
 
-    def end(self, entries: Entries) -> Any:
-        """Where each lane's slots end."""
+    def end(self, entries: Entries) -> UInt32:
+        """Return the end of each lane's slots."""
         last = self._first_of_sample(entries) + entries.last
         first, word = self.at(last, entries.micro, entries.head != 0)
         return first + dr.popcnt(word & entries.tail)
 
-    def number(self, entries: Entries) -> Any:
-        """How many slots each lane has."""
+    def number(self, entries: Entries) -> UInt32:
+        """Return the number of slots of each lane."""
         occupied = entries.head != 0
         first_group = self._first_of_sample(entries) + entries.first
         first, word = self.at(first_group, entries.micro, occupied)
         begin = first + dr.popcnt(word & ~entries.head)
         return dr.select(occupied, self.end(entries) - begin, 0)
 
-    def _first_of_sample(self, entries: Entries) -> Any:
+    def _first_of_sample(self, entries: Entries) -> UInt32:
         """The first group of each lane's sample."""
         start, groups = self.samples.start, self.groups_of_sample
         start, groups = (dr.opaque(type(self.first_group), number) for number in (start, groups))
@@ -179,7 +179,7 @@ def assign_slots(pairs: CompositedPairs, band: Band) -> Slots:
     return Slots(table, first_group, band, pairs.samples, of_sample)
 
 
-def _words(pairs: CompositedPairs, band: Band, group: Any, micro: Any) -> Any:
+def _words(pairs: CompositedPairs, band: Band, group: UInt32, micro: UInt32) -> UInt32:
     """The composited bits of entries of the band."""
     UInt32 = type(group)
     start, stop = (dr.opaque(UInt32, n) for n in (band.entries.start, band.entries.stop))
@@ -201,7 +201,7 @@ def sum_entries(
     entry = dr.opaque(t.UInt32, slots.band.entries.start) + dr.arange(t.UInt32, count)
     group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
 
-    def body(micros: Any, totals: list) -> tuple:
+    def body(micros: UInt32, totals: list) -> tuple:
         for _ in range(2):  # two at a time wait for memory together
             active = micros != 0
             first, word = slots.at(group, dr.tzcnt(micros), active)
@@ -227,7 +227,9 @@ def sum_entries(
     dr.eval(sums)
 
 
-def sum_runs(Float: type, first: Any, run: Any, load: Callable[[Any], Sequence[Any]]) -> list[Any]:
+def sum_runs(
+    Float: type, first: UInt32, run: UInt32, load: Callable[[UInt32], Sequence[Float]]
+) -> list[Float]:
     """Sums over runs, one lane a run: run r is from ``first[r]`` to ``first[r + 1]``.
 
     run: r of each lane; load: the numbers of an element of a run.
@@ -236,7 +238,7 @@ def sum_runs(Float: type, first: Any, run: Any, load: Callable[[Any], Sequence[A
     begin, end = (dr.gather(UInt32, first, run + k) for k in (0, 1))
     width = len(load(begin))
 
-    def body(element: Any, totals: list) -> tuple:
+    def body(element: UInt32, totals: list) -> tuple:
         return element + 1, [a + b for a, b in zip(totals, load(element), strict=True)]
 
     zero = dr.zeros(Float, dr.width(run))

@@ -1,8 +1,8 @@
 """The stages composed: from Gaussians and a camera to planes of pixels, and back.
 
-A :class:`Pipeline` says what a scene calls for: which SH degree, which opacity rule, which features
-are composited, which approximations are made. It does so by naming functions and objects, and
-Dr.Jit traces only what is called: what is not composed in leaves no instruction in any kernel.
+A :class:`Pipeline` holds the SH degree, the opacity rule, the features that are composited and the
+approximations, as functions and objects. Dr.Jit traces only what is called, so that a stage that is
+not composed in leaves no instruction in any kernel.
 ``drgs.config.approximations`` makes a pipeline from names.
 
 The chain is  Gaussians -> ``project`` -> Splats2D -> ``footprints_of`` -> Footprints
@@ -25,6 +25,7 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
 from drgs.core.constants import LOW_PASS
+from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting.feature_groups import in_groups
 from drgs.splatting.footprint import DEFAULT, FootprintModel
@@ -53,17 +54,17 @@ from drgs.splatting.rasterize import (
 )
 from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
 
-Feature = Callable[[Splats2D, GaussianRows, Camera], list[Any]]
+Feature = Callable[[Splats2D, GaussianRows, Camera], list[Float]]
 """Something that is composited of each splat: columns, Float (N,) each, one for each plane."""
 
 
-def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
     """Red, green and blue in display space: three planes."""
     del rows, camera
     return list(splats.colors)
 
 
-def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
     """z in the camera, scene units: one plane, the alpha-weighted sum of the depths."""
     del rows, camera
     return [splats.depths]
@@ -72,7 +73,7 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
 @ORDERS.register("center")
 @dataclass(frozen=True)
 class CenterOrder:
-    """In which order a pixel composites its splats: here, all by the depth of their means.
+    """The order in which a pixel composites its splats: by the depth of their means.
 
     The base of all orders.
     """
@@ -86,16 +87,16 @@ class CenterOrder:
         return projection.shape, cls()
 
     def for_camera(self, camera: Camera) -> CenterOrder:
-        """For any camera."""
+        """Return this order for one camera; here, nothing depends on it."""
         del camera
         return self
 
-    def keys(self, splats: Splats2D) -> list[Any]:
+    def keys(self, splats: Splats2D) -> list[Float]:
         """Return columns that compositing needs besides the order of the entries."""
         del splats
         return []
 
-    def sort_depths(self, splats: Splats2D) -> Any:
+    def sort_depths(self, splats: Splats2D) -> Float:
         """Return the depths by which the entries are sorted, Float (N,), the smallest first."""
         return splats.depths
 
@@ -112,8 +113,8 @@ class CenterOrder:
         bins: TileBins,
         records: Records,
         layers: Layers,
-        d_features: list[Any],
-        d_transmittance: Any,
+        d_features: list[Float],
+        d_transmittance: Float,
         samples: range = ONE_SAMPLE,
         before: SplatGradients | None = None,
     ) -> SplatGradients:
@@ -129,22 +130,22 @@ class CenterOrder:
 
 
 class ProjectionStage(Protocol):
-    """Where the splats of a frame come from, and where their derivatives go."""
+    """The source of a frame's splats, and the destination of their derivatives."""
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-        """The splats as ``camera`` sees them."""
+        """Return the splats of the Gaussians for ``camera``."""
         ...
 
     def gradients(
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
     ) -> GaussianGradients:
-        """Derivatives of the loss, from those with respect to the splats of a frame."""
+        """Return derivatives of the loss, from those with respect to the splats of a frame."""
         ...
 
 
 @dataclass(frozen=True)
 class Projected:
-    """The Gaussians that are to be rendered, projected."""
+    """Project the Gaussians that are rendered, and go back through the projection."""
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
         """Project them."""
@@ -159,13 +160,13 @@ class Projected:
 
 
 def as_loaded(rows: GaussianRows) -> GaussianRows:
-    """The Gaussians as they are."""
+    """Return the Gaussians unchanged."""
     return rows
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """What is rendered, and how; see the module's description."""
+    """The stages and approximations of a rendering; see the module's description."""
 
     sh_degree: int = 3
     opacity_rule: OpacityRule = plain_opacity
@@ -201,7 +202,7 @@ class Pipeline:
             splats = replace(splats, visible=splats.visible & finite)
         return splats
 
-    def feature_columns(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+    def feature_columns(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
         """The columns of all features, in order."""
         return [column for feature in self.features for column in feature(splats, rows, camera)]
 
@@ -217,7 +218,7 @@ class Frame:
     records: Any  # of that order
     layers: Layers  # of that order
 
-    def planes(self) -> list[Any]:
+    def planes(self) -> list[Float]:
         """Transmittance, then the pipeline's features, unevaluated.
 
         Each Float (samples * H * W,): the pixels of the first sample, then those of the second.
@@ -230,10 +231,10 @@ class GaussianGradients:
     """Derivatives of the loss, shaped like the parameters, and what densification needs."""
 
     parameters: Gaussians | None  # None: the splats came from elsewhere, where theirs are found
-    means2d: Any  # Array2f (N,): loss per px
-    visible: Any  # Bool (N,): the Gaussian's extent touches the film
-    first_fault: Any  # UInt32 (1,): of ``parameters``, see :func:`decode_fault`
-    camera: list[Any] | None = None  # Float (1,): of ``camera.numbers()``, where found here
+    means2d: Array2f  # (N,): loss per px
+    visible: Bool  # (N,): the Gaussian's extent touches the film
+    first_fault: UInt32  # (1,): of ``parameters``, see :func:`decode_fault`
+    camera: list[Float] | None = None  # (1,) each: of ``camera.numbers()``, where found here
 
 
 def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
@@ -253,7 +254,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
 
 
 def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-    """What compositing needs of ``gaussians``, from projection; see :func:`render`."""
+    """Project ``gaussians`` and store what compositing needs; see :func:`render`."""
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
     columns = pipeline.feature_columns(splats, rows, camera)
@@ -264,7 +265,7 @@ def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline)
 
 
 def render_again(frame: Frame, model: FootprintModel) -> Frame:
-    """The same splats, in the same tiles, with another image model.
+    """Composite the same splats, in the same tiles, with another footprint model.
 
     model: that of the frame's pipeline, but for points of the pixels within the same margin, or
     for features that are composited of the same stored numbers.
@@ -277,10 +278,10 @@ def render_again(frame: Frame, model: FootprintModel) -> Frame:
 def frames_adjoint(
     gaussians: Gaussians,
     frames: list[Frame],
-    d_planes: list[list[Any]],
+    d_planes: list[list[Float]],
     of_camera: bool = False,
 ) -> GaussianGradients:
-    """Derivatives of a loss with respect to all parameters.
+    """Return derivatives of a loss with respect to all parameters.
 
     The loss depends on several frames of the same splats and one camera.
 
@@ -299,6 +300,7 @@ def frames_adjoint(
         for first in range(0, bins.grid.samples, at_once):
             samples = range(first, min(first + at_once, bins.grid.samples))
             total = frame.order.adjoint(bins, *inputs, samples, total)
+    assert total is not None, "there is at least one frame"
     return frames[0].pipeline.source.gradients(gaussians, frames[0], total, of_camera)
 
 
@@ -314,9 +316,9 @@ def gradients_of(
     of_splats: SplatGradients,
     of_camera: bool = False,
 ) -> GaussianGradients:
-    """From the derivatives of the 2D splats to those of the parameters, by Dr.Jit.
+    """Return derivatives of the parameters, from those of the 2D splats, by Dr.Jit.
 
-    As :func:`frames_adjoint`; ``visible`` is what projection says, without regard to the film.
+    See :func:`frames_adjoint`; ``visible`` is that of projection, without regard to the film.
     """
     found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, of_camera)
     # In an order that is the same in every run.
@@ -329,15 +331,16 @@ def gradients_by_row(
     pipeline: Pipeline,
     of_splats: SplatGradients,
     of_camera: bool,
-) -> tuple[GaussianGradients, list[Any]]:
-    """As :func:`gradients_of`, with what each Gaussian adds to the derivatives of the camera.
+) -> tuple[GaussianGradients, list[Float]]:
+    """Return :func:`gradients_of`, and each Gaussian's share of the camera's derivatives.
 
-    These are evaluated: Float (N,) of each of ``camera.numbers()``, none if not ``of_camera``.
+    The shares are evaluated: (N,) of each of ``camera.numbers()``, none if not ``of_camera``.
     """
     rows = load_rows(gaussians, pipeline.sh_degree)
     d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
     columns = _columns_of(d_rows, gaussians, visible)
-    parameters, (faults,) = _as_tensors(columns, gaussians, [_faults(d_rows, visible)])
+    faults = _faults(d_rows, visible)
+    parameters = _as_tensors(columns, gaussians, [faults])
     of_rows = [dr.select(visible, number, 0) for number in d_numbers]
     dr.eval(of_rows)
     found = GaussianGradients(
@@ -351,7 +354,7 @@ def gradients_by_row(
 
 @dataclass(frozen=True)
 class SeenSplats:
-    """What one camera saw of Gaussians, and derivatives with respect to it."""
+    """The derivatives of the splats that one camera sees."""
 
     camera: Camera
     pipeline: Pipeline
@@ -360,29 +363,29 @@ class SeenSplats:
 
 def sum_of_views(
     gaussians: Gaussians, views: Sequence[Sequence[SeenSplats]]
-) -> tuple[Gaussians, list[Any]]:
-    """The sum of what :func:`gradients_of` gives for several views, by one kernel.
+) -> tuple[Gaussians, list[UInt32]]:
+    """Sum :func:`gradients_of` over several views, in one kernel.
 
-    views: what is seen at each time of each view, in which order they are added. What the views
+    views: the derivatives at each time of each view, which are added in this order. What the views
     share is computed once, and the sum stays in registers.
 
     Returns the derivatives, and the first fault of each view.
     """
-    rows, total, faults = load_rows(gaussians, views[0][0].pipeline.sh_degree), None, []
+    rows, faults = load_rows(gaussians, views[0][0].pipeline.sh_degree), []
+    total: dict[str, list[Float]] = {}
     for view in views:
         of_times = []
         for seen in view:
             own = dr.copy(rows)  # whose derivatives are of this camera alone
             d_rows, visible, _ = _back_to_rows(own, seen.camera, seen.pipeline, seen.gradients)
             columns = _columns_of(d_rows, gaussians, visible)
-            total = columns if total is None else _sum_of_columns(total, columns)
+            total = _sum_of_columns(total, columns) if total else columns
             of_times.append(_faults(d_rows, visible))
         faults.append(reduce(dr.minimum, of_times))
-    parameters, faults = _as_tensors(total, gaussians, faults)
-    return parameters, [dr.min(each) for each in faults]
+    return _as_tensors(total, gaussians, faults), [dr.min(each) for each in faults]
 
 
-def _sum_of_columns(a: dict[str, list[Any]], b: dict[str, list[Any]]) -> dict[str, list[Any]]:
+def _sum_of_columns(a: dict[str, list[Float]], b: dict[str, list[Float]]) -> dict[str, list[Float]]:
     return {name: [x + y for x, y in zip(own, b[name], strict=True)] for name, own in a.items()}
 
 
@@ -392,8 +395,8 @@ def _back_to_rows(
     pipeline: Pipeline,
     of_splats: SplatGradients,
     of_camera: bool = False,
-) -> tuple[GaussianRows, Any, list[Any]]:
-    """Derivatives per lane, which of them are visible, and derivatives of the camera's numbers."""
+) -> tuple[GaussianRows, Bool, list[Float]]:
+    """Return derivatives per lane, the visible lanes, and derivatives of the camera's numbers."""
     falloff, numbers = pipeline.model.for_camera(camera).falloff, []
     if of_camera:
         pipeline.model.check_differentiable_in_camera()
@@ -413,8 +416,8 @@ def _back_to_rows(
         return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
 
 
-def weighted_sums(frame: Frame, plane: Any) -> Any:
-    """Of each Gaussian, the sum over pixels of its weight times ``plane``: Float (N,).
+def weighted_sums(frame: Frame, plane: Float) -> Float:
+    """Return, for each Gaussian, the sum over pixels of its weight times ``plane``: (N,).
 
     plane: x, Float (H * W,), the same for all samples. A plane of the frame is C = sum_i w_i c_i,
     so that the adjoint's derivative with respect to c_i is sum w_i g over pixels: here g is x for
@@ -432,9 +435,9 @@ def weighted_sums(frame: Frame, plane: Any) -> Any:
 
 
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
-    """Those of a loss that depends on what several cameras see."""
+    """Add the derivatives of a loss that depends on several cameras."""
     total = GaussianGradients(
-        parameters=None if a.parameters is None else _sum_of(a.parameters, b.parameters),
+        parameters=a.parameters and b.parameters and _sum_of(a.parameters, b.parameters),
         means2d=a.means2d + b.means2d,
         visible=a.visible | b.visible,
         first_fault=dr.select(a.first_fault < b.first_fault, a.first_fault, b.first_fault),
@@ -473,8 +476,8 @@ def frames_tangent(
     gaussians: Gaussians,
     frames: list[Frame],
     tangents: Gaussians,
-    camera_tangents: list[Any] | None = None,
-) -> list[list[Any]]:
+    camera_tangents: list[Float] | None = None,
+) -> list[list[Float]]:
     """Directional derivatives of each frame's planes along ``tangents`` of the parameters.
 
     gaussians: those that ``frames`` were rendered from, all by one camera; camera_tangents: of
@@ -492,9 +495,9 @@ def _splat_tangents(
     gaussians: Gaussians,
     frame: Frame,
     tangents: Gaussians,
-    camera_tangents: list[Any] | None = None,
+    camera_tangents: list[Float] | None = None,
 ) -> SplatGradients:
-    """From a direction of the parameters to that of the 2D splats, by Dr.Jit."""
+    """Return the direction of the 2D splats, from that of the parameters, by Dr.Jit."""
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
     camera, numbers = frame.camera, []
     if camera_tangents is not None:
@@ -521,8 +524,10 @@ def _splat_tangents(
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 
-def _columns_of(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> dict[str, list[Any]]:
-    """Per-lane derivatives by parameter, as many columns as it has.
+def _columns_of(
+    d_rows: GaussianRows, gaussians: Gaussians, visible: Bool
+) -> dict[str, list[Float]]:
+    """Return per-lane derivatives by parameter, as many columns as it has.
 
     Rows that are not visible have zero gradient, also where their values are not finite; so have
     SH coefficients above the pipeline's degree.
@@ -540,21 +545,21 @@ def _columns_of(d_rows: GaussianRows, gaussians: Gaussians, visible: Any) -> dic
     }
 
 
-def _parameter_columns(rows: GaussianRows) -> dict[str, list[Any]]:
+def _parameter_columns(rows: GaussianRows) -> dict[str, list[Float]]:
     """The columns of ``PARAMETER_NAMES``, as far as they were loaded."""
     return {
-        "means": rows.means,
-        "quats": rows.quats,
-        "log_scales": rows.log_scales,
+        "means": [*rows.means],
+        "quats": [*rows.quats],
+        "log_scales": [*rows.log_scales],
         "logit_opacities": [rows.logit_opacities],
-        "sh0": rows.sh[0],
+        "sh0": [*rows.sh[0]],
         "shN": [component for vector in rows.sh[1:] for component in vector],
     }
 
 
 def _as_tensors(
-    columns: dict[str, list[Any]], gaussians: Gaussians, others: list[Any]
-) -> tuple[Gaussians, list[Any]]:
+    columns: dict[str, list[Float]], gaussians: Gaussians, others: list[UInt32]
+) -> Gaussians:
     """Columns as tensors shaped like the parameters; evaluated together with ``others``."""
     t = types_of(type(gaussians.logit_opacities))
     stored = {name: store_columns(own) for name, own in columns.items()}
@@ -567,15 +572,15 @@ def _as_tensors(
         return t.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
 
     features = gaussians.features
-    gradients = Gaussians(
-        **{name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES},
+    parameters = {name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES}
+    return Gaussians(
+        **parameters,
         smoothing=gradient("smoothing", gaussians.smoothing) if "smoothing" in stored else None,
         features=features and {name: gradient(name, like) for name, like in features.items()},
     )
-    return gradients, others
 
 
-def _faults(d_rows: GaussianRows, visible: Any) -> Any:
+def _faults(d_rows: GaussianRows, visible: Bool) -> UInt32:
     """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``NO_FAULT``."""
     UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
     row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
@@ -588,8 +593,8 @@ def _faults(d_rows: GaussianRows, visible: Any) -> Any:
     return dr.select(visible, faults, NO_FAULT)
 
 
-def on_film(bins: TileBins) -> Any:
-    """Bool per Gaussian: it has entries."""
+def on_film(bins: TileBins) -> Bool:
+    """Return the Gaussians that have entries."""
     t = types_of(bins.rows.Float)
     rank = dr.arange(t.UInt32, dr.width(bins.order))
     first, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))

@@ -18,13 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from drgs.core.arrays import Rows, interleave, types_of
 from drgs.core.errors import UserError
 from drgs.core.private import bucket_order
+from drgs.core.types import Array2u, Float, UInt32
 from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
 from drgs.splatting.projection import Splats2D
@@ -42,17 +42,17 @@ class TileBins:
     to a multiple of 32 with entries that touch nothing.
     """
 
-    order: Any  # UInt32 (N,): rank -> index of the Gaussian
+    order: UInt32  # (N,): rank -> index of the Gaussian
     rows: Rows  # by rank: geometry, features, keys
     num_features: int
     num_keys: int
-    first_entry: Any  # UInt32 (N + 1,): rank -> first of its run of unsorted entries
-    source: Any  # UInt32 (M padded,): sorted -> unsorted
-    ranks: Any  # UInt32 (M padded,): sorted -> rank
-    tiles: Any  # UInt32 (M padded,): sorted -> tile
-    masks: Any  # UInt32 (M padded,): sorted -> bit per micro-tile that the splat touches
-    words: Any  # UInt32 (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
-    tile_start: Any  # UInt32 (tiles + 1,): tile -> first sorted entry
+    first_entry: UInt32  # (N + 1,): rank -> first of its run of unsorted entries
+    source: UInt32  # (M padded,): sorted -> unsorted
+    ranks: UInt32  # (M padded,): sorted -> rank
+    tiles: UInt32  # (M padded,): sorted -> tile
+    masks: UInt32  # (M padded,): sorted -> bit per micro-tile that the splat touches
+    words: UInt32  # (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
+    tile_start: UInt32  # (tiles + 1,): tile -> first sorted entry
     num_entries: int  # M
     grid: TileGrid
     model: FootprintModel
@@ -65,7 +65,7 @@ class TileBins:
 
 @dataclass(frozen=True)
 class Footprints:
-    """What tiles and compositing need to know of splats, stored: a row each.
+    """The stored splats that tiles and compositing read: a row each.
 
     Splats of several of these, put behind one another, are binned as if they had been projected
     together, since every number depends on one splat alone.
@@ -73,7 +73,7 @@ class Footprints:
 
     boxes: Rows  # first column and row of tiles, columns, number of tiles
     rows: Rows  # geometry, features, keys
-    depths: Any  # Float (N,), to sort by; inf: not visible
+    depths: Float  # (N,), to sort by; inf: not visible
     num_features: int
     num_keys: int
 
@@ -81,11 +81,11 @@ class Footprints:
 def footprints_of(
     splats: Splats2D,
     grid: TileGrid,
-    features: Sequence[Any] = (),
+    features: Sequence[Float] = (),
     model: FootprintModel = DEFAULT,
-    keys: Sequence[Any] = (),
+    keys: Sequence[Float] = (),
 ) -> Footprints:
-    """What is to be binned of ``splats``, evaluated.
+    """Store ``splats`` for binning, evaluated.
 
     features: columns, one value per Gaussian, that compositing will read beside the geometry;
     keys: more of them, that it will not composite. Neither they nor the splats need to be
@@ -112,7 +112,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
             f"{dr.width(depths):,}; render them in parts, or prune them"
         )
     # A stable sort: equal depths stay in the order of the Gaussians.
-    order = dr.argsort(depths)
+    order = t.UInt32(dr.argsort(depths))
     # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
     box = boxes.load(order)
     boxes, rows, counts = Rows.of(box), Rows.of(rows.load(order)), t.UInt32(box[-1])
@@ -151,9 +151,9 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
 
 
 def _store_rows(
-    splats: Splats2D, grid: TileGrid, stored: Sequence[Any], model: FootprintModel
-) -> tuple[Rows, Rows, Any]:
-    """By Gaussian, evaluated at once: boxes of tiles, all other numbers, depths to sort by."""
+    splats: Splats2D, grid: TileGrid, stored: Sequence[Float], model: FootprintModel
+) -> tuple[Rows, Rows, Float]:
+    """Return, by Gaussian, boxes of tiles, all other numbers, and depths to sort by; evaluated."""
     geometry = model.falloff.geometry(splats)
     boxes, rows = Rows.of(_tile_box(splats, geometry, grid, model)), Rows.of([*geometry, *stored])
     depths = dr.select(splats.visible, splats.depths, dr.inf)
@@ -161,8 +161,8 @@ def _store_rows(
     return boxes, rows, depths
 
 
-def _reach(geometry: list[Any], grid: TileGrid, model: FootprintModel) -> Any:
-    """What |U d|^2 may be (base 2) where a splat ends, and a margin for rounding.
+def _reach(geometry: list[Float], grid: TileGrid, model: FootprintModel) -> Float:
+    """Return |U d|^2 (base 2) at which a splat ends, with a margin for rounding.
 
     For the default cut-offs, sqrt(2 ln(opacity / alpha_cut)) standard deviations: the
     opacity-aware radius, instead of 3.
@@ -173,8 +173,8 @@ def _reach(geometry: list[Any], grid: TileGrid, model: FootprintModel) -> Any:
 
 
 def _tile_box(
-    splats: Splats2D, geometry: list[Any], grid: TileGrid, model: FootprintModel
-) -> list[Any]:
+    splats: Splats2D, geometry: list[Float], grid: TileGrid, model: FootprintModel
+) -> list[Float]:
     """First column and row, columns, and number of tiles: whole numbers, exact up to 2^24."""
     t = types_of(type(splats.depths))
     center, radius = model.falloff.bounds(splats, geometry, _reach(geometry, grid, model))
@@ -197,14 +197,14 @@ def _tile_box(
 
 
 def _make_entries(
-    first_entry: Any,
+    first_entry: UInt32,
     boxes: Rows,
     rows: Rows,
     num_entries: int,
     grid: TileGrid,
     model: FootprintModel,
-) -> tuple[Any, Any]:
-    """Of each entry its tile; and two words: see :func:`_pack`.
+) -> tuple[UInt32, Array2u]:
+    """Return the tile of each entry, and two words: see :func:`_pack`.
 
     Entries of the padding touch nothing, in the last tile: a stable sort leaves them at the end.
     """
@@ -239,8 +239,8 @@ _RANK_BITS = 26
 """With 64 - 16 - 26 bits for the tile."""
 
 
-def _pack(rank: Any, tile: Any, mask: Any) -> list[Any]:
-    """An entry in two words, as it is read in no order: 26 bits of rank, 22 of tile, 16 of mask.
+def _pack(rank: UInt32, tile: UInt32, mask: UInt32) -> list[UInt32]:
+    """Pack an entry into two words: 26 bits of rank, 22 of tile, 16 of mask.
 
     2^22 tiles have 2^30 pixels, whose four planes are more numbers than an array of Dr.Jit holds;
     more ranks are refused by :func:`bin_footprints`.
@@ -248,13 +248,13 @@ def _pack(rank: Any, tile: Any, mask: Any) -> list[Any]:
     return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
 
 
-def _unpack(first: Any, second: Any) -> tuple[Any, Any, Any]:
+def _unpack(first: UInt32, second: UInt32) -> tuple[UInt32, UInt32, UInt32]:
     """Rank, tile and mask of an entry."""
     tile = (second >> MICROS) | ((first >> _RANK_BITS) << MICROS)
     return first & ((1 << _RANK_BITS) - 1), tile, second & ((1 << MICROS) - 1)
 
 
-def stable_order(keys: Any, bound: int) -> Any:
+def stable_order(keys: UInt32, bound: int) -> UInt32:
     """The stable order of ``keys``, all below ``bound``: one pass with a bucket for each key.
 
     ``dr.argsort`` does not know the bound and needs three passes for 32 bits.
@@ -264,8 +264,8 @@ def stable_order(keys: Any, bound: int) -> Any:
 
 
 def _touched_micros(
-    geometry: list[Any], tile_x: Any, tile_y: Any, grid: TileGrid, model: FootprintModel
-) -> Any:
+    geometry: list[Float], tile_x: UInt32, tile_y: UInt32, grid: TileGrid, model: FootprintModel
+) -> UInt32:
     """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
 
     |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
@@ -279,12 +279,12 @@ def _touched_micros(
     dx_per_dy = -r / p
     dy_per_dx = -(p * r) / dr.fma(r, r, s * s)
 
-    def intervals(tile: Any, mean: Any) -> list[tuple[Any, Any]]:
+    def intervals(tile: UInt32, mean: Float) -> list[tuple[Float, Float]]:
         first = dr.fma(t.Float(tile), TILE, 0.5 - margin) - mean
         size = MICRO - 1 + 2 * margin
         return [(first + MICRO * k, first + (MICRO * k + size)) for k in range(GRID)]
 
-    def exponent(dx: Any, dy: Any) -> Any:
+    def exponent(dx: Float, dy: Float) -> Float:
         u = dr.fma(p, dx, r * dy)
         v = s * dy
         return dr.fma(u, u, v * v)
@@ -302,14 +302,14 @@ def _touched_micros(
     return mask
 
 
-def _clamp(x: Any, lo: Any, hi: Any) -> Any:
-    """Unlike dr.clip this maps to two vector instructions; a NaN becomes ``lo`` or stays NaN."""
+def _clamp(x: Float, lo: Float, hi: Float) -> Float:
+    """Clamp in two vector instructions, unlike dr.clip; a NaN becomes ``lo`` or stays NaN."""
     x = dr.select(x < lo, lo, x)
     return dr.select(x > hi, hi, x)
 
 
-def transpose_masks(masks: Any) -> Any:
-    """From 16 bits per entry to 32 bits per (group of 32 entries, micro-tile).
+def transpose_masks(masks: UInt32) -> UInt32:
+    """Transpose 16 bits per entry to 32 bits per (group of 32 entries, micro-tile).
 
     Two 16x16 bit matrices side by side in each word, transposed by exchanging ever smaller
     blocks (Warren, "Hacker's Delight", 2nd ed., section 7-3).
@@ -329,12 +329,12 @@ def transpose_masks(masks: Any) -> Any:
     return interleave(m)
 
 
-def lower_bounds(sorted_tiles: Any, num_entries: int, num_tiles: int) -> Any:
-    """(num_tiles + 1,): the first sorted position whose tile is not smaller; binary search."""
+def lower_bounds(sorted_tiles: UInt32, num_entries: int, num_tiles: int) -> UInt32:
+    """Return the first sorted position of each tile, (num_tiles + 1,), by binary search."""
     UInt32 = type(sorted_tiles)
     tile = dr.arange(UInt32, num_tiles + 1)
 
-    def body(first: Any, last: Any) -> tuple[Any, Any]:
+    def body(first: UInt32, last: UInt32) -> tuple[UInt32, UInt32]:
         middle = (first + last) >> 1
         smaller = dr.gather(UInt32, sorted_tiles, middle) < tile
         return dr.select(smaller, middle + 1, first), dr.select(smaller, last, middle)
