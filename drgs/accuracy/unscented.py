@@ -101,10 +101,11 @@ def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Any) -> _Sigm
     """Through a pinhole: by formulas that do not cancel."""
     slopes = lens.true_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
+    far_enough = dr.max(dr.abs(n)) <= (1 - NEAREST) / SPREAD  # no point is too near
     return _SigmaPoints(
         offsets=[_sigma_offsets(m, n) for m in (m0, m1)],
         mean=[_mean_offset(m, n) for m in (m0, m1)],
-        usable=_same(slopes, lens.clamped_slopes(camera, position)) & _far_enough(n),
+        usable=_same(slopes, lens.clamped_slopes(camera, position)) & far_enough,
     )
 
 
@@ -112,11 +113,6 @@ def _same(slopes: list[Any] | None, clamped: list[Any] | None) -> Any:
     if slopes is None:
         return True
     return (slopes[0] == clamped[0]) & (slopes[1] == clamped[1])
-
-
-def _far_enough(n: Any) -> Any:
-    """Whether no point is too near; n: half axes in depth, relative to the mean's."""
-    return dr.max(dr.abs(n)) <= (1 - NEAREST) / SPREAD
 
 
 def _sigma_offsets(m: Any, n: Any) -> list[Any]:

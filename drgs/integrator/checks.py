@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Integral
 
 import drjit as dr
 import mitsuba as mi
@@ -53,14 +52,6 @@ def check_shapes(gaussians: Gaussians) -> None:
             f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
             f"({dr.width(gaussians.smoothing)},)"
         )
-
-
-def degree_of(value: object) -> int:
-    """A degree of spherical harmonics that Gaussians may have."""
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
-    if not is_integer or value not in range(4):
-        raise PluginError(f"splats: sh_degree must be an integer from 0 to 3, got {value!r}")
-    return int(value)
 
 
 def check_degree(degree: int, gaussians: Gaussians) -> None:

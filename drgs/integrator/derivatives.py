@@ -117,7 +117,9 @@ def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
         owners = [node]
         while (parent := params.hierarchy[owners[-1]][0]) is not None:
             owners.append(parent)
-        if any(_is_elsewhere(owner) for owner in owners):
+        if any(isinstance(owner, (mi.Sensor, mi.Integrator)) for owner in owners):
+            continue
+        if any(isinstance(owner, mi.Shape) and owner.is_ellipsoids() for owner in owners):
             continue
         bsdf = next((owner for owner in owners if isinstance(owner, mi.BSDF)), None)
         nested = (n for n, (p, _) in params.hierarchy.items() if bsdf is not None and p is bsdf)
@@ -137,11 +139,6 @@ def type_of(integrator: mi.Integrator) -> str:
         return SPLATPATH
     name = integrator.class_name()
     return type(integrator).__name__ if name == "SamplingIntegrator" else name
-
-
-def _is_elsewhere(node: mi.Object) -> bool:
-    is_gaussians = isinstance(node, mi.Shape) and node.is_ellipsoids()
-    return is_gaussians or isinstance(node, (mi.Sensor, mi.Integrator))
 
 
 def _is_padded(parameter: Parameter) -> bool:

@@ -221,11 +221,8 @@ def product(matrix: Any, vector: list[Any], start: int = 0) -> list[Any]:
         [number_of(matrix, start + j * len(vector) + k) for k in range(len(vector))]
         for j in range(len(vector))
     ]
-    return [_sum(a * x for a, x in zip(row, vector, strict=True)) for row in rows]
-
-
-def _sum(terms: Any) -> Any:
-    return reduce(operator.add, terms)
+    terms = [[a * x for a, x in zip(row, vector, strict=True)] for row in rows]
+    return [reduce(operator.add, of_row) for of_row in terms]
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,7 +92,7 @@ class _Estimate:
         ratio = dr.ones(mi.Color3f, gaussians.num_gaussians)
         if not self.scene.scene.emitters():
             return ratio
-        lit, dark = self._irradiance(means, normals, _unhindered)
+        lit, dark = self._irradiance(means, normals, lambda ray, sample: mi.Float(1))
         shaded = dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark))
         if dr.width(shaded) > 0:
             place = [dr.gather(type(v), v, shaded) for v in (means, normals)]
@@ -142,11 +142,6 @@ class _Estimate:
         segment = Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.maxt, dr.full(mi.Bool, True))
         T = self.splats.transmittance(segment, sample)
         return dr.select(sample > T, HIDDEN, mi.Float(1))
-
-
-def _unhindered(ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
-    del ray, sample
-    return mi.Float(1)
 
 
 def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:

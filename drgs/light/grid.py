@@ -93,7 +93,7 @@ class SplatGrid:
         t_ = types_of(type(self.size))
         count = t_.Float(self.resolution)
         distance = self._distance(origin + direction * t)
-        step = STEP * self._cell_size(dr.select(distance > 1, distance, 1))
+        step = STEP * (self.size * dr.select(distance > 1, distance, 1) * 2 / count)
         rounding = 4 * dr.epsilon(t) * t  # a ray from far away goes on where cells are smaller
         ahead = t + dr.select(step > rounding, step, rounding)
         point = origin + direction * ahead
@@ -129,10 +129,6 @@ class SplatGrid:
     def _distance(self, point: Any) -> Any:
         """From the centre, as cubes go, in half edges of the innermost one."""
         return dr.max(dr.abs(point - self.center)) / self.size
-
-    def _cell_size(self, distance: Any) -> Any:
-        """World units, of the cells there: half of it, to all of it."""
-        return self.size * distance * 2 / type(self.size)(self.resolution)
 
 
 def build_grid(ellipsoids: Ellipsoids) -> SplatGrid:

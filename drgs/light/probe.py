@@ -128,11 +128,18 @@ class Probes:
         reach = LEAST_REACH * dr.gather(t.Float, self.nearest, probe, active)
         reach = dr.maximum(reach, dr.norm(start))
         end = dr.select(far < dr.inf, far / (far + reach), 1)
-        line = _Line(start, direction * reach, end)
+        towards = direction * reach
+
+        def place(u: Any) -> Any:
+            """From the centre, times 1 - u; u: 0 where the ray starts, 1 infinitely far."""
+            return start * (1 - u) + towards * u
+
         active &= dr.dot(dr.gather(t.Array3f, self.normals, probe, active), direction) >= 0
-        u, meets, is_known = self._search(line, _Cube.of(probe, dr.minimum(level, FINE)), active)
+        u, meets, is_known = self._search(
+            place, end, _Cube.of(probe, dr.minimum(level, FINE)), active
+        )
         is_known &= active
-        v, texels = line.place(u), _Cube.of(probe, level).around(line.place(u))
+        v, texels = place(u), _Cube.of(probe, level).around(place(u))
         colors = [w * dr.gather(t.Array4f, self.colors, texel, is_known) for texel, w in texels]
         places = [w * dr.gather(t.Array2f, self.places, texel, is_known) for texel, w in texels]
         red, green, blue, _ = sum(colors[1:], colors[0])
@@ -142,50 +149,39 @@ class Probes:
         color = dr.select(shows, t.Array3f(red, green, blue), 0)
         return Seen(color, dr.select(shows, coverage, 0), is_known)
 
-    def _search(self, line: _Line, cube: _Cube, active: Any) -> tuple[Any, Any, Any]:
+    def _search(
+        self, place: Callable[[Any], Any], end: Any, cube: _Cube, active: Any
+    ) -> tuple[Any, Any, Any]:
         """Find where lines meet the splats, or end; whether they meet any; is that known."""
-        t = types_of(type(line.end))
+        t = types_of(type(end))
 
         def look(u: Any, active: Any) -> tuple[Any, Any, Any]:
             """How far a place is from the centre, how far splats are there, and which is nearer."""
-            v = line.place(u)
+            v = place(u)
             coverage, nearness = dr.gather(t.Array2f, self.places, cube.nearest(v), active)
             is_solid, r = coverage > SOLID, dr.norm(v)
             is_behind = is_solid & (r * nearness > (1 - u) * coverage)
             return r / (1 - u), dr.select(is_solid, coverage / nearness, dr.inf), is_behind
 
         def step(k: Any, before: Any, meets: Any, is_known: Any) -> tuple:
-            r, distance, is_behind = look(line.end * (t.Float(k) / STEPS), active)
+            r, distance, is_behind = look(end * (t.Float(k) / STEPS), active)
             meets = is_behind & (distance > MARGIN * before)
             return k + 1, r, meets, meets | ~is_behind
 
-        r, _, is_behind = look(line.end * (0.01 / STEPS), active)
+        r, _, is_behind = look(end * (0.01 / STEPS), active)
         nothing = dr.full(t.Bool, False, dr.width(r))
         k, _, meets, is_known = dr.while_loop(
             state=(dr.ones(t.UInt32, dr.width(r)), r, nothing, ~is_behind),
             cond=lambda k, before, meets, is_known: active & (k <= STEPS) & ~meets & is_known,
             body=step,
         )
-        high = line.end * (t.Float(k - 1) / STEPS)
-        low = high - line.end / STEPS
+        high = end * (t.Float(k - 1) / STEPS)
+        low = high - end / STEPS
         for _ in range(REFINEMENTS):
             u = 0.5 * (low + high)
             _, _, is_behind = look(u, active & meets)
             low, high = dr.select(is_behind, low, u), dr.select(is_behind, u, high)
-        return dr.select(meets, high, line.end), meets, is_known
-
-
-@dataclass(frozen=True)
-class _Line:
-    """A ray as seen from a centre: at u in 0..1, start (1 - u) + towards u, times 1 / (1 - u)."""
-
-    start: Any  # Array3f, from the centre
-    towards: Any  # Array3f: where it goes, as long as the steps are large
-    end: Any  # Float: u; 1: infinitely far
-
-    def place(self, u: Any) -> Any:
-        """Array3f, times 1 - u."""
-        return self.start * (1 - u) + self.towards * u
+        return dr.select(meets, high, end), meets, is_known
 
 
 def _beyond(t: Any, plane: np.ndarray, pipeline: rendering.Pipeline) -> rendering.Pipeline:

@@ -291,7 +291,7 @@ print(json.dumps([kernels, [] if blocked else loaded_modules]))
 
 
 MODULES = (
-    *("integrator.ellipsoids", "integrator.gathering"),
+    "integrator.gathering",
     *("gaussians.similarity", "gaussians.rotation"),
 )
 
