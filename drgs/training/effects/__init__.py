@@ -1,1 +1,4 @@
-"""Effects of a fit: they may import what ``training`` may, but nothing of the trainer."""
+"""Effects of a fit, each imported when it is used.
+
+May import what ``training`` may, but nothing of the trainer.
+"""
