@@ -17,9 +17,16 @@ and for every later one; these names are imported when they are first used.
 from __future__ import annotations
 
 import importlib
+from typing import TYPE_CHECKING
 
 from drgs import _registration
 from drgs.core import errors, llvm
+
+if TYPE_CHECKING:
+    from drgs.datasets import load_dataset
+    from drgs.gaussians.parameters import Gaussians
+    from drgs.gsplat_api import rasterization
+    from drgs.training.session import train
 
 __version__ = "0.1.0"
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Set
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +28,7 @@ from drgs.capture.path_tracing import (
     lit_part,
 )
 from drgs.core.errors import UserError
+from drgs.core.types import Float
 from drgs.datasets.viewpoints import look_at
 
 KINDS = ("around", "inside", "sensors")
@@ -87,7 +88,7 @@ def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
         pose = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
         pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
         width, height = sensor.film().size()
-        fov = math.radians(parameters["x_fov"][0])
+        fov = math.radians(cast("Float", parameters["x_fov"])[0])
         if height < width:
             fov = 2 * math.atan(height / width * math.tan(fov / 2))
         found.append(OwnCamera(pose @ OPENGL_TO_MITSUBA, fov))

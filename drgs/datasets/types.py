@@ -32,7 +32,7 @@ class LazyImage:
             raise ValueError("a lazy image becomes an array only by a copy")
         return np.asarray(self.compute(), dtype)
 
-    def __getitem__(self, index: object) -> np.ndarray:
+    def __getitem__(self, index: int | slice | tuple | np.ndarray) -> np.ndarray:
         """Return some of the numbers."""
         return self.compute()[index]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from drgs.core.environment import denormals_kept
 from drgs.datasets.types import View
@@ -62,7 +62,7 @@ def colors_from_images(
         return None
     if unseen.any():
         with denormals_kept():
-            _, nearest = cKDTree(points[~unseen]).query(points[unseen])
+            _, nearest = KDTree(points[~unseen]).query(points[unseen])
         colors[unseen] = colors[~unseen][nearest]
     return colors
 

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from drgs.core.environment import denormals_kept
 from drgs.datasets.types import View
@@ -208,7 +208,7 @@ def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np
     thin = cubes
     if len(inside):
         with denormals_kept():
-            distance, _ = cKDTree(inside).query(cubes.centers())
+            distance, _ = KDTree(inside).query(cubes.centers())
         thin = cubes.chosen(distance > THIN * cubes.edge)
     surface = inside[_half_empty(silhouettes, inside, SHELL * cubes.edge / 2)]
     return np.concatenate([surface, _thin_points(silhouettes, thin)])

@@ -170,6 +170,7 @@ def write_viewer(out: Path, dataset: Dataset, shown: Shown) -> None:
     """
     gaussians = shown.gaussians
     size, least = least_bytes(gaussians.num_gaussians, gaussians.sh_degree), "at least "
+    page = b""
     if size <= MAX_PAGE_BYTES:
         views = refined_viewpoints(out, dataset.origin) or dataset.train
         standpoint = Standpoint.of_views(views, gaussians)
