@@ -41,7 +41,7 @@ INSIDE_PART = 0.6  # place of a camera on the way from the target to the wall be
 ENOUGH_SENSORS = 10  # number of sensors from which a scene is photographed from where they are
 
 TEST_EVERY = 8
-"""Every eighth of the scene's own sensors is for testing, as in the nerfstudio layout."""
+"""Interval of the scene's own sensors that are for testing, as in the nerfstudio layout."""
 
 COUNTS = {"views", "val_views", "test_views"}
 

@@ -100,7 +100,7 @@ class CaptureSettings:
 
     @property
     def hides_lights(self) -> bool:
-        """Whether shining surfaces are left out: an object's studio is, a room's lamps are not."""
+        """True if shining surfaces are left out: an object's studio is, a room's lamps are not."""
         return self.cameras != "inside"
 
     def count(self, split: str) -> int:
@@ -110,7 +110,7 @@ class CaptureSettings:
 
 @dataclass(frozen=True, eq=False)
 class CaptureView:
-    """One image to take."""
+    """Image to take."""
 
     split: str
     index: int
@@ -119,7 +119,7 @@ class CaptureView:
 
     @property
     def file_path(self) -> str:
-        """Its name in the transforms file, without the suffix."""
+        """The image's name in the transforms file, without the suffix."""
         return f"./{self.split}/r_{self.index}"
 
 

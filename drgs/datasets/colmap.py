@@ -47,12 +47,10 @@ class ColmapReader(DatasetReader):
     """Reads a model of COLMAP and its photographs."""
 
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        """See :class:`DatasetReader`."""
         del names
         return find_model(folder) is not None
 
     def photographs(self, config: DataConfig) -> Photographs:
-        """See :class:`DatasetReader`."""
         notes: list[str] = []
         root, folder = _root_and_model(config.path)
         model = read_model(folder)

@@ -43,7 +43,6 @@ class NerfSyntheticReader(DatasetReader):
     """Reads folders of NeRF-synthetic."""
 
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        """See :class:`DatasetReader`."""
         del folder
         return "transforms_train.json" in names
 

@@ -33,12 +33,10 @@ class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        """See :class:`DatasetReader`."""
         del folder
         return "transforms.json" in names
 
     def photographs(self, config: DataConfig) -> Photographs:
-        """See :class:`DatasetReader`."""
         notes: list[str] = []
         meta = read_transforms(config.path / "transforms.json")
         frames = frames_with_files(config, meta, notes)

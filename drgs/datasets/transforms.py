@@ -128,7 +128,7 @@ POINT_CLOUD = FileKind(
 
 
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
-    """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
+    """Return the pose (4, 4) float64, camera to world, in OpenCV axes; the file's are OpenGL's."""
     if [len(row) for row in rows] != [4] * 4:
         raise ValueError("must be 4 x 4 numbers")
     matrix = np.array(rows, np.float64)

@@ -71,17 +71,17 @@ class Viewpoint:
 
     @property
     def center(self) -> np.ndarray:
-        """(3,) position of the camera, world."""
+        """Position (3,) of the camera, world."""
         return self.camera_to_world[:3, 3]
 
     @property
     def K(self) -> np.ndarray:  # noqa: N802
-        """(3, 3) float64: camera coordinates to homogeneous pixel coordinates."""
+        """Matrix (3, 3) float64 from camera coordinates to homogeneous pixel coordinates."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
 
     @property
     def viewmat(self) -> np.ndarray:
-        """(4, 4) float64, world to camera, OpenCV axes, as ``drgs.rasterization`` takes it."""
+        """Pose (4, 4) float64, world to camera, OpenCV axes, as ``drgs.rasterization`` takes it."""
         rotation = self.camera_to_world[:3, :3].T
         viewmat = np.eye(4)
         viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])

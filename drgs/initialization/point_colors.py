@@ -40,7 +40,7 @@ def colors_from_images(
     views: Sequence[View],
     background: tuple[float, float, float],
 ) -> np.ndarray | None:
-    """(N, 3) float32, display space 0..1; None: no image shows any of the points.
+    """Return colours (N, 3) float32, display space 0..1; None: no image shows any of the points.
 
     points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: of
     the composited images, display space. A point that no image shows gets the colour of the nearest
@@ -99,7 +99,7 @@ def _shown(
 
 
 def _middle(samples: np.ndarray) -> np.ndarray:
-    """(N, 3): means of the middle half of (V, N, 3), channel by channel; NaN: there are none.
+    """Return means (N, 3) of the middle half of (V, N, 3), channel by channel; NaN: there are none.
 
     inf: not a sample. Of n, floor(n / 4) are left out at either end.
     """

@@ -259,7 +259,7 @@ def _median_radius(points: np.ndarray) -> float:
 
 
 def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
-    """(N,) float64: mean squared distance of each of (N, 3) points to the 3 nearest others."""
+    """Return mean squared distances (N,) float64 of (N, 3) points to the 3 nearest others."""
     # SciPy divides points by the number next to the least. If that is taken for zero, it divides
     # points with a coordinate of zero for ever, until the stack ends.
     with denormals_kept():

@@ -146,7 +146,7 @@ class Cubes:
         return len(self.index)
 
     def centers(self) -> np.ndarray:
-        """(N, 3) float64, world."""
+        """Return centres (N, 3) float64, world."""
         return self.low + self.edge * (self.index + 0.5)
 
     def divided(self) -> Cubes:
@@ -161,7 +161,7 @@ class Cubes:
 
 
 def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: int) -> np.ndarray:
-    """(M, 3) float64, world: points on the surface of the visual hull within ``box``.
+    """Return points (M, 3) float64, world, on the surface of the visual hull within ``box``.
 
     At most ``count``, about evenly spread, each at a random place within a cube of its own: M is
     about ``count``, unless images contradict each other and there is no hull, which is M = 0.
@@ -198,7 +198,7 @@ def _surface(silhouettes: Sequence[Silhouette], cubes: Cubes, levels: int, enoug
 
 
 def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np.ndarray:
-    """(M, 3): points of the hull near its surface, at most one in each eighth of a cube."""
+    """Return points (M, 3) of the hull near its surface, at most one in each eighth of a cube."""
     random, found = np.random.Generator(np.random.Philox(key=seed)), [np.zeros((0, 3))]
     for some in _chunks(np.arange(len(cubes))):
         eighths = cubes.chosen(some).divided()
@@ -215,7 +215,7 @@ def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np
 
 
 def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
-    """(M, 3): where cubes without a point have parts of the hull, at most one in each eighth."""
+    """Return points (M, 3) of the hull in cubes without a point, at most one in each eighth."""
     levels = 0
     while levels == 0 or (levels < THIN_LEVELS and len(cubes) <= CHUNK):
         cubes = cubes.divided()
@@ -228,7 +228,7 @@ def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
 def _shown_by_all(
     silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float
 ) -> np.ndarray:
-    """(N,) bool: cubes that no image shows empty, and that enough of the images show.
+    """Return which (N,) cubes no image shows empty, and enough of the images show.
 
     centers: (N, 3) world; edge 0: points.
     """
@@ -248,7 +248,7 @@ def _shown_by_all(
 
 
 def _half_empty(silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float) -> np.ndarray:
-    """(N,) bool: cubes that some image shows with a transparent pixel; centers: (N, 3) world."""
+    """Return which (N,) cubes some image shows with a transparent pixel; centers: (N, 3) world."""
     columns = [np.ascontiguousarray(c) for c in centers.T]
     rows, result = np.arange(len(centers)), np.zeros(len(centers), bool)
     for silhouette in silhouettes:

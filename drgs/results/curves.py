@@ -52,7 +52,7 @@ THEMES = (LIGHT, DARK)
 
 @dataclass(frozen=True)
 class Panel:
-    """One curve."""
+    """A curve."""
 
     title: str
     x: np.ndarray  # (n,)

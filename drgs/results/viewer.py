@@ -91,7 +91,7 @@ class Standpoint:
 
     @property
     def target(self) -> np.ndarray:
-        """(3,) world: the point on the camera's optical axis that is the nearest to the focus.
+        """Point (3,), world, on the camera's optical axis that is nearest to the focus.
 
         Where that is behind the camera or next to it: the point at the orbit's radius.
         """

@@ -131,7 +131,7 @@ class CameraControls:
 
     @property
     def is_straight(self) -> bool:
-        """Whether the lens shows straight lines where the browser's pinhole draws them."""
+        """True if the lens shows straight lines where the browser's pinhole draws them."""
         return self._lens.value in ("pinhole", "thin lens")
 
     def fov(self, camera: viser.CameraHandle) -> float:

@@ -62,7 +62,6 @@ class EarlyStop:
         return self._criterion.should_continue(trainer)
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """See :class:`StopCriterion`."""
         return self._criterion.num_iterations(trainer)
 
 
