@@ -48,7 +48,7 @@ from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import FIELD_OF_VIEW, field_of_view, look_at, pinhole, read_viewpoints
 from drgs.effects.compose import IGNORABLE
 from drgs.integrator.scene import render_views
-from drgs.integrator.state import is_splats
+from drgs.integrator.types import is_splats
 from drgs.io.formats import format_for, readable_formats
 from drgs.io.pictures import (
     MITSUBA_FORMATS,

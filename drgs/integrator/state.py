@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +31,6 @@ from drgs.splatting import rendering
 
 if TYPE_CHECKING:  # imported where a scene has other Gaussians than the integrator's, unmoved
     from drgs.integrator.gathering import Gathered, Part
-    from drgs.integrator.types import SplatsIntegrator
 
 AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """Outputs besides colour, and the names of their channels as in Mitsuba's ``aov``."""
@@ -314,11 +313,6 @@ class SplatsState:
             **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
             features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
         )
-
-
-def is_splats(node: object) -> TypeGuard[SplatsIntegrator]:
-    """Return whether an object of Mitsuba is the integrator ``splats``."""
-    return isinstance(getattr(node, "state", None), SplatsState)
 
 
 def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:

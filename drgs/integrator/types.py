@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import mitsuba as mi
 
@@ -32,3 +32,8 @@ if TYPE_CHECKING:
 
 else:
     SplatsIntegrator = Any
+
+
+def is_splats(node: object) -> TypeGuard[SplatsIntegrator]:
+    """Return whether an object of Mitsuba is the integrator ``splats``."""
+    return isinstance(getattr(node, "state", None), SplatsState)

@@ -24,8 +24,8 @@ from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
-from drgs.integrator.state import is_splats
 from drgs.integrator.summary import described, summary_of_views
+from drgs.integrator.types import is_splats
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
 from drgs.results.folder import found_again
 from drgs.results.refined_cameras import refined_dataset
