@@ -15,6 +15,7 @@ from typing import NamedTuple, cast
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
 from drgs.capture.path_tracing import (
@@ -219,7 +220,7 @@ def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]
     return spots[best], bool(is_closed.any())
 
 
-def _look_around(scene: mi.Scene, spots: object) -> tuple[np.ndarray, np.ndarray]:
+def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the part of all directions with a surface, and the room, (N,), at places (N, 3).
 
     A surface that is seen from behind does not count: the place is inside an object.
@@ -257,7 +258,7 @@ def _free_way(
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
     """Return the target of cameras around a scene, (3,) world, and their distance from it.
 
-    Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
+    Without ``distance``, the bounding box's sphere just fits between the edges of the image:
     radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
     has empty corners.
     """

@@ -65,7 +65,7 @@ class CaptureSettings:
     spp: int = 256  # paths per pixel
     max_depth: int = 8  # segments of a path
     fov: float = NERF_SYNTHETIC_FOV  # radians, horizontal
-    distance: float | None = None  # of the cameras from the target; None: all is in the picture
+    distance: float | None = None  # of the cameras from the target; None: all is in the image
     target: tuple[float, float, float] | None = None  # None: centre of the bounding box
     up: str = "z"
     points: int = 100_000

@@ -194,7 +194,9 @@ def smaller_view(view: View, factor: int) -> View:
     width, height = downscaled_size(view.width, view.height, new_width)
     x, y = width / view.width, height / view.height
 
-    def smaller(image: Pixels | None, scale: Callable = downscale) -> LazyImage | None:
+    def smaller(
+        image: Pixels | None, scale: Callable[[np.ndarray, int | None], np.ndarray] = downscale
+    ) -> LazyImage | None:
         if image is None:
             return None
         shape = (height, width, *image.shape[2:])

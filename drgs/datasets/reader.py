@@ -215,7 +215,7 @@ def load_views(
 def in_parallel(
     function: Callable[..., T], *arguments: Sequence[object], threads: int | None = None
 ) -> tuple[T, ...]:
-    """``map`` on threads, in order: decoding images releases Python's lock."""
+    """Map a function on threads, in order: decoding images releases Python's lock."""
     with ThreadPoolExecutor(threads) as pool:
         return tuple(pool.map(function, *arguments))
 

@@ -179,7 +179,7 @@ class CameraValues(BaseModel):
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
 
-    camera_angle_x: Angle | None = None  # radians, across the picture's width
+    camera_angle_x: Angle | None = None  # radians, across the image's width
     camera_angle_y: Angle | None = None
     fl_x: Positive | None = None  # px
     fl_y: Positive | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import EllipsisType
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
@@ -32,7 +33,9 @@ class LazyImage:
             raise ValueError("a lazy image becomes an array only by a copy")
         return np.asarray(self.compute(), dtype)
 
-    def __getitem__(self, index: int | slice | tuple | np.ndarray) -> np.ndarray:
+    def __getitem__(
+        self, index: int | slice | tuple[int | slice | EllipsisType | None, ...] | np.ndarray
+    ) -> np.ndarray:
         """Return some of the numbers."""
         return self.compute()[index]
 
@@ -51,7 +54,7 @@ class Motion:
 
     close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: the pose at the end
     shutter: str  # global: all pixels were open all the time; rolling: row after row
-    samples: int = SHUTTER_SAMPLES  # global: times at which the picture is rendered
+    samples: int = SHUTTER_SAMPLES  # global: times at which the image is rendered
 
 
 @dataclass(frozen=True, eq=False)

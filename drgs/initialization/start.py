@@ -23,10 +23,10 @@ from drgs.initialization.start_box import (
     box_looked_at,
     box_to_start_in,
     focus_of,
+    focus_text,
     num_looking,
     points_in_view,
     shown,
-    where_they_look,
 )
 from drgs.io.ply import read_points
 
@@ -282,7 +282,7 @@ def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Da
     looking = num_looking(points, views)
     if looking < LEAST_LOOKING * len(views):
         raise UserError(
-            f"{file}: must hold what the cameras look at{where_they_look(dataset)}, in their frame "
+            f"{file}: must hold what the cameras look at{focus_text(dataset)}, in their frame "
             f"of reference, but only {looking} of {len(views)} have any of its {num:,} points in "
             "the middle of their pictures; give another init.point_cloud, or start from random "
             "points (init.point_cloud=null, data.ignore_points=true)"

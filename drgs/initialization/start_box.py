@@ -112,7 +112,7 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
     again behind it. Half of the points are uniform in it. The others are for walls and skies: in
     any direction uniform in one over the distance, out to 10 D, as Mip-NeRF 360 (Barron et al.
     2022) contracts space. Points that no camera sees would never be moved or removed, and one close
-    to a camera covers its picture, so only points are kept that lie in a picture and nowhere nearer
+    to a camera covers its image, so only points are kept that lie in an image and nowhere nearer
     than D / 4 to a camera.
     """
     focus, distance = focus_of(views)
@@ -170,7 +170,7 @@ def num_looking(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
     return sum(bool(_in_image(points, view, MIDDLE).any()) for view in views)
 
 
-def where_they_look(dataset: Dataset) -> str:
+def focus_text(dataset: Dataset) -> str:
     """Return the place that the cameras look at, world, for a message; "" where there is none."""
     try:
         focus, distance = focus_of(dataset.train)
@@ -193,7 +193,7 @@ def check_box(box: Box, dataset: Dataset) -> None:
     in_world = Box(box.center + dataset.origin, box.half_extent)
     raise UserError(
         f"init.half_extent: the start box {in_world} must be what the cameras look at"
-        f"{where_they_look(dataset)}, but {reason}; set init.half_extent=null, and it follows "
+        f"{focus_text(dataset)}, but {reason}; set init.half_extent=null, and it follows "
         "from them"
     )
 

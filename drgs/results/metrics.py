@@ -1,6 +1,6 @@
 """Image quality as papers report it: PSNR and SSIM in float64 numpy.
 
-Reads finished pictures on the host, (H, W, 3) in display space, and shares no code with
+Reads finished images on the host, (H, W, 3) in display space, and shares no code with
 ``drgs.training.losses``: one checks the other. Not differentiated.
 """
 
@@ -62,7 +62,7 @@ def psnr(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
     """Return the peak signal-to-noise ratio in dB, -10 log10(mean squared error).
 
     image, target: (H, W, 3) display space, clamped to [0, 1] (the peak is 1). mask: (H, W), 1 where
-    a pixel counts. Infinite for equal pictures, NaN if a pixel is.
+    a pixel counts. Infinite for equal images, NaN if a pixel is.
     """
     image, target = _prepare("psnr()", image, target)
     with np.errstate(divide="ignore"):

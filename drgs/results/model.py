@@ -27,7 +27,7 @@ from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_
 from drgs.integrator.summary import described, summary_of_views
 from drgs.integrator.types import is_splats
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
-from drgs.results.folder import found_again
+from drgs.results.folder import relocate_data
 from drgs.results.refined_cameras import refined_dataset
 
 Background = tuple[float, float, float] | Path
@@ -172,7 +172,7 @@ def load_model(
         config_path, path = scene or what / CONFIG, what / GAUSSIANS
     config = None if config_path is None else load_open_config(config_path, overrides, background)
     if config is not None and what.is_dir() and scene is None:
-        config = found_again(what, config, ("data.path",))
+        config = relocate_data(what, config, ("data.path",))
     gaussians = Gaussians.load(path)
     if config is not None:
         settings, default_background = config.model, config.data.background_rgb

@@ -40,8 +40,8 @@ from drgs.results.folder import (
     claim_output_folder,
     continue_run,
     has_results,
+    image_names,
     is_finished,
-    pictures_of,
     remove_run,
     require_no_run,
     seal_run,
@@ -97,7 +97,7 @@ class FitFolder:
     def take(self, config: FitConfig, dataset: Dataset) -> None:
         """Make the folder that of the fit, or raise ``UserError`` and leave it as it is."""
         self._keep()
-        images = pictures_of(dataset.test_split, [view.name for view in dataset.test])
+        images = image_names(dataset.test_split, [view.name for view in dataset.test])
         if self.overwrites:
             remove_run(self.path, images)
         if self.resumes:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,7 +24,12 @@ from drgs.viewer.scheduler import RenderRequests
 if TYPE_CHECKING:
     import viser
 
-Control = TypeVar("Control", bound="viser.GuiInputHandle")
+    FrustumClick = viser.SceneNodePointerEvent[viser.CameraFrustumHandle]
+
+Control = TypeVar("Control", bound="viser.GuiInputHandle[Any]")
+
+EventHandler = Callable[[object], Coroutine[None, None, None]]
+"""Handles an event of viser's in its event loop."""
 
 JPEG_QUALITY = {False: 70, True: 92}  # quality of images of a moving camera, and of whole ones
 MAX_FRUSTUMS = 200  # training cameras that are drawn, spread over all of them
@@ -96,7 +101,7 @@ class StartView:
         return StartView(replace(camera, camera_to_world=pose), up / np.linalg.norm(up))
 
 
-def event_handler(function: Callable[[], None]) -> Callable[[object], Coroutine]:
+def event_handler(function: Callable[[], None]) -> EventHandler:
     """Return a handler of any event of viser's, which its event loop runs."""
 
     async def handle(event: object) -> None:
@@ -170,7 +175,7 @@ class CameraControls:
         values |= {name: DECLARED[name].kind(c.value) for name, c in self._values.items()}
         return Approximations(**values)
 
-    def _control(self, name: str) -> viser.GuiInputHandle:
+    def _control(self, name: str) -> viser.GuiInputHandle[Any]:
         """Return an input of viser's for an approximation."""
         declared, gui, value = DECLARED[name], self._gui, getattr(self._fitted, name)
         hint = declared.description
@@ -313,8 +318,10 @@ class Page:
         for frustum in self._frustums:
             frustum.visible = self._cameras.value and self.controls.is_straight
 
-    def _look_through(self, view: Viewpoint) -> Callable[..., Coroutine]:
-        async def look_through(event: viser.SceneNodePointerEvent) -> None:
+    def _look_through(
+        self, view: Viewpoint
+    ) -> Callable[[FrustumClick], Coroutine[None, None, None]]:
+        async def look_through(event: FrustumClick) -> None:
             camera = event.client.camera
             with event.client.atomic():
                 camera.position = tuple(view.center)

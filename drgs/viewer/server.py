@@ -76,7 +76,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     try:
         with warnings.catch_warnings():
-            # A browser may be closed while its picture is being sent.
+            # A browser may be closed while its image is being sent.
             warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
             yield server
     finally:
@@ -146,7 +146,11 @@ def _guarded(address: str, control: ControlOf) -> Iterator[None]:
     connection_type = partial(PageConnection, control=control, connections=set())
     logger = logging.Logger("page", logging.CRITICAL)
 
-    def guarded(*arguments: Any, process_request: Callable, **settings: Any) -> object:
+    def guarded(
+        *arguments: Any,
+        process_request: Callable[[ServerConnection, Request], Response | None],
+        **settings: Any,
+    ) -> object:
         def process(connection: ServerConnection, request: Request) -> Response | None:
             if reason := _refusal(request, address):
                 return connection.respond(HTTPStatus.FORBIDDEN, reason)

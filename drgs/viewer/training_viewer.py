@@ -184,7 +184,7 @@ class TrainingPage(Page):
         self._pause.label = "Go on" if paused else "Pause"
         self._pause.icon = self._icons[paused]
 
-    async def _confirm_end(self, event: viser.GuiEvent) -> None:
+    async def _confirm_end(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
         assert event.client is not None, "a client has clicked"
         gui = event.client.gui
         with gui.add_modal("End the fit here?") as modal:
