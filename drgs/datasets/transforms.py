@@ -38,7 +38,7 @@ from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.files import FileKind, find_files
-from drgs.datasets.types import Motion
+from drgs.datasets.types import CameraMotion
 from drgs.io.pictures import MAX_SIDE
 
 if TYPE_CHECKING:
@@ -457,13 +457,13 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
         raise UserError(f"{frame.where('camera_model')}: {error}") from error
 
 
-def motion_of(frame: TransformsFrame, samples: int) -> Motion | None:
+def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:
     """Return the camera's motion while the shutter was open; None: it stands still.
 
     samples: times at which what a global shutter blurs is rendered.
     """
     close = frame.values.transform_matrix_close
-    return None if close is None else Motion(close, frame.values.shutter or "global", samples)
+    return None if close is None else CameraMotion(close, frame.values.shutter or "global", samples)
 
 
 def unique_names(files: Sequence[str]) -> list[str]:

@@ -49,7 +49,7 @@ Pixels = np.ndarray | LazyImage
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class CameraMotion:
     """Motion of a camera while its shutter is open."""
 
     close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: the pose at the end
@@ -70,7 +70,7 @@ class Viewpoint:
     width: int  # px
     height: int  # px
     lens: Lens | None = None  # with numbers of the host; None: a pinhole
-    motion: Motion | None = None  # while the shutter is open; None: the camera does not move
+    motion: CameraMotion | None = None  # while the shutter is open; None: the camera does not move
 
     @property
     def center(self) -> np.ndarray:
