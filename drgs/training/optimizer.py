@@ -24,6 +24,7 @@ from drjit.opt import Adam
 
 from drgs.core.arrays import types_of
 from drgs.core.private import new_rate_cache, same_memory
+from drgs.core.types import Bool, Float, TensorXf, UInt32
 
 LARGE = 1 << 20
 """Entries of an array from which on memory is worth saving."""
@@ -37,17 +38,17 @@ class _Moments:
     moments do. The former ones are therefore read under a name that Dr.Jit takes for other memory.
     """
 
-    arrays: list[Any]  # as in the optimizer's state
+    arrays: list[Float]  # as in the optimizer's state
     indices: list[int]  # of the arrays: an array has another one if it was assigned to
-    former: list[Any]  # of the same memory
+    former: list[Float]  # of the same memory
 
     @staticmethod
-    def from_arrays(arrays: list[Any]) -> _Moments:
+    def from_arrays(arrays: list[Float]) -> _Moments:
         """Wait for the device, and take other names for the memory of arrays."""
         former = [same_memory(array) for array in arrays]
         return _Moments(arrays, [array.index for array in arrays], former)
 
-    def are(self, arrays: list[Any]) -> bool:
+    def are(self, arrays: list[Float]) -> bool:
         """Return whether these are the moments still."""
         pairs = zip(self.arrays, self.indices, arrays, strict=True)
         return all(own is array and index == array.index for own, index, array in pairs)
@@ -67,7 +68,9 @@ class LeanAdam(Adam):
         super().__init__(*arguments, **settings)
         self._moments: dict[str, _Moments] = {}
 
-    def step(self, *, eval: bool = True, grad_scale: Any = None, active: Any = None) -> None:
+    def step(
+        self, *, eval: bool = True, grad_scale: Float | None = None, active: Bool | None = None
+    ) -> None:
         """Take a step, and clear the gradients of large arrays.
 
         Waits for nothing, but in the first step after large moments were assigned. A step that is
@@ -85,7 +88,7 @@ class LeanAdam(Adam):
         """Free memory of moments that are the parameters' no longer."""
         self._moments.clear()
 
-    def _replaced(self, key: str, rates: Any) -> list[Any]:
+    def _replaced(self, key: str, rates: Any) -> list[Float]:
         """Give a parameter its new state, not evaluated, and return what is to be evaluated."""
         value, promoted, rate, (count, *moments, _) = self.state[key]
         is_large = dr.width(value) >= LARGE and dr.backend_v(value) == dr.JitBackend.LLVM
@@ -114,7 +117,7 @@ class LeanAdam(Adam):
 
 
 def make_optimizer(
-    parameters: Mapping[str, Any],
+    parameters: Mapping[str, TensorXf],
     rates: Mapping[str, float],
     prefix: str = "",
     beta_1: float = 0.9,
@@ -153,7 +156,10 @@ def num_rows(optimizer: Adam, prefix: str = "") -> int:
 
 
 def edit_rows(
-    optimizer: LeanAdam, keep: Any, append: Mapping[str, Any] | None = None, prefix: str = ""
+    optimizer: LeanAdam,
+    keep: UInt32,
+    append: Mapping[str, TensorXf] | None = None,
+    prefix: str = "",
 ) -> None:
     """Keep some rows of every parameter, in the order given, and append new ones.
 
@@ -192,7 +198,7 @@ def edit_rows(
     dr.eval()
 
 
-def take_rows(optimizer: Adam, rows: Any, prefix: str = "") -> dict[str, Any]:
+def take_rows(optimizer: Adam, rows: UInt32, prefix: str = "") -> dict[str, TensorXf]:
     """Return copies of some rows of every parameter by name, detached; rows: (M,) ``UInt32``."""
     result = {}
     for name in _names(optimizer, prefix):
@@ -205,7 +211,7 @@ def take_rows(optimizer: Adam, rows: Any, prefix: str = "") -> dict[str, Any]:
     return result
 
 
-def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
+def replace_values(optimizer: Adam, name: str, value: TensorXf, prefix: str = "") -> None:
     """Give a parameter new values of the same shape, and moments of zero.
 
     The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
@@ -218,7 +224,7 @@ def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> 
     optimizer.state[prefix + name] = value, promoted, rate, (step, *moments)
 
 
-def set_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
+def set_values(optimizer: Adam, name: str, value: TensorXf, prefix: str = "") -> None:
     """Give a parameter new values of the same shape; moments, step count and rate stay.
 
     Detached; waits for nothing.
@@ -266,7 +272,7 @@ def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: 
         optimizer.state[prefix + name] = value, promoted, rate, extra
 
 
-def _with_value(caller: str, optimizer: Adam, key: str, value: Any) -> tuple[Any, ...]:
+def _with_value(caller: str, optimizer: Adam, key: str, value: TensorXf) -> Any:
     """Return the optimizer's entry of a parameter with other values, which are evaluated."""
     old, *others = optimizer.state[key]
     if tuple(value.shape) != tuple(old.shape):
@@ -285,7 +291,7 @@ def _names(optimizer: Adam, prefix: str) -> list[str]:
     return [key[len(prefix) :] for key in optimizer.state if key.startswith(prefix)]
 
 
-def _num_appended(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) -> int:
+def _num_appended(optimizer: Adam, rows: Mapping[str, TensorXf] | None, prefix: str) -> int:
     """Return the number of ``rows``, which must be given for every parameter in its shape."""
     if rows is None:
         return 0
@@ -300,7 +306,7 @@ def _num_appended(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) 
     return count
 
 
-def _elements(rows: Any, width: int) -> Any:
+def _elements(rows: UInt32, width: int) -> UInt32:
     """Return the places of ``rows`` in a flat row-major array of ``width`` columns."""
     if dr.width(rows) == 0:
         return rows  # Dr.Jit does not compute with empty arrays
@@ -308,7 +314,7 @@ def _elements(rows: Any, width: int) -> Any:
     return dr.gather(type(rows), rows, element // width) * width + element % width
 
 
-def _gather_and_append(flat: Any, elements: Any, added: Any | None) -> Any:
+def _gather_and_append(flat: Float, elements: UInt32, added: Float | None) -> Float:
     kept = dr.gather(type(flat), flat, elements)
     if added is None:
         return kept

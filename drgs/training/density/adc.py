@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -22,6 +21,7 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
     DensityReport,
@@ -39,8 +39,8 @@ class AdaptiveDensityControl(DensityStrategy):
 
     config: DensifyConfig
     white_background: bool = False
-    gradient_norms: Any = None  # Float (N,): sum over views of |d loss / d mean2d| in NDC units
-    views: Any = None  # Float (N,): number of views in which the Gaussian was visible
+    gradient_norms: Float | None = None  # (N,): sum over views of |d loss / d mean2d| in NDC units
+    views: Float | None = None  # (N,): number of views in which the Gaussian was visible
     by_row = ("gradient_norms", "views")
     start_share, stop_share, rate_decay = SCHEDULES["adc"]
 
@@ -207,7 +207,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
     def _new_rows(
         self, population: Population, chosen: _ChosenRows, iteration: int
-    ) -> dict[str, Any]:
+    ) -> dict[str, TensorXf]:
         """Return the clones, then ``split_count`` samples of each row that is split.
 
         A sample is drawn from its parent's own Gaussian: mean + R(q) (s * n), n standard normal. A

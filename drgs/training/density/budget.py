@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -34,6 +33,7 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import CoarseStage, FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
     DensityReport,
@@ -62,7 +62,7 @@ class GrowthToNumber(DensityStrategy):
 
     config: DensifyConfig
     coarse: Sequence[CoarseStage] = ()
-    errors: Any = None  # Float (N,): sum over views of s; None until it begins
+    errors: Float | None = None  # (N,): sum over views of s; None until it begins
     first: int = 0  # Gaussians at the start
     by_row = ("errors",)
     start_share, stop_share, rate_decay = SCHEDULES["budget"]
@@ -155,7 +155,7 @@ class GrowthToNumber(DensityStrategy):
         return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
 
 
-def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
+def halves(population: Population, rows: np.ndarray) -> dict[str, TensorXf]:
     """Return two halves of each of ``rows``: all the first ones, then all the second ones.
 
     The halves' means lie on both sides of the Gaussian's, on its longest axis.

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -22,6 +21,7 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.core.types import Array3f, Float, TensorXf, UInt32
 from drgs.datasets.types import Dataset
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, displaced
@@ -62,7 +62,7 @@ class MarkovChain(DensityStrategy):
         """Gaussians that the population grows to; one that starts with more stays as it is."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
-    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, TensorXf], num_rows: int) -> Iterator[Float]:
         """Yield the paper's equation 10: mean opacity, and mean scale in scene extents."""
         config, logits = self.config.mcmc, parameters["logit_opacities"]
         log_scales = parameters["log_scales"].array
@@ -168,7 +168,7 @@ def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np
 
 def _copies(
     population: Population, copied: np.ndarray, opacities: np.ndarray, min_opacity: float
-) -> tuple[np.ndarray, dict[str, Any]]:
+) -> tuple[np.ndarray, dict[str, TensorXf]]:
     """Return the rows that are drawn, and their successors: themselves, corrected, then copies.
 
     copied: row numbers, ascending; opacities: (N,), of all rows.
@@ -188,7 +188,7 @@ def _copies(
     return drawn, rows
 
 
-def _mean(values: Any, weight: float, count: int) -> Any:
+def _mean(values: Float, weight: float, count: int) -> Float:
     """Return the weighted mean; no literals: the number of values changes."""
     return dr.sum(values) * dr.opaque(type(values), weight / count)
 
@@ -214,7 +214,7 @@ def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray
     return np.minimum(np.searchsorted(ends, positions, side="right"), last)
 
 
-def normals(float_type: type, rows: Any, iteration: Any, seed: Any) -> Any:
+def normals(float_type: type, rows: UInt32, iteration: UInt32, seed: UInt32) -> Array3f:
     """Return standard normal vectors, Array3f (N,), a function of iteration, seed and row.
 
     rows: UInt32 (N,); iteration, seed: UInt32 (1,), opaque, so that each value is no new kernel.
@@ -231,7 +231,7 @@ def normals(float_type: type, rows: Any, iteration: Any, seed: Any) -> Any:
     return t.Array3f(radius * cosine, radius * sine, other * dr.cos(dr.two_pi * fourth))
 
 
-def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+def pcg4d(x: UInt32, y: UInt32, z: UInt32, w: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
     """Return four random words of four numbers, UInt32 each."""
     x, y, z, w = (1664525 * v + 1013904223 for v in (x, y, z, w))
     x, y, z, w = _mix(x, y, z, w)
@@ -239,7 +239,7 @@ def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
     return _mix(x, y, z, w)
 
 
-def _mix(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+def _mix(x: UInt32, y: UInt32, z: UInt32, w: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
     x = x + y * w
     y = y + z * x
     z = z + x * y

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -17,6 +16,7 @@ import numpy as np
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
     DensityReport,
@@ -94,7 +94,7 @@ class Importance(Pruning):
     """
 
     by_row = ("weights",)
-    scores: Any = None  # (N,) Float
+    scores: Float  # (N,)
 
     def begin(self, population: Population) -> None:
         float_type = type(population.value("means").array)
@@ -196,6 +196,6 @@ def keep_best(population: Population, scores: np.ndarray, count: int) -> Density
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)
 
 
-def _ones(image: Any, photograph: Any) -> Any:
+def _ones(image: TensorXf, photograph: TensorXf) -> Float:
     height, width, _ = image.shape
     return dr.opaque(type(image.array), 1, height * width)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
 from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
     DensityReport,
@@ -70,7 +70,7 @@ class Phases(DensityStrategy):
             if phase.needs_statistics(step.iteration):
                 phase.update_statistics(step)
 
-    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, TensorXf], num_rows: int) -> Iterator[Float]:
         """Return the terms of all phases."""
         return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,6 +9,7 @@ import numpy as np
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
@@ -55,7 +54,7 @@ class RandomBackground(TrainingEffect):
         """
         self.seed, self.background, self.window = seed, np.array(background), (window, sigma)
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> TensorXf:
         """Return 1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
         transparent = 1 - np.asarray(view.alpha)
         if view.mask is not None:
@@ -75,6 +74,6 @@ class RandomBackground(TrainingEffect):
         image = view.photograph.image.array + transparent.array * shift
         view.replacement = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Float]) -> None:
         set_background(fit.integrator, self.background)
         view.replacement = None

@@ -17,7 +17,9 @@ from drgs.config.extensions import EFFECTS, extensions_in_use, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
+from drgs.integrator.types import SplatsIntegrator
 from drgs.training.views import TrainingView
 
 
@@ -29,8 +31,8 @@ class FitState:
     iterations_of_step: range
     begins_stage: bool  # whether the images have other sizes than in the step before
     rate_decay: float  # the means' learning rate, relative to the initial one
-    integrator: Any  # splats, which renders the fit
-    means: Any  # TensorXf (N, 3), world
+    integrator: SplatsIntegrator  # renders the fit
+    means: TensorXf  # (N, 3), world
     views: list[TrainingView]  # the training views, at the image size that is in use
     effects: Sequence[TrainingEffect]
 
@@ -71,7 +73,7 @@ class TrainingEffect(Protocol):
     upload_bytes = 0  # of a pixel: its upload of a view, at most
     by_row: frozenset[str] = frozenset()  # names in its state that have a row for each Gaussian
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> object:
         """Return what the effect needs of a view, on the device: see ``TrainingView.uploads``."""
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
@@ -87,22 +89,22 @@ class TrainingEffect(Protocol):
     def before(self, fit: FitState, view: TrainingView) -> None:
         """Called before the view is rendered."""
 
-    def adjust(self, image: Any, view: TrainingView) -> Any:
+    def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the image that is compared with the photograph, from the rendered one."""
         return image
 
-    def penalties(self, view: TrainingView) -> Iterator[Any]:
+    def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield terms of the loss, Float of one value each; called after :meth:`adjust`."""
         yield from ()
 
-    def leaves(self, view: TrainingView) -> dict[str, Any]:
+    def leaves(self, view: TrainingView) -> dict[str, Float]:
         """Return the optimised numbers of a view, with derivatives, as :meth:`before` has them.
 
         Where several processes fit, each knows the numbers of all views.
         """
         return {}
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Float]) -> None:
         """Take a step, when the derivatives of all views of the fit's step are known.
 
         derivatives: of the step's loss, with respect to the view's :meth:`leaves`. Called in the
@@ -122,7 +124,7 @@ class TrainingEffect(Protocol):
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write what was found for the training views into the output folder."""
 
-    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+    def numbers_of(self, view: TrainingView) -> dict[str, Float]:
         """Return the optimised numbers of a view: Float by name, without derivatives."""
         return {}
 

@@ -11,7 +11,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +22,7 @@ from drgs.config.extensions import EFFECTS
 from drgs.config.schema import CamerasConfig, FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
+from drgs.core.types import Float
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
@@ -67,7 +67,7 @@ class CameraRefinement(OptimisedEffect):
         shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
         values = {name: np.zeros(shape) for name, shape in shapes.items()}
         self.parameters = ViewParameters(values, rates | shared)
-        self.numbers: dict[int, dict[str, Any]] = {}  # of the step's sensors, by view
+        self.numbers: dict[int, dict[str, Float]] = {}  # of the step's sensors, by view
 
     def upload(self, view: View) -> _Start:
         """Return the view's camera."""
@@ -97,10 +97,10 @@ class CameraRefinement(OptimisedEffect):
     def place(self, view: TrainingView) -> None:
         _put(view.sensor, dr.detach(self._camera_of(view)))
 
-    def leaves(self, view: TrainingView) -> dict[str, Any]:
+    def leaves(self, view: TrainingView) -> dict[str, Float]:
         return self.numbers[view.index]
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Float]) -> None:
         """Step the view's numbers, at the means' rate: cameras are refined against these."""
         del self.numbers[view.index]
         if not self._begun(fit):
@@ -113,11 +113,11 @@ class CameraRefinement(OptimisedEffect):
         dr.traverse(dr.ADMode.Backward)
         self.parameters.step(view.index, fit.rate_decay)
 
-    def _camera_of(self, view: TrainingView) -> dict[str, Any]:
+    def _camera_of(self, view: TrainingView) -> dict[str, Float]:
         return self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
 
     @staticmethod
-    def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Any]:
+    def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Float]:
         """Return the sensor's parameters, from the numbers that are optimised."""
         turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
         rotation = rotation_matrix(turn)
@@ -182,7 +182,7 @@ class CameraRefinement(OptimisedEffect):
             temporary.write_text(json.dumps(found, indent=1) + "\n")
 
 
-def _put(sensor: mi.Sensor, numbers: dict[str, Any]) -> None:
+def _put(sensor: mi.Sensor, numbers: dict[str, Float]) -> None:
     """Set a sensor's parameters."""
     params = mi.traverse(sensor)
     params["to_world"] = mi.AffineTransform4f(numbers["to_world"])

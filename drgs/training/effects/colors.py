@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +21,7 @@ from drgs.config.extensions import EFFECTS
 from drgs.config.schema import ColorConfig, FitConfig
 from drgs.core.arrays import from_host, image_of, planes_of, types_of
 from drgs.core.files import atomic_path
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
 from drgs.training.effects.base import FitState, as_tensor
@@ -51,9 +51,9 @@ class ColorCorrection(OptimisedEffect):
         # What all have in common, and do without: not differentiated.
         self.common = dr.opaque(mi.Float, 0, IDENTITY.size)
         self.share = 1 / num_views
-        self.matrix: Any = None  # of the view that is rendered
+        self.matrix: Float  # (12,), of the view that is rendered
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> TensorXf | None:
         """Return the photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
         if view.alpha is None:
             return None
@@ -62,18 +62,18 @@ class ColorCorrection(OptimisedEffect):
     def before(self, fit: FitState, view: TrainingView) -> None:
         self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
 
-    def adjust(self, image: Any, view: TrainingView) -> Any:
+    def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the rendering with the colours of the photograph."""
         seen = transform_colors(image, mi.TensorXf(self.matrix, (3, 4)))
         opaque = view.uploads[self.name]
         return seen if opaque is None else image + opaque * (seen - image)
 
-    def penalties(self, view: TrainingView) -> Iterator[Any]:
+    def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield the mean square by which the transform differs from the identity."""
         difference = self.matrix - from_host(mi.Float, IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Float]) -> None:
         """Step the view's transform, and all a little back: their mean stays."""
         dr.set_grad(self.leaves(view), derivatives)
         before = self.numbers_of(view)["matrices"]
@@ -102,7 +102,7 @@ class ColorCorrection(OptimisedEffect):
             temporary.write_text(json.dumps(by_view, indent=1) + "\n")
 
 
-def transform_colors(image: Any, matrix: Any) -> Any:
+def transform_colors(image: TensorXf, matrix: TensorXf) -> TensorXf:
     """Return A y with y = (red, green, blue, 1) of each pixel.
 
     image: (H, W, 3); matrix: A, a tensor (3, 4). Differentiable in both.
@@ -111,7 +111,7 @@ def transform_colors(image: Any, matrix: Any) -> Any:
 
 
 class _TransformColors(dr.CustomOp):
-    def eval(self, image: Any, matrix: Any) -> Any:
+    def eval(self, image: TensorXf, matrix: TensorXf) -> TensorXf:
         self.image, self.matrix = dr.detach(image), dr.detach(matrix)
         return self._transform(planes_of(image), self._rows(self.matrix))
 
@@ -132,12 +132,12 @@ class _TransformColors(dr.CustomOp):
         d_matrix = dr.concat([dr.sum(product) for product in products])
         self.set_grad_in("matrix", type(self.matrix)(d_matrix, (3, 4)))
 
-    def _transform(self, planes: list[Any], rows: list[list[Any]]) -> Any:
+    def _transform(self, planes: list[Float], rows: list[list[Float]]) -> TensorXf:
         moved = [sum(a * x for a, x in zip(row, (*planes, 1), strict=True)) for row in rows]
         return image_of(moved, self.image)
 
     @staticmethod
-    def _rows(matrix: Any) -> list[list[Any]]:
+    def _rows(matrix: TensorXf) -> list[list[Float]]:
         """Return the numbers as arrays of one entry, that are not compiled into the kernel."""
         flat = matrix.array
         UInt32 = types_of(type(flat)).UInt32

@@ -7,7 +7,6 @@ Dr.Jit differentiates a gather by adding atomically, in an order that no two run
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +15,7 @@ import numpy as np
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, image_of, planes_of
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.views import TrainingView
@@ -42,7 +42,7 @@ class DepthSupervision(TrainingEffect):
         """weight: of the term, per scene extent."""
         self.weight, self.depths = weight / extent, None
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> tuple[Float, Float] | None:
         """Return depths, and weights of the pixels; None where a view has none that counts."""
         if view.depth is None:
             return None
@@ -55,24 +55,24 @@ class DepthSupervision(TrainingEffect):
         weights = self.weight * known / known.sum()
         return from_host(mi.Float, depth), from_host(mi.Float, weights)
 
-    def adjust(self, image: Any, view: TrainingView) -> Any:
+    def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the colours; depth and alpha are kept for the penalty."""
         image, self.depths = split(image, 3)
         return image
 
-    def penalties(self, view: TrainingView) -> Iterator[Any]:
+    def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield the difference in depth."""
         if (known := view.uploads[self.name]) is not None:
             yield depth_error(self.depths, *known)
 
 
-def split(image: Any, count: int) -> tuple[Any, Any]:
+def split(image: TensorXf, count: int) -> tuple[TensorXf, TensorXf]:
     """Return the first ``count`` channels of an image (H, W, C), and the others."""
     return dr.custom(_Split, image=image, count=count)
 
 
 class _Split(dr.CustomOp):
-    def eval(self, image: Any, count: int) -> tuple[Any, Any]:
+    def eval(self, image: TensorXf, count: int) -> tuple[TensorXf, TensorXf]:
         self.count = count
         planes = planes_of(image)
         return image_of(planes[:count], image), image_of(planes[count:], image)
@@ -85,7 +85,7 @@ class _Split(dr.CustomOp):
         self.set_grad_in("image", image_of(planes_of(first) + planes_of(rest), first))
 
 
-def depth_error(depths: Any, target: Any, weights: Any) -> Any:
+def depth_error(depths: TensorXf, target: Float, weights: Float) -> Float:
     """Return sum_i w_i |D_i - A_i d_i| over pixels, a Float of one value.
 
     depths: (H, W, 2), the composited depth D and alpha A; target: d, Float (H * W,), in the units
@@ -96,7 +96,7 @@ def depth_error(depths: Any, target: Any, weights: Any) -> Any:
 
 
 class _DepthError(dr.CustomOp):
-    def eval(self, depths: Any, target: Any, weights: Any) -> Any:
+    def eval(self, depths: TensorXf, target: Float, weights: Float) -> Float:
         self.like, self.target, self.weights = dr.detach(depths), target, weights
         depth, alpha = planes_of(depths)
         difference = dr.fma(-alpha, target, depth)

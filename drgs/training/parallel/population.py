@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -19,6 +18,7 @@ import numpy as np
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
+from drgs.core.types import Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.training.density.strategy import Population
 from drgs.training.optimizer import LeanAdam, take_rows
@@ -118,16 +118,16 @@ class ShardedPopulation(Population):
     def first_row(self) -> int:
         return self.shard.local.start
 
-    def gather(self, values: Any) -> np.ndarray:
+    def gather(self, values: TensorXf | Float | np.ndarray) -> np.ndarray:
         return self.comm.all_gather_rows(np.array(values)).astype(np.float64)
 
     def local(self, values: np.ndarray) -> np.ndarray:
         return values[self.shard.local]
 
-    def row_numbers(self) -> Any:
+    def row_numbers(self) -> UInt32:
         return super().row_numbers() + dr.opaque(self._index_type, self.first_row)
 
-    def take(self, rows: Any) -> dict[str, Any]:
+    def take(self, rows: UInt32) -> dict[str, TensorXf]:
         wanted = np.array(rows)
         owners = self.shard.owners(wanted)
         place = np.argsort(owners, kind="stable")
@@ -140,7 +140,7 @@ class ShardedPopulation(Population):
             taken[name] = _on_device(values, result)
         return taken
 
-    def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
+    def edit(self, keep: UInt32, append: Mapping[str, TensorXf] | None = None) -> None:
         kept, optimizer = np.array(keep), self.optimizer
         num_appended = 0 if append is None else append["means"].shape[0]
         after = replace(self.shard, total=len(kept) + num_appended)
@@ -183,7 +183,9 @@ class ShardedPopulation(Population):
 
         return move
 
-    def gather_terms(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
+    def gather_terms(
+        self, terms: list[Float], compute: Callable[[Mapping[str, TensorXf]], list[Float]]
+    ) -> list[Float]:
         """Return terms of the loss over all rows.
 
         They are computed again: the sum of what the ranks have would be rounded otherwise.
@@ -234,20 +236,20 @@ class ShardedPopulation(Population):
         return own
 
 
-def _on_device(like: Any, rows: np.ndarray) -> Any:
+def _on_device(like: TensorXf, rows: np.ndarray) -> TensorXf:
     """Return rows as the tensor, or array, that other rows of a parameter are in."""
     flat = from_host(type(dr.detach(like).array), rows)
     return type(like)(flat, rows.shape) if dr.is_tensor_v(like) else flat
 
 
-class _AllRows(dict[str, Any]):
+class _AllRows(dict[str, TensorXf]):
     """Parameters of the Gaussians of all processes by name, gathered when they are read."""
 
     def __init__(self, population: ShardedPopulation) -> None:
         super().__init__()
         self._population = population
 
-    def __missing__(self, name: str) -> Any:
+    def __missing__(self, name: str) -> TensorXf:
         """Return a tensor of all rows."""
         value = self._population.value(name)
         self[name] = type(value)(self._population.comm.all_gather_rows(np.array(value)))
