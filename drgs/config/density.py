@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field, field_validator
 
 from drgs.config.extensions import STRATEGIES, StrategyName
-from drgs.config.section import Count, Section
+from drgs.config.section import UNRESOLVED, Count, Resolved, Section
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
 """Iterations: the reference's schedule, for 30,000."""
@@ -78,8 +78,8 @@ class AdcConfig(Section):
 class BudgetConfig(Section):
     """The strategy budget: growth to a number of Gaussians, where errors are."""
 
-    gaussians: Count | None = Field(
-        None,
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
         ge=4,
         description="How many there are to be at densify.stop. null: as many as suit the pictures' "
         "size, 250 times the square root of the number of their pixels: 100,000 for 400 x 400 px.",
@@ -96,8 +96,8 @@ class BudgetConfig(Section):
 class McmcConfig(Section):
     """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
 
-    gaussians: Count | None = Field(
-        None,
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
         ge=4,
         description="The population grows to this, and no further. null: as with budget.",
     )
@@ -176,14 +176,14 @@ class DensifyConfig(Section):
         "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024). Or the name "
         "of an extension.",
     )
-    start: Count | None = Field(
+    start: Resolved[Count] = Field(
         REFERENCE_START,
         ge=0,
         description="The population changes only after this iteration. Not given, or null: 500; "
         "less where that is more than half of stop, or, with budget and mcmc, than a twentieth of "
         "all iterations.",
     )
-    stop: Count | None = Field(
+    stop: Resolved[Count] = Field(
         REFERENCE_STOP,
         ge=1,
         description="It changes, and is reset, only before this iteration; with budget, at it for "

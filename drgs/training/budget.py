@@ -22,8 +22,10 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
@@ -31,9 +33,15 @@ from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.report import seconds_of_curves, seconds_of_results
+from drgs.training.density.strategy import DensityStrategy
+from drgs.training.effects.base import TrainingEffect
+from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.inputs import share_inputs
 from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 CURVES = Path(__file__).parent / "training_curves.csv"
 """Curves that ``scenes/studies/training.py`` measured."""
@@ -84,9 +92,10 @@ class Strategy:
         if self.half_size is not None:
             until = max(1, round(self.half_size * config.iterations))
             changes["coarse"] = [{"until": until, "factor": 2}]
-        if self.share is not None:
+        target = target_of(config)
+        if self.share is not None and target is not None:
             least = max(num_points, config.init.num_points or 0)
-            number = max(least, round(self.share * target_of(config)))
+            number = max(least, round(self.share * target))
             changes[f"densify.{config.densify.strategy}.gaussians"] = number
         return changed(config, changes)
 
@@ -133,8 +142,9 @@ class Curve:
         return _interpolate(math.log(iterations), np.log(self.iterations), self.psnr)
 
 
-def _interpolate(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+def _interpolate(x: float, xs: ArrayLike, ys: ArrayLike) -> float:
     """Interpolate linearly; beyond the ends as in the last piece."""
+    xs, ys = np.asarray(xs), np.asarray(ys)
     i = min(max(int(np.searchsorted(xs, x)), 1), len(xs) - 1)
     return float(ys[i - 1] + (x - xs[i - 1]) / (xs[i] - xs[i - 1]) * (ys[i] - ys[i - 1]))
 
@@ -229,6 +239,14 @@ def make_plan(
     return Plan(planned, chosen, tuple(candidates), seconds, start_s, most)
 
 
+class FitObjects(TypedDict):
+    """Objects that take part in a fit besides those of its configuration, for :class:`Trainer`."""
+
+    density: DensityStrategy | None
+    effects: Sequence[TrainingEffect]
+    loss: Loss | None
+
+
 @dataclass(frozen=True)
 class Rehearsal:
     """The first iterations of a fit, to be thrown away."""
@@ -242,7 +260,7 @@ def rehearse(
     dataset: Dataset | None,
     gaussians: Gaussians,
     comm: Communicator | None = None,
-    **objects: object,
+    **objects: Unpack[FitObjects],
 ) -> Rehearsal:
     """Time a few iterations on a few of the views.
 
@@ -250,7 +268,7 @@ def rehearse(
     objects: given to :class:`Trainer`, copies of which take part.
     """
     comm = comm or Communicator()
-    if comm.is_root:
+    if config is not None and dataset is not None:
         config, dataset = _first_iterations(config, dataset)
     config, dataset = share_inputs(comm, config, dataset)
     trainer = Trainer(config, dataset, gaussians, comm, **deepcopy(objects))
@@ -259,9 +277,8 @@ def rehearse(
     warm_up, timed = (max(2, math.ceil(n / views_per_step)) for n in (WARM_UP, TIMED))
     for count in (warm_up, timed):
         start = time.perf_counter()
-        for _ in range(count):
-            report = trainer.step()
-        _ = report.loss  # waits for the device
+        reports = [trainer.step() for _ in range(count)]
+        _ = reports[-1].loss  # waits for the device
     return Rehearsal(trainer, (time.perf_counter() - start) / (timed * views_per_step))
 
 
@@ -284,6 +301,7 @@ def plan_fit(
     """
     num_points, most = gaussians.num_gaussians, target_of(config) or 0
     scene, degree = rehearsal.trainer.full_scene(), config.model.sh_degree
+    assert scene is not None, "rank 0 plans"
     results = seconds_of_results(scene, dataset, max(num_points, most), degree)
     pictures = results.renders if config.output.save_renders else 0.0
     pictures += results.report + seconds_of_curves() if config.output.report else 0.0

@@ -35,7 +35,7 @@ MEANS = "means.value"
 """The array that has a row for each Gaussian."""
 
 FILTER = "smoothing/filter"
-"""Of an effect, with a number for each Gaussian; a trainer has none at its start."""
+"""The array of an effect that has a number for each Gaussian; a trainer has none at its start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +59,17 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
         before = load_run_config(folder)
     except UserError:  # there is none, or the user is just editing it
         before = config
+    arrays = {
+        "config": np.array(_as_text(config)),
+        "config_before": np.array(_as_text(before)),
+        "history": checkpoint.history,
+        "density": checkpoint.density,
+        "wall_s": np.array(checkpoint.wall_s),
+        "data": np.frombuffer(checkpoint.data.to_bytes(), np.uint8),
+        **{f"trainer.{name}": values for name, values in checkpoint.trainer.items()},
+    }
     with atomic_path(folder / CHECKPOINT) as temporary:
-        np.savez(
-            temporary,
-            config=np.array(_as_text(config)),
-            config_before=np.array(_as_text(before)),
-            history=checkpoint.history,
-            density=checkpoint.density,
-            wall_s=np.array(checkpoint.wall_s),
-            data=np.frombuffer(checkpoint.data.to_bytes(), np.uint8),
-            **{f"trainer.{name}": values for name, values in checkpoint.trainer.items()},
-        )
+        np.savez(temporary, **arrays)  # pyright: ignore[reportArgumentType]  # allow_pickle=
     if before != config or not (folder / CONFIG).is_file():
         write_run_config(folder, config)
 
@@ -116,6 +116,7 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
 
     start: ``Trainer.state()`` of that trainer before its first iteration.
     """
+    assert checkpoint.config is not None, "it was read from a file"
     try:
         _check_state(checkpoint.trainer, start, checkpoint.config)
     except ValueError as error:

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.errors import UserError
-from drgs.core.types import Float, TensorXf, UInt32
+from drgs.core.types import Float, UInt32
 from drgs.splatting.rendering import decode_fault
 
 
@@ -36,7 +36,7 @@ class WatchedIteration:
     view: str
     loss: Float  # (1,)
     first_fault: UInt32  # (1,), of the gradients: see drgs.splatting.rendering.decode_fault
-    numbers: Mapping[str, Float]  # by name: of the view, optimised by effects
+    numbers: Mapping[str, dr.ArrayBase]  # by name: of the view, optimised by effects
 
     def faults(self) -> Iterator[str]:
         """Yield what is not finite; waits for the device."""
@@ -73,7 +73,7 @@ class GradientWatch:
 
 def check_values(
     iteration: int,
-    values: Mapping[str, TensorXf | np.ndarray],
+    values: Mapping[str, dr.ArrayBase | np.ndarray],
     first_row: int = 0,
     views: Sequence[str] = (),
 ) -> None:
@@ -99,4 +99,4 @@ def check_values(
 def _first_fault(array: np.ndarray) -> tuple[int, float] | None:
     """Return the first row, and in it the first value, that is not finite; None: all are."""
     faults = np.argwhere(~np.isfinite(array))
-    return (int(faults[0][0]), array[tuple(faults[0])]) if len(faults) else None
+    return (int(faults[0][0]), float(array[tuple(faults[0])])) if len(faults) else None

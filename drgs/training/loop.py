@@ -106,9 +106,11 @@ class StopCriterion(Protocol):
 
     def should_continue(self, trainer: Trainer) -> bool:
         """Return whether to run another iteration; may revise the trainer's configuration."""
+        ...
 
     def num_iterations(self, trainer: Trainer) -> int:
         """Return the number of iterations of the whole fit, as expected now."""
+        ...
 
 
 class AllIterations:

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 
@@ -33,7 +33,7 @@ C1, C2 = 0.01**2, 0.03**2
 """(K L)^2 with K1 = 0.01, K2 = 0.03, dynamic range L = 1 (Wang et al. 2004, section IV)."""
 
 TARGET_BYTES = 36
-"""Of a pixel: three numbers for each of three channels in single precision, see :class:`Target`."""
+"""Memory of a pixel: three numbers for each of three channels, float32; see :class:`Target`."""
 
 _TILE = 8  # pixels; 4 and 16 were measured to be slower
 _CHANNELS = 3
@@ -86,7 +86,8 @@ class Loss:
     @classmethod
     def from_config(cls, config: FitConfig, section: Any) -> Loss:
         """Return the loss of a fit; section: see ``TrainingEffect.from_config``."""
-        return cls() if section is None else cls(section)
+        make = cast("Callable[..., Loss]", cls)
+        return make() if section is None else make(section)
 
     def __call__(self, image: TensorXf, target: Target) -> Float:
         """Return the loss, a ``Float`` of one value; image: (H, W, 3) tensor, display space.
@@ -110,12 +111,13 @@ class LossTerm:
     @classmethod
     def from_config(cls, config: FitConfig, section: Any) -> LossTerm:
         """Return the term of a fit; section: see ``TrainingEffect.from_config``."""
-        return cls() if section is None else cls(section)
+        make = cast("Callable[..., LossTerm]", cls)
+        return make() if section is None else make(section)
 
     def of_image(self, image: TensorXf, target: Target) -> Float | None:
         """Return a ``Float`` of one value, or None; see :class:`Loss` for the arguments."""
 
-    def of_gaussians(self, parameters: Mapping[str, TensorXf], num_rows: int) -> Float | None:
+    def of_gaussians(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Float | None:
         """Return a ``Float`` of one value, or None.
 
         parameters: raw values by name, attached, of ``num_rows`` Gaussians in all. If several
@@ -149,11 +151,9 @@ class PhotometricLoss(Loss):
             )
 
     def __call__(self, image: TensorXf, target: Target) -> Float:
-        """Return the loss: see :class:`Loss`."""
         return self.with_squared_error(image, target)[0]
 
     def with_squared_error(self, image: TensorXf, target: Target) -> tuple[Float, Float]:
-        """Return the loss, and the mean of (x - y)^2: see :meth:`Loss.with_squared_error`."""
         height, width = _film_size("PhotometricLoss()", image)
         if (height, width) != (target.height, target.width):
             raise ValueError(
@@ -209,11 +209,12 @@ class _PhotometricOp(dr.CustomOp):
         return self.tiling.from_tiles(tiles)
 
     def backward(self) -> None:
-        flat = self.gradient() * self.grad_out()[0]
+        d_loss, _ = cast("tuple[Float, Float]", self.grad_out())
+        flat = self.gradient() * d_loss
         self.set_grad_in("image", types_of(type(flat)).TensorXf(flat, self.shape))
 
     def forward(self) -> None:
-        tangent = dr.sum(self.gradient() * self.grad_in("image").array)
+        tangent = dr.sum(self.gradient() * cast(TensorXf, self.grad_in("image")).array)
         self.set_grad_out((tangent, dr.zeros(type(tangent))))
 
     def name(self) -> str:
@@ -229,8 +230,9 @@ def _blur_along_rows(
     maps = (x, _product(x, x), _product(x, y))
     blurred = [rows.store_across(_blur(z, tiling.weights)) for z in maps]
     differences = [x[k] - y[k] for k in range(_TILE)]  # beyond the image both are 0
-    absolute = sum(map(dr.abs, differences))
-    squared = sum(map(dr.square, differences))
+    zero = type(values)(0)
+    absolute = sum(map(dr.abs, differences), zero)
+    squared = sum(map(dr.square, differences), zero)
     dr.eval(blurred, absolute, squared)
     return blurred, absolute, squared
 
@@ -378,12 +380,12 @@ class _Tiling:
 
     @property
     def rows(self) -> _Lines:
-        """One lane a tile row."""
+        """Lanes of tile rows."""
         return _Lines(self, stride=1, axis=1)
 
     @property
     def columns(self) -> _Lines:
-        """One lane a tile column."""
+        """Lanes of tile columns."""
         return _Lines(self, stride=self.grid[1], axis=0)
 
 

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from drgs.config.schema import FitConfig
+from drgs.core.arrays import Array
 from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.datasets.images import smaller_view
 from drgs.datasets.types import View
@@ -26,8 +27,9 @@ from drgs.training.rates import LearningRates
 from drgs.training.views import TrainingView
 
 KEPT_BYTES = 1 << 30
-"""Of targets and effects' uploads that stay on the device until their view is drawn again: of 180
-images of 400 x 400 px. Without room, they are made anew, in a tenth of an iteration."""
+"""Memory of targets and effects' uploads that stay on the device until their view is drawn again:
+those of 180 images of 400 x 400 px. Without room, they are made anew, which takes a tenth of an
+iteration."""
 
 
 @dataclass(eq=False)
@@ -127,7 +129,7 @@ class Step:
 
     @property
     def last(self) -> int:
-        """Its last iteration."""
+        """The last iteration."""
         return self.iterations[-1]
 
 
@@ -227,5 +229,5 @@ class WholeGradients:
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
         return list(losses.values())
 
-    def share(self, view: StepView, value: Float) -> Float:
+    def share(self, view: StepView, value: Array) -> Array:
         return value

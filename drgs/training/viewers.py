@@ -47,7 +47,7 @@ RATES = {
 """High, as few iterations have to do, and those of colours most of all."""
 
 NEGLIGIBLE_RATE = 1e-9
-"""For values that are to stay, where 0 is not a rate."""
+"""Rate of values that are to stay, where 0 is not a rate."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One training photograph: its sensor, what is rendered is compared with, and effects' uploads.
+"""A training photograph: its sensor, the target of its rendering, and effects' uploads.
 
 What depends on images is made when an iteration needs it, from what the dataset keeps, and stays on
 the device as long as there is room: see :class:`drgs.training.steps.Stage`.

@@ -33,9 +33,10 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import CoarseStage, FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
-from drgs.core.types import Float, TensorXf
+from drgs.core.types import Float
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
+    NOT_BEGUN,
     DensityReport,
     DensityStrategy,
     PixelWeight,
@@ -46,7 +47,7 @@ from drgs.training.density.strategy import (
 )
 
 OFFSET = 1.35
-"""Of the halves' means from that of the Gaussian, in standard deviations of its longest axis."""
+"""Distance of the halves' means from the Gaussian's, in standard deviations of its longest axis."""
 
 LONG_SCALE, SHORT_SCALE = 0.55, 0.893
 """Factors of the halves' scales: along that axis, and along the two others."""
@@ -62,7 +63,7 @@ class GrowthToNumber(DensityStrategy):
 
     config: DensifyConfig
     coarse: Sequence[CoarseStage] = ()
-    errors: Float | None = None  # (N,): sum over views of s; None until it begins
+    errors: Float = NOT_BEGUN  # (N,): sum over views of s
     first: int = 0  # Gaussians at the start
     by_row = ("errors",)
     start_share, stop_share, rate_decay = SCHEDULES["budget"]
@@ -151,11 +152,10 @@ class GrowthToNumber(DensityStrategy):
         self.first = int(state["first"])
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
-        """Return the number that the population grows to."""
         return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
 
 
-def halves(population: Population, rows: np.ndarray) -> dict[str, TensorXf]:
+def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
     """Return two halves of each of ``rows``: all the first ones, then all the second ones.
 
     The halves' means lie on both sides of the Gaussian's, on its longest axis.

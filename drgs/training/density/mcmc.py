@@ -21,17 +21,17 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
-from drgs.core.types import Array3f, Float, TensorXf, UInt32
+from drgs.core.types import Array3f, Float, UInt32
 from drgs.datasets.types import Dataset
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, displaced
 
 MAX_COPIES = 51
-"""In one place, of one Gaussian at a time; as in the paper's code. Binomials up to here are exact
-in double precision."""
+"""Most copies of a Gaussian in its place at a time, as in the paper's code. Binomials up to here
+are exact in double precision."""
 
 MAX_OPACITY = 1 - 2.0**-23
-"""Of copies: the largest opacity in float32 that has a logit."""
+"""Largest opacity of copies: the largest in float32 that has a logit."""
 
 NOISE_STEEPNESS = 100.0
 """Noise fades out over some 0.05 of opacity: the paper's equation 8."""
@@ -62,7 +62,7 @@ class MarkovChain(DensityStrategy):
         """Gaussians that the population grows to; one that starts with more stays as it is."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
-    def penalties(self, parameters: Mapping[str, TensorXf], num_rows: int) -> Iterator[Float]:
+    def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         """Yield the paper's equation 10: mean opacity, and mean scale in scene extents."""
         config, logits = self.config.mcmc, parameters["logit_opacities"]
         log_scales = parameters["log_scales"].array
@@ -86,8 +86,8 @@ class MarkovChain(DensityStrategy):
         )
         t = types_of(type(logits))
         strength = dr.opaque(t.Float, config.noise_lr * means_lr / self.extent**2)
-        iteration, seed = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
-        normal = normals(t.Float, population.row_numbers(), iteration, seed)
+        key = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
+        normal = normals(t.Float, population.row_numbers(), *key)
         opacity = 1 / (1 + dr.exp(-logits))
         fading = 1 / (1 + dr.exp(NOISE_STEEPNESS * (opacity - config.min_opacity)))
         rotation = quat_to_rotation(dr.unravel(t.Array4f, quats.array))
@@ -168,7 +168,7 @@ def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np
 
 def _copies(
     population: Population, copied: np.ndarray, opacities: np.ndarray, min_opacity: float
-) -> tuple[np.ndarray, dict[str, TensorXf]]:
+) -> tuple[np.ndarray, dict[str, dr.ArrayBase]]:
     """Return the rows that are drawn, and their successors: themselves, corrected, then copies.
 
     copied: row numbers, ascending; opacities: (N,), of all rows.

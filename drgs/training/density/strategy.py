@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import drjit as dr
 import numpy as np
@@ -47,6 +47,9 @@ class StepInfo:
     visible: Bool  # (N,)
     weighted_sums: Mapping[str, Float]  # (N,): see DensityStrategy.pixel_weights
 
+
+NOT_BEGUN: Any = None
+"""Statistics before :meth:`DensityStrategy.begin`."""
 
 PixelWeight = Callable[[TensorXf, TensorXf], Float]
 """Computes a plane, Float (H W,), from the rendered image and the photograph: tensors (H, W, 3) in
@@ -87,7 +90,7 @@ class Population:
         """The number of the first row of this process."""
         return 0
 
-    def value(self, name: str) -> TensorXf:
+    def value(self, name: str) -> dr.ArrayBase:
         """Return a parameter as it is at the moment, on the device: the rows of this process."""
         return dr.detach(self.optimizer[self.prefix + name])
 
@@ -95,7 +98,7 @@ class Population:
         """Return a parameter of all rows on the host, float64; waits for the device."""
         return self.gather(self.value(name))
 
-    def gather(self, values: TensorXf | Float | np.ndarray) -> np.ndarray:
+    def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
         """Return the values of all rows from those of this process: on the host, float64."""
         return np.array(values, dtype=np.float64)
 
@@ -115,11 +118,11 @@ class Population:
     def _index_type(self) -> type:
         return dr.uint32_array_t(type(self.value("means").array))
 
-    def take(self, rows: UInt32) -> dict[str, TensorXf]:
+    def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
         """Return copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
         return take_rows(self.optimizer, rows, self.prefix)
 
-    def edit(self, keep: UInt32, append: Mapping[str, TensorXf] | None = None) -> None:
+    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
         """Keep some rows in the order given and append others.
 
         keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Kept rows
@@ -127,17 +130,17 @@ class Population:
         """
         edit_rows(self.optimizer, keep, append, self.prefix)
 
-    def replace(self, name: str, value: TensorXf) -> None:
+    def replace(self, name: str, value: dr.ArrayBase) -> None:
         """Give a parameter new values of the same shape, and moments of zero."""
         replace_values(self.optimizer, name, value, self.prefix)
 
-    def set_values(self, name: str, value: TensorXf) -> None:
+    def set_values(self, name: str, value: dr.ArrayBase) -> None:
         """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
         set_values(self.optimizer, name, value, self.prefix)
 
     def gather_terms(
-        self, terms: list[Float], compute: Callable[[Mapping[str, TensorXf]], list[Float]]
-    ) -> list[Float]:
+        self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
+    ) -> list[Float] | list[np.ndarray]:
         """Return terms of the loss over all rows, detached.
 
         terms: over the rows of this process; compute: computes them from parameters by name.
@@ -161,7 +164,7 @@ class Population:
         return state
 
 
-def displaced(rows: Mapping[str, TensorXf], offsets: np.ndarray) -> TensorXf:
+def displaced(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> TensorXf:
     """Return means moved along their own axes: mean + R(q) (s * offset), tensor (M, 3).
 
     rows: of every parameter by name; offsets: (M, 3), in standard deviations.
@@ -184,14 +187,17 @@ class DensityStrategy(Protocol):
     """
 
     @classmethod
-    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: Any) -> Any:
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset | None, section: Any
+    ) -> DensityStrategy:
         """Return the strategy of a fit.
 
         section: the section that the strategy has registered, with the values of the
         configuration, or the model's defaults; by default the only argument of the class. None:
         the strategy has no section. dataset: None where only :meth:`max_num_gaussians` is called.
         """
-        return cls() if section is None else cls(section)
+        make = cast("Callable[..., DensityStrategy]", cls)
+        return make() if section is None else make(section)
 
     by_row: Sequence[str] = ()
     """Names in :meth:`state` of arrays with a row for each Gaussian."""
@@ -221,7 +227,7 @@ class DensityStrategy(Protocol):
     def update_statistics(self, step: StepInfo) -> None:
         """Add an iteration to the statistics, after its optimizer step."""
 
-    def penalties(self, parameters: Mapping[str, TensorXf], num_rows: int) -> Iterator[Float]:
+    def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         """Yield terms of the loss, Float of one value each.
 
         parameters: raw values by name, with derivatives, of ``num_rows`` Gaussians or of some.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,7 +11,7 @@ import numpy as np
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.core.types import Float, TensorXf
+from drgs.core.types import TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
@@ -28,7 +30,7 @@ def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:
 
 @EFFECTS.register("background")
 class RandomBackground(TrainingEffect):
-    """Another colour behind each image: nothing but an opaque splat can look like what is there.
+    """A new colour behind each image: nothing but an opaque splat can look like what is there.
 
     The colours are functions of seed and iteration.
     """
@@ -72,8 +74,10 @@ class RandomBackground(TrainingEffect):
         channel = dr.arange(mi.UInt32, dr.width(transparent.array)) % 3
         shift = dr.select(channel == 0, shift.x, dr.select(channel == 1, shift.y, shift.z))
         image = view.photograph.image.array + transparent.array * shift
-        view.replacement = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
+        view.replacement = prepare_target(type(transparent)(image, transparent.shape), *self.window)
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Float]) -> None:
+    def after(
+        self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
+    ) -> None:
         set_background(fit.integrator, self.background)
         view.replacement = None

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -172,7 +172,8 @@ class Communicator:
         """
         if self.size == 1:
             return call()
-        result, error = None, None
+        result: T | None = None
+        error: UserError | None = None
         try:
             result = call()
         except UserError as caught:
@@ -182,7 +183,7 @@ class Communicator:
         first = int(errors[:, 0].argmin())
         iteration, is_non_finite = errors[first]
         if iteration == NEVER:
-            return result
+            return cast(T, result)
         text = self.broadcast_text("" if error is None else str(error), first)
         raise NonFiniteError(text, int(iteration)) if is_non_finite else UserError(text)
 

@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import add, or_
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.camera import Camera, cameras_in_time
-from drgs.core.arrays import Rows, block_widths, empty_on_host, from_host, types_of, wrapped
+from drgs.core.arrays import Array, Rows, block_widths, empty_on_host, from_host, types_of, wrapped
 from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.effects.compose import with_effects, without_effects
@@ -120,7 +121,7 @@ class PackedProjection:
     @staticmethod
     def from_footprints(local: LocalProjection, found: Footprints) -> PackedProjection:
         """Pack what is on the film. The host reads the number of splats."""
-        rows = dr.compress(local.visible)
+        rows = cast(UInt32, dr.compress(local.visible))
         count, float_type = dr.width(rows), found.rows.Float
         blocks = _empty_blocks(0, local.widths, float_type)
         if count > 0:
@@ -196,18 +197,20 @@ class _View:
 
     view: StepView
     renderer: int  # the rank that renders it
-    counts: np.ndarray | None = None  # (ranks, times): splats that each rank sends to the renderer
+    counts: np.ndarray = field(
+        init=False
+    )  # (ranks, times): splats that each rank sends to the renderer
     packed: list[PackedProjection] = field(default_factory=list)  # by time, for another renderer
     local: list[LocalProjection] = field(default_factory=list)  # by time
     frames: list[Frame] = field(default_factory=list)  # by time, until the backward pass has ended
     gradients: list[SplatGradients] = field(default_factory=list)  # by time, of own rows; until
     # they are added
-    means2d: Array2f | None = None  # derivatives with respect to own rows' places on the film
+    means2d: Array2f = field(init=False)  # derivatives with respect to own rows' places on the film
     sums: dict[str, Float] = field(
         default_factory=dict
     )  # by name: see DensityStrategy.pixel_weights
     needs_camera: bool = False
-    first_fault: UInt32 | None = None
+    first_fault: UInt32 = field(init=False)
 
     def num_splats(self, rank: int, time: int) -> int:
         """Return the number of splats that a rank contributes to the rendered view."""
@@ -276,6 +279,7 @@ class ViewExchange:
     def end_view(self, weights: Mapping[str, Float]) -> None:
         """End the backward pass of a view; weights: planes for weighted sums, by name."""
         each = self._current
+        assert each is not None, "a view is rendered"
         for name, plane in weights.items():
             sums = []
             for time, frame in enumerate(each.frames):
@@ -317,7 +321,7 @@ class ViewExchange:
         rows = zip(loss[:, None], error[:, None], numbers[:, 2], strict=True)
         return [ViewLoss(*row) for row in rows]
 
-    def share(self, view: StepView, value: Float) -> Float:
+    def share(self, view: StepView, value: Array) -> Array:
         """Return an array of the rank that renders a view; others give one of the same size."""
         if self.comm.size == 1:
             return value
@@ -471,6 +475,7 @@ class ViewExchange:
                     sums = [dr.sum(from_host(type(of_rows[0]), column)) for column in rows.T]
                     of_cameras.append(sums)
             total = reduce(sum_of_gradients, found)
+        assert total.parameters is not None, "they are asked for"
         self._accumulate(total.parameters)
         each.first_fault = total.first_fault
         if of_cameras:
