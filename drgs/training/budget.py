@@ -52,7 +52,7 @@ MIN_ITERATIONS = 50
 MIN_SIDE_PX = 32
 """Images of coarse stages are not smaller than SSIM's windows need."""
 
-WARM_UP, TIMED, REHEARSAL_VIEWS = 6, 20, 8
+WARM_UP_ITERATIONS, TIMED_ITERATIONS, REHEARSAL_VIEWS = 6, 20, 8
 """Iterations of a rehearsal, the first of which compile kernels; and its views."""
 
 REVISION_SHARE = 0.1
@@ -86,7 +86,7 @@ class Strategy:
             return False
         return self.share is None or target_of(config) is not None
 
-    def applied(self, config: FitConfig, num_points: int) -> FitConfig:
+    def apply(self, config: FitConfig, num_points: int) -> FitConfig:
         """Return ``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
         changes: dict[str, object] = {}
         if self.half_size is not None:
@@ -234,7 +234,7 @@ def make_plan(
         )
     chosen = max(candidates, key=lambda candidate: candidate.psnr)
     planned = with_iterations(config, chosen.iterations)
-    planned = chosen.strategy.applied(planned, num_points)
+    planned = chosen.strategy.apply(planned, num_points)
     most = max(num_points, target_of(planned) or planned.densify.max_gaussians)
     return Plan(planned, chosen, tuple(candidates), seconds, start_s, most)
 
@@ -274,7 +274,9 @@ def rehearse(
     trainer = Trainer(config, dataset, gaussians, comm, **deepcopy(objects))
     views_per_step = config.optimizer.views_per_step
     # Steps of several views are fewer.
-    warm_up, timed = (max(2, math.ceil(n / views_per_step)) for n in (WARM_UP, TIMED))
+    warm_up, timed = (
+        max(2, math.ceil(n / views_per_step)) for n in (WARM_UP_ITERATIONS, TIMED_ITERATIONS)
+    )
     for count in (warm_up, timed):
         start = time.perf_counter()
         reports = [trainer.step() for _ in range(count)]
@@ -287,7 +289,7 @@ def _first_iterations(config: FitConfig, dataset: Dataset) -> tuple[FitConfig, D
     views_per_step = config.optimizer.views_per_step
     count = max(REHEARSAL_VIEWS, views_per_step)
     views = dataset.train[:: max(1, len(dataset.train) // count)]
-    never = config.iterations + (WARM_UP + TIMED) * views_per_step
+    never = config.iterations + (WARM_UP_ITERATIONS + TIMED_ITERATIONS) * views_per_step
     still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
     return changed(config, {"coarse": [], **still}), replace(dataset, train=views[:count])
 

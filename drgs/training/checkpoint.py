@@ -27,14 +27,14 @@ from drgs.results.folder import load_run_config, write_run_config
 from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 
-PLACES = ("data.path", "data.source", "init.point_cloud")
+PATH_KEYS = ("data.path", "data.source", "init.point_cloud")
 """Values that say where something is: a project that was moved has others. The start point is
 needed no more; the data has a fingerprint."""
 
-MEANS = "means.value"
+MEANS_ARRAY = "means.value"
 """The array that has a row for each Gaussian."""
 
-FILTER = "smoothing/filter"
+SMOOTHING_ARRAY = "smoothing/filter"
 """The array of an effect that has a number for each Gaussian; a trainer has none at its start."""
 
 
@@ -164,7 +164,7 @@ def _as_text(config: FitConfig) -> str:
 def _at_the_places_of(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
     """Return a checkpoint's configuration, with places and the section ``output`` of another."""
     places = {}
-    for key in PLACES:
+    for key in PATH_KEYS:
         section, name = key.split(".")
         places[key] = getattr(getattr(config, section), name)
     output = config.output.model_dump()
@@ -185,11 +185,11 @@ def _check_state(
     """
     if missing := [name for name in start if name not in state]:
         raise ValueError(f"{listed(missing)} missing")
-    num, most = len(np.atleast_1d(state[MEANS])), config.densify.max_gaussians
+    num, most = len(np.atleast_1d(state[MEANS_ARRAY])), config.densify.max_gaussians
     if not 1 <= num <= most:
         raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")
     expected = {name: (_shape(name, start, num), array.dtype) for name, array in start.items()}
-    expected[FILTER] = (num,), np.dtype(np.float32)
+    expected[SMOOTHING_ARRAY] = (num,), np.dtype(np.float32)
     values = [name for name in start if name.endswith(".value")]
     expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
     for name in filter(expected.__contains__, state):
@@ -208,7 +208,7 @@ def _shape(name: str, start: Mapping[str, np.ndarray], num: int) -> tuple[int, .
     of_effect = "/" in name and not name.startswith(DENSITY)
     if not shape or of_effect or name.endswith(".t"):
         return shape
-    return (shape[0] // len(start[MEANS]) * num, *shape[1:])
+    return (shape[0] // len(start[MEANS_ARRAY]) * num, *shape[1:])
 
 
 def _check_tables(checkpoint: Checkpoint) -> None:

@@ -37,7 +37,7 @@ AdamState = tuple[
 ]
 """The optimizer's entry of a parameter: ``(value, promoted, rate, (t, m, v, v_max))``."""
 
-LARGE = 1 << 20
+LARGE_WIDTH = 1 << 20
 """Entries of an array from which on memory is worth saving."""
 
 
@@ -59,7 +59,7 @@ class _Moments:
         former = same_memory(first), same_memory(second)
         return _Moments((first, second), (first.index, second.index), former)
 
-    def are(self, *arrays: dr.ArrayBase) -> bool:
+    def match(self, *arrays: dr.ArrayBase) -> bool:
         """Return whether these are the moments still."""
         pairs = zip(self.arrays, self.indices, arrays, strict=True)
         return all(own is array and index == array.index for own, index, array in pairs)
@@ -97,20 +97,20 @@ class LeanAdam(Adam):
             super().step(eval=eval, grad_scale=grad_scale, active=active)
             return
         rates = new_rate_cache()
-        dr.eval([self._replaced(key, rates) for key in self.state])
+        dr.eval([self._update(key, rates) for key in self.state])
 
     def forget_moments(self) -> None:
         """Free memory of moments that are the parameters' no longer."""
         self._moments.clear()
 
-    def _replaced(self, key: str, rates: _LRCache) -> list[dr.ArrayBase]:
+    def _update(self, key: str, rates: _LRCache) -> list[dr.ArrayBase]:
         """Give a parameter its new state, not evaluated, and return what is to be evaluated."""
         value, promoted, rate, (count, first, second, _) = self.state[key]
-        is_large = dr.width(value) >= LARGE and dr.backend_v(value) == dr.JitBackend.LLVM
+        is_large = dr.width(value) >= LARGE_WIDTH and dr.backend_v(value) == dr.JitBackend.LLVM
         former = first, second
         if is_large:
             known = self._moments.get(key)
-            if known is None or not known.are(first, second):
+            if known is None or not known.match(first, second):
                 self._moments[key] = known = _Moments.from_arrays(first, second)
             former = known.former
         rate_in_use = self.lr if rate is None else rate
@@ -194,7 +194,7 @@ def edit_rows(
         raise ValueError("edit_rows(): at least one row must remain, but none is kept or appended")
     optimizer.forget_moments()
     for name in _names(optimizer, prefix):
-        value, promoted, rate, (step, first, second, maximum) = optimizer.state[prefix + name]
+        value, promoted, rate, (step, first, second, _) = optimizer.state[prefix + name]
         row_shape = tuple(value.shape[1:])
         width = math.prod(row_shape)
         elements = _elements(keep, width)
@@ -205,13 +205,11 @@ def edit_rows(
 
         flat = _gather_and_append(dr.detach(value).array, elements, new_rows)
         first, second = (_gather_and_append(m, elements, no_moments) for m in (first, second))
-        if maximum is not None:
-            maximum = _gather_and_append(maximum, elements, no_moments)
         if dr.is_tensor_v(value):
             flat = type(value)(flat, (dr.width(flat) // width, *row_shape))
         dr.enable_grad(flat)
-        dr.schedule(flat, first, second, maximum)
-        optimizer.state[prefix + name] = flat, promoted, rate, (step, first, second, maximum)
+        dr.schedule(flat, first, second)
+        optimizer.state[prefix + name] = flat, promoted, rate, (step, first, second, None)
     dr.eval()
 
 
@@ -234,13 +232,11 @@ def replace_values(optimizer: Adam, name: str, value: dr.ArrayBase, prefix: str 
     The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
     correction does not start again.
     """
-    new, promoted, rate, (step, first, second, maximum) = _with_value(
+    new, promoted, rate, (step, first, second, _) = _with_value(
         "replace_values", optimizer, prefix + name, value
     )
     first, second = (dr.opaque(type(m), 0, m.shape) for m in (first, second))
-    if maximum is not None:
-        maximum = dr.opaque(type(maximum), 0, maximum.shape)
-    optimizer.state[prefix + name] = new, promoted, rate, (step, first, second, maximum)
+    optimizer.state[prefix + name] = new, promoted, rate, (step, first, second, None)
 
 
 def set_values(optimizer: Adam, name: str, value: dr.ArrayBase, prefix: str = "") -> None:

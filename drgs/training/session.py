@@ -146,7 +146,7 @@ class FitSession:
             if finished:
                 folder.finish()  # a process that was killed after its last file has not
                 self._print(f"{folder.path}: this fit is finished; --overwrite does it again")
-        return bool(self.comm.of_root(finished))
+        return bool(self.comm.broadcast_numbers(finished))
 
     @property
     def _given_config(self) -> FitConfig:
@@ -171,7 +171,7 @@ class FitSession:
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
         self.trainer = Trainer(self.config, self.dataset, gaussians, comm, **self._objects)
         self.history = History()  # whose clock begins
-        if comm.of_root(checkpoint is not None):
+        if comm.broadcast_numbers(checkpoint is not None):
             self._restore(checkpoint)
         return plan
 
@@ -257,7 +257,7 @@ class FitSession:
                 self.check_ranges()
                 for observer in observers:
                     observer.after(trainer, self.history, done, lambda: stop.requested)
-                stops = bool(comm.of_root(stop.requested))
+                stops = bool(comm.broadcast_numbers(stop.requested))
                 if stops or self._is_checkpoint_due(done):
                     self._save_checkpoint()
                 if stops:

@@ -31,7 +31,7 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.parallel.inputs import share_gaussians
 from drgs.training.trainer import Trainer
 
-SHARE, TIME_SHARE = 0.08, 0.12
+ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12
 """Iterations that are added, as a share of the fit's; and their time: late ones take longer."""
 
 RATES = {
@@ -68,7 +68,7 @@ class ForViewers:
 
 def num_iterations(config: FitConfig) -> int:
     """Return the number of iterations that are added to those of a fit."""
-    return math.ceil(SHARE * config.iterations)
+    return math.ceil(ITERATIONS_SHARE * config.iterations)
 
 
 def for_viewers(

@@ -30,7 +30,7 @@ from drgs.training.density.strategy import (
     DensityStrategy,
     Population,
     StepInfo,
-    displaced,
+    displace_means,
 )
 
 
@@ -226,7 +226,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
         t = types_of(type(population.value("means").array))
         rows = population.take(population.rows(np.append(chosen.clone, samples_of)))
-        rows["means"] = displaced(rows, normals)
+        rows["means"] = displace_means(rows, normals)
         shrink = t.TensorXf(from_host(t.Float, log_shrink), normals.shape)
         rows["log_scales"] = rows["log_scales"] - shrink
         return rows

@@ -43,16 +43,16 @@ from drgs.training.density.strategy import (
     Population,
     StepInfo,
     absolute_errors,
-    displaced,
+    displace_means,
 )
 
-OFFSET = 1.35
+HALF_OFFSET = 1.35
 """Distance of the halves' means from the Gaussian's, in standard deviations of its longest axis."""
 
-LONG_SCALE, SHORT_SCALE = 0.55, 0.893
+HALF_LONG_SCALE, HALF_SHORT_SCALE = 0.55, 0.893
 """Factors of the halves' scales: along that axis, and along the two others."""
 
-OPACITY, OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
+HALF_OPACITY, HALF_OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
 """Factor of the halves' opacities, which overlap; and their range, so that logits stay small."""
 
 
@@ -164,15 +164,17 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
     new = population.take(population.rows(twice))
     longest = population.host("log_scales")[twice].argmax(axis=1)
     offsets = np.zeros((len(twice), 3))
-    offsets[np.arange(len(twice)), longest] = np.repeat([OFFSET, -OFFSET], len(rows))
-    factors = np.where(offsets != 0, LONG_SCALE, SHORT_SCALE)
-    opacities = np.clip(OPACITY * expit(population.host("logit_opacities")[twice]), *OPACITY_RANGE)
+    offsets[np.arange(len(twice)), longest] = np.repeat([HALF_OFFSET, -HALF_OFFSET], len(rows))
+    factors = np.where(offsets != 0, HALF_LONG_SCALE, HALF_SHORT_SCALE)
+    opacities = np.clip(
+        HALF_OPACITY * expit(population.host("logit_opacities")[twice]), *HALF_OPACITY_RANGE
+    )
 
     t = types_of(type(new["logit_opacities"]))
     log_factors = t.TensorXf(from_host(t.Float, np.log(factors)), factors.shape)
     return {
         **new,
-        "means": displaced(new, offsets),
+        "means": displace_means(new, offsets),
         "log_scales": new["log_scales"] + log_factors,
         "logit_opacities": from_host(t.Float, logit(opacities)),
     }

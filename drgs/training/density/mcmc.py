@@ -24,7 +24,12 @@ from drgs.core.errors import UserError
 from drgs.core.types import Array3f, Float, UInt32
 from drgs.datasets.types import Dataset
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, displaced
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    Population,
+    displace_means,
+)
 
 MAX_COPIES = 51
 """Most copies of a Gaussian in its place at a time, as in the paper's code. Binomials up to here
@@ -124,12 +129,12 @@ class MarkovChain(DensityStrategy):
         grown = max(int(before * (1 + config.growth)), before + (config.growth > 0))
         aim = max(num_alive, min(self.cap, grown))
         key = [population.seed, iteration]
-        copied = in_proportion(np.where(alive, opacities, 0), aim - num_alive, key)
+        copied = sample_in_proportion(np.where(alive, opacities, 0), aim - num_alive, key)
         if len(copied):
             drawn, rows = _copies(population, copied, opacities, config.min_opacity)
             offsets = np.random.default_rng([*key, 1]).standard_normal(rows["means"].shape)
             offsets[: len(drawn)] = 0
-            rows["means"] = displaced(rows, config.spread * offsets)
+            rows["means"] = displace_means(rows, config.spread * offsets)
             alive[drawn] = False
             population.edit(population.rows(np.flatnonzero(alive)), rows)
         elif num_alive < before:
@@ -147,7 +152,7 @@ class MarkovChain(DensityStrategy):
         return max(start, self.cap)
 
 
-def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def correct_copies(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return opacities of n coincident Gaussians that look like one, and factors of their scales.
 
     opacities: (M,) of the one; counts: (M,) of n, of which at most ``MAX_COPIES`` count. The
@@ -174,7 +179,7 @@ def _copies(
     copied: row numbers, ascending; opacities: (N,), of all rows.
     """
     drawn, counts = np.unique(copied, return_counts=True)
-    shared, factors = corrected(opacities[drawn], counts + 1)
+    shared, factors = correct_copies(opacities[drawn], counts + 1)
     shared = np.clip(shared, min_opacity, MAX_OPACITY)
     rows = population.take(population.rows(np.append(drawn, copied)))
     # Of each new row, the place of its source among those that were drawn.
@@ -193,7 +198,7 @@ def _mean(values: Float, weight: float, count: int) -> Float:
     return dr.sum(values) * dr.opaque(type(values), weight / count)
 
 
-def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray:
+def sample_in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray:
     """Return ``count`` row numbers, ascending, each as often as its weight requires.
 
     weights: (N,) of at least 0, not all of them 0; NaN counts as 0. key: of the random numbers.
@@ -206,7 +211,9 @@ def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray
     weights = np.where(weights > 0, weights, 0.0)
     ends = np.cumsum(weights)
     if not (len(ends) and 0 < ends[-1] < np.inf):
-        raise ValueError("in_proportion(): the sum of the weights must be positive and finite")
+        raise ValueError(
+            "sample_in_proportion(): the sum of the weights must be positive and finite"
+        )
     offset = np.random.default_rng(key).random()
     positions = (np.arange(count) + offset) * (ends[-1] / count if count else 0.0)
     # Rounding may put the last position onto the end, behind the last row of any weight.

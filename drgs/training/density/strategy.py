@@ -164,7 +164,7 @@ class Population:
         return state
 
 
-def displaced(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> TensorXf:
+def displace_means(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> TensorXf:
     """Return means moved along their own axes: mean + R(q) (s * offset), tensor (M, 3).
 
     rows: of every parameter by name; offsets: (M, 3), in standard deviations.

@@ -17,7 +17,7 @@ from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
 from drgs.training.views import TrainingView
 
-STREAM = 71
+RANDOM_STREAM = 71
 """Tells the random numbers of backgrounds from others of the same seed."""
 
 
@@ -64,7 +64,7 @@ class RandomBackground(TrainingEffect):
         return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
-        rng = np.random.default_rng([self.seed, STREAM, fit.iteration])
+        rng = np.random.default_rng([self.seed, RANDOM_STREAM, fit.iteration])
         color = rng.uniform(size=3)
         set_background(fit.integrator, color)
         # No literal, or every colour would be a new kernel.

@@ -14,7 +14,7 @@ from drgs.effects.smoothing import smoothing_of
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.training.effects.base import FitState, TrainingEffect
 
-EVERY = 100
+UPDATE_EVERY = 100
 """Iterations (as in Mip-Splatting's code); also where another stage begins, and after each change
 of the population."""
 
@@ -30,7 +30,7 @@ class TrainingSmoothing(TrainingEffect):
         self.filter: Float | None = None
 
     def begin(self, fit: FitState) -> None:
-        is_due = any(iteration % EVERY == 1 for iteration in fit.iterations_of_step)
+        is_due = any(iteration % UPDATE_EVERY == 1 for iteration in fit.iterations_of_step)
         if self.filter is None or fit.begins_stage or is_due:
             self.filter = _smoothing(fit)
         fit.integrator.smoothing = self.filter

@@ -116,7 +116,7 @@ class Communicator:
         wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, sizes)))
         return gathered
 
-    def of_root(self, numbers: ArrayLike) -> np.ndarray:
+    def broadcast_numbers(self, numbers: ArrayLike) -> np.ndarray:
         """Return the numbers of rank 0; other ranks give as many, of the same type."""
         return self.all_gather(np.array(numbers))[0]
 
