@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import mitsuba as mi
 
 from drgs.core.types import Float
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.state import BackwardResult
+from drgs.integrator.state import BackwardResult, SplatsState
 from drgs.splatting.rendering import Pipeline, ProjectionStage
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     class SplatsIntegrator(mi.Integrator):
         """The part of ``plugins/splats.py`` that other modules use."""
 
+        state: SplatsState
         gaussians: Gaussians
         sh_degree: int
         smoothing: Float | None
@@ -27,6 +28,12 @@ if TYPE_CHECKING:
 
         def use_projection(self, stage: ProjectionStage) -> None: ...
         def forget_frames(self) -> None: ...
+        def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str: ...
 
 else:
     SplatsIntegrator = Any
+
+
+def is_splats(node: object) -> TypeGuard[SplatsIntegrator]:
+    """Return whether an object of Mitsuba is the integrator ``splats``."""
+    return isinstance(getattr(node, "state", None), SplatsState)
