@@ -7,43 +7,65 @@ sensor's transform is never read back to the host.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.lens import PINHOLE, Lens
+from drgs.cameras.lens import PINHOLE, CameraParameters, Lens
 from drgs.core.arrays import types_of
-from drgs.core.types import Array2f, Array3f, Bool, Float, Matrix3f, UInt32
-
-if TYPE_CHECKING:
-    from drgs.cameras.motion import Shutter
-    from drgs.cameras.thin_lens import RoundAperture
-else:  # imported with a camera that has one; Dr.Jit evaluates the annotations of fields
-    RoundAperture = Shutter = Any
+from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar, UInt32
 
 MISSED = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
 
+class Aperture(Protocol):
+    """The aperture of a lens that blurs: see ``drgs.cameras.thin_lens``."""
+
+    @property
+    def radius(self) -> Float:
+        """Radius, scene units."""
+        ...
+
+    def variance(self, camera: Camera, depth: Float) -> Float:
+        """Return the variance along either axis, px^2, of the blur of a point at ``depth``."""
+        ...
+
+    def rays(self, camera: Camera, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool]:
+        """Return directions (world) of ``count`` rays of each place (px), and validity."""
+        ...
+
+    def in_focus(self, origin: Array3f, direction: Array3f) -> Array3f:
+        """Return the point of a ray (camera axes) where all rays of its place meet."""
+        ...
+
+
+class Shutter(Protocol):
+    """The shutter of a camera that moves while it is open: see ``drgs.cameras.motion``."""
+
+    label: ClassVar[str]  # for messages
+
+    def pose(self, camera: Camera, time: Scalar) -> Camera:
+        """Return ``camera``, which is at time 0, at another time, without a shutter."""
+        ...
+
+    def cameras(self, camera: Camera) -> list[Camera]:
+        """Return the cameras whose images are averaged."""
+        ...
+
+    def camera_of(self, means: Array3f, camera: Camera) -> Camera:
+        """Return the camera that sees each of some means (world)."""
+        ...
+
+
 @dataclass(frozen=True)
-class Camera:
-    """A camera: x right, y down, z forward; pixel centres at (i + 0.5, j + 0.5).
+class Camera(CameraParameters):
+    """A camera: x right, y down, z forward; pixel centres at (i + 0.5, j + 0.5)."""
 
-    A world point x has camera coordinates ``rotation (x - center)``. The centre is kept rather
-    than the translation ``-rotation center``, which cancels far from the origin.
-    """
-
-    rotation: Matrix3f  # world to camera
-    center: Array3f  # world
-    focal: Array2f  # (fx, fy), px
-    principal: Array2f  # (cx, cy), px
-    film_start: Array2f  # px: where the whole film begins, (0, 0) unless this is a crop window
-    film_end: Array2f  # px: where it ends, (width, height) unless this is a crop window
-    near: Float  # scene units: means with smaller z are culled
     width: int
     height: int
     lens: Lens = PINHOLE
-    aperture: RoundAperture | None = None  # of a lens that blurs
+    aperture: Aperture | None = None  # of a lens that blurs
     shutter: Shutter | None = None  # of a camera that moves while it is open
 
     @staticmethod

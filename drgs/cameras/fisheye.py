@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -22,12 +22,9 @@ from drgs.cameras.distortion import (
     up_to_the_last,
     usable_coefficients,
 )
-from drgs.cameras.lens import LENSES, Lens, film_coordinates, pixel_coordinates
+from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
 from drgs.core.arrays import is_float64, types_of
 from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
-
-if TYPE_CHECKING:
-    from drgs.cameras.camera import Camera
 
 MAX_ANGLE = 0.95 * math.pi
 """Radians from the axis: points behind the camera have no place on the film."""
@@ -68,16 +65,16 @@ class Fisheye(Lens):
         """Return whether a point's angle from the axis is within the model."""
         return position.z > self.min_cosine * dr.norm(position)
 
-    def project_point(self, camera: Camera, position: Array3f) -> Array2f:
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *place_of(position, self.radial_terms))
 
     def projection_jacobian(
-        self, camera: Camera, position: Array3f, slopes: list[Float] | None = None
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
         directions = place_directions(camera, position, self.radial_terms)
         return [f * direction for f, direction in zip(camera.focal, directions, strict=True)]
 
-    def ray(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         squared = dr.squared_norm(film)
         off_axis = squared > 0
@@ -108,7 +105,7 @@ def place_of(position: Array3f, coefficients: Sequence[Scalar] = ()) -> tuple[Fl
 
 
 def place_directions(
-    camera: Camera, position: Array3f, coefficients: Sequence[Scalar] = ()
+    camera: CameraParameters, position: Array3f, coefficients: Sequence[Scalar] = ()
 ) -> list[Array3f]:
     """Return the derivatives of that place, world: per scene unit.
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -22,10 +22,7 @@ from drgs.core.arrays import types_of
 from drgs.core.constants import MAX_COEFFICIENT, TAN_CLAMP
 from drgs.core.errors import UserError
 from drgs.core.registry import ClassRegistry
-from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar, UInt32
-
-if TYPE_CHECKING:
-    from drgs.cameras.camera import Camera
+from drgs.core.types import Array2f, Array3f, Bool, Float, Matrix3f, Scalar, UInt32
 
 LENSES: ClassRegistry[Lens] = ClassRegistry(
     "lens",
@@ -40,6 +37,23 @@ LENSES: ClassRegistry[Lens] = ClassRegistry(
 
 NEWTON_STEPS = 24
 """Steps of the search for a ray: most need 5; those that would leave the lens are halved."""
+
+
+@dataclass(frozen=True)
+class CameraParameters:
+    """Parameters of a camera that its lens may use: Dr.Jit scalars.
+
+    A world point x has camera coordinates ``rotation (x - center)``. The centre is kept rather
+    than the translation ``-rotation center``, which cancels far from the origin.
+    """
+
+    rotation: Matrix3f  # world to camera: its rows are the camera's axes in the world
+    center: Array3f  # world
+    focal: Array2f  # (fx, fy), px
+    principal: Array2f  # (cx, cy), px
+    film_start: Array2f  # px: where the whole film begins, (0, 0) unless this is a crop window
+    film_end: Array2f  # px: where it ends, (width, height) unless this is a crop window
+    near: Float  # scene units: means with smaller z are culled
 
 
 @dataclass(frozen=True)
@@ -58,12 +72,12 @@ class Lens:
     """Names of coefficients by field, a tuple of the first of them; none: a field is a coefficient.
     """
 
-    def project_point(self, camera: Camera, position: Array3f) -> Array2f:
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         """Return the place of a point on the film, px; position: camera axes."""
         raise NotImplementedError
 
     def projection_jacobian(
-        self, camera: Camera, position: Array3f, slopes: list[Float] | None = None
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
         """Return the derivatives of x and of y on the film, world: px per scene unit.
 
@@ -71,7 +85,7 @@ class Lens:
         """
         raise NotImplementedError
 
-    def ray(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         """Return the direction of the ray through a place of the film (px).
 
         It is in camera axes, of any length. Here it is found by Newton's method on the
@@ -150,7 +164,7 @@ class Lens:
 
         return replace(self, **{f.name: opaque(getattr(self, f.name)) for f in fields(self)})
 
-    def for_camera(self, camera: Camera) -> Lens:
+    def for_camera(self, camera: CameraParameters) -> Lens:
         """Return the lens that knows what the film of ``camera`` sees."""
         return self
 
@@ -161,7 +175,9 @@ class Lens:
         """
         return position.z > 0
 
-    def visibility(self, camera: Camera, position: Array3f) -> tuple[Bool, Array3f, Float]:
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         """Return whether a point is seen, its position, and its depth: the distance, scene units.
 
         Position and depth of a point that is not seen are replaced: a masked lane must not divide
@@ -171,15 +187,15 @@ class Lens:
         _, position, _ = with_unseen_on_axis(position, seen)
         return seen, position, dr.norm(position)
 
-    def true_slopes(self, camera: Camera, position: Array3f) -> list[Float] | None:
+    def true_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         """Return x / z and y / z of a point; None if the projection is linearised at the point."""
         return None
 
-    def clamped_slopes(self, camera: Camera, position: Array3f) -> list[Float] | None:
+    def clamped_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         """Return the same, but not far outside the film: see ``constants.TAN_CLAMP``."""
         return None
 
-    def depth_direction(self, camera: Camera, position: Array3f) -> Array3f:
+    def depth_direction(self, camera: CameraParameters, position: Array3f) -> Array3f:
         """Return the derivative of the depth divided by the depth, world."""
         right, down, forward = camera.rotation
         x, y, z = position / dr.squared_norm(position)
@@ -189,18 +205,20 @@ class Lens:
         """Return where a ray of unit ``direction`` (camera axes) reaches two depths."""
         return near, far
 
-    def view_direction(self, camera: Camera, offset: Array3f) -> Array3f:
+    def view_direction(self, camera: CameraParameters, offset: Array3f) -> Array3f:
         """Return the direction in which a point is seen, world, of any length.
 
         offset: from the camera's centre to the point, world.
         """
         return offset
 
-    def origin(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def origin(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         """Return where the ray through a place of the film (px) begins, camera axes."""
         return types_of(type(x)).Array3f(0, 0, 0)
 
-    def place_of_ray(self, camera: Camera, origin: Array3f, direction: Array3f) -> Array2f:
+    def place_of_ray(
+        self, camera: CameraParameters, origin: Array3f, direction: Array3f
+    ) -> Array2f:
         """Return the place on the film of a ray (camera axes), px."""
         return self.project_point(camera, direction)
 
@@ -208,28 +226,30 @@ class Lens:
 class Perspective(Lens):
     """A lens that sees what is in front of it, and whose depth is z."""
 
-    def visibility(self, camera: Camera, position: Array3f) -> tuple[Bool, Array3f, Float]:
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         x, y, z = position
         seen = z >= camera.near
         z = dr.select(seen, z, 1)
         return seen, type(position)(x, y, z), z
 
-    def true_slopes(self, camera: Camera, position: Array3f) -> list[Float] | None:
+    def true_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         return slopes_of(position)
 
-    def clamped_slopes(self, camera: Camera, position: Array3f) -> list[Float] | None:
+    def clamped_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         start, end = self.frustum(camera)
         margin = TAN_CLAMP * (end - start) / 2
         bounds = zip(slopes_of(position), start - margin, end + margin, strict=True)
         return [dr.select(s < lo, lo, dr.select(s > hi, hi, s)) for s, lo, hi in bounds]
 
-    def depth_direction(self, camera: Camera, position: Array3f) -> Array3f:
+    def depth_direction(self, camera: CameraParameters, position: Array3f) -> Array3f:
         return camera.rotation[2] / position.z
 
     def ray_range(self, direction: Array3f, near: Float, far: Float) -> tuple[Float, Float]:
         return near / direction.z, far / direction.z
 
-    def frustum(self, camera: Camera) -> tuple[Array2f, Array2f]:
+    def frustum(self, camera: CameraParameters) -> tuple[Array2f, Array2f]:
         """Return the least and the largest slopes on the film."""
         # Of the whole film: a crop window is a part of the same picture.
         start = (camera.film_start - camera.principal) / camera.focal
@@ -244,12 +264,12 @@ class Pinhole(Perspective):
 
     distorts: ClassVar[bool] = False
 
-    def project_point(self, camera: Camera, position: Array3f) -> Array2f:
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         x, y, z = position
         return camera.focal * types_of(type(z)).Array2f(x, y) / z + camera.principal
 
     def projection_jacobian(
-        self, camera: Camera, position: Array3f, slopes: list[Float] | None = None
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
         # J's rows are focal / z (e_axis - slope e_z).
         right, down, forward = camera.rotation
@@ -259,7 +279,7 @@ class Pinhole(Perspective):
             for axis, focal, slope in zip((right, down), camera.focal, slopes, strict=True)
         ]
 
-    def ray(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         film = film_coordinates(camera, x, y)
         return types_of(type(x)).Array3f(film.x, film.y, 1)
 
@@ -272,12 +292,12 @@ def slopes_of(position: Array3f) -> list[Float]:
     return [position.x / position.z, position.y / position.z]
 
 
-def film_coordinates(camera: Camera, x: Float, y: Float) -> Array2f:
+def film_coordinates(camera: CameraParameters, x: Float, y: Float) -> Array2f:
     """Return a place of the film (px) in focal lengths from the principal point."""
     return (types_of(type(x)).Array2f(x, y) - camera.principal) / camera.focal
 
 
-def pixel_coordinates(camera: Camera, x: Float, y: Float) -> Array2f:
+def pixel_coordinates(camera: CameraParameters, x: Float, y: Float) -> Array2f:
     """Return the place of the film, px; the inverse of :func:`film_coordinates`."""
     return camera.focal * types_of(type(x)).Array2f(x, y) + camera.principal
 

@@ -7,15 +7,13 @@ the camera turns at a constant rate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
+from drgs.cameras.camera import Camera, Shutter
 from drgs.core.arrays import types_of
 from drgs.core.types import Array3f, Bool, Float, Matrix3f, Scalar
-
-if TYPE_CHECKING:
-    from drgs.cameras.camera import Camera
 
 NEWTON_STEPS = 3
 """Steps of the search for a splat's time: pixels move little while the film is read."""
@@ -25,13 +23,8 @@ SLOWEST = 1e-4
 
 
 @dataclass(frozen=True)
-class Shutter:
-    """The motion of a camera from the first pose to the second while its shutter is open.
-
-    Subclasses define :meth:`cameras` and :meth:`camera_of`.
-    """
-
-    label: ClassVar[str]  # for messages
+class CameraMotion(Shutter):
+    """The motion of a camera from the first pose to the second while its shutter is open."""
 
     travel: Array3f  # world: of the centre
     turn: Array3f  # camera axes: axis times angle (radians), below half a turn
@@ -40,12 +33,11 @@ class Shutter:
     def between(camera: Camera, rotation: Matrix3f, center: Array3f) -> tuple[Array3f, Array3f]:
         """Return ``travel`` and ``turn`` from the pose of ``camera`` to another.
 
-        rotation: Matrix3f, world to camera; center: world.
+        rotation: world to camera; center: world.
         """
         return center - camera.center, rotation_vector(rotation @ camera.rotation.T)
 
     def pose(self, camera: Camera, time: Scalar) -> Camera:
-        """Return ``camera``, which is at time 0, at another time."""
         turn = rotation_matrix(self.turn * time)
         return replace(
             camera,
@@ -53,14 +45,6 @@ class Shutter:
             center=camera.center + self.travel * time,
             shutter=None,
         )
-
-    def cameras(self, camera: Camera) -> list[Camera]:
-        """Return the cameras whose images are averaged."""
-        raise NotImplementedError
-
-    def camera_of(self, means: Array3f, camera: Camera) -> Camera:
-        """Return the camera, without a shutter, that sees each of some means (world)."""
-        raise NotImplementedError
 
     def velocity(self, camera: Camera, offset: Array3f) -> Array3f:
         """Return the velocity of a point relative to the camera, world axes, per unit of time.
@@ -72,7 +56,7 @@ class Shutter:
 
 
 @dataclass(frozen=True)
-class MotionBlur(Shutter):
+class MotionBlur(CameraMotion):
     """The mean of images at ``samples`` times."""
 
     label: ClassVar[str] = "blurred"
@@ -88,7 +72,7 @@ class MotionBlur(Shutter):
 
 
 @dataclass(frozen=True)
-class RollingShutter(Shutter):
+class RollingShutter(CameraMotion):
     """The film's rows are read from the first, at time 0, to the last, at time 1."""
 
     label: ClassVar[str] = "rolling shutter"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from drgs.cameras.lens import (
+    CameraParameters,
     Perspective,
     film_coordinates,
     pixel_coordinates,
@@ -13,9 +14,6 @@ from drgs.cameras.lens import (
 )
 from drgs.core.arrays import types_of
 from drgs.core.types import Array2f, Array3f, Bool, Float
-
-if TYPE_CHECKING:
-    from drgs.cameras.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -25,33 +23,37 @@ class Orthographic(Perspective):
     distorts: ClassVar[bool] = False
     parallel: ClassVar[bool] = True
 
-    def visibility(self, camera: Camera, position: Array3f) -> tuple[Bool, Array3f, Float]:
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         return with_unseen_on_axis(position, position.z >= camera.near)
 
-    def true_slopes(self, camera: Camera, position: Array3f) -> None:
+    def true_slopes(self, camera: CameraParameters, position: Array3f) -> None:
         """Return None: the projection is linear."""
 
     clamped_slopes = true_slopes
 
-    def project_point(self, camera: Camera, position: Array3f) -> Array2f:
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, position.x, position.y)
 
     def projection_jacobian(
-        self, camera: Camera, position: Array3f, slopes: list[Float] | None = None
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
         right, down, _ = camera.rotation
         return [right * camera.focal.x, down * camera.focal.y]
 
-    def view_direction(self, camera: Camera, offset: Array3f) -> Array3f:
+    def view_direction(self, camera: CameraParameters, offset: Array3f) -> Array3f:
         """Return the axis: all points are seen along it."""
         return camera.rotation[2]
 
-    def ray(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         return types_of(type(x)).Array3f(0, 0, 1)
 
-    def origin(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def origin(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         film = film_coordinates(camera, x, y)
         return types_of(type(x)).Array3f(film.x, film.y, 0)
 
-    def place_of_ray(self, camera: Camera, origin: Array3f, direction: Array3f) -> Array2f:
+    def place_of_ray(
+        self, camera: CameraParameters, origin: Array3f, direction: Array3f
+    ) -> Array2f:
         return self.project_point(camera, origin)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -28,6 +28,7 @@ from drgs.cameras.distortion import (
 )
 from drgs.cameras.lens import (
     LENSES,
+    CameraParameters,
     Perspective,
     film_coordinates,
     pixel_coordinates,
@@ -36,9 +37,6 @@ from drgs.cameras.lens import (
 )
 from drgs.core.arrays import types_of
 from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
-
-if TYPE_CHECKING:
-    from drgs.cameras.camera import Camera
 
 BORDER = 65  # points on each side of the film's border, whose slopes bound those on the film
 MISSED = 1e-6  # squared distance, in slopes, at which Newton's method may end
@@ -92,17 +90,19 @@ class RadialTangential(PlaneDistortion, Perspective):
         change = change - self.radial(squared) * derivative(self.denominator, squared)
         return change / denominator
 
-    def visibility(self, camera: Camera, position: Array3f) -> tuple[Bool, Array3f, Float]:
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         x, y, z = position
         # Not divided by z, which may be zero.
         limit = self.max_squared_radius * z * z
         return with_unseen_on_axis(position, (z >= camera.near) & (x * x + y * y < limit))
 
-    def project_point(self, camera: Camera, position: Array3f) -> Array2f:
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *self.distort(*slopes_of(position)))
 
     def projection_jacobian(
-        self, camera: Camera, position: Array3f, slopes: list[Float] | None = None
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
         slopes = slopes or slopes_of(position)
         xx, xy, yx, yy = self.distortion_jacobian(*slopes)
@@ -113,19 +113,19 @@ class RadialTangential(PlaneDistortion, Perspective):
         )
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
-    def for_camera(self, camera: Camera) -> RadialTangential:
+    def for_camera(self, camera: CameraParameters) -> RadialTangential:
         return replace(self, on_film=_slopes_on_border(self, camera))
 
-    def frustum(self, camera: Camera) -> tuple[Array2f, Array2f]:
+    def frustum(self, camera: CameraParameters) -> tuple[Array2f, Array2f]:
         assert self.on_film is not None, "Camera.with_lens() sets it"
         return self.on_film
 
-    def ray(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         return t.Array3f(*self.undistort(film.x, film.y), 1)
 
 
-def _slopes_on_border(lens: RadialTangential, camera: Camera) -> tuple[Array2f, Array2f]:
+def _slopes_on_border(lens: RadialTangential, camera: CameraParameters) -> tuple[Array2f, Array2f]:
     """Return the box around the slopes of points on the film's border.
 
     Where the lens does not see all of them, only the end of its model bounds the slopes.

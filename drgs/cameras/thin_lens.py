@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
+from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
 from drgs.core.types import Array3f, Bool, Float
-
-if TYPE_CHECKING:
-    from drgs.cameras.camera import Camera
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -23,12 +23,9 @@ from drgs.cameras.distortion import (
     usable_coefficients,
 )
 from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
-from drgs.cameras.lens import LENSES, film_coordinates, pixel_coordinates
+from drgs.cameras.lens import LENSES, CameraParameters, film_coordinates, pixel_coordinates
 from drgs.core.arrays import types_of
 from drgs.core.types import Array2f, Array3f, Float, Scalar
-
-if TYPE_CHECKING:
-    from drgs.cameras.camera import Camera
 
 
 @LENSES.register("thin_prism_fisheye")
@@ -92,17 +89,17 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         sx1, sy1 = self.prism
         return xx + 2 * sx1 * x, xy + 2 * sx1 * y, yx + 2 * sy1 * x, yy + 2 * sy1 * y
 
-    def project_point(self, camera: Camera, position: Array3f) -> Array2f:
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *self.distort(*place_of(position)))
 
     def projection_jacobian(
-        self, camera: Camera, position: Array3f, slopes: list[Float] | None = None
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
         xx, xy, yx, yy = self.distortion_jacobian(*place_of(position))
         dx, dy = place_directions(camera, position)
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
-    def ray(self, camera: Camera, x: Float, y: Float) -> Array3f:
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         u, v = self.undistort(film.x, film.y)
         squared = u * u + v * v
