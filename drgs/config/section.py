@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
@@ -26,6 +26,14 @@ class Section(BaseModel):
     """Frozen; unknown keys, infinities and silent conversions ("3" for 3) are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+SectionType = TypeVar("SectionType", bound=Section)
+
+
+def subsection(model: type[SectionType]) -> SectionType:
+    """Return a field whose default is the section with all defaults."""
+    return Field(default_factory=model)
 
 
 _RELATIONS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
