@@ -40,6 +40,14 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
+SectionType = TypeVar("SectionType", bound=Section)
+
+
+def subsection(model: type[SectionType]) -> SectionType:
+    """Return a field whose default is the section with all defaults."""
+    return Field(default_factory=model)
+
+
 _RELATIONS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 _EXPECTED = {

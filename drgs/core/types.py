@@ -29,6 +29,9 @@ else:
     Array2f = Array2u = Array3f = Array4f = Array4u = ArrayXf = Any
     Bool = Float = Int32 = Matrix3f = TensorXf = UInt32 = UInt64 = Any
 
+Scalar = Float | float
+"""A Dr.Jit scalar or a number of the host."""
+
 __all__ = [
     "Array2f",
     "Array2u",
@@ -40,6 +43,7 @@ __all__ = [
     "Float",
     "Int32",
     "Matrix3f",
+    "Scalar",
     "TensorXf",
     "UInt32",
     "UInt64",
