@@ -23,7 +23,7 @@ from drgs.config.extensions import EFFECTS
 from drgs.config.schema import CamerasConfig, FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
-from drgs.core.types import Float
+from drgs.core.types import Array3f, Float
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
@@ -123,7 +123,7 @@ class CameraRefinement(OptimisedEffect):
     def _camera(start: _Start, leaves: Mapping[str, Float]) -> dict[str, dr.ArrayBase]:
         """Return the sensor's parameters, from the numbers that are optimised."""
         turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
-        rotation = rotation_matrix(turn)
+        rotation = rotation_matrix(cast(Array3f, turn))
         rows = [[rotation[i, j] for j in range(3)] + [move[i]] for i in range(3)]
         moved = start.to_world @ mi.Matrix4f([*rows, [0, 0, 0, 1]])
         fx, fy, cx, cy = start.intrinsics
