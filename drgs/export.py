@@ -74,7 +74,7 @@ def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:
 
 
 @dataclass(frozen=True)
-class Target:
+class ExportTarget:
     """A format that ``--format`` names."""
 
     suffix: str  # of files, in small letters
@@ -85,10 +85,10 @@ class Target:
     honoured: Honoured | None = None  # None: nothing is
 
 
-def targets() -> dict[str, Target]:
+def targets() -> dict[str, ExportTarget]:
     """Return what ``--format`` takes, by name: the file formats, and the page."""
     found = {
-        each.name: Target(
+        each.name: ExportTarget(
             suffix=each.value.suffix,
             text=each.value.description,
             encode=lambda source, name=each.name: source.gaussians.to_bytes(name),
@@ -117,7 +117,7 @@ def _page(source: Source) -> bytes:
     return viewer_page(title, shown, initial_view, background)
 
 
-PAGE = Target(
+PAGE = ExportTarget(
     ".html",
     "a page to walk around in, for any browser",
     _page,
@@ -334,7 +334,7 @@ def _selected(source: Source, args: argparse.Namespace) -> Gaussians:
     return take(source.gaussians, kept)
 
 
-def _up(args: argparse.Namespace, source: Source, target: Target) -> np.ndarray | None:
+def _up(args: argparse.Namespace, source: Source, target: ExportTarget) -> np.ndarray | None:
     """Return the direction (3,) that is up, and print it; None: the model is not to be turned."""
     words = args.up
     if words is None and not target.has_axes:
