@@ -143,9 +143,9 @@ class CalibratedSensor(mi.Sensor):
         camera = on_crop_window(state, opaque_host(state), device["to_world"], focal, principal)
         if self.to_world_close is None:
             return camera
-        from drgs.cameras.motion import CameraMotion, MotionBlur, RollingShutter
+        from drgs.cameras.motion import Motion, MotionBlur, RollingShutter
 
-        motion = CameraMotion.between(camera, *pose_from_to_world(device["to_world_close"]))
+        motion = Motion.between(camera, *pose_from_to_world(device["to_world_close"]))
         if self.shutter == "rolling":
             return replace(camera, shutter=RollingShutter(*motion))
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
