@@ -5,12 +5,12 @@ Each strategy has a section of its own in it; what all of them share stands besi
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from pydantic import Field, field_validator
 
 from drgs.config.extensions import STRATEGIES, StrategyName
-from drgs.config.section import Count, Section, subsection
+from drgs.config.section import UNRESOLVED, Count, Resolved, Section, subsection
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
 """Iterations: the reference's schedule, for 30,000."""
@@ -40,13 +40,6 @@ def schedule_of(strategy: str) -> Schedule:
         return SCHEDULES[strategy]
     extension = STRATEGIES.get(strategy).value
     return Schedule(extension.start_share, extension.stop_share, extension.rate_decay)
-
-
-if TYPE_CHECKING:
-    Completed = Count
-else:
-    Completed = Count | None
-"""A count that is not given, or null, until ``FitConfig`` completes it."""
 
 
 class AdcConfig(Section):
@@ -85,8 +78,8 @@ class AdcConfig(Section):
 class BudgetConfig(Section):
     """The strategy budget: growth to a number of Gaussians, where errors are."""
 
-    gaussians: Count | None = Field(
-        None,
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
         ge=4,
         description="How many there are to be at densify.stop. null: as many as suit the pictures' "
         "size, 250 times the square root of the number of their pixels: 100,000 for 400 x 400 px.",
@@ -103,8 +96,8 @@ class BudgetConfig(Section):
 class McmcConfig(Section):
     """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
 
-    gaussians: Count | None = Field(
-        None,
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
         ge=4,
         description="The population grows to this, and no further. null: as with budget.",
     )
@@ -183,14 +176,14 @@ class DensifyConfig(Section):
         "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024). Or the name "
         "of an extension.",
     )
-    start: Completed = Field(
+    start: Resolved[Count] = Field(
         REFERENCE_START,
         ge=0,
         description="The population changes only after this iteration. Not given, or null: 500; "
         "less where that is more than half of stop, or, with budget and mcmc, than a twentieth of "
         "all iterations.",
     )
-    stop: Completed = Field(
+    stop: Resolved[Count] = Field(
         REFERENCE_STOP,
         ge=1,
         description="It changes, and is reset, only before this iteration; with budget, at it for "

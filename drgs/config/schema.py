@@ -33,7 +33,7 @@ from drgs.config.density import (
     schedule_of,
 )
 from drgs.config.extensions import LossName, ReaderName, Sections
-from drgs.config.section import Count, Rate, Section, Weight, subsection
+from drgs.config.section import UNRESOLVED, Count, Rate, Resolved, Section, Weight, subsection
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
@@ -215,14 +215,14 @@ class _Model(Section):
     """Fields of :class:`ModelConfig` before the approximations."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
-    sh_increase_every: Count | None = Field(
+    sh_increase_every: Resolved[Count] = Field(
         LATEST_DEGREE,
         ge=1,
         description="Iterations between +1 of the degree in use, which starts at 0. Not given, or "
         "null: a fortieth of all, at most 1000.",
     )
-    near: float | None = Field(
-        None,
+    near: Resolved[float] = Field(
+        UNRESOLVED,
         ge=NEAR_LIMITS[0],
         le=NEAR_LIMITS[1],
         description="Near plane, scene units: closer means are culled. null: about a twenty-fifth "
@@ -320,8 +320,8 @@ class OptimizerConfig(Section):
     )
     scales_lr: Rate = Field(1e-2, ge=0, description="Logarithms of the scales.")
     quats_lr: Rate = Field(2e-3, ge=0, description="Quaternions.")
-    decay: float | None = Field(
-        None,
+    decay: Resolved[float] = Field(
+        UNRESOLVED,
         ge=1e-6,
         le=1,
         description="What the rates but that of the means have fallen to at the last iteration, in "
@@ -476,8 +476,8 @@ class FitConfig(Section):
         description="Views that are rendered; each is a step of the optimizer, unless "
         "optimizer.views_per_step or optimizer.views says otherwise.",
     )
-    coarse: list[CoarseStage] | None = Field(
-        None,
+    coarse: Resolved[list[CoarseStage]] = Field(
+        UNRESOLVED,
         description="Stages of smaller training pictures, before those of full size: a list of "
         "{until: iteration, factor: 4}. null: half the size for the first 35 % of a fit to "
         "photographs of at least 100 px that are not cut out, else none; with the strategy adc "

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 import drjit as dr
 
 from drgs.core.errors import UserError
-from drgs.core.types import Float, UInt32
+from drgs.core.types import UInt32
 
 if TYPE_CHECKING:
     from drjit.opt import _LRCache
@@ -43,7 +43,7 @@ def same_variables(tree: object, other: object) -> bool:
     return dr.detail.collect_indices(tree) == dr.detail.collect_indices(other)
 
 
-def same_memory(array: Float) -> Float:
+def same_memory(array: dr.ArrayBase) -> dr.ArrayBase:
     """Return an evaluated array that Dr.Jit takes for another one, of the same memory; LLVM only.
 
     What is scattered to one of them is in the other, too. Waits for the device.

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         Array3f,
         Array4f,
         Array4u,
+        ArrayXf,
         Bool,
         Float,
         Int32,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
         UInt64,
     )
 else:
-    Array2f = Array2u = Array3f = Array4f = Array4u = Any
+    Array2f = Array2u = Array3f = Array4f = Array4u = ArrayXf = Any
     Bool = Float = Int32 = Matrix3f = TensorXf = UInt32 = UInt64 = Any
 
 Scalar = Float | float
@@ -37,6 +38,7 @@ __all__ = [
     "Array3f",
     "Array4f",
     "Array4u",
+    "ArrayXf",
     "Bool",
     "Float",
     "Int32",

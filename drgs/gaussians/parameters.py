@@ -22,7 +22,7 @@ from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, shown_origin
 from drgs.core.registry import HOW_TO_INSTALL
-from drgs.core.types import Float, TensorXf
+from drgs.core.types import TensorXf
 
 Tensor = TypeVar("Tensor", bound=np.ndarray | dr.ArrayBase)
 """``np.ndarray`` or ``TensorXf``."""
@@ -193,11 +193,11 @@ class Gaussians(Generic[Tensor]):
         arrays = {name: np.array(getattr(self, name)) for name in self._names}
         return cast("Gaussians[np.ndarray]", replace(self, **arrays, features=features))
 
-    def to(self, tensor_type: type[TensorXf]) -> Gaussians[TensorXf]:
+    def to(self, tensor_type: type[dr.ArrayBase]) -> Gaussians[TensorXf]:
         """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
         flat_type = dr.array_t(tensor_type)
 
-        def upload(array: Tensor) -> Float | TensorXf:
+        def upload(array: Tensor) -> dr.ArrayBase:
             values = np.asarray(array)
             flat = from_host(flat_type, values)
             return flat if values.ndim == 1 else tensor_type(flat, values.shape)
