@@ -22,6 +22,7 @@ from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
 from drgs.core.memory import why_too_large
+from drgs.core.types import Float
 from drgs.effects.compose import NamedFeature
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import GaussianRows, load_rows
@@ -94,24 +95,24 @@ COEFFICIENTS = [("N", "K", 3), ("C", "N", "K", 3)]
 
 
 def rasterization(
-    means: Any,
-    quats: Any,
-    scales: Any,
-    opacities: Any,
-    colors: Any,
-    viewmats: Any,
-    Ks: Any,
+    means: Float,
+    quats: Float,
+    scales: Float,
+    opacities: Float,
+    colors: Float,
+    viewmats: Float,
+    Ks: Float,
     width: int,
     height: int,
     *,
     near_plane: float = 0.01,
     eps2d: float = LOW_PASS,
     sh_degree: int | None = None,
-    backgrounds: Any = None,
+    backgrounds: Float = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
     **approximations: str | float,
-) -> tuple[Any, Any, dict[str, Any]]:
+) -> tuple[Float, Float, dict[str, Float]]:
     """Pictures of N Gaussians as C pinhole cameras see them: (colors, alphas, meta).
 
     Names, defaults, conventions and the order of results are those of gsplat 1.x. Arrays are numpy
@@ -219,7 +220,7 @@ def _approximations(
         raise ValueError(f"rasterization(): {reason}") from None
 
 
-def _tensor_type(means: Any) -> type:
+def _tensor_type(means: Float) -> type:
     """The type of all tensors: that of ``means``."""
     if dr.is_tensor_v(means) and dr.is_float_v(means):
         return type(means)
@@ -232,7 +233,7 @@ def _tensor_type(means: Any) -> type:
     return llvm.ad.TensorXf64 if np.asarray(means).dtype == np.float64 else llvm.ad.TensorXf
 
 
-def _tensor(name: str, value: Any, tensor_type: type) -> Any:
+def _tensor(name: str, value: Float, tensor_type: type) -> Any:
     """``value`` as a tensor, still attached."""
     if type(value) is tensor_type:
         return value
@@ -247,7 +248,7 @@ def _tensor(name: str, value: Any, tensor_type: type) -> Any:
     raise TypeError(f"rasterization(): {name} must be a tensor, got {type(value).__name__}")
 
 
-def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
+def _check_shapes(inputs: Mapping[str, Float], sh_degree: int | None) -> None:
     sizes: dict[str | int, int] = {}  # by letter
     for name, value in inputs.items():
         is_sh = name == "colors" and sh_degree is not None
@@ -302,7 +303,7 @@ class _Film:
     is_camera_attached: bool  # whether derivatives with respect to cameras are needed
 
 
-def _images(views: list[_View], inputs: Mapping[str, Any], mode: str) -> tuple[Any, Any]:
+def _images(views: list[_View], inputs: Mapping[str, Float], mode: str) -> tuple[Float, Float]:
     """Return images (C, H, W, X) and alphas (C, H, W, 1), attached to ``inputs``."""
     images, alphas = [], []
     all_planes, backgrounds = dr.custom(_Planes, views, inputs)
@@ -325,7 +326,7 @@ def _images(views: list[_View], inputs: Mapping[str, Any], mode: str) -> tuple[A
     return _stacked(images, shape), _stacked(alphas, shape)
 
 
-def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
+def _stacked(parts: list[Float], shape: tuple[int, ...]) -> Any:
     """Return one flat array per camera as a tensor of this shape and one axis more."""
     flat = parts[0] if len(parts) == 1 else dr.concat(parts)
     return types_of(type(flat)).TensorXf(flat, (*shape, dr.width(flat) // math.prod(shape)))
@@ -334,7 +335,7 @@ def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
 class _Planes(dr.CustomOp):
     """Planes of all cameras (transmittance, features), and each number of the backgrounds."""
 
-    def eval(self, views: list[_View], inputs: dict[str, Any]) -> tuple[list[list[Any]], list[Any]]:
+    def eval(self, views: list[_View], inputs: dict[str, Float]) -> tuple[list[list[Float]], list[Float]]:
         """Return what the views have rendered from ``inputs``, detached."""
         self.views, self.inputs = views, inputs
         planes = [view.frame.planes() for view in views]
@@ -365,7 +366,7 @@ class _Planes(dr.CustomOp):
             gradients[name] = type(self.inputs[name])(total, shape)
         self.set_grad_in("inputs", gradients)
 
-    def _entries(self, values: Mapping[str, Any]) -> list[Any]:
+    def _entries(self, values: Mapping[str, Float]) -> list[Float]:
         """Each number of the backgrounds, Float (1,)."""
         if "backgrounds" not in values:
             return []
@@ -383,7 +384,7 @@ class _View:
     """Planes of one camera, and their derivatives."""
 
     def __init__(
-        self, film: _Film, pipeline: Pipeline, inputs: Mapping[str, Any], index: int
+        self, film: _Film, pipeline: Pipeline, inputs: Mapping[str, Float], index: int
     ) -> None:
         """Render; inputs: detached; index: of the camera among them."""
         self.film, self.pipeline, self.inputs, self.index = film, pipeline, inputs, index
@@ -397,7 +398,7 @@ class _View:
         self.gaussians = self._gaussians(inputs)
         self.frame = render(self.gaussians, camera, pipeline)
 
-    def tangents(self, directions: Mapping[str, Any]) -> list[Any]:
+    def tangents(self, directions: Mapping[str, Float]) -> list[Float]:
         """Return directional derivatives of the planes along tangents of the inputs."""
         d_gaussians = self._gaussians(directions)
         d_camera = self._camera_tangents(directions) if self.film.is_camera_attached else None
@@ -405,7 +406,7 @@ class _View:
         dr.eval(d_planes)
         return d_planes
 
-    def gradients(self, d_planes: list[Any]) -> dict[str, Any]:
+    def gradients(self, d_planes: list[Float]) -> dict[str, Float]:
         """Return derivatives with respect to the inputs from those with respect to the planes."""
         dr.eval(d_planes)
         found = frames_adjoint(
@@ -425,7 +426,7 @@ class _View:
             gradients |= self._camera_gradients(np.array([number[0] for number in found.camera]))
         return gradients
 
-    def _gaussians(self, values: Mapping[str, Any]) -> Gaussians:
+    def _gaussians(self, values: Mapping[str, Float]) -> Gaussians:
         """Values, or tangents, of the Gaussians that the kernels see."""
         num, t, colors = values["means"].shape[0], self.types, values["colors"]
         if len(colors.shape) == (3 if self.film.sh_degree is None else 4):
@@ -446,7 +447,7 @@ class _View:
             features=features,
         )
 
-    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Any]:
+    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Float]:
         """Return derivatives with respect to the matrices from those of a camera's numbers.
 
         The centre is c = -R^-1 t, hence dc = -R^-1 (dt + dR c).
@@ -460,7 +461,7 @@ class _View:
         Float = self.types.Float
         return {"viewmats": from_host(Float, d_viewmat), "Ks": from_host(Float, d_K)}
 
-    def _camera_tangents(self, directions: Mapping[str, Any]) -> list[Any]:
+    def _camera_tangents(self, directions: Mapping[str, Float]) -> list[Float]:
         d_viewmat = np.array(directions["viewmats"], np.float64)[self.index]
         d_K = np.array(directions["Ks"], np.float64)[self.index]
         moved = d_viewmat[:3, 3] + d_viewmat[:3, :3] @ self.center
@@ -471,7 +472,7 @@ class _View:
         return [dr.opaque(self.types.Float, float(x)) for x in numbers]
 
 
-def _meta(views: list[_View]) -> dict[str, Any]:
+def _meta(views: list[_View]) -> dict[str, Float]:
     """Return the intermediate values of each splat, by gsplat's names."""
     columns: dict[str, list[Any]] = {}
     for view in views:

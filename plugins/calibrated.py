@@ -30,6 +30,7 @@ from drgs.integrator.sensors import (
     pose_from_to_world,
     read_sensor,
 )
+from drgs.core.types import Bool, Float
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 """Coefficients of the shipped lenses; other lenses have others."""
@@ -151,7 +152,7 @@ class CalibratedSensor(mi.Sensor):
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
 
     def sample_ray(
-        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        self, time: Float, sample1: Float, sample2: Float, sample3: Float, active: Bool = True
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         del sample3
         place = sample2 * mi.Vector2f(self.film().crop_size())
@@ -178,7 +179,7 @@ class CalibratedSensor(mi.Sensor):
         )
         return ray, weight & seen
 
-    def _time_of(self, camera: Camera, time: Any, y: Any) -> Any:
+    def _time_of(self, camera: Camera, time: Float, y: Float) -> Any:
         """From 0, the first pose, to 1, the second, of a ray that starts in the row ``y``, px."""
         if self.shutter == "rolling":
             return (y - camera.film_start.y) / (camera.film_end.y - camera.film_start.y)
@@ -187,7 +188,7 @@ class CalibratedSensor(mi.Sensor):
         return (mi.Float(time) - self.shutter_open()) / self.shutter_open_time()
 
     def sample_ray_differential(
-        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        self, time: Float, sample1: Float, sample2: Float, sample3: Float, active: Bool = True
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()

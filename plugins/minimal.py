@@ -19,6 +19,7 @@ from drgs.splatting.projection import load_rows
 from drgs.splatting.rasterize import Layers, Records, composite, composite_adjoint
 from drgs.splatting.rendering import Pipeline, gradients_of
 from drgs.splatting.tiles import TileBins, bin_footprints, footprints_of
+from drgs.core.types import Float
 
 
 class MinimalSplatsIntegrator(mi.CppADIntegrator):
@@ -44,7 +45,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
             callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
     def render(
-        self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, sensor: Float = 0, seed: Float = 0, spp: int = 0,
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
         with dr.suspend_grad():
@@ -52,8 +53,8 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
             return develop_pixels(film, _channels(film, layers.planes()), [])
 
     def render_backward(
-        self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
-        sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, params: Float, grad_in: mi.TensorXf,
+        sensor: Float = 0, seed: Float = 0, spp: int = 0,
     ) -> None:  # fmt: skip
         with dr.suspend_grad():
             film, camera, bins, records, layers = self._composited(scene, sensor)

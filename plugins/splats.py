@@ -23,6 +23,7 @@ from drgs.integrator.image_render import ImageRender
 from drgs.integrator.properties import check_object, nested_integrators, read_state
 from drgs.integrator.state import BackwardResult
 from drgs.splatting.rendering import ProjectionStage
+from drgs.core.types import Bool, Float
 
 
 class SplatsIntegrator(mi.CppADIntegrator):
@@ -165,7 +166,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     # ------------------------------------------------------------------------------------------
 
     def render(
-        self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, sensor: Float = 0, seed: Float = 0, spp: int = 0,
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
         sensor = _resolve_sensor(scene, sensor)
@@ -178,8 +179,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return image if develop else mi.TensorXf()
 
     def render_backward(
-        self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
-        sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, params: Float, grad_in: mi.TensorXf,
+        sensor: Float = 0, seed: Float = 0, spp: int = 0,
     ) -> None:  # fmt: skip
         """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
         sensor = _resolve_sensor(scene, sensor)
@@ -201,7 +202,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it may hold an attached block
 
     def render_forward(
-        self, scene: mi.Scene, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+        self, scene: mi.Scene, params: Float, sensor: Float = 0, seed: Float = 0, spp: int = 0
     ) -> mi.TensorXf:
         """Return the directional derivative of the image along gradients set on parameters."""
         sensor = _resolve_sensor(scene, sensor)
@@ -215,7 +216,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return d_image
 
     def sample(
-        self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any
+        self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Float, active: Bool, **others: Any
     ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
         """Render along the rays of a whole image, for ``aov``: see ``drgs.integrator.aov_rays``."""
         from drgs.integrator.aov_rays import ImageRays

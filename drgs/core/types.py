@@ -14,30 +14,34 @@ if TYPE_CHECKING:
         Array2f,
         Array2u,
         Array3f,
+        Array3u,
         Array4f,
         Array4u,
         Bool,
         Float,
         Int32,
         Matrix3f,
+        Matrix4f,
         TensorXf,
         UInt32,
         UInt64,
     )
 else:
-    Array2f = Array2u = Array3f = Array4f = Array4u = Any
-    Bool = Float = Int32 = Matrix3f = TensorXf = UInt32 = UInt64 = Any
+    Array2f = Array2u = Array3f = Array3u = Array4f = Array4u = Any
+    Bool = Float = Int32 = Matrix3f = Matrix4f = TensorXf = UInt32 = UInt64 = Any
 
 __all__ = [
     "Array2f",
     "Array2u",
     "Array3f",
+    "Array3u",
     "Array4f",
     "Array4u",
     "Bool",
     "Float",
     "Int32",
     "Matrix3f",
+    "Matrix4f",
     "TensorXf",
     "UInt32",
     "UInt64",
