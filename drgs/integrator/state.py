@@ -216,9 +216,9 @@ class SplatsState:
         """Raise PluginError for AOVs of too many channels."""
         check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
 
-    def parameters_changed(self, keys: list[str], is_object: bool) -> None:
+    def parameters_changed(self, keys: Sequence[str], is_object: bool) -> None:
         """Check that own parameters fit together; keys: none for all."""
-        if keys != ["background"]:
+        if list(keys) != ["background"]:
             self.cache.forget("frames")
             self.cache.gathered = None
         if not self.own.has_gaussians:
