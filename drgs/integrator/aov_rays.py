@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -45,7 +45,7 @@ ROUNDING = 1e-5
 class ImageRays:
     """Rays of a whole picture, and where they start. Equality is identity."""
 
-    ray: Any  # RayDifferential3f (H * W * count,): those of a pixel are neighbours
+    ray: mi.RayDifferential3f  # (H * W * count,): those of a pixel are neighbours
     count: int  # rays per pixel
     positions: tuple[SamplePoints, ...]  # by pass
 
@@ -68,7 +68,7 @@ class ImageRays:
         inside = (dr.min(within) > -SLACK) & (dr.max(within) < 1 + SLACK)
         if not dr.all(inside & on_camera):
             raise UnsupportedError(_unknown(sensor))
-        within = dr.clip(within, 0, 1 - dr.epsilon(mi.Float))
+        within = mi.Point2f(dr.clip(within, 0, 1 - dr.epsilon(mi.Float)))
         positions = in_passes(within, count, width * height)
         dr.eval([(p.x, p.y) for p in positions])
         return ImageRays(ray, count, positions)
@@ -96,7 +96,7 @@ class ImageRays:
             hybrid=hybrid,
         )
         if hybrid is not None:
-            hybrid = hybrid.with_surfaces(view.num_surfaces())
+            hybrid = hybrid.with_surfaces(view.num_surfaces(hybrid))
             view = replace(view, hybrid=hybrid)
         channels = self._gathered(view.channels(view.planes(), constant_background(splats)))
         for kind in ("frames", "surfaces"):

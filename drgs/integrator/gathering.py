@@ -49,6 +49,7 @@ import numpy as np
 from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
+from drgs.core.types import Float, Matrix4f
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.rotation import (
     left_multiplication_matrix,
@@ -58,6 +59,12 @@ from drgs.gaussians.rotation import (
 from drgs.gaussians.sh import num_coefficients
 from drgs.gaussians.similarity import Similarity
 
+Arrays = dict[str, Any]
+"""Arrays by name: a TensorXf or Float for each parameter, a Matrix4f for ``to_world``."""
+
+Columns = dict[str, list[Float]]
+"""Columns of parameters by name."""
+
 TO_WORLD = "to_world"
 
 PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
@@ -66,15 +73,23 @@ PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
 class Part(Protocol):
     """Conversion of stored Gaussians to raw parameters in world space."""
 
-    values: dict[str, Any]  # arrays by name; detached in a gathered part, which holds them so that
-    # their indices are not reused
+    @property
+    def values(self) -> Arrays:
+        """Arrays by name; a gathered part holds them, so that their indices are not reused."""
+        ...
 
     @property
     def fixed(self) -> object:
         """Anything else that the conversion depends on; equal if the same."""
+        ...
 
     def gaussians(self) -> Gaussians:
         """Return all parameters, differentiable with respect to ``values``."""
+        ...
+
+    def detached(self) -> Part:
+        """Return the same conversion of detached values."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +112,7 @@ class Gathered:
         for part, own, (num, degree) in zip(parts, self.parts, self.sizes, strict=True):
             attached = {k: v for k, v in part.values.items() if dr.width(v) and dr.grad_enabled(v)}
             if attached and num > 0:
-                copy = replace(own, values=dr.detach(own.values))
+                copy = own.detached()
                 dr.enable_grad([copy.values[name] for name in attached])
                 rows = _arrays(_rows(gradients, start, num, degree))
                 found = _arrays(copy.gaussians())
@@ -114,7 +129,7 @@ class Gathered:
         """Return derivatives of all Gaussians along those set on the same parts, attached."""
         found = []
         for part, own in zip(parts, self.parts, strict=True):
-            copy = replace(own, values=dr.detach(own.values))
+            copy = own.detached()
             dr.enable_grad(copy.values)
             for name, values in part.values.items():
                 dr.set_grad(copy.values[name], tangent_of(values))
@@ -130,7 +145,7 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     last: the result of the last call, which is returned again while nothing has changed. Features
     and coefficients that a part lacks are zeros, and so is a smoothing filter.
     """
-    parts = [replace(part, values=dr.detach(part.values)) for part in parts]
+    parts = [part.detached() for part in parts]
     if last is not None and last.matches(parts):
         return last
     converted = [part.gaussians() for part in parts]
@@ -166,22 +181,24 @@ def _sh_shape(degree: int) -> tuple[int, int]:
     return num_coefficients(degree) - 1, 3
 
 
-def _shaped(flat: Any, num: int, row: tuple[int, ...]) -> Any:
+def _shaped(flat: Float, num: int, row: tuple[int, ...]) -> mi.TensorXf | Float:
     return mi.TensorXf(flat, (num, *row)) if row else flat
 
 
-def _arrays(part: Gaussians) -> dict[str, Any]:
+def _arrays(part: Gaussians) -> Arrays:
     named = {name: getattr(part, name) for name in (*PARAMETER_NAMES, "smoothing")}
     return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
 
 
-def _gaussians(arrays: dict[str, Any]) -> Gaussians:
+def _gaussians(arrays: Arrays) -> Gaussians:
     features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
     own = {k: v for k, v in arrays.items() if k not in features}
     return Gaussians(**own, features=features or None)
 
 
-def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) -> Any:
+def _block(
+    values: mi.TensorXf | Float | None, start: int, num: int, total: int, row: tuple[int, ...]
+) -> Float:
     """Return ``num`` rows of ``total``, flat: cut to ``row``, or filled with zeros."""
     flat = mi.Float() if values is None else values.array  # an array is its own
     kept, width = math.prod(row), dr.width(flat) // total
@@ -196,7 +213,7 @@ def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) 
     return dr.gather(type(flat), flat, (at + first) * width + column, column < width)
 
 
-def columns(flat: Any, width: int) -> list[Any]:
+def columns(flat: Float, width: int) -> list[Float]:
     """Return the columns of rows of ``width`` numbers; see :func:`interleaved`."""
     if width == 0:
         return []
@@ -205,17 +222,17 @@ def columns(flat: Any, width: int) -> list[Any]:
     return [dr.gather(type(flat), flat, row + k, mode=dr.ReduceMode.Permute) for k in range(width)]
 
 
-def interleaved(values: list[Any]) -> Any:
+def interleaved(values: list[Float]) -> Float:
     """Return columns as rows again, flat; of no columns, an empty array."""
     return interleave(values) if values else mi.Float()
 
 
-def number_of(flat: Any, index: int) -> Any:
+def number_of(flat: Float, index: int) -> Float:
     """Return one entry of an array, in no kernel: other numbers need no other one."""
     return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))
 
 
-def product(matrix: Any, vector: list[Any], start: int = 0) -> list[Any]:
+def product(matrix: Float, vector: list[Float], start: int = 0) -> list[Float]:
     """Multiply by a square matrix, flat from ``start`` on."""
     rows = [
         [number_of(matrix, start + j * len(vector) + k) for k in range(len(vector))]
@@ -229,7 +246,7 @@ def product(matrix: Any, vector: list[Any], start: int = 0) -> list[Any]:
 class Turn:
     """A linear map of the coefficients of degree 1 to 3 by one matrix per degree."""
 
-    matrices: Any  # Float (9 + 25 + 49,)
+    matrices: Float  # (9 + 25 + 49,)
 
     @staticmethod
     def by(rotation: np.ndarray) -> Turn:
@@ -245,7 +262,7 @@ class Turn:
     def _from(matrices: Sequence[np.ndarray]) -> Turn:
         return Turn(from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices])))
 
-    def of(self, columns: list[Any]) -> list[Any]:
+    def of(self, columns: list[Float]) -> list[Float]:
         """Turn columns of the coefficients of degree 1 and above, three a coefficient."""
         turned, start = [], 0
         for degree in range(1, PER_DEGREE[len(columns) // 3 + 1] + 1):
@@ -266,11 +283,14 @@ class Turn:
 class Placement:
     """The move of an object into the scene: see :class:`Part`."""
 
-    values: dict[str, Any]  # arrays of the object's Gaussians, and its to_world: Matrix4f
+    values: Arrays  # of the object's Gaussians, and its to_world
     fixed: str  # name of the parameter to_world, in messages
 
+    def detached(self) -> Placement:
+        return replace(self, values=dr.detach(self.values))
+
     @staticmethod
-    def of(gaussians: Gaussians, to_world: Any, name: str) -> Placement:
+    def of(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
         """Place Gaussians by a matrix of one lane."""
         return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
 
@@ -285,7 +305,7 @@ class Placement:
     def _place(self) -> Similarity:
         return similarity_of(self.values[TO_WORLD], self.fixed)
 
-    def _moved(self, arrays: dict[str, Any]) -> dict[str, Any]:
+    def _moved(self, arrays: Arrays) -> Arrays:
         place, split = self._place, {k: _columns_of(arrays[k]) for k in ("means", "quats", "shN")}
         turned = {
             "means": product(_device(place.scale * place.rotation), split["means"]),
@@ -294,7 +314,7 @@ class Placement:
         }
         scale = _device(np.array([place.scale, np.log(place.scale)]))
         log_scales = [c + number_of(scale, 1) for c in _columns_of(arrays["log_scales"])]
-        moved = turned | {"log_scales": log_scales}
+        moved: Columns = turned | {"log_scales": log_scales}
         if "smoothing" in arrays:
             moved["smoothing"] = [arrays["smoothing"] * number_of(scale, 0)]
         if dr.grad_enabled(self.values[TO_WORLD]):
@@ -306,18 +326,18 @@ class Placement:
         tensors = {k: mi.TensorXf(interleaved(v), arrays[k].shape) for k, v in moved.items()}
         return tensors | smoothing
 
-    def _check_finite(self, own: dict[str, Any], moved: dict[str, Any]) -> None:
+    def _check_finite(self, own: Columns, moved: Columns) -> None:
         pairs = zip(own["means"] + own["quats"], moved["means"] + moved["quats"], strict=True)
         dr.eval(moved["means"], moved["quats"])
         beyond = [dr.isfinite(before) & ~dr.isfinite(after) for before, after in pairs]
-        rows = dr.compress(reduce(operator.or_, beyond))
+        rows = mi.UInt32(dr.compress(reduce(operator.or_, beyond)))
         if dr.width(rows) > 0:
             raise PluginError(
                 f"{self.fixed} moves Gaussian {rows[0]} beyond the end of float32, 3.4e38; crop or "
                 "scale the object"
             )
 
-    def _with_motion(self, moved: dict[str, Any]) -> dict[str, Any]:
+    def _with_motion(self, moved: Columns) -> Columns:
         """Attach Gaussians, turned about the object's origin, to a change of the matrix.
 
         Numbers that are not finite, of Gaussians that are not visible, do not move: they would make
@@ -358,7 +378,7 @@ class Placement:
         )
 
 
-def similarity_of(to_world: Any, name: str) -> Similarity:
+def similarity_of(to_world: Matrix4f, name: str) -> Similarity:
     """Return the similarity nearest to a Matrix4f; PluginError unless it is close to one."""
     matrix = np.array(dr.detach(to_world), np.float64)
     if matrix.size != 16:
@@ -370,7 +390,7 @@ def _device(values: np.ndarray) -> mi.Float:
     return from_host(mi.Float, values.ravel())
 
 
-def _columns_of(tensor: Any) -> list[Any]:
+def _columns_of(tensor: mi.TensorXf) -> list[Float]:
     return columns(tensor.array, math.prod(tensor.shape[1:]))
 
 
@@ -390,7 +410,7 @@ HIDDEN = -1e4
 # ----------------------------------------------------------------------------------------------
 
 
-def read(shape: mi.Shape) -> dict[str, Any]:
+def read(shape: mi.Shape) -> Arrays:
     """Read the shape's arrays, attached. Raises PluginError that names what does not fit."""
     values = mi.traverse(shape)
     where = f"splats: the {_name(shape)}"
@@ -425,8 +445,11 @@ def _name(shape: mi.Shape) -> str:
 class Conversion:
     """The conversion of a shape's arrays to raw parameters; see ``gathering.Part``."""
 
-    values: dict[str, Any]  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
+    values: Arrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
     fixed: Turn | None  # of the harmonics, which is not differentiated
+
+    def detached(self) -> Conversion:
+        return replace(self, values=dr.detach(self.values))
 
     def gaussians(self) -> Gaussians:
         num = dr.width(self.values["opacities"])

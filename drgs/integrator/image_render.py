@@ -18,7 +18,7 @@ import mitsuba as mi
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_image
 from drgs.integrator.film import CenterSamples
-from drgs.integrator.rays import passes_splats
+from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.sensor_render import Planes, SensorRender, constant_background
 from drgs.integrator.sensors import is_batch, num_poses, sensors_of
 from drgs.integrator.state import SplatsState
@@ -82,7 +82,8 @@ class ImageRender:
     def _with_surfaces(self) -> ImageRender:
         if self.hybrid is None:
             return self
-        hybrid = self.hybrid.with_surfaces(max(view.num_surfaces() for view in self.views))
+        count = max(view.num_surfaces(self.hybrid) for view in self.views)
+        hybrid = self.hybrid.with_surfaces(count)
         self.samples.aovs += hybrid.insertion.channels
         return replace(self, views=[replace(v, hybrid=hybrid) for v in self.views], hybrid=hybrid)
 
@@ -95,6 +96,7 @@ class ImageRender:
 
     def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
         """Return derivatives with respect to the Gaussians; accumulate all others."""
+        d_nested: list[mi.TensorXf] = []
         if self.hybrid is not None:
             own, nested = self._image_of_splats(), self.hybrid.pictures()
             grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
@@ -151,16 +153,19 @@ def hybrid_of(
 
     cache, hide_emitters = splats.cache, splats.hide_emitters
     surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
+    nested: mi.SamplingIntegrator
+    adjoint: mi.SamplingIntegrator
     if splats.light == "none":
-        nested = adjoint = splats.nested
-        if nested is None:
+        if splats.nested is not None:
+            nested = adjoint = splats.nested
+        else:
             # The same paths, whose derivatives are right for more of their parameters, and which
             # see lamps through what lets light pass straight on.
             adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
             nested = adjoint
             if not surfaces.is_transparent:
                 nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
-        if passes_splats(nested):
+        if isinstance(nested, TransportIntegrator):
             nested.use_transport(None)  # another integrator may have given it one
     else:
         from drgs.integrator.splat_transport import nested_with_transport

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
+from drgs.accuracy.pixel_order import PixelOrder
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
@@ -71,7 +72,7 @@ class Plane:
         """Signed distance of a point."""
         return dr.dot(self.normal, point) - self.offset
 
-    def at(self, mirror: mi.UInt32, active: mi.Bool = True) -> Plane:
+    def at(self, mirror: mi.UInt32, active: mi.Bool | bool = True) -> Plane:
         """Gather the planes of some of the mirrors."""
         normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
         return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
@@ -127,11 +128,13 @@ class FlatMirror:
 
 def _points(shape: mi.Shape) -> np.ndarray:
     """Points (N, 3) of a shape, world, that tell whether it is flat; none if it cannot be."""
-    if shape.is_mesh():
+    if isinstance(shape, mi.Mesh):
         return np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     if shape.class_name() != "Disk":
         return np.zeros((0, 3))
-    matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+    to_world = mi.traverse(shape)["to_world"]
+    assert isinstance(to_world, mi.AffineTransform4f), "of a disk"
+    matrix = np.array(to_world.matrix, np.float64).reshape(4, 4)
     return np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1]]) @ matrix[:3].T
 
 
@@ -296,6 +299,7 @@ def _picture(
     dr.make_opaque(plane, camera)
     nearest, farthest, ends = _trace(camera, plane, scene)
     pipeline = with_effects(pipeline, gaussians, camera)
+    assert isinstance(pipeline.order, PixelOrder), "see _pipeline"
     depths = replace(pipeline.order.depths, bounds=(nearest, farthest))
     order = replace(pipeline.order, depths=depths)
     frame = rendering.render(gaussians, camera, replace(pipeline, order=order))
@@ -303,7 +307,7 @@ def _picture(
     coverage = 1 - T
     color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
     color = coverage * mi.math.srgb_to_linear(color)
-    colors = dr.ravel(mi.Vector4f(*color, coverage))
+    colors = mi.Float(dr.ravel(mi.Vector4f(*color, coverage)))
     dr.eval(colors, ends)
     return colors, ends
 

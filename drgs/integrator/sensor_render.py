@@ -12,16 +12,17 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, repeat
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.film import Channels, offsets_of, pixel_corners, samples_in
-from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
+from drgs.integrator.sensors import SensorState, camera_from_sensor, depth_range, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
 from drgs.splatting.footprint import Positions
@@ -34,8 +35,8 @@ if TYPE_CHECKING:  # imported where a scene calls for them
 Passes = list[Channels]
 """Channels by pass: of one sample per pixel or, on a small film, of several."""
 
-Planes = list[list[list[Any]]]
-"""Planes of frames, each Float (samples * H * W,), by time and by pass."""
+Planes = list[list[list[Float]]]
+"""Planes of frames, each (samples * H * W,), by time and by pass."""
 
 
 PASSES_PER_KERNEL = 16
@@ -112,7 +113,7 @@ class SensorRender:
         behind = self._behind(constant)
         seen = repeat(repeat(None))
         if self.hybrid is not None:
-            seen = self._traced_surfaces(self._state().detached()).value
+            seen = self._traced_surfaces(self.hybrid, self._state().detached()).value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -123,7 +124,7 @@ class SensorRender:
     def _channels_of(
         self,
         behind: _Behind,
-        planes: list[Any],
+        planes: list[Float],
         layers: Layers | None,
         color: mi.Color3f,
         radiance: mi.Color3f | None,
@@ -141,15 +142,17 @@ class SensorRender:
 
         def of_surfaces(kind: str) -> Channels | None:
             values = [surface.aov_values(kind, front) for surface, front in pairs]
-            return None if values[0] is None else list(map(sum, zip(*values, strict=True)))
+            found = [of_surface for of_surface in values if of_surface is not None]
+            return [_sum(terms) for terms in zip(*found, strict=True)] if found else None
 
         past = [rest_behind(layers) * planes[0], *planes[1:]]
         own = self._composited(past, whole, behind, color, of_surfaces)
+        assert self.hybrid is not None, "its surfaces are the layers"
         return own + self.hybrid.insertion.values(layers, fronts, radiance)
 
     def _composited(
         self,
-        planes: list[Any],
+        planes: list[Float],
         whole: mi.Float,
         behind: _Behind,
         color_behind: mi.Color3f,
@@ -189,6 +192,7 @@ class SensorRender:
             nothing = repeat(repeat(None))
             return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
         behind = splats.background if environment is None else environment
+        assert isinstance(behind, (mi.Emitter, mi.Texture)), "a colour would be constant"
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
@@ -203,7 +207,7 @@ class SensorRender:
         """Return frames by time and by pass, those of the last image where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
         state = self._state().detached()
-        traced = None if self.hybrid is None else self._traced_surfaces(state)
+        traced = None if self.hybrid is None else self._traced_surfaces(self.hybrid, state)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
 
         def render() -> list[list[rendering.Frame]]:
@@ -215,30 +219,31 @@ class SensorRender:
 
         return self.splats.cache.find(f"frames {self.index}", *key, render).value
 
-    def _traced_surfaces(self, state: SensorState) -> Cached:
+    def _traced_surfaces(self, hybrid: Hybrid, state: SensorState) -> Cached[list[list[Layers]]]:
         from drgs.integrator.visible_surfaces import trace_surfaces
 
-        sensor, hides = self.sensor, self.splats.hide_emitters
-        settings = self.hybrid.surfaces, self.key, hides, sensor.far_clip(), *state.settings
+        hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
+        settings = hybrid.surfaces, self.key, hides, far, *state.settings
         return self.splats.cache.find(
             f"surfaces {self.index}",
             settings,
             state.device,
             lambda: trace_surfaces(
-                self.hybrid.rays,
-                sensor,
+                hybrid.rays,
+                far,
+                self.sensor.film(),
                 self._cameras(state),
                 self._offsets,
                 with_normals="normal" in self.splats.aovs.values(),
             ),
         )
 
-    def num_surfaces(self) -> int:
-        """Number of surfaces that are seen one through the other."""
-        return len(self._traced_surfaces(self._state().detached()).value[0][0])
+    def num_surfaces(self, hybrid: Hybrid) -> int:
+        """Return the number of surfaces that are seen one through the other."""
+        return len(self._traced_surfaces(hybrid, self._state().detached()).value[0][0])
 
     @property
-    def _offsets(self) -> list[tuple[Any, Any]]:
+    def _offsets(self) -> list[tuple[Float | float, Float | float]]:
         return [offsets_of(positions) for positions in self.positions]
 
     def _state(self) -> SensorState:
@@ -247,7 +252,7 @@ class SensorRender:
     def _cameras(self, state: SensorState) -> list[Camera]:
         return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
-    def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
+    def _camera_tangents(self, count: int) -> Sequence[list[mi.Float] | None]:
         """Return the derivatives of each time's camera numbers along those set on the sensor."""
         state = self._state()
         if not state.is_attached:
@@ -257,6 +262,10 @@ class SensorRender:
         return dr.grad(numbers)
 
 
+def _sum(values: Sequence[Float]) -> Float:
+    return sum(values[1:], values[0])
+
+
 def _mean(passes: Sequence[Passes]) -> Passes:
     total: list[Passes] = []
     for first in range(0, len(passes), PASSES_PER_KERNEL):
@@ -264,7 +273,7 @@ def _mean(passes: Sequence[Passes]) -> Passes:
         terms = [*total, *passes[first : first + PASSES_PER_KERNEL]]
         total = [
             [
-                [sum(values[1:], values[0]) for values in zip(*of_sample, strict=True)]
+                [_sum(values) for values in zip(*of_sample, strict=True)]
                 for of_sample in zip(*terms, strict=True)
             ]
         ]
@@ -323,7 +332,7 @@ def constant_background(splats: SplatsState) -> mi.Color3f | None:
 
 
 def accumulate_in_sensor(
-    ignored: Collection[str], state: SensorState, gradients: list[list[Any]]
+    ignored: Collection[str], state: SensorState, gradients: list[list[Float]]
 ) -> None:
     """Accumulate derivatives by ``Camera.numbers()``, by time, into a sensor."""
     numbers = [camera.numbers() for camera in _attached_cameras(ignored, state)]
@@ -335,7 +344,7 @@ def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Came
     return cameras_in_time(without_effects(state.make(state), ignored))
 
 
-def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:
+def _accumulate_through(values: list[list[Float]], gradients: list[list[mi.Float]]) -> None:
     pairs = zip(chain(*values), chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
     for value, gradient in attached:

@@ -93,10 +93,11 @@ class _Estimate:
         if not self.scene.scene.emitters():
             return ratio
         lit, dark = self._irradiance(means, normals, lambda ray, sample: mi.Float(1))
-        shaded = dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark))
+        shaded = mi.UInt32(dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark)))
         if dr.width(shaded) > 0:
-            place = [dr.gather(type(v), v, shaded) for v in (means, normals)]
-            lit, dark = self._irradiance(*place, self._let_through)
+            points = dr.gather(mi.Point3f, means, shaded)
+            directions = dr.gather(mi.Vector3f, normals, shaded)
+            lit, dark = self._irradiance(points, directions, self._let_through)
             found = dr.select(lit + dark > 0, lit / (lit + dark), 1)
             dr.scatter(ratio, found, shaded)
         dr.eval(ratio)
@@ -119,7 +120,7 @@ class _Estimate:
             )
             cosine = dr.dot(normals, ds.d)  # the normal is as long as the splat is thick
             start = points + AHEAD * dr.sign(cosine) * normals
-            ray = mi.Ray3f(start, ds.d, ds.dist * (1 - mi.math.ShadowEpsilon), 0, [])
+            ray = mi.Ray3f(mi.Ray3f(start, ds.d), ds.dist * (1 - mi.math.ShadowEpsilon))
             weight *= dr.abs(cosine) * dr.rcp(dr.norm(normals))
             weight *= let_through(ray, sampler.next_1d())
             passes = self.scene.transmittance(ray, mi.Bool(True))

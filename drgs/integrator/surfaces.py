@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Protocol, TypeVar, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -36,12 +36,14 @@ from drgs.integrator.film import pixels_adjoint as film_adjoint
 from drgs.integrator.rays import (
     RaysBehind,
     StraightRays,
+    TransportIntegrator,
     has_transparent_parts,
-    passes_splats,
     sensor_behind,
 )
 from drgs.integrator.sensors import sensors_of
 from drgs.integrator.visible_surfaces import Layers, rest_behind
+
+T = TypeVar("T")
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")
 """Words of errors of Dr.Jit and ``splatpath`` about a picture that no parameter changes."""
@@ -62,7 +64,7 @@ class Surfaces:
     """
 
     objects: list[mi.Object]  # of the scene, without its Gaussians and integrator
-    parameters: list[Any]  # of these, detached: held, so that equal indices mean equal values
+    parameters: list[object]  # of these, detached: held, so that equal indices mean equal values
     apart: mi.Scene | None  # made of the objects, where the scene has Gaussians besides
     is_transparent: bool  # in parts: whether anything lets light pass straight on
 
@@ -86,7 +88,7 @@ class Surfaces:
         return scene if self.apart is None else self.apart
 
 
-def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
+def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[object]]:
     """A scene's own objects but Gaussians and integrators, and parameters of all but sensors.
 
     Shape groups are found among them alone: instances do not show what they repeat.
@@ -105,7 +107,7 @@ def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
     return objects, [parameter_value(params, name) for name in names]
 
 
-def _same(parameters: list[Any], others: list[Any]) -> bool:
+def _same(parameters: list[object], others: list[object]) -> bool:
     """Return whether arrays are the same variables, and everything else has the same value."""
     on_host = [[v for v in of if not dr.is_array_v(v)] for of in (parameters, others)]
     return on_host[0] == on_host[1] and same_variables(parameters, dr.detach(others))
@@ -157,6 +159,7 @@ class Insertion:
         nothing = dr.zeros(mi.Float, dr.width(layers[0].coverage))
         values += [nothing] * (2 * (self.num_surfaces - len(layers)))
         if self.shows_background:
+            assert radiance is not None, "of the background"
             values += list(rest_behind(layers) * radiance)
         return values
 
@@ -252,7 +255,9 @@ class Insertion:
 def _mapped(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
     if not planes or np.array_equal(matrix, np.eye(3)):
         return planes
-    return [sum(float(m) * p for m, p in zip(row, planes, strict=True)) for row in matrix]
+    return [
+        sum((float(m) * p for m, p in zip(row, planes, strict=True)), mi.Float(0)) for row in matrix
+    ]
 
 
 @dataclass(frozen=True)
@@ -260,8 +265,8 @@ class Hybrid:
     """One rendering of splats and surfaces: the part of the surfaces."""
 
     surfaces: Surfaces
-    integrator: mi.Integrator  # of the picture
-    adjoint_integrator: mi.Integrator  # of its derivatives
+    integrator: mi.SamplingIntegrator  # of the picture
+    adjoint_integrator: mi.SamplingIntegrator  # of its derivatives
     sensor: mi.Sensor
     seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
@@ -289,7 +294,7 @@ class Hybrid:
             if self.surfaces.is_transparent:
                 behind, weight = RaysBehind(self.rays, count).moved(behind, active)
             with _depth_reduced(self.integrator, count):
-                # Of the base class, as integrators written in Python have another signature.
+                # The base class's, as integrators written in Python have another signature.
                 radiance, *_ = mi.SamplingIntegrator.sample(
                     self.integrator, self.rays.scene, sampler, behind, None, active
                 )
@@ -317,7 +322,7 @@ class Hybrid:
                 self.rays.scene, params, sensor, self.seed, self.spp
             )
 
-        found = [None] * len(pictures)
+        found: list[mi.TensorXf | None] = [None] * len(pictures)
         with self._differentiating() as parameters:
             if parameters:
                 # A loop sees tangents of what is inside of it alone, so that those of all that
@@ -328,9 +333,10 @@ class Hybrid:
         pairs = zip(found, pictures, strict=True)
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 
-    def _where_they_matter(self, differentiate: Callable[[mi.Sensor], Any]) -> list[Any]:
+    def _where_they_matter(self, differentiate: Callable[[mi.Sensor], T]) -> list[T | None]:
         """Differentiate nested images; None for those that do not depend on parameters."""
-        found, errors = [], []
+        found: list[T | None] = []
+        errors: list[Exception] = []
         for sensor in self._sensors():
             try:
                 found.append(differentiate(sensor))
@@ -378,19 +384,27 @@ class Hybrid:
                 ) from None
 
 
+@runtime_checkable
+class _HasMaxDepth(Protocol):
+    """An integrator with a limit of its paths that Python can set."""
+
+    max_depth: object
+
+
 @contextmanager
 def _depth_reduced(integrator: mi.Integrator, count: int) -> Iterator[None]:
     """Shorten paths by ``count`` bounces, where they are bounded by an attribute of Python."""
-    depth = getattr(integrator, "max_depth", None)
-    counts_windows = not passes_splats(integrator)
-    is_bounded = counts_windows and isinstance(depth, int) and depth < UNBOUNDED
-    if is_bounded:
+    counts_windows = not isinstance(integrator, TransportIntegrator)
+    if not counts_windows or not isinstance(integrator, _HasMaxDepth):
+        yield
+        return
+    depth = integrator.max_depth
+    if isinstance(depth, int) and depth < UNBOUNDED:
         integrator.max_depth = max(depth - count, 0)
     try:
         yield
     finally:
-        if is_bounded:
-            integrator.max_depth = depth
+        integrator.max_depth = depth
 
 
 @contextmanager

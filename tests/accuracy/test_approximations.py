@@ -228,9 +228,9 @@ def test_a_colour_at_its_minimum_keeps_its_derivative():
     [
         (
             {"projection": "affine"},
-            "projection must be one of ewa, unscented, exact or of a package",
+            "projection must be one of ewa, unscented, exact \\(others come with",
         ),
-        ({"order": "entry"}, "order must be one of center, pixel or of a package"),
+        ({"order": "entry"}, "order must be one of center, pixel \\(others come with"),
         ({"order_window": 0}, "order_window must be from 1 to 64, got 0"),
         ({"sh_direction": "ray"}, "sh_direction must be one of mean, pixel, got 'ray'"),
         ({"alpha_max": 1.0}, "alpha_max must be above 0 and below 1 in float32, got 1.0"),

@@ -354,7 +354,7 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
             lambda m: m.update(camera_model="EQUIRECTANGULAR"),
             "camera_model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
             "FULL_OPENCV, SIMPLE_FISHEYE, FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, "
-            "OPENCV_FISHEYE, THIN_PRISM_FISHEYE, or a lens: fisheye, opencv, pinhole, "
+            "OPENCV_FISHEYE, THIN_PRISM_FISHEYE, or a lens: pinhole, opencv, fisheye, "
             "thin_prism_fisheye; others come with installed packages that have an entry point of "
             'the group "drgs", got '
             '"EQUIRECTANGULAR"',

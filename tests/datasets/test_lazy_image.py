@@ -131,8 +131,8 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
     monkeypatch.setattr(images, "available_memory", lambda: 1487)
     monkeypatch.setattr(reader, "read_pixels", None)
     message = (
-        f"{photographs / 'images'}: 10 photographs take 1 kB of memory as they are kept, and 1 kB "
-        "are available; set a smaller data.image_size, or use fewer of them"
+        f"{photographs / 'images'}: 10 photographs take 1.49 kB of memory as they are kept, and "
+        "1.49 kB are available; set a smaller data.image_size, or use fewer of them"
     )
     assert refusal(photographs) == message
     check_room(files, 2)

@@ -193,8 +193,8 @@ REFUSED = {
     ),
     "lens that is no name": (
         {"lens": 3},
-        'PluginError: calibrated: lens: no lens is called "3"; there are fisheye, opencv, '
-        "pinhole, thin_prism_fisheye (others come with installed packages that have an entry "
+        'PluginError: calibrated: lens: no lens is called "3"; there are pinhole, opencv, '
+        "fisheye, thin_prism_fisheye (others come with installed packages that have an entry "
         'point of the group "drgs")',
     ),
     "coefficient of another lens": (
