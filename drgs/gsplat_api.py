@@ -423,7 +423,7 @@ class _View:
             self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
         )
         d, t = found.parameters, self.types
-        assert d is not None, "found here, as this process has projected"
+        assert d is not None and d.features is not None, "this process has projected"
         gradients = {
             "means": d.means,
             "quats": d.quats,
@@ -458,7 +458,7 @@ class _View:
             features=features,
         )
 
-    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, TensorXf]:
+    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Float]:
         """Return derivatives with respect to the matrices from those of a camera's numbers.
 
         The centre is c = -R^-1 t, hence dc = -R^-1 (dt + dR c).

@@ -55,7 +55,7 @@ from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
-from drgs.core.types import Array2f, Array3f, Bool, Float
+from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
 from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions, flat_columns
 from drgs.splatting.projection import (
     FilmShape,
@@ -81,7 +81,7 @@ LARGEST_EXPONENT = 1e4
 
 
 def exact_shape(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
 ) -> FilmShape:
     """Project to the shape that :class:`RayFalloff` evaluates; its slopes are not clamped.
 
@@ -112,7 +112,7 @@ def closest_on_film(camera: Camera, x: Float, y: Float) -> Array2f:
 
 
 def ewa_with_depth(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
 ) -> FilmShape:
     """Project as ``projection.ewa``, with the terms of the depth at a pixel: kappa (2) and h."""
     slopes = camera.lens.clamped_slopes(camera, position)
@@ -126,7 +126,7 @@ def _seen_along(
     camera: Camera,
     position: Array3f,
     slopes: list[Float] | None,
-    low_pass: float,
+    low_pass: Scalar,
 ) -> tuple[Array3f, tuple[Float, Float], Float]:
     """Return U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)

@@ -19,7 +19,7 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
-from drgs.core.types import Array3f, Bool, Float
+from drgs.core.types import Array3f, Bool, Float, Scalar
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
@@ -47,7 +47,7 @@ where slopes are clamped. Such splats are projected by the affine approximation.
 
 
 def unscented_shape(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
 ) -> FilmShape:
     """Return the unscented transform; not differentiated: where :data:`NEAREST` decides."""
     points = _sigma_points(camera.lens, rows, camera, position)

@@ -61,7 +61,7 @@ def normal_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> lis
 
     def shortest(row: int) -> Float:
         return dr.select(
-            first, rotation[row, 0], dr.select(second, rotation[row, 1], rotation[row, 2])
+            first, rotation[row][0], dr.select(second, rotation[row][1], rotation[row][2])
         )
 
     normal = t.Array3f([shortest(row) for row in range(3)])

@@ -304,7 +304,8 @@ class SplatsState:
             return
         own = self.own.gaussians
         pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
-        pairs += [(own.features[name], d) for name, d in (gradients.features or {}).items()]
+        features = own.features or {}
+        pairs += [(features[name], d) for name, d in (gradients.features or {}).items()]
         for parameter, gradient in pairs:
             if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
                 dr.accum_grad(parameter, gradient)
