@@ -352,13 +352,13 @@ class _Planes(dr.CustomOp):
         return planes, self._entries(inputs)
 
     def forward(self) -> None:
-        """Hand on tangents of the inputs."""
+        """Propagate tangents of the inputs."""
         directions = cast(dict[str, TensorXf], self.grad_in("inputs"))
         tangents = [view.tangents(directions) for view in self.views]
         self.set_grad_out((tangents, self._entries(directions)))
 
     def backward(self) -> None:
-        """Hand back derivatives with respect to the inputs."""
+        """Propagate derivatives to the inputs."""
         grad_out: Any = self.grad_out()  # as of :meth:`eval`
         all_d_planes, d_backgrounds = grad_out
         found: dict[str, list] = {name: [] for name in self.inputs}

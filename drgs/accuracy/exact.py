@@ -205,7 +205,7 @@ class RayFalloff(GaussianFalloff):
         return Array2f(x, y), dr.sqrt(reach) * half_sizes
 
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
-        """Centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
+        """Return centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
 
         |e| <= sqrt(q) (1 - kappa . e) is (e - c)^T (I - q kappa kappa^T) (e - c) <= q / g^2 with
         g^2 = 1 - q |kappa|^2 and c = -q kappa / g^2. I - q kappa kappa^T = V^T V with V upper
@@ -273,7 +273,7 @@ class RayFalloff(GaussianFalloff):
     def moments(
         self, footprint: Footprint, weights: list[Float], positions: Positions
     ) -> list[Float]:
-        """Sums over the 16 pixels of w = d loss / d ln(alpha) times each of these.
+        """Sum over the 16 pixels w = d loss / d ln(alpha) times each of these.
 
         1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B (x - c); B^2. With f = |e|^2 / D,
 
