@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 BACKENDS = ("scalar_", "llvm_", "cuda_", "metal_")
-"""How the names of Mitsuba's variants begin."""
+"""Beginnings of the names of Mitsuba's variants."""
 
 
 def register_plugins() -> None:
@@ -45,7 +45,7 @@ def _follow_variants() -> None:
 def _on_variant(old: str | None, new: str | None) -> None:
     if new is None:
         return
-    import drgs.plugins
+    import drgs.plugins  # pyright: ignore[reportMissingImports]  # plugins/, where it is installed
 
     drgs.plugins.register(new)
 

@@ -160,6 +160,7 @@ def add_observers(
     if args.tensorboard:
         from drgs.training.event_log import EventLog
 
+        assert session.folder is not None, "the command has an output folder"
         log = EventLog(session.folder.path / EVENTS, session.history)
         session.observers.append(blocks.enter_context(closing(log)))
     if server is not None:
@@ -167,7 +168,7 @@ def add_observers(
         from drgs.viewer.training_viewer import watch
 
         watching, session.criterion = watch(
-            server, session.trainer, session.dataset, session.criterion
+            server, session.trainer, session.trainer.dataset, session.criterion
         )
         session.observers.append(watching)
         print(f"look on at {url(server)}", flush=True)

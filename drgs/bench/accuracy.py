@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import drjit.llvm.ad as llvm
@@ -65,10 +65,10 @@ EXACT_PIXEL = {"projection": "exact", "order": "pixel"}
 
 @dataclass(frozen=True)
 class Rung:
-    """One way to render."""
+    """A way to render."""
 
     name: str
-    approximations: dict[str, object] = field(default_factory=dict)
+    approximations: Mapping[str, Any] = field(default_factory=dict)
     is_approximation: bool = True  # of the most accurate form
     samples: int = 1  # per pixel, a square number
     sh_degree: int | None = None  # None: all
@@ -114,8 +114,8 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class Measurement:
-    """One rung on one subject: means over views, the largest error of all."""
+class AccuracyMeasurement:
+    """Measurement of a rung on a subject: means over views, and the largest error of all."""
 
     scene: str
     rung: str
@@ -174,7 +174,7 @@ def run(args: argparse.Namespace) -> None:
         found = measure(subject, accurate, RUNGS, QUICK_ROUNDS if args.quick else ROUNDS)
         results += found
         print(table(found), flush=True)
-    write_rows(args.out / "accuracy.csv", Measurement, results)
+    write_rows(args.out / "accuracy.csv", AccuracyMeasurement, results)
     write_figure(args.out / "accuracy.png", plot(results))
 
 
@@ -217,8 +217,9 @@ def _check_pinholes(views: Sequence[View], config_file: Path, ply: Path) -> None
 def camera_of(view: View, near: float) -> reference.Camera:
     """Return the camera of a photograph, rounded to single precision."""
     pose = view.camera_to_world.astype(np.float32)
-    numbers = (float(np.float32(v)) for v in (view.fx, view.fy, view.cx, view.cy))
-    return reference.Camera(pose[:3, :3].T, pose[:3, 3], *numbers, view.width, view.height, near)
+    fx, fy, cx, cy = (float(np.float32(v)) for v in (view.fx, view.fy, view.cx, view.cy))
+    rotation, center = pose[:3, :3].T, pose[:3, 3]
+    return reference.Camera(rotation, center, fx, fy, cx, cy, view.width, view.height, near)
 
 
 def positions(samples: int, camera: reference.Camera, float_type: type) -> list[Positions]:
@@ -231,7 +232,7 @@ def positions(samples: int, camera: reference.Camera, float_type: type) -> list[
 
 
 @dataclass(frozen=True)
-class Renderer:
+class RungRenderer:
     """A rung, ready to render one view."""
 
     rung: Rung
@@ -241,12 +242,14 @@ class Renderer:
     background: tuple[float, float, float]
 
     @staticmethod
-    def from_rung(rung: Rung, subject: Subject, camera: reference.Camera) -> Renderer:
+    def from_rung(rung: Rung, subject: Subject, camera: reference.Camera) -> RungRenderer:
         """Upload the subject."""
         Float = llvm.Float64 if rung.float64 else llvm.Float
         gaussians = subject.gaussians.to(llvm.TensorXf64 if rung.float64 else llvm.TensorXf)
         points = positions(rung.samples, camera, Float)
-        return Renderer(rung, gaussians, device_camera(camera, Float), points, subject.background)
+        return RungRenderer(
+            rung, gaussians, device_camera(camera, Float), points, subject.background
+        )
 
     def frames(self) -> list[rendering.Frame]:
         """Render; returns when the planes are in memory."""
@@ -311,9 +314,9 @@ def check_on_crops(subject: Subject, accurate: np.ndarray) -> float:
 
 def measure(
     subject: Subject, accurate: Sequence[np.ndarray], rungs: Sequence[Rung], rounds: int
-) -> list[Measurement]:
+) -> list[AccuracyMeasurement]:
     """Measure errors of all rungs, and their times on the first view, in turns."""
-    renderers = [Renderer.from_rung(rung, subject, subject.cameras[0]) for rung in rungs]
+    renderers = [RungRenderer.from_rung(rung, subject, subject.cameras[0]) for rung in rungs]
     operations = [renderer.operations() for renderer in renderers]  # compiles the kernels
     for renderer in renderers:
         renderer.forward_backward()
@@ -328,14 +331,16 @@ def measure(
                 times[k].append((seconds(renderer.frames), seconds(renderer.forward_backward)))
     results = []
     for rung, count, spent in zip(rungs, operations, times, strict=True):
-        images = [Renderer.from_rung(rung, subject, camera).image() for camera in subject.cameras]
+        images = [
+            RungRenderer.from_rung(rung, subject, camera).image() for camera in subject.cameras
+        ]
         pairs = list(zip(images, accurate, strict=True))
         quality, views = metrics.mean_quality(pairs), subject.photographs
         photos = [
             (image, view.image, view.mask) for image, view in zip(images, views, strict=bool(views))
         ]
         results.append(
-            Measurement(
+            AccuracyMeasurement(
                 subject.name,
                 rung.name,
                 rung.is_approximation,
@@ -350,19 +355,19 @@ def measure(
     return results
 
 
-def pareto_front(results: Sequence[Measurement]) -> list[Measurement]:
+def pareto_front(results: Sequence[AccuracyMeasurement]) -> list[AccuracyMeasurement]:
     """Return approximations that none is both faster and closer than, fastest first."""
     candidates = sorted(
         (m for m in results if m.is_approximation), key=lambda m: (m.milliseconds, -m.psnr)
     )
-    front: list[Measurement] = []
+    front: list[AccuracyMeasurement] = []
     for m in candidates:
         if not front or m.psnr > front[-1].psnr:
             front.append(m)
     return front
 
 
-def table(results: Sequence[Measurement]) -> str:
+def table(results: Sequence[AccuracyMeasurement]) -> str:
     """Format all rungs; times relative to the first."""
     first, front = results[0], pareto_front(results)
     rows = []
@@ -391,7 +396,7 @@ def table(results: Sequence[Measurement]) -> str:
     return f"{columns_table(columns, rows)}\n\n{note}"
 
 
-def plot(results: Sequence[Measurement]) -> Figure:
+def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
     """Error over time for each scene, the Pareto front drawn as a line."""
     scenes = list(dict.fromkeys(m.scene for m in results))
     figure = new_figure(4.6 * len(scenes) + 2.6, 4.6)
@@ -413,5 +418,5 @@ def plot(results: Sequence[Measurement]) -> Figure:
             ylabel="root mean square error",
         )  # fmt: skip
         axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1))
+    axes_of[scenes[-1]].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1))
     return figure

@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -48,14 +48,14 @@ ENVIRONMENT = (64, 128)
 
 
 @dataclass(frozen=True)
-class Case:
+class RenderingCase:
     """An image with an effect, or without any."""
 
     effect: str
     variant: str
-    sensor: dict[str, object] = field(default_factory=dict)  # instead of a perspective one
-    integrator: dict[str, object] = field(default_factory=dict)
-    scene: dict[str, object] = field(default_factory=dict)
+    sensor: Mapping[str, object] = field(default_factory=dict)  # instead of a perspective one
+    integrator: Mapping[str, object] = field(default_factory=dict)
+    scene: Mapping[str, object] = field(default_factory=dict)
     sh_degree: int = 3
     smoothing: bool = False
     of_camera: bool = False  # whether there are derivatives of the pose and the lens
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> None:
     count, rounds = (10_000, QUICK_ROUNDS) if args.quick else (NUM_GAUSSIANS, ROUNDS)
     gaussians = bench_gaussians(count)
     print(f"{machine()}\nbench scene, {count:,} Gaussians, {SIZE}x{SIZE}")
-    rendered = measure(rendering_cases(), lambda case: Renderer(case, gaussians), rounds)
+    rendered = measure(rendering_cases(), lambda case: CaseRenderer(case, gaussians), rounds)
     print(f"\n{table(rendered, 'picture', 'picture + derivatives')}", flush=True)
     fitted = measure(fitting_cases(), lambda case: Fitter(case, gaussians), rounds)
     print(f"\n{table(fitted, '', 'training iteration')}")
@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> None:
     write_figure(args.out / "effects.png", plot(rendered, fitted))
 
 
-def rendering_cases() -> list[Case]:
+def rendering_cases() -> list[RenderingCase]:
     """Return the cases of the integrator; the others are compared with the first."""
     camera = bench_camera(SIZE)
     calibrated = {"type": "calibrated", "fx": camera.fx, "fy": camera.fx}
@@ -127,21 +127,21 @@ def rendering_cases() -> list[Case]:
         return calibrated | {"lens": kind, **coefficients}
 
     return [
-        Case("none", "none"),
-        *(Case("view dependence", f"SH degree {k}", sh_degree=k) for k in range(3)),
-        Case("background", "environment", scene={"sky": sky}),
-        Case("background", "picture", integrator={"background": behind}),
-        Case("lens", "distortion: k1 k2 p1 p2", lens("opencv", fox)),
-        Case("lens", "distortion: k1 to k6, p1 p2", lens("opencv", rational)),
-        Case("lens", "fisheye: k1 k2", lens("fisheye", fisheye)),
-        Case("lens", "fisheye: k1 k2 p1 p2 sx1 sy1", lens("thin_prism_fisheye", prism)),
-        Case("lens", "orthographic", {"type": "orthographic", "to_world": wide}),
-        Case("depth of field", "thin lens", mitsuba_sensor(camera) | focused),
-        Case("motion", "blur, 8 times", moving | {"shutter_samples": 8}),
-        Case("motion", "rolling shutter", moving | {"shutter": "rolling"}),
-        Case("antialiasing", "opacity compensation", integrator={"antialiased": True}),
-        Case("antialiasing", "3D smoothing filter", smoothing=True),
-        Case("camera refinement", "pose and focal lengths", calibrated, of_camera=True),
+        RenderingCase("none", "none"),
+        *(RenderingCase("view dependence", f"SH degree {k}", sh_degree=k) for k in range(3)),
+        RenderingCase("background", "environment", scene={"sky": sky}),
+        RenderingCase("background", "picture", integrator={"background": behind}),
+        RenderingCase("lens", "distortion: k1 k2 p1 p2", lens("opencv", fox)),
+        RenderingCase("lens", "distortion: k1 to k6, p1 p2", lens("opencv", rational)),
+        RenderingCase("lens", "fisheye: k1 k2", lens("fisheye", fisheye)),
+        RenderingCase("lens", "fisheye: k1 k2 p1 p2 sx1 sy1", lens("thin_prism_fisheye", prism)),
+        RenderingCase("lens", "orthographic", {"type": "orthographic", "to_world": wide}),
+        RenderingCase("depth of field", "thin lens", mitsuba_sensor(camera) | focused),
+        RenderingCase("motion", "blur, 8 times", moving | {"shutter_samples": 8}),
+        RenderingCase("motion", "rolling shutter", moving | {"shutter": "rolling"}),
+        RenderingCase("antialiasing", "opacity compensation", integrator={"antialiased": True}),
+        RenderingCase("antialiasing", "3D smoothing filter", smoothing=True),
+        RenderingCase("camera refinement", "pose and focal lengths", calibrated, of_camera=True),
     ]
 
 
@@ -158,14 +158,15 @@ def fitting_cases() -> list[FittingCase]:
     ]
 
 
-class Renderer:
+class CaseRenderer:
     """Images of the bench scene, and their derivatives in all parameters."""
 
-    def __init__(self, case: Case, gaussians: Gaussians) -> None:
+    def __init__(self, case: RenderingCase, gaussians: Gaussians) -> None:
         """gaussians: numpy, SH of degree 3."""
         sensor = mitsuba_sensor(bench_camera(SIZE))
         if case.sensor:
-            sensor = {name: sensor[name] for name in ("to_world", "film", "sampler")} | case.sensor
+            kept = {name: sensor[name] for name in ("to_world", "film", "sampler")}
+            sensor = {**kept, **case.sensor}
         uploaded = gaussians.to(mi.TensorXf)
         integrator = {
             "type": "splats",
@@ -230,8 +231,23 @@ class Fitter:
         dr.sync_thread()
 
 
-def measure(cases: Sequence[Any], make: Callable[[Any], Any], rounds: int) -> list[Price]:
-    """Time each case and the first one in turns; make: a :class:`Renderer`, or the like."""
+class TimedCase(Protocol):
+    """A case that is ready to be timed."""
+
+    def forward(self) -> None:
+        """Render an image."""
+        ...
+
+    def both(self) -> None:
+        """Render an image and its derivatives, or run an iteration."""
+        ...
+
+
+C = TypeVar("C", RenderingCase, FittingCase)
+
+
+def measure(cases: Sequence[C], make: Callable[[C], TimedCase], rounds: int) -> list[Price]:
+    """Time each case and the first one in turns."""
     base, prices = make(cases[0]), []
     base_operations = operations(base)
     for case in cases:
@@ -258,7 +274,7 @@ def measure(cases: Sequence[Any], make: Callable[[Any], Any], rounds: int) -> li
     return prices
 
 
-def operations(subject: Any) -> int:
+def operations(subject: TimedCase) -> int:
     """Count the operations of an image and its derivatives, or of an iteration; warms up."""
     for _ in range(2):
         subject.forward()

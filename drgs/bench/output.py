@@ -7,7 +7,7 @@ import csv
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 import drjit as dr
 
@@ -15,6 +15,11 @@ from drgs.core.environment import processor
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
 from drgs.core.private import llvm_version
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Row = TypeVar("Row", bound="DataclassInstance")
 
 COMMAND = "bench"
 
@@ -60,13 +65,13 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]
         writer.writerows(rows)
 
 
-def write_rows(path: Path, row_type: Any, rows: Iterable[Any]) -> None:
+def write_rows(path: Path, row_type: type[Row], rows: Iterable[Row]) -> None:
     """Write instances of the dataclass ``row_type``, a column for each field."""
     names = [field.name for field in fields(row_type)]
     write_csv(path, names, [[getattr(row, name) for name in names] for row in rows])
 
 
-def columns_table(columns: Sequence[tuple[str, str]], items: Iterable[Any]) -> str:
+def columns_table(columns: Sequence[tuple[str, str]], items: Iterable[object]) -> str:
     """Format a row for each item; columns: header, and format such as ``{.seconds:.1f} s``."""
     headers, formats = zip(*columns, strict=True)
     return markdown_table(headers, [[each.format(item) for each in formats] for item in items])

@@ -49,7 +49,7 @@ DENSITY = 100_000 / 400**2
 
 @dataclass(frozen=True)
 class Point:
-    """One problem to measure."""
+    """A problem to measure."""
 
     sweep: str
     count: int  # Gaussians

@@ -70,7 +70,7 @@ def mitsuba_pose(camera: reference.Camera, shift: float = 0.0) -> mi.ScalarTrans
     pose = np.eye(4)
     pose[:3, :3] = camera.rotation.T * [-1, -1, 1]  # Mitsuba's x is to the left, its y up
     pose[:3, 3] = camera.center + shift * camera.rotation[0]
-    return mi.ScalarTransform4f(pose)
+    return mi.ScalarTransform4f(pose)  # pyright: ignore[reportCallIssue, reportArgumentType]  # the stub lacks float64
 
 
 def mitsuba_sensor(camera: reference.Camera) -> dict[str, object]:
@@ -148,17 +148,18 @@ def trainer_of(
 def bench_config(gaussians: Gaussians) -> FitConfig:
     """Return the configuration of a fit that renders as 3DGS and keeps the population."""
     model = ModelConfig(sh_degree=gaussians.sh_degree, sh_increase_every=1).of_file()
-    return FitConfig(
-        data={"path": "."},
-        model=model.model_dump(),
-        densify={
+    values = {
+        "data": {"path": "."},
+        "model": model.model_dump(),
+        "densify": {
             "start": 1_000_000,
             "stop": 1_000_001,
             "strategy": "adc",
             "adc": {"reset_every": 1_000_000},
         },
-        iterations=2_000_000,
-    )
+        "iterations": 2_000_000,
+    }
+    return FitConfig.model_validate(values)
 
 
 def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:

@@ -153,8 +153,8 @@ def make_scenes(trained: Path, quick: bool) -> list[Scene]:
 
 
 @dataclass(frozen=True)
-class Renderer:
-    """One implementation with a scene loaded.
+class TimedRenderer:
+    """An implementation with a scene loaded.
 
     ``forward`` renders a frame; ``forward_backward`` also differentiates sum(weights * image) /
     pixels with respect to all parameters. Both return when the device has finished.
@@ -175,13 +175,13 @@ class Problem:
     weights: np.ndarray  # (H, W, 3): the loss is sum(weights * image) / (H W)
 
 
-def drgs_renderer(problem: Problem) -> Renderer:
+def drgs_renderer(problem: Problem) -> TimedRenderer:
     """Return the ``splats`` integrator through ``mi.render``, as a user of Mitsuba calls it."""
     scene = make_scene(problem.gaussians, ModelConfig().of_file(), (1.0, 1.0, 1.0))
     return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
 
 
-def volprim_renderer(problem: Problem, shape: str, seconds: float) -> Renderer:
+def volprim_renderer(problem: Problem, shape: str, seconds: float) -> TimedRenderer:
     """Return Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
     scene = mi.load_dict(volprim_scene(problem.gaussians, shape, 256))
     return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
@@ -209,13 +209,14 @@ def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str,
 
 def _mitsuba_renderer(
     name: str, scene: mi.Scene, problem: Problem, prefix: str, seconds: float
-) -> Renderer:
+) -> TimedRenderer:
     camera = problem.camera
     sensor = mi.load_dict(mitsuba_sensor(camera) | {"near_clip": 1e-3})
     params = mi.traverse(scene)
     names = [prefix + name for name in (*PARAMETER_NAMES, "data", "opacities", "sh_coeffs")]
     names = [name for name in names if name in params]
-    weights = mi.TensorXf(problem.weights.astype(np.float32) / (camera.width * camera.height))
+    num_pixels = np.float32(camera.width * camera.height)
+    weights = mi.TensorXf(problem.weights.astype(np.float32) / num_pixels)
     integrator = scene.integrator()
 
     def forward() -> None:
@@ -235,10 +236,10 @@ def _mitsuba_renderer(
         dr.sync_thread()
         dr.disable_grad(values)
 
-    return Renderer(name, forward, forward_backward, seconds)
+    return TimedRenderer(name, forward, forward_backward, seconds)
 
 
-def reference_renderer(problem: Problem) -> Renderer:
+def reference_renderer(problem: Problem) -> TimedRenderer:
     """Return the float64 numpy reference."""
     fields = [getattr(problem.gaussians, name) for name in PARAMETER_NAMES]
     gaussians, white = reference.Gaussians(*fields), np.ones(3)
@@ -252,7 +253,7 @@ def reference_renderer(problem: Problem) -> Renderer:
         reference.render_gradients(gaussians, problem.camera, white, d_image)
 
     seconds = 6e-4 * len(gaussians.means)
-    return Renderer("numpy reference, float64", forward, forward_backward, seconds)
+    return TimedRenderer("numpy reference, float64", forward, forward_backward, seconds)
 
 
 def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
@@ -283,7 +284,13 @@ def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
                     (seconds(renderer.forward), seconds(renderer.forward_backward))
                 )
     return [
-        Timing(scene.name, name, *map(statistics.median, zip(*pairs, strict=True)), len(pairs))
+        Timing(
+            scene.name,
+            name,
+            statistics.median(forward for forward, _ in pairs),
+            statistics.median(both for _, both in pairs),
+            len(pairs),
+        )
         for name, pairs in times.items()
     ]
 
@@ -310,7 +317,7 @@ def comparison_table(timings: list[Timing]) -> str:
     """Format times of all implementations, and their ratios to the first one's."""
     ours = timings[0]
     header = ["400x400", "forward", "forward + backward", "ratio", "ratio, both", "rounds"]
-    rows = []
+    rows: list[list[object]] = []
     for timing in timings:
         forward, both = timing.forward, timing.forward_backward
         ratios = f"{forward / ours.forward:.1f}", f"{both / ours.forward_backward:.1f}"
@@ -325,7 +332,9 @@ def _milliseconds(duration: float) -> str:
 
 def stage_table(report: IterationReport) -> str:
     """Format the stages of a training iteration."""
-    rows = [[s, f"{report.stage_ms[s]:.1f} ms", f"{report.num_kernels[s]}"] for s in STAGES]
+    rows: list[list[object]] = [
+        [s, f"{report.stage_ms[s]:.1f} ms", f"{report.num_kernels[s]}"] for s in STAGES
+    ]
     rows.append(["rest of wall time", f"{report.rest_ms:.1f} ms", ""])
     total = sum(report.num_kernels.values())
     rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", total])

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import drjit.llvm.ad as llvm
 import numpy as np
@@ -22,6 +22,7 @@ import numpy as np
 from drgs.bench.output import add_out, columns_table, machine, write_csv
 from drgs.bench.scenes import device_camera
 from drgs.cli.commands import CommandParser
+from drgs.core.types import Float
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
@@ -55,7 +56,7 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Measurement:
+class StabilityMeasurement:
     """Errors at one step of a sweep, relative to the largest value of each array."""
 
     value: float
@@ -94,7 +95,7 @@ def run(args: argparse.Namespace) -> None:
         results[sweep.name] = [measure(sweep, value, samples) for value in values]
         columns = [(sweep.axis, "{.value:g}"), *ERRORS]
         print(f"\n{sweep.name}\n{columns_table(columns, results[sweep.name])}", flush=True)
-    columns = list(Measurement.__dataclass_fields__)
+    columns = list(StabilityMeasurement.__dataclass_fields__)
     rows = [[name, *vars(m).values()] for name, steps in results.items() for m in steps]
     write_csv(args.out / "stability.csv", ["sweep", *columns], rows)
     write_figure(args.out / "stability.png", plot(results))
@@ -195,7 +196,7 @@ def _offset(offset: float) -> Scene:
     return _ordinary(camera, 1, 4), camera
 
 
-def measure(sweep: Sweep, value: float, samples: int) -> Measurement:
+def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
     """Measure errors and noise of one scene; both sides start from the same, rounded numbers."""
     exact = sweep.scene(value)
     gaussians, camera = _stored(*exact)
@@ -219,7 +220,7 @@ def measure(sweep: Sweep, value: float, samples: int) -> Measurement:
         moved = _by_reference(*_moved(gaussians, camera, sample), cotangent)
         errors.append([picture_error(moved[0]), gradient_error(moved[1])])
     picture_noise, gradient_noise = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
-    return Measurement(
+    return StabilityMeasurement(
         value=value,
         picture=picture_error(image32),
         picture_noise=picture_noise,
@@ -273,13 +274,14 @@ def _by_kernels(
     frame = rendering.render(device, device_camera(camera, llvm.Float), pipeline)
     _, *color = frame.planes()
     image = np.stack([np.array(plane).reshape(HEIGHT, WIDTH) for plane in color], axis=-1)
-    planes = [llvm.Float(np.ascontiguousarray(w, np.float32)) for w in cotangent.reshape(-1, 3).T]
-    nothing = llvm.Float(np.zeros(HEIGHT * WIDTH, np.float32))
+    float_type = cast("type[Float]", llvm.Float)
+    planes = [float_type(np.ascontiguousarray(w, np.float32)) for w in cotangent.reshape(-1, 3).T]
+    nothing = float_type(np.zeros(HEIGHT * WIDTH, np.float32))
     gradients = rendering.frames_adjoint(device, [frame], [[nothing, *planes]]).parameters
     return image, {name: np.array(getattr(gradients, name)) for name in PARAMETER_NAMES}
 
 
-def plot(results: dict[str, list[Measurement]]) -> Figure:
+def plot(results: dict[str, list[StabilityMeasurement]]) -> Figure:
     """Draw a panel for each sweep: errors as lines, their noise dashed in the same colour."""
     figure = new_figure(11, 6)
     axes = figure.subplots(2, 2, sharey=True).ravel()

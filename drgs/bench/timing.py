@@ -20,9 +20,10 @@ import drjit as dr
 
 from drgs.bench.scenes import Scene, trainer_of
 from drgs.core.arrays import types_of
+from drgs.core.types import UInt32
 from drgs.splatting import rasterize, rendering, tiles
 from drgs.splatting.grid import PIXELS
-from drgs.splatting.lanes import Entries, load_lane_row, make_lanes
+from drgs.splatting.lanes import Cursor, Entries, load_lane_row, make_lanes
 from drgs.training.trainer import Trainer
 
 STAGES = (
@@ -164,7 +165,7 @@ def count_work(frame: rendering.Frame) -> Work:
     ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
     model = bins.model.bind(lanes, bins.grid)
 
-    def body(cursor: Any, visited: Any, useful: Any) -> tuple:
+    def body(cursor: Cursor, visited: UInt32, useful: UInt32) -> tuple[Cursor, UInt32, UInt32]:
         entry, active = entries.current(cursor)
         geometry, _ = frame.records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)

@@ -7,41 +7,70 @@ sensor's transform is never read back to the host.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.lens import PINHOLE, Lens
+from drgs.cameras.lens import PINHOLE, CameraParameters, Lens
 from drgs.core.arrays import types_of
+from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar, UInt32
 
 MISSED = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
 
+class Aperture(Protocol):
+    """The aperture of a lens that blurs: see ``drgs.cameras.thin_lens``."""
+
+    @property
+    def radius(self) -> Float:
+        """Radius, scene units."""
+        ...
+
+    def variance(self, camera: Camera, depth: Float) -> Float:
+        """Return the variance along either axis, px^2, of the blur of a point at ``depth``."""
+        ...
+
+    def rays(self, camera: Camera, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool]:
+        """Return directions (world) of ``count`` rays of each place (px), and validity."""
+        ...
+
+    def in_focus(self, origin: Array3f, direction: Array3f) -> Array3f:
+        """Return the point of a ray (camera axes) where all rays of its place meet."""
+        ...
+
+
+class Shutter(Protocol):
+    """The shutter of a camera that moves while it is open: see ``drgs.cameras.motion``."""
+
+    label: ClassVar[str]  # for messages
+
+    def pose(self, camera: Camera, time: Scalar) -> Camera:
+        """Return ``camera``, which is at time 0, at another time, without a shutter."""
+        ...
+
+    def cameras(self, camera: Camera) -> list[Camera]:
+        """Return the cameras whose images are averaged."""
+        ...
+
+    def camera_of(self, means: Array3f, camera: Camera) -> Camera:
+        """Return the camera that sees each of some means (world)."""
+        ...
+
+
 @dataclass(frozen=True)
-class Camera:
-    """A camera: x right, y down, z forward; pixel centres at (i + 0.5, j + 0.5).
+class Camera(CameraParameters):
+    """A camera: x right, y down, z forward; pixel centres at (i + 0.5, j + 0.5)."""
 
-    A world point x has camera coordinates ``rotation (x - center)``. The centre is kept rather
-    than the translation ``-rotation center``, which cancels far from the origin.
-    """
-
-    rotation: Any  # 3 x 3 (Matrix3f), world to camera
-    center: Any  # Array3f, world
-    focal: Any  # Array2f (fx, fy), px
-    principal: Any  # Array2f (cx, cy), px
-    film_start: Any  # Array2f, px: where the whole film begins, (0, 0) unless this is a crop window
-    film_end: Any  # Array2f, px: where it ends, (width, height) unless this is a crop window
-    near: Any  # Float, scene units: means with smaller z are culled
     width: int
     height: int
     lens: Lens = PINHOLE
-    aperture: Any = None  # drgs.cameras.thin_lens.RoundAperture, of a lens that blurs
-    shutter: Any = None  # drgs.cameras.motion.Motion, of a camera that moves while it is open
+    aperture: Aperture | None = None  # of a lens that blurs
+    shutter: Shutter | None = None  # of a camera that moves while it is open
 
     @staticmethod
     def create(
-        float_type: type,
+        float_type: type[Float],
         rotation: np.ndarray,
         center: np.ndarray,
         K: np.ndarray,
@@ -54,7 +83,7 @@ class Camera:
         t = types_of(float_type)
         rotation, center, K = (np.asarray(a, dtype=np.float64) for a in (rotation, center, K))
 
-        def scalar(value: float) -> Any:
+        def scalar(value: float) -> Float:
             return dr.opaque(float_type, float(value))
 
         camera = Camera(
@@ -70,10 +99,10 @@ class Camera:
         )
         return camera.with_lens(lens)
 
-    def look_through(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    def look_through(self, x: Float, y: Float) -> tuple[Array3f, Array3f, Bool | bool]:
         """Return the ray through a place of the film (px): origin, direction, and if it is one.
 
-        Origin and direction (of any length) are Array3f in camera axes. A lens shows nothing beyond
+        Origin and direction (of any length) are in camera axes. A lens shows nothing beyond
         the end of its model.
         """
         direction = self.lens.ray(self, x, y)
@@ -85,8 +114,8 @@ class Camera:
         missed = self.lens.project_point(self, direction) - t.Array2f(x, y)
         return origin, direction, seen & (dr.squared_norm(missed) < MISSED**2)
 
-    def view_directions(self, x: Any, y: Any, count: int) -> tuple[Any, Any, int]:
-        """Return directions of rays through places of the film (px): Array3f, world, any length.
+    def view_directions(self, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool, int]:
+        """Return directions of rays through places of the film (px): world, any length.
 
         And whether they are any, and their number at each place, next to each other: ``count``,
         spread evenly over the aperture if there is one, else 1.
@@ -97,28 +126,28 @@ class Camera:
         _, ray, seen = camera.look_through(x, y)
         return camera.rotation.T @ ray, seen, 1
 
-    def place_of_ray(self, origin: Any, direction: Any) -> tuple[Any, Any]:
-        """Return the place of a ray on the film, Array2f, px, and the radius of the aperture.
+    def place_of_ray(self, origin: Array3f, direction: Array3f) -> tuple[Array2f, Float]:
+        """Return the place of a ray on the film, px, and the radius of the aperture.
 
-        origin, direction: Array3f, camera axes. The radius is Float, scene units.
+        origin, direction: camera axes. The radius is in scene units.
         """
         if self.aperture is None:
             return self.lens.place_of_ray(self, origin, direction), type(self.near)(0)
         point = self.aperture.in_focus(origin, direction)
         return self.lens.project_point(self, point), self.aperture.radius
 
-    def at_row(self, y: Any) -> Camera:
+    def at_row(self, y: Float) -> Camera:
         """Return the camera when a rolling shutter reads the row at y, px; others as they are."""
         if self.shutter is None:
             return self
         row = (y - self.film_start.y) / (self.film_end.y - self.film_start.y)
         return self.shutter.pose(self, row)
 
-    def seeing(self, means: Any) -> Camera:
-        """Return the camera when a rolling shutter reads the rows of means (Array3f, world)."""
+    def seeing(self, means: Array3f) -> Camera:
+        """Return the camera when a rolling shutter reads the rows of means (world)."""
         return self if self.shutter is None else self.shutter.camera_of(means, self)
 
-    def numbers(self) -> list[Any]:
+    def numbers(self) -> list[Float]:
         """Return pose, focal lengths, principal point and lens as Float, in a fixed order."""
         return [n for name in _DIFFERENTIABLE for n in _numbers_of(getattr(self, name))]
 
@@ -140,16 +169,17 @@ class Camera:
 _DIFFERENTIABLE = ("rotation", "center", "focal", "principal", "lens", "aperture", "shutter")
 
 
-def _numbers_of(value: Any) -> list[Any]:
+def _numbers_of(value: Any) -> list[Float]:
     if is_dataclass(value):
         return [n for f in fields(value) for n in _numbers_of(getattr(value, f.name))]
-    if isinstance(value, tuple) or (dr.is_array_v(value) and dr.depth_v(value) > 1):
-        return [n for item in value for n in _numbers_of(item)]
-    return [value] if dr.is_array_v(value) else []
+    if dr.is_array_v(value) and dr.depth_v(value) == 1:
+        return [value]
+    is_sequence = isinstance(value, tuple) or dr.is_array_v(value)
+    return [n for item in value for n in _numbers_of(item)] if is_sequence else []
 
 
-def _gathered(value: Any, lanes: Any) -> Any:
-    if is_dataclass(value):
+def _gathered(value: object, lanes: UInt32) -> object:
+    if is_dataclass(value) and not isinstance(value, type):
         changes = {f.name: _gathered(getattr(value, f.name), lanes) for f in fields(value)}
         return replace(value, **changes)
     if isinstance(value, tuple):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 import numpy as np
 
 from drgs.cameras.lens import check_coefficients
 from drgs.core.arrays import types_of
+from drgs.core.types import Bool, Float, Scalar, UInt32
 
 NEGLIGIBLE_COEFFICIENT = 1e-30
 """A smaller one is as good as 0: at a slope of 1e4, k3 r^6 is 1e-6. With it, roots overflow."""
@@ -28,7 +29,7 @@ UNBOUNDED = 1e4  # a slope that no film shows
 NEWTON_STEPS = 5  # steps for the other terms, which are small: the search starts nearby
 
 
-def horner(coefficients: Sequence[Any], x: Any) -> Any:
+def horner(coefficients: Sequence[Scalar], x: Scalar) -> Scalar:
     """Return c_0 + c_1 x + c_2 x^2 + ...; 0.0 without coefficients."""
     if not coefficients:
         return 0.0
@@ -38,12 +39,12 @@ def horner(coefficients: Sequence[Any], x: Any) -> Any:
     return total
 
 
-def polynomial(coefficients: Sequence[Any], x: Any) -> Any:
+def polynomial(coefficients: Sequence[Scalar], x: Scalar) -> Scalar:
     """Return 1 + c_1 x + c_2 x^2 + ..."""
     return horner([1.0, *coefficients], x)
 
 
-def derivative(coefficients: Sequence[Any], x: Any) -> Any:
+def derivative(coefficients: Sequence[Scalar], x: Scalar) -> Scalar:
     """Return c_1 + 2 c_2 x + ..."""
     return horner([power * c for power, c in enumerate(coefficients, 1)], x)
 
@@ -55,7 +56,9 @@ def first_root(coefficients: np.ndarray) -> float:
     return float(real.min(initial=math.inf))
 
 
-def radius_at(distorted: Callable, target: Any, end: Any) -> Any:
+def radius_at(
+    distorted: Callable[[Float], tuple[Float, Scalar]], target: Float, end: Scalar
+) -> Float:
     """Return where an increasing function reaches ``target``; close to ``end`` if it never does.
 
     distorted: radius -> its value and its derivative; 0 at 0. Newton's method within a bracket,
@@ -63,10 +66,12 @@ def radius_at(distorted: Callable, target: Any, end: Any) -> Any:
     it converges whatever the function, and stays finite. Not differentiated.
     """
     UInt32 = types_of(type(target)).UInt32
-    high = dr.minimum(end, UNBOUNDED)
+    high = dr.minimum(type(target)(end), UNBOUNDED)
     first = dr.select(target < high, target, _between(0, high))
 
-    def body(count: Any, low: Any, high: Any, radius: Any) -> tuple[Any, Any, Any, Any]:
+    def body(
+        count: UInt32, low: Float, high: Float, radius: Float
+    ) -> tuple[UInt32, Float, Float, Float]:
         value, slope = distorted(radius)
         below = value < target
         low, high = dr.select(below, radius, low), dr.select(below, high, radius)
@@ -85,7 +90,7 @@ def radius_at(distorted: Callable, target: Any, end: Any) -> Any:
     return radius
 
 
-def _between(low: Any, high: Any) -> Any:
+def _between(low: Scalar, high: Float) -> Float:
     """Return the middle on the scale r / (1 + r): a bracket may reach from 0 to very far."""
     middle = (low / (1 + low) + high / (1 + high)) / 2
     return middle / (1 - middle)
@@ -116,17 +121,20 @@ class PlaneDistortion(Protocol):
 
         x' = L x + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = L y + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-    (Brown 1966). It is one-to-one where r^2 is below ``max_squared_radius``.
+    (Brown 1966). It is one-to-one where r^2 is below :meth:`squared_limit`.
     """
 
-    tangential: tuple[Any, ...]  # p1, p2; or none
-    max_squared_radius: Any  # the end of the model
+    tangential: tuple[Scalar, ...]  # p1, p2; or none
 
-    def radial(self, squared: Any) -> Any:
+    def squared_limit(self) -> Scalar:
+        """Return the r^2 at which the model ends."""
+        ...
+
+    def radial(self, squared: Float) -> Scalar:
         """Return L at r^2."""
         ...
 
-    def radial_derivative(self, squared: Any) -> Any:
+    def radial_derivative(self, squared: Float) -> Scalar:
         """Return d L / d r^2."""
         ...
 
@@ -134,7 +142,7 @@ class PlaneDistortion(Protocol):
         """Return whether places are moved along their radius alone."""
         return not self.tangential
 
-    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
+    def distort(self, x: Float, y: Float) -> tuple[Float, Float]:
         """Return places as the film shows them."""
         squared = x * x + y * y
         radial = self.radial(squared)
@@ -146,7 +154,7 @@ class PlaneDistortion(Protocol):
             radial * y + p1 * (squared + 2 * y * y) + 2 * p2 * (x * y),
         )
 
-    def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
+    def distortion_jacobian(self, x: Float, y: Float) -> tuple[Float, Float, Float, Float]:
         """Return d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
         squared = x * x + y * y
         radial, slope = self.radial(squared), 2 * self.radial_derivative(squared)
@@ -157,7 +165,7 @@ class PlaneDistortion(Protocol):
         xx, xy = xx + 2 * p1 * y + 6 * p2 * x, xy + 2 * p1 * x + 2 * p2 * y
         return xx, xy, xy, yy + 6 * p1 * y + 2 * p2 * x
 
-    def undistort(self, x: Any, y: Any) -> tuple[Any, Any]:
+    def undistort(self, x: Float, y: Float) -> tuple[Float, Float]:
         """Return the places that :meth:`distort` sends to (x, y), or any finite ones.
 
         Only the last step of the search is differentiated: a step of Newton's method from the
@@ -165,7 +173,7 @@ class PlaneDistortion(Protocol):
         """
         with dr.suspend_grad():
             length = dr.sqrt(x * x + y * y)
-            radius = radius_at(self._radius, length, dr.sqrt(self.max_squared_radius))
+            radius = radius_at(self._radius, length, dr.sqrt(self.squared_limit()))
             # In the middle, radius and length are the same.
             scale = dr.select(length > 0, radius / dr.select(length > 0, length, 1), 1)
             u, v = scale * x, scale * y
@@ -178,13 +186,13 @@ class PlaneDistortion(Protocol):
                 )
         return self._step(u, v, x, y)
 
-    def _radius(self, radius: Any) -> tuple[Any, Any]:
+    def _radius(self, radius: Float) -> tuple[Float, Scalar]:
         """Return the distorted radius by the radial terms alone, and its derivative."""
         squared = radius * radius
         radial = self.radial(squared)
         return radial * radius, radial + 2 * squared * self.radial_derivative(squared)
 
-    def _step(self, u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    def _step(self, u: Float, v: Float, x: Float, y: Float) -> tuple[Float, Float]:
         """Take a step of Newton's method towards (x, y), unless it would leave the lens model."""
         at_x, at_y = self.distort(u, v)
         dx, dy = x - at_x, y - at_y
@@ -193,13 +201,13 @@ class PlaneDistortion(Protocol):
             xx, xy, yx, yy = jacobian
             per_determinant = 1 / (xx * yy - xy * yx)
             xx, xy, yx, yy = (value * per_determinant for value in jacobian)
-        following = u + (yy * dx - xy * dy), v + (xx * dy - yx * dx)
-        inside = self.is_within(*following)
-        return tuple(dr.select(inside, b, a) for a, b in zip((u, v), following, strict=True))
+        next_u, next_v = u + (yy * dx - xy * dy), v + (xx * dy - yx * dx)
+        inside = self.is_within(next_u, next_v)
+        return dr.select(inside, next_u, u), dr.select(inside, next_v, v)
 
-    def is_within(self, x: Any, y: Any) -> Any:
+    def is_within(self, x: Float, y: Float) -> Bool:
         """Return whether places are within the model."""
-        return x * x + y * y < self.max_squared_radius
+        return x * x + y * y < self.squared_limit()
 
 
 def steepest_fall(tangential: Sequence[float], prism: Sequence[float] = (0.0, 0.0)) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -24,6 +24,7 @@ from drgs.cameras.distortion import (
 )
 from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
 from drgs.core.arrays import is_float64, types_of
+from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
 
 MAX_ANGLE = 0.95 * math.pi
 """Radians from the axis: points behind the camera have no place on the film."""
@@ -49,8 +50,8 @@ class Fisheye(Lens):
 
     groups: ClassVar[Mapping[str, tuple[str, ...]]] = {"radial_terms": ("k1", "k2", "k3", "k4")}
 
-    radial_terms: tuple[Any, ...]  # k1 up to the last that is given
-    min_cosine: Any
+    radial_terms: tuple[Scalar, ...]  # k1 up to the last that is given
+    min_cosine: Scalar
 
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> Fisheye:
@@ -60,23 +61,20 @@ class Fisheye(Lens):
         turn = math.sqrt(first_root(np.array(growth)))
         return cls(terms, math.cos(min(turn, MAX_ANGLE)))
 
-    def shows(self, position: Any) -> Any:
-        """Return whether a point's angle from the axis is within the model, Bool."""
+    def shows(self, position: Array3f) -> Bool:
+        """Return whether a point's angle from the axis is within the model."""
         return position.z > self.min_cosine * dr.norm(position)
 
-    def project_point(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the place of a point on the film, Array2f, px."""
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *place_of(position, self.radial_terms))
 
     def projection_jacobian(
-        self, camera: CameraParameters, position: Any, slopes: None = None
-    ) -> list[Any]:
-        """Return the derivatives of the place on the film, two Array3f, world."""
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
+    ) -> list[Array3f]:
         directions = place_directions(camera, position, self.radial_terms)
         return [f * direction for f, direction in zip(camera.focal, directions, strict=True)]
 
-    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
-        """Return the direction of the ray through a place of the film (px), Array3f."""
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         squared = dr.squared_norm(film)
         off_axis = squared > 0
@@ -91,15 +89,15 @@ class Fisheye(Lens):
         scale = dr.select(off_axis, sine / radius, 1)
         return t.Array3f(scale * film.x, scale * film.y, dr.select(off_axis, cosine, 1))
 
-    def _distorted_angle(self, angle: Any) -> tuple[Any, Any]:
+    def _distorted_angle(self, angle: Float) -> tuple[Float, Scalar]:
         """Return theta_d of an angle, and its derivative."""
         squared = angle * angle
         h, dh = polynomial(self.radial_terms, squared), derivative(self.radial_terms, squared)
         return h * angle, h + 2 * dh * squared
 
 
-def place_of(position: Any, coefficients: Sequence[Any] = ()) -> tuple[Any, Any]:
-    """Return the place of a point (Array3f, camera axes) on the film, in focal lengths."""
+def place_of(position: Array3f, coefficients: Sequence[Scalar] = ()) -> tuple[Float, Float]:
+    """Return the place of a point (camera axes) on the film, in focal lengths."""
     x, y, _ = position
     per_radius, _ = _angle_per_radius(position)
     scale = per_radius * polynomial(coefficients, _squared_angle(position, per_radius))
@@ -107,9 +105,9 @@ def place_of(position: Any, coefficients: Sequence[Any] = ()) -> tuple[Any, Any]
 
 
 def place_directions(
-    camera: CameraParameters, position: Any, coefficients: Sequence[Any] = ()
-) -> list[Any]:
-    """Return the derivatives of that place, two Array3f, world: per scene unit.
+    camera: CameraParameters, position: Array3f, coefficients: Sequence[Scalar] = ()
+) -> list[Array3f]:
+    """Return the derivatives of that place, world: per scene unit.
 
     With rho^2 = x^2 + y^2, n^2 = rho^2 + z^2, a = theta / rho, b = (d a / d rho) / rho, and
     theta_d = h theta: the place is A (x, y) with A = h a, (d A / d rho) / rho = B = h b +
@@ -127,7 +125,7 @@ def place_directions(
     return [scale * axis + c * change for axis, c in zip((right, down), (x, y), strict=True)]
 
 
-def _angle_per_radius(position: Any) -> tuple[Any, Any]:
+def _angle_per_radius(position: Array3f) -> tuple[Float, Float]:
     """Return a = theta / rho and b = (z / n^2 - a) / rho^2, near the axis by their series.
 
     With t = rho / z: z a = 1 - t^2 / 3 + t^4 / 5 ..., z^3 b = -2/3 + 4/5 t^2 - 6/7 t^4 ...
@@ -148,5 +146,5 @@ def _angle_per_radius(position: Any) -> tuple[Any, Any]:
     return dr.select(on_axis, series_a, a), dr.select(on_axis, series_b, b)
 
 
-def _squared_angle(position: Any, per_radius: Any) -> Any:
+def _squared_angle(position: Array3f, per_radius: Float) -> Float:
     return (per_radius * per_radius) * (dr.square(position.x) + dr.square(position.y))

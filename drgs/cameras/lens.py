@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar
 
 import drjit as dr
 
@@ -22,8 +22,9 @@ from drgs.core.arrays import types_of
 from drgs.core.constants import MAX_COEFFICIENT, TAN_CLAMP
 from drgs.core.errors import UserError
 from drgs.core.registry import ClassRegistry
+from drgs.core.types import Array2f, Array3f, Bool, Float, Matrix3f, Scalar, UInt32
 
-LENSES = ClassRegistry(
+LENSES: ClassRegistry[Lens] = ClassRegistry(
     "lens",
     {
         "pinhole": "drgs.cameras.lens",
@@ -38,15 +39,21 @@ NEWTON_STEPS = 24
 """Steps of the search for a ray: most need 5; those that would leave the lens are halved."""
 
 
-class CameraParameters(Protocol):
-    """Parameters of a ``drgs.cameras.camera.Camera`` that a lens may use: Dr.Jit scalars."""
+@dataclass(frozen=True)
+class CameraParameters:
+    """Parameters of a camera that its lens may use: Dr.Jit scalars.
 
-    rotation: Any  # Matrix3f, world to camera: its rows are the camera's axes in the world
-    focal: Any  # Array2f (fx, fy), px
-    principal: Any  # Array2f (cx, cy), px
-    film_start: Any  # Array2f, px: upper left corner of the whole film
-    film_end: Any  # Array2f, px: its lower right corner
-    near: Any  # Float, scene units
+    A world point x has camera coordinates ``rotation (x - center)``. The centre is kept rather
+    than the translation ``-rotation center``, which cancels far from the origin.
+    """
+
+    rotation: Matrix3f  # world to camera: its rows are the camera's axes in the world
+    center: Array3f  # world
+    focal: Array2f  # (fx, fy), px
+    principal: Array2f  # (cx, cy), px
+    film_start: Array2f  # px: where the whole film begins, (0, 0) unless this is a crop window
+    film_end: Array2f  # px: where it ends, (width, height) unless this is a crop window
+    near: Float  # scene units: means with smaller z are culled
 
 
 @dataclass(frozen=True)
@@ -65,42 +72,41 @@ class Lens:
     """Names of coefficients by field, a tuple of the first of them; none: a field is a coefficient.
     """
 
-    def project_point(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the place of a point on the film, Array2f, px; position: Array3f, camera axes."""
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
+        """Return the place of a point on the film, px; position: camera axes."""
         raise NotImplementedError
 
     def projection_jacobian(
-        self, camera: CameraParameters, position: Any, slopes: list[Any] | None = None
-    ) -> list[Any]:
-        """Return the derivatives of x and of y on the film, two Array3f, world: px per scene unit.
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
+    ) -> list[Array3f]:
+        """Return the derivatives of x and of y on the film, world: px per scene unit.
 
-        slopes: of the ray of projection, see :meth:`clamped_slopes`; None for most lenses.
+        slopes: of the ray of projection, see :meth:`clamped_slopes`; None: those of the point.
         """
         raise NotImplementedError
 
-    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         """Return the direction of the ray through a place of the film (px).
 
-        It is an Array3f in camera axes, of any length. Here it is found by Newton's method on the
+        It is in camera axes, of any length. Here it is found by Newton's method on the
         sphere of directions, from the axis. The search is not differentiated, but its last step: a
         step from the solution has the solution's derivative (the implicit function theorem).
         """
         t = types_of(type(x))
         axes = replace(camera, rotation=dr.identity(t.Matrix3f))
 
-        def step(direction: Any, factor: Any = 1) -> Any:
+        def step(direction: Array3f, factor: Scalar = 1) -> Array3f:
             """Return where ``factor`` of the shortest step of a linear projection leads."""
             missed = t.Array2f(x, y) - self.project_point(axes, direction)
             with dr.suspend_grad():
-                slopes = self.true_slopes(axes, direction)
-                dx, dy = self.projection_jacobian(axes, direction, slopes)
+                dx, dy = self.projection_jacobian(axes, direction)
                 xx, xy, yy = dr.dot(dx, dx), dr.dot(dx, dy), dr.dot(dy, dy)
                 per_determinant = factor / (xx * yy - xy * xy)
             along_x = (yy * missed.x - xy * missed.y) * per_determinant
             along_y = (xx * missed.y - xy * missed.x) * per_determinant
             return dr.normalize(direction + along_x * dx + along_y * dy)
 
-        def body(count: Any, direction: Any, factor: Any) -> tuple[Any, Any, Any]:
+        def body(count: UInt32, direction: Array3f, factor: Float) -> tuple[UInt32, Array3f, Float]:
             following = step(direction, factor)
             shown = self.shows(following)
             factor = dr.select(shown, dr.minimum(2 * factor, 1), factor / 2)
@@ -134,14 +140,14 @@ class Lens:
             got = ", ".join(coefficients) or "none"
             raise UserError(f"lens {cls.kind} has the coefficients {names}; got {got}") from None
 
-    def coefficients(self) -> dict[str, Any]:
+    def coefficients(self) -> dict[str, Scalar]:
         """Return the coefficients by name, without those that are left out."""
         if not self.groups:
             return {name: getattr(self, name) for name in self.coefficient_names()}
         groups = (zip(names, getattr(self, f), strict=False) for f, names in self.groups.items())
         return dict(chain(*groups))
 
-    def with_coefficients(self, values: Mapping[str, Any]) -> Lens:
+    def with_coefficients(self, values: Mapping[str, Scalar]) -> Lens:
         """Return the lens with other numbers for its coefficients; the model's end stays."""
         if not self.groups:
             return replace(self, **{name: values[name] for name in self.coefficients()})
@@ -151,7 +157,7 @@ class Lens:
     def upload(self, float_type: type) -> Lens:
         """Return the lens with Dr.Jit scalars for its numbers: kernels are the same for all."""
 
-        def opaque(value: Any) -> Any:
+        def opaque(value: object) -> object:
             if isinstance(value, tuple):
                 return tuple(opaque(item) for item in value)
             return dr.opaque(float_type, value) if isinstance(value, float) else value
@@ -162,14 +168,16 @@ class Lens:
         """Return the lens that knows what the film of ``camera`` sees."""
         return self
 
-    def shows(self, position: Any) -> Any:
-        """Return whether the lens sees a point (Array3f, camera axes) at any distance, Bool.
+    def shows(self, position: Array3f) -> Bool:
+        """Return whether the lens sees a point (camera axes) at any distance.
 
         Points that it does not see need no place on the film: they are moved to the axis first.
         """
         return position.z > 0
 
-    def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         """Return whether a point is seen, its position, and its depth: the distance, scene units.
 
         Position and depth of a point that is not seen are replaced: a masked lane must not divide
@@ -179,72 +187,70 @@ class Lens:
         _, position, _ = with_unseen_on_axis(position, seen)
         return seen, position, dr.norm(position)
 
-    def true_slopes(self, camera: CameraParameters, position: Any) -> list[Any] | None:
+    def true_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         """Return x / z and y / z of a point; None if the projection is linearised at the point."""
         return None
 
-    def clamped_slopes(self, camera: CameraParameters, position: Any) -> list[Any] | None:
+    def clamped_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         """Return the same, but not far outside the film: see ``constants.TAN_CLAMP``."""
         return None
 
-    def depth_direction(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the derivative of the depth divided by the depth, Array3f, world."""
+    def depth_direction(self, camera: CameraParameters, position: Array3f) -> Array3f:
+        """Return the derivative of the depth divided by the depth, world."""
         right, down, forward = camera.rotation
         x, y, z = position / dr.squared_norm(position)
         return x * right + y * down + z * forward
 
-    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
+    def ray_range(self, direction: Array3f, near: Float, far: Float) -> tuple[Float, Float]:
         """Return where a ray of unit ``direction`` (camera axes) reaches two depths."""
         return near, far
 
-    def view_direction(self, camera: CameraParameters, offset: Any) -> Any:
-        """Return the direction in which a point is seen, Array3f, world, of any length.
+    def view_direction(self, camera: CameraParameters, offset: Array3f) -> Array3f:
+        """Return the direction in which a point is seen, world, of any length.
 
-        offset: from the camera's centre to the point, Array3f, world.
+        offset: from the camera's centre to the point, world.
         """
         return offset
 
-    def origin(self, camera: CameraParameters, x: Any, y: Any) -> Any:
-        """Return where the ray through a place of the film (px) begins, Array3f, camera axes."""
+    def origin(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
+        """Return where the ray through a place of the film (px) begins, camera axes."""
         return types_of(type(x)).Array3f(0, 0, 0)
 
-    def place_of_ray(self, camera: CameraParameters, origin: Any, direction: Any) -> Any:
-        """Return the place on the film of a ray (Array3f, camera axes), Array2f, px."""
+    def place_of_ray(
+        self, camera: CameraParameters, origin: Array3f, direction: Array3f
+    ) -> Array2f:
+        """Return the place on the film of a ray (camera axes), px."""
         return self.project_point(camera, direction)
 
 
 class Perspective(Lens):
     """A lens that sees what is in front of it, and whose depth is z."""
 
-    def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
-        """Return whether a point is seen, its position, and its depth."""
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         x, y, z = position
         seen = z >= camera.near
         z = dr.select(seen, z, 1)
         return seen, type(position)(x, y, z), z
 
-    def true_slopes(self, camera: CameraParameters, position: Any) -> list[Any]:
-        """Return x / z and y / z of a point."""
-        return [position.x / position.z, position.y / position.z]
+    def true_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
+        return slopes_of(position)
 
-    def clamped_slopes(self, camera: CameraParameters, position: Any) -> list[Any]:
-        """Return the same, but not far outside the film: see ``constants.TAN_CLAMP``."""
+    def clamped_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         start, end = self.frustum(camera)
         margin = TAN_CLAMP * (end - start) / 2
-        slopes = self.true_slopes(camera, position)
-        bounds = zip(slopes, start - margin, end + margin, strict=True)
+        bounds = zip(slopes_of(position), start - margin, end + margin, strict=True)
         return [dr.select(s < lo, lo, dr.select(s > hi, hi, s)) for s, lo, hi in bounds]
 
-    def depth_direction(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the derivative of the depth divided by the depth, Array3f, world."""
+    def depth_direction(self, camera: CameraParameters, position: Array3f) -> Array3f:
         return camera.rotation[2] / position.z
 
-    def ray_range(self, direction: Any, near: Any, far: Any) -> tuple[Any, Any]:
-        """Return where a ray of unit ``direction`` reaches two depths."""
+    def ray_range(self, direction: Array3f, near: Float, far: Float) -> tuple[Float, Float]:
         return near / direction.z, far / direction.z
 
-    def frustum(self, camera: CameraParameters) -> tuple[Any, Any]:
-        """Return the least and the largest slopes on the film, Array2f."""
+    def frustum(self, camera: CameraParameters) -> tuple[Array2f, Array2f]:
+        """Return the least and the largest slopes on the film."""
         # Of the whole film: a crop window is a part of the same picture.
         start = (camera.film_start - camera.principal) / camera.focal
         end = (camera.film_end - camera.principal) / camera.focal
@@ -258,26 +264,22 @@ class Pinhole(Perspective):
 
     distorts: ClassVar[bool] = False
 
-    def project_point(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the place of a point on the film, Array2f, px."""
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         x, y, z = position
         return camera.focal * types_of(type(z)).Array2f(x, y) / z + camera.principal
 
     def projection_jacobian(
-        self, camera: CameraParameters, position: Any, slopes: list[Any]
-    ) -> list[Any]:
-        """Return the derivatives of the place on the film, two Array3f, world: px per scene unit.
-
-        J's rows are focal / z (e_axis - slope e_z).
-        """
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
+    ) -> list[Array3f]:
+        # J's rows are focal / z (e_axis - slope e_z).
         right, down, forward = camera.rotation
+        slopes = slopes or slopes_of(position)
         return [
             (axis - slope * forward) * (focal / position.z)
             for axis, focal, slope in zip((right, down), camera.focal, slopes, strict=True)
         ]
 
-    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
-        """Return the direction of the ray through a place of the film (px), Array3f."""
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         film = film_coordinates(camera, x, y)
         return types_of(type(x)).Array3f(film.x, film.y, 1)
 
@@ -285,13 +287,18 @@ class Pinhole(Perspective):
 PINHOLE = Pinhole()
 
 
-def film_coordinates(camera: CameraParameters, x: Any, y: Any) -> Any:
-    """Return a place of the film (px) in focal lengths from the principal point, Array2f."""
+def slopes_of(position: Array3f) -> list[Float]:
+    """Return x / z and y / z of a point, camera axes."""
+    return [position.x / position.z, position.y / position.z]
+
+
+def film_coordinates(camera: CameraParameters, x: Float, y: Float) -> Array2f:
+    """Return a place of the film (px) in focal lengths from the principal point."""
     return (types_of(type(x)).Array2f(x, y) - camera.principal) / camera.focal
 
 
-def pixel_coordinates(camera: CameraParameters, x: Any, y: Any) -> Any:
-    """Return the place of the film, Array2f, px; the inverse of :func:`film_coordinates`."""
+def pixel_coordinates(camera: CameraParameters, x: Float, y: Float) -> Array2f:
+    """Return the place of the film, px; the inverse of :func:`film_coordinates`."""
     return camera.focal * types_of(type(x)).Array2f(x, y) + camera.principal
 
 
@@ -305,8 +312,8 @@ def check_coefficients(given: Mapping[str, float]) -> None:
             )
 
 
-def with_unseen_on_axis(position: Any, seen: Any) -> tuple[Any, Any, Any]:
-    """Return ``seen`` (Bool), positions (Array3f, camera axes), and their z.
+def with_unseen_on_axis(position: Array3f, seen: Bool) -> tuple[Bool, Array3f, Float]:
+    """Return ``seen``, positions (camera axes), and their z.
 
     Points that are not seen are moved to (0, 0, 1), where every lens is differentiable.
     """

@@ -7,12 +7,13 @@ the camera turns at a constant rate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
-from drgs.cameras.camera import Camera
+from drgs.cameras.camera import Camera, Shutter
 from drgs.core.arrays import types_of
+from drgs.core.types import Array3f, Bool, Float, Matrix3f, Scalar
 
 NEWTON_STEPS = 3
 """Steps of the search for a splat's time: pixels move little while the film is read."""
@@ -22,28 +23,21 @@ SLOWEST = 1e-4
 
 
 @dataclass(frozen=True)
-class Motion:
-    """The motion from the first pose to the second; its subclasses are shutters.
+class Motion(Shutter):
+    """The motion of a camera from the first pose to the second while its shutter is open."""
 
-    ``cameras`` of a shutter returns those whose images are averaged, ``camera_of`` the camera,
-    without a shutter, that sees each of some means.
-    """
-
-    label: ClassVar[str]  # for messages
-
-    travel: Any  # Array3f, world: of the centre
-    turn: Any  # Array3f, camera axes: axis times angle (radians), below half a turn
+    travel: Array3f  # world: of the centre
+    turn: Array3f  # camera axes: axis times angle (radians), below half a turn
 
     @staticmethod
-    def between(camera: Camera, rotation: Any, center: Any) -> tuple[Any, Any]:
+    def between(camera: Camera, rotation: Matrix3f, center: Array3f) -> tuple[Array3f, Array3f]:
         """Return ``travel`` and ``turn`` from the pose of ``camera`` to another.
 
-        rotation: Matrix3f, world to camera; center: Array3f, world.
+        rotation: world to camera; center: world.
         """
         return center - camera.center, rotation_vector(rotation @ camera.rotation.T)
 
-    def pose(self, camera: Camera, time: Any) -> Camera:
-        """Return ``camera``, which is at time 0, at another time."""
+    def pose(self, camera: Camera, time: Scalar) -> Camera:
         turn = rotation_matrix(self.turn * time)
         return replace(
             camera,
@@ -52,7 +46,7 @@ class Motion:
             shutter=None,
         )
 
-    def velocity(self, camera: Camera, offset: Any) -> Any:
+    def velocity(self, camera: Camera, offset: Array3f) -> Array3f:
         """Return the velocity of a point relative to the camera, world axes, per unit of time.
 
         camera: at the time in question; offset: from its centre to the point, world.
@@ -70,11 +64,10 @@ class MotionBlur(Motion):
     samples: int
 
     def cameras(self, camera: Camera) -> list[Camera]:
-        """Return the cameras in the middle of equal intervals of time."""
+        # In the middle of equal intervals of time.
         return [self.pose(camera, (k + 0.5) / self.samples) for k in range(self.samples)]
 
-    def camera_of(self, means: Any, camera: Camera) -> Camera:
-        """Raise ValueError: means are seen all the time, by each of :meth:`cameras`."""
+    def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         raise ValueError("a camera that motion blurs has a picture for each of its cameras_in_time")
 
 
@@ -85,11 +78,10 @@ class RollingShutter(Motion):
     label: ClassVar[str] = "rolling shutter"
 
     def cameras(self, camera: Camera) -> list[Camera]:
-        """Return the camera itself: it has one image."""
         return [camera]
 
-    def camera_of(self, means: Any, camera: Camera) -> Camera:
-        """Return the camera when it reads the row of the film that shows a mean (Array3f, world).
+    def camera_of(self, means: Array3f, camera: Camera) -> Camera:
+        """Return the camera when it reads the row of the film that shows a mean.
 
         The time is that of the row on which the mean is seen then, by Newton's method, of which the
         last step is differentiated (the implicit function theorem). A splat is projected as a whole
@@ -103,7 +95,7 @@ class RollingShutter(Motion):
         moved, inside = self._step(means, camera, dr.detach(time))
         return self.pose(camera, dr.select(inside, moved, time))
 
-    def _step(self, means: Any, camera: Camera, time: Any) -> tuple[Any, Any]:
+    def _step(self, means: Array3f, camera: Camera, time: Float) -> tuple[Float, Bool]:
         """Take a step of Newton's method; return the time, and whether it is on the film."""
         at = self.pose(camera, time)
         offset = means - at.center
@@ -111,8 +103,7 @@ class RollingShutter(Motion):
         height = camera.film_end.y - camera.film_start.y
         row = (at.lens.project_point(at, position).y - camera.film_start.y) / height
         with dr.suspend_grad():
-            slopes = at.lens.true_slopes(at, position)
-            _, down = at.lens.projection_jacobian(at, position, slopes)
+            _, down = at.lens.projection_jacobian(at, position)
             rate = dr.dot(down, self.velocity(at, offset)) / height
             # Where rows run away from the reader as fast as it reads, no time is the right one.
             rate = dr.select(seen & (rate < 0.5), rate, 0)
@@ -120,7 +111,7 @@ class RollingShutter(Motion):
         return moved, seen & (moved > 0) & (moved < 1)
 
 
-def rotation_vector(rotation: Any) -> Any:
+def rotation_vector(rotation: Matrix3f) -> Array3f:
     """Return axis times angle, radians, of a rotation by less than half a turn."""
     t = types_of(type(rotation[0, 0]))
     twice_sine = t.Array3f(
@@ -136,7 +127,7 @@ def rotation_vector(rotation: Any) -> Any:
     return twice_sine * dr.select(turns, angle / (2 * sine), 0.5)
 
 
-def rotation_matrix(turn: Any) -> Any:
+def rotation_matrix(turn: Array3f) -> Matrix3f:
     """Return the rotation matrix of axis times angle, radians (Rodrigues)."""
     t = types_of(type(turn.x))
     squared = dr.squared_norm(turn)

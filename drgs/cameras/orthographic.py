@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from drgs.cameras.lens import (
     CameraParameters,
@@ -13,6 +13,7 @@ from drgs.cameras.lens import (
     with_unseen_on_axis,
 )
 from drgs.core.arrays import types_of
+from drgs.core.types import Array2f, Array3f, Bool, Float
 
 
 @dataclass(frozen=True)
@@ -22,39 +23,37 @@ class Orthographic(Perspective):
     distorts: ClassVar[bool] = False
     parallel: ClassVar[bool] = True
 
-    def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
-        """Return whether a point is seen, its position, and its depth."""
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         return with_unseen_on_axis(position, position.z >= camera.near)
 
-    def true_slopes(self, camera: CameraParameters, position: Any) -> None:
+    def true_slopes(self, camera: CameraParameters, position: Array3f) -> None:
         """Return None: the projection is linear."""
 
     clamped_slopes = true_slopes
 
-    def project_point(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the place of a point on the film, Array2f, px."""
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, position.x, position.y)
 
     def projection_jacobian(
-        self, camera: CameraParameters, position: Any, slopes: None = None
-    ) -> list[Any]:
-        """Return the derivatives of the place on the film, two Array3f, world."""
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
+    ) -> list[Array3f]:
         right, down, _ = camera.rotation
         return [right * camera.focal.x, down * camera.focal.y]
 
-    def view_direction(self, camera: CameraParameters, offset: Any) -> Any:
+    def view_direction(self, camera: CameraParameters, offset: Array3f) -> Array3f:
         """Return the axis: all points are seen along it."""
         return camera.rotation[2]
 
-    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
-        """Return the direction of the ray through a place of the film, Array3f, camera axes."""
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         return types_of(type(x)).Array3f(0, 0, 1)
 
-    def origin(self, camera: CameraParameters, x: Any, y: Any) -> Any:
-        """Return where the ray through a place of the film (px) begins, Array3f, camera axes."""
+    def origin(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         film = film_coordinates(camera, x, y)
         return types_of(type(x)).Array3f(film.x, film.y, 0)
 
-    def place_of_ray(self, camera: CameraParameters, origin: Any, direction: Any) -> Any:
-        """Return the place on the film of a ray (Array3f, camera axes), Array2f, px."""
+    def place_of_ray(
+        self, camera: CameraParameters, origin: Array3f, direction: Array3f
+    ) -> Array2f:
         return self.project_point(camera, origin)

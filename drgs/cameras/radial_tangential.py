@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -32,9 +32,11 @@ from drgs.cameras.lens import (
     Perspective,
     film_coordinates,
     pixel_coordinates,
+    slopes_of,
     with_unseen_on_axis,
 )
 from drgs.core.arrays import types_of
+from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
 
 BORDER = 65  # points on each side of the film's border, whose slopes bound those on the film
 MISSED = 1e-6  # squared distance, in slopes, at which Newton's method may end
@@ -59,11 +61,11 @@ class RadialTangential(PlaneDistortion, Perspective):
         "tangential": ("p1", "p2"),
     }
 
-    numerator: tuple[Any, ...]  # k1, k2, k3
-    denominator: tuple[Any, ...]  # k4, k5, k6
-    tangential: tuple[Any, ...]  # p1, p2; or none
-    max_squared_radius: Any  # of the slopes
-    on_film: Any = None  # (2) Array2f: the least and the largest slopes on the film
+    numerator: tuple[Scalar, ...]  # k1, k2, k3
+    denominator: tuple[Scalar, ...]  # k4, k5, k6
+    tangential: tuple[Scalar, ...]  # p1, p2; or none
+    max_squared_radius: Scalar  # of the slopes
+    on_film: tuple[Array2f, Array2f] | None = None  # the least and the largest slopes on the film
 
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> RadialTangential:
@@ -76,32 +78,33 @@ class RadialTangential(PlaneDistortion, Perspective):
         radius = largest_squared_radius(numerator, denominator, fall)
         return cls(numerator, denominator, tangential, radius)
 
-    def radial(self, squared: Any) -> Any:
-        """Return L at r^2."""
+    def squared_limit(self) -> Scalar:
+        return self.max_squared_radius
+
+    def radial(self, squared: Float) -> Scalar:
         return polynomial(self.numerator, squared) / polynomial(self.denominator, squared)
 
-    def radial_derivative(self, squared: Any) -> Any:
-        """Return d L / d r^2."""
+    def radial_derivative(self, squared: Float) -> Scalar:
         denominator = polynomial(self.denominator, squared)
         change = derivative(self.numerator, squared)
         change = change - self.radial(squared) * derivative(self.denominator, squared)
         return change / denominator
 
-    def visibility(self, camera: CameraParameters, position: Any) -> tuple[Any, Any, Any]:
-        """Return whether a point is seen, its position, and its depth."""
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
         x, y, z = position
         # Not divided by z, which may be zero.
         limit = self.max_squared_radius * z * z
         return with_unseen_on_axis(position, (z >= camera.near) & (x * x + y * y < limit))
 
-    def project_point(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the place of a point on the film, Array2f, px."""
-        return pixel_coordinates(camera, *self.distort(*self.true_slopes(camera, position)))
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
+        return pixel_coordinates(camera, *self.distort(*slopes_of(position)))
 
     def projection_jacobian(
-        self, camera: CameraParameters, position: Any, slopes: list[Any]
-    ) -> list[Any]:
-        """Return the derivatives of the place on the film, two Array3f, world."""
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
+    ) -> list[Array3f]:
+        slopes = slopes or slopes_of(position)
         xx, xy, yx, yy = self.distortion_jacobian(*slopes)
         right, down, forward = camera.rotation
         dx, dy = (
@@ -111,20 +114,18 @@ class RadialTangential(PlaneDistortion, Perspective):
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
     def for_camera(self, camera: CameraParameters) -> RadialTangential:
-        """Return the lens that knows what the film of ``camera`` sees."""
         return replace(self, on_film=_slopes_on_border(self, camera))
 
-    def frustum(self, camera: CameraParameters) -> tuple[Any, Any]:
-        """Return the least and the largest slopes on the film."""
+    def frustum(self, camera: CameraParameters) -> tuple[Array2f, Array2f]:
+        assert self.on_film is not None, "Camera.with_lens() sets it"
         return self.on_film
 
-    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
-        """Return the direction of the ray through a place of the film (px), Array3f."""
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         return t.Array3f(*self.undistort(film.x, film.y), 1)
 
 
-def _slopes_on_border(lens: RadialTangential, camera: CameraParameters) -> tuple[Any, Any]:
+def _slopes_on_border(lens: RadialTangential, camera: CameraParameters) -> tuple[Array2f, Array2f]:
     """Return the box around the slopes of points on the film's border.
 
     Where the lens does not see all of them, only the end of its model bounds the slopes.
@@ -139,16 +140,17 @@ def _slopes_on_border(lens: RadialTangential, camera: CameraParameters) -> tuple
     slopes = lens.undistort(film.x, film.y)
     missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
     bounded = dr.all(lens.is_within(*slopes) & (missed < MISSED))
-    return tuple(
+    least, largest = (
         t.Array2f([dr.select(bounded, _mean_where(s, extreme(s)), other) for s in slopes])
         for extreme, other in ((dr.min, -UNBOUNDED), (dr.max, UNBOUNDED))
     )
+    return least, largest
 
 
-def _mean_where(values: Any, extreme: Any) -> Any:
+def _mean_where(values: Float, extreme: Float) -> Float:
     """Return ``extreme``, with the mean derivative of the values that are it.
 
     Several corners of a film may be equally far: Dr.Jit's own reductions add up their derivatives.
     """
     equal = values == extreme
-    return dr.sum(dr.select(equal, values, 0)) / dr.count(equal)
+    return dr.sum(dr.select(equal, values, 0)) / type(values)(dr.count(equal))

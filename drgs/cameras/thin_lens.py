@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
+from drgs.core.types import Array3f, Bool, Float
 
 
 @dataclass(frozen=True)
 class RoundAperture:
     """A disc; points at ``focus_distance`` are sharp."""
 
-    radius: Any  # Float, scene units
-    focus_distance: Any  # Float, scene units, along the axis
+    radius: Float  # scene units
+    focus_distance: Float  # scene units, along the axis
 
-    def variance(self, camera: Camera, depth: Any) -> Any:
+    def variance(self, camera: Camera, depth: Float) -> Float:
         """Return the variance along either axis, px^2, of the blur of a point at ``depth``.
 
         Its radius is focal radius |1 / focus_distance - 1 / depth| (similar triangles), and a
@@ -28,8 +28,8 @@ class RoundAperture:
         radius = camera.focal.x * self.radius * (1 / self.focus_distance - 1 / depth)
         return dr.square(radius) / 4
 
-    def rays(self, camera: Camera, x: Any, y: Any, count: int) -> tuple[Any, Any]:
-        """Return directions (Array3f, world) of ``count`` rays of each place (px), and validity.
+    def rays(self, camera: Camera, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool]:
+        """Return directions (world) of ``count`` rays of each place (px), and validity.
 
         They begin all over the disc and meet at the focus distance.
         """
@@ -42,8 +42,8 @@ class RoundAperture:
         ray = ray * self.focus_distance - begin * self.radius
         return camera.rotation.T @ ray, seen
 
-    def in_focus(self, origin: Any, direction: Any) -> Any:
-        """Return the point of a ray (Array3f, camera axes) where all rays of its place meet."""
+    def in_focus(self, origin: Array3f, direction: Array3f) -> Array3f:
+        """Return the point of a ray (camera axes) where all rays of its place meet."""
         t = (self.focus_distance - origin.z) / direction.z
         return origin + t * direction
 

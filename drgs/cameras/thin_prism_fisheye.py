@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -25,6 +25,7 @@ from drgs.cameras.distortion import (
 from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
 from drgs.cameras.lens import LENSES, CameraParameters, film_coordinates, pixel_coordinates
 from drgs.core.arrays import types_of
+from drgs.core.types import Array2f, Array3f, Float, Scalar
 
 
 @LENSES.register("thin_prism_fisheye")
@@ -49,8 +50,8 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         "prism": ("sx1", "sy1"),
     }
 
-    tangential: tuple[Any, ...] = ()  # p1, p2; or none
-    prism: tuple[Any, ...] = ()  # sx1, sy1; or none
+    tangential: tuple[Scalar, ...] = ()  # p1, p2; or none
+    prism: tuple[Scalar, ...] = ()  # sx1, sy1; or none
 
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> ThinPrismFisheye:
@@ -62,53 +63,43 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         angle = min(math.sqrt(largest_squared_radius(kept, (), fall)), MAX_ANGLE)
         return cls(kept, math.cos(angle), tangential, prism)
 
-    @property
-    def max_squared_radius(self) -> Any:
-        """The end of the model in (u, v)."""
+    def squared_limit(self) -> Scalar:
         return dr.square(dr.acos(self.min_cosine))
 
-    def radial(self, squared: Any) -> Any:
-        """Return L at r^2."""
+    def radial(self, squared: Float) -> Scalar:
         return polynomial(self.radial_terms, squared)
 
-    def radial_derivative(self, squared: Any) -> Any:
-        """Return d L / d r^2."""
+    def radial_derivative(self, squared: Float) -> Scalar:
         return derivative(self.radial_terms, squared)
 
     def is_radial(self) -> bool:
-        """Return whether places are moved along their radius alone."""
         return not (self.tangential or self.prism)
 
-    def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Return places as the film shows them."""
+    def distort(self, x: Float, y: Float) -> tuple[Float, Float]:
         shown_x, shown_y = super().distort(x, y)
         if not self.prism:
             return shown_x, shown_y
         squared, (sx1, sy1) = x * x + y * y, self.prism
         return shown_x + sx1 * squared, shown_y + sy1 * squared
 
-    def distortion_jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
-        """Return d x' / d x, d x' / d y, d y' / d x, d y' / d y."""
+    def distortion_jacobian(self, x: Float, y: Float) -> tuple[Float, Float, Float, Float]:
         xx, xy, yx, yy = super().distortion_jacobian(x, y)
         if not self.prism:
             return xx, xy, yx, yy
         sx1, sy1 = self.prism
         return xx + 2 * sx1 * x, xy + 2 * sx1 * y, yx + 2 * sy1 * x, yy + 2 * sy1 * y
 
-    def project_point(self, camera: CameraParameters, position: Any) -> Any:
-        """Return the place of a point on the film, Array2f, px."""
+    def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *self.distort(*place_of(position)))
 
     def projection_jacobian(
-        self, camera: CameraParameters, position: Any, slopes: None = None
-    ) -> list[Any]:
-        """Return the derivatives of the place on the film, two Array3f, world."""
+        self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
+    ) -> list[Array3f]:
         xx, xy, yx, yy = self.distortion_jacobian(*place_of(position))
         dx, dy = place_directions(camera, position)
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
-    def ray(self, camera: CameraParameters, x: Any, y: Any) -> Any:
-        """Return the unit direction of the ray through a place of the film (px), Array3f."""
+    def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         u, v = self.undistort(film.x, film.y)
         squared = u * u + v * v

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -105,17 +105,26 @@ class Declared:
     def allows(self, value: Value) -> bool:
         """Return whether a value of this kind is within the limits."""
         if self.limits is not None:
-            return self.limits.hold_for(value)
+            return not isinstance(value, str) and self.limits.hold_for(value)
         if self.registry is not None:
             return value in self.registry
         return not self.words or value in self.words
 
 
-def _declare(default: Value, description: str, limits: Limits | None = None, **others: Any) -> Any:
-    return field(
-        default=default,
-        metadata={"declared": Declared(default, description, limits=limits, **others)},
-    )
+Default = TypeVar("Default", bool, int, float, str)
+
+
+def _declare(
+    default: Default,
+    description: str,
+    limits: Limits | None = None,
+    *,
+    given_words: tuple[str, ...] = (),
+    registry: ClassRegistry | None = None,
+    unrounded: float | None = None,
+) -> Default:
+    declared = Declared(default, description, given_words, registry, limits, unrounded)
+    return field(default=default, metadata={"declared": declared})
 
 
 @dataclass(frozen=True)
@@ -200,9 +209,8 @@ class Approximations:
     def of(values: Mapping[str, Value | None]) -> Approximations:
         """Return those among ``values``; None, and a default that is not rounded: the default."""
         given = {name: value for name, value in values.items() if name in DECLARED}
-        return Approximations(
-            **{k: v for k, v in given.items() if v not in (None, DECLARED[k].unrounded)}
-        )
+        changes = {k: v for k, v in given.items() if v not in (None, DECLARED[k].unrounded)}
+        return replace(Approximations(), **changes)
 
     @property
     def others_than_default(self) -> dict[str, Value]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import reduce
+from typing import Any
 
 from drgs.config.schema import FitConfig
 
@@ -25,8 +26,8 @@ _COUNTS = (
 
 
 def changed(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
-    """``config`` with other values, by names such as ``densify.every``; checked like a file's."""
-    values: dict[str, object] = config.model_dump()
+    """Set values by names such as ``densify.every``; the result is checked like a file's."""
+    values = config.model_dump()
     for key, value in changes.items():
         *sections, name = key.split(".")
         target = values
@@ -37,19 +38,20 @@ def changed(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
 
 
 def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
-    """``config`` with another number of iterations, and everything else in proportion.
+    """Change the number of iterations, and everything else in proportion.
 
     The iterations between two changes of the population (``densify.every``) stay: what a change
     needs to know is gathered over views. The means' rate falls until the end, without revisions.
     """
     share = iterations / config.iterations
 
-    def scaled(count: int | None) -> int | None:
-        return count if not count else max(1, round(count * share))  # None, and 0: from the start
+    def scaled(count: int) -> int:
+        return max(1, round(count * share)) if count else 0  # 0: from the start
 
-    changes: dict[str, object] = {"iterations": iterations}
+    changes: dict[str, Any] = {"iterations": iterations}
     for key in _COUNTS:
-        changes[key] = scaled(_value(config, key))
+        count = _value(config, key)
+        changes[key] = count if count is None else scaled(count)
     if config.coarse is not None:
         ends = {scaled(stage.until): stage.factor for stage in reversed(config.coarse)}
         changes["coarse"] = [{"until": k, "factor": ends[k]} for k in sorted(ends)]
@@ -80,10 +82,10 @@ def is_open(config: FitConfig) -> bool:
 
 
 def decided_as(config: FitConfig, other: FitConfig) -> FitConfig:
-    """``config``, with those values that it leaves to the dataset as ``other`` has them."""
+    """Set the values that ``config`` leaves to the dataset as ``other`` has them."""
     changes = {key: _value(other, key) for key in OPEN_AT_START if _value(config, key) is None}
     return changed(config, changes)
 
 
-def _value(config: FitConfig, key: str) -> object:
+def _value(config: FitConfig, key: str) -> Any:
     return reduce(getattr, key.split("."), config)

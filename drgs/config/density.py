@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field, field_validator
 
 from drgs.config.extensions import STRATEGIES, StrategyName
-from drgs.config.section import Count, Section
+from drgs.config.section import UNRESOLVED, Count, Resolved, Section, subsection
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000
 """Iterations: the reference's schedule, for 30,000."""
@@ -78,8 +78,8 @@ class AdcConfig(Section):
 class BudgetConfig(Section):
     """The strategy budget: growth to a number of Gaussians, where errors are."""
 
-    gaussians: Count | None = Field(
-        None,
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
         ge=4,
         description="How many there are to be at densify.stop. null: as many as suit the pictures' "
         "size, 250 times the square root of the number of their pixels: 100,000 for 400 x 400 px.",
@@ -96,8 +96,8 @@ class BudgetConfig(Section):
 class McmcConfig(Section):
     """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
 
-    gaussians: Count | None = Field(
-        None,
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
         ge=4,
         description="The population grows to this, and no further. null: as with budget.",
     )
@@ -176,14 +176,14 @@ class DensifyConfig(Section):
         "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024). Or the name "
         "of an extension.",
     )
-    start: Count | None = Field(
+    start: Resolved[Count] = Field(
         REFERENCE_START,
         ge=0,
         description="The population changes only after this iteration. Not given, or null: 500; "
         "less where that is more than half of stop, or, with budget and mcmc, than a twentieth of "
         "all iterations.",
     )
-    stop: Count | None = Field(
+    stop: Resolved[Count] = Field(
         REFERENCE_STOP,
         ge=1,
         description="It changes, and is reset, only before this iteration; with budget, at it for "
@@ -200,10 +200,10 @@ class DensifyConfig(Section):
     max_gaussians: int = Field(
         1_000_000, ge=4, le=100_000_000, description="Cap that is never exceeded."
     )
-    adc: AdcConfig = Field(default_factory=AdcConfig)
-    budget: BudgetConfig = Field(default_factory=BudgetConfig)
-    mcmc: McmcConfig = Field(default_factory=McmcConfig)
-    prune: PruneConfig = Field(default_factory=PruneConfig)
+    adc: AdcConfig = subsection(AdcConfig)
+    budget: BudgetConfig = subsection(BudgetConfig)
+    mcmc: McmcConfig = subsection(McmcConfig)
+    prune: PruneConfig = subsection(PruneConfig)
 
     def stop_seen_from(self, iteration: int) -> int:
         """Return what ``stop`` was when this iteration was done."""
@@ -219,7 +219,7 @@ class DensifyConfig(Section):
         return aims
 
     def prune_window(self, iterations: int) -> tuple[int, int]:
-        """The iteration after which the last phase begins, and that of its last change.
+        """Return the iteration after which the last phase begins, and that of its last change.
 
         iterations: of the fit. A phase that would begin behind its end does not take place.
         """
@@ -227,6 +227,6 @@ class DensifyConfig(Section):
         return start, self.prune.stop or (start + iterations + 1) // 2
 
     def settled_from(self, iterations: int) -> int:
-        """The iteration from which on no row is added or removed; iterations: of the fit."""
+        """Return the iteration from which on no row is added or removed; iterations: of the fit."""
         last = self.stop if self.prune.to is None else self.prune_window(iterations)[1]
         return max(self.stop, last) + 1

@@ -8,7 +8,7 @@ is there, be it empty. A strategy is chosen by ``densify.strategy``, a loss by `
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, SerializeAsAny, ValidationError
 
@@ -84,13 +84,13 @@ LossName = Annotated[str, _name_check(LOSSES, ("photometric",))]
 ReaderName = Annotated[str, _name_check(READERS, ("auto", *READERS.shipped))]
 
 
-def _check_sections(sections: Any) -> dict[str, BaseModel | None]:
+def _check_sections(sections: object) -> dict[str, BaseModel | None]:
     if not isinstance(sections, Mapping):
         raise ValueError("extensions must contain sections by the names of extensions")
     return {name: _check_section(str(name), values) for name, values in sections.items()}
 
 
-def _check_section(name: str, values: Any) -> BaseModel | None:
+def _check_section(name: str, values: object) -> BaseModel | None:
     known = {extension.name: extension for extension in all_extensions()}
     if name not in known:
         there_are = f"there are {', '.join(known)}" if known else "none is installed"

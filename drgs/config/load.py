@@ -78,8 +78,9 @@ def _section(annotation: object) -> type[BaseModel] | None:
     """Return the section that a value is, or that the elements of a list are."""
     if arguments := get_args(annotation):
         return next(filter(None, map(_section, arguments)), None)
-    is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
-    return annotation if is_section else None
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return None
 
 
 class _Loader(yaml.SafeLoader):
@@ -197,9 +198,10 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
 
 
 def _description(key: str) -> str:
-    model = FitConfig
+    model: type[BaseModel] | None = FitConfig
     *sections, leaf = (part for part in key.split(".") if not part.isdigit())
     for section in sections:
         model = _section(model.model_fields[section].annotation)
+        assert model is not None, "pydantic names sections only"
     field = model.model_fields[leaf]
-    return field.description or field.annotation.__doc__
+    return field.description or getattr(field.annotation, "__doc__", "")

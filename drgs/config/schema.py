@@ -23,6 +23,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value
 from drgs.config.density import (
@@ -32,7 +33,7 @@ from drgs.config.density import (
     schedule_of,
 )
 from drgs.config.extensions import LossName, ReaderName, Sections
-from drgs.config.section import Count, Rate, Section, Weight
+from drgs.config.section import UNRESOLVED, Count, Rate, Resolved, Section, Weight, subsection
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
@@ -55,16 +56,17 @@ DEGREE_SHARE = 1 / 40
 """Iterations between rises of the harmonics' degree, in parts of all."""
 
 
-def _color(value: Any) -> Color | None:
+def _color(value: object) -> Color | None:
     if value is None or (isinstance(value, str) and value in NAMED_COLORS):
         return value
-    is_triple = isinstance(value, (list, tuple)) and len(value) == 3
-    if is_triple and all(type(v) in (int, float) and 0 <= v <= 1 for v in value):
-        return tuple(float(v) for v in value)
+    numbers = value if isinstance(value, (list, tuple)) else ()
+    if len(numbers) == 3 and all(type(v) in (int, float) and 0 <= v <= 1 for v in numbers):
+        r, g, b = map(float, numbers)
+        return r, g, b
     raise ValueError("must be white, black or three numbers in 0..1")
 
 
-def _color_to_yaml(color: Color | None) -> Any:
+def _color_to_yaml(color: Color | None) -> str | list[float] | None:
     return list(color) if isinstance(color, tuple) else color
 
 
@@ -79,7 +81,7 @@ Decay = Annotated[float, Field(ge=0, le=0.999999)]
 
 
 class DataConfig(Section):
-    """Where the photographs and their cameras are, and how they are read."""
+    """The photographs and their cameras, and how they are read."""
 
     path: PathField = Field(description="Dataset folder; relative to the configuration file.")
     source: str = Field(
@@ -151,7 +153,7 @@ class DataConfig(Section):
     def background_rgb(self) -> tuple[float, float, float]:
         """The background's display-space colour, three numbers in 0..1; white if it is null."""
         background = self.background or DEFAULT_BACKGROUND
-        return NAMED_COLORS.get(background, background)
+        return NAMED_COLORS[background] if isinstance(background, str) else background
 
 
 class InitConfig(Section):
@@ -213,14 +215,14 @@ class _Model(Section):
     """Fields of :class:`ModelConfig` before the approximations."""
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
-    sh_increase_every: Count | None = Field(
+    sh_increase_every: Resolved[Count] = Field(
         LATEST_DEGREE,
         ge=1,
         description="Iterations between +1 of the degree in use, which starts at 0. Not given, or "
         "null: a fortieth of all, at most 1000.",
     )
-    near: float | None = Field(
-        None,
+    near: Resolved[float] = Field(
+        UNRESOLVED,
         ge=NEAR_LIMITS[0],
         le=NEAR_LIMITS[1],
         description="Near plane, scene units: closer means are culled. null: about a twenty-fifth "
@@ -234,23 +236,22 @@ FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 pictures of views that were not trained on. What was fitted says so in its file."""
 
 
-def _as_field(name: str, declared: Declared) -> tuple[Any, Any]:
-    """An approximation as a configuration has it; YAML has no infinity, which is null there."""
+def _as_field(name: str, declared: Declared) -> tuple[object, FieldInfo]:
+    """Return the type and the field of an approximation; infinity is null, as YAML has none."""
     default, description = FITTED_WITH.get(name, declared.default), declared.description
     kind = Literal[declared.given_words] if declared.given_words else declared.kind
     if declared.unrounded is not None:
         default = declared.unrounded
     elif default == math.inf:
-        kind, default = kind | None, None
+        kind, default = float | None, None
         description = f"{description} null: where alpha_cut ends them."
-    limits = declared.limits.finite if declared.limits else {}
+    limits: dict[str, Any] = declared.limits.finite if declared.limits else {}
     return kind, Field(default, description=description, **limits)
 
 
-_ModelWithApproximations = create_model(
-    "_ModelWithApproximations",
-    __base__=_Model,
-    **{name: _as_field(name, declared) for name, declared in DECLARED.items()},
+_approximations: dict[str, Any] = {name: _as_field(name, each) for name, each in DECLARED.items()}
+_ModelWithApproximations: Any = create_model(
+    "_ModelWithApproximations", __base__=_Model, **_approximations
 )
 
 
@@ -267,6 +268,7 @@ class ModelConfig(_ModelWithApproximations):
     @classmethod
     def _check(cls, value: Value | None, field: ValidationInfo) -> Value | None:
         """Check names, and numbers in single precision: they may be rounded onto a limit."""
+        assert field.field_name is not None, "validators of fields have one"
         declared = DECLARED[field.field_name]
         if value is not None and not declared.allows(value):
             raise ValueError(f"must be {declared.expected}")
@@ -318,8 +320,8 @@ class OptimizerConfig(Section):
     )
     scales_lr: Rate = Field(1e-2, ge=0, description="Logarithms of the scales.")
     quats_lr: Rate = Field(2e-3, ge=0, description="Quaternions.")
-    decay: float | None = Field(
-        None,
+    decay: Resolved[float] = Field(
+        UNRESOLVED,
         ge=1e-6,
         le=1,
         description="What the rates but that of the means have fallen to at the last iteration, in "
@@ -460,22 +462,22 @@ class FitConfig(Section):
     """Everything that decides a fit."""
 
     data: DataConfig
-    init: InitConfig = Field(default_factory=InitConfig)
-    model: ModelConfig = Field(default_factory=ModelConfig)
-    optimizer: OptimizerConfig = Field(default_factory=OptimizerConfig)
-    loss: LossConfig = Field(default_factory=LossConfig)
-    colors: ColorConfig = Field(default_factory=ColorConfig)
-    cameras: CamerasConfig = Field(default_factory=CamerasConfig)
-    densify: DensifyConfig = Field(default_factory=DensifyConfig)
-    output: OutputConfig = Field(default_factory=OutputConfig)
+    init: InitConfig = subsection(InitConfig)
+    model: ModelConfig = subsection(ModelConfig)
+    optimizer: OptimizerConfig = subsection(OptimizerConfig)
+    loss: LossConfig = subsection(LossConfig)
+    colors: ColorConfig = subsection(ColorConfig)
+    cameras: CamerasConfig = subsection(CamerasConfig)
+    densify: DensifyConfig = subsection(DensifyConfig)
+    output: OutputConfig = subsection(OutputConfig)
     iterations: Count = Field(
         30_000,
         ge=1,
         description="Views that are rendered; each is a step of the optimizer, unless "
         "optimizer.views_per_step or optimizer.views says otherwise.",
     )
-    coarse: list[CoarseStage] | None = Field(
-        None,
+    coarse: Resolved[list[CoarseStage]] = Field(
+        UNRESOLVED,
         description="Stages of smaller training pictures, before those of full size: a list of "
         "{until: iteration, factor: 4}. null: half the size for the first 35 % of a fit to "
         "photographs of at least 100 px that are not cut out, else none; with the strategy adc "
@@ -557,8 +559,8 @@ class FitConfig(Section):
         if densify.strategy == "mcmc" and densify.mcmc.gaussians is not None:
             caps["densify.mcmc.gaussians"] = densify.mcmc.gaussians
         for name, cap in caps.items():
-            is_used = init.point_cloud is None and init.num_points is not None
-            fits = not is_used or init.num_points <= cap
+            num_points = init.num_points if init.point_cloud is None else None
+            fits = num_points is None or num_points <= cap
             _require(fits, f"init.num_points must be <= {name} ({cap})", init.num_points)
         for before, after in pairwise(self.coarse or ()):
             is_in_order = before.until < after.until and before.factor > after.factor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
@@ -13,6 +13,18 @@ from drgs.core.constants import MAX_INT
 from drgs.core.errors import one_line
 
 Count = Annotated[int, Field(le=MAX_INT)]
+
+T = TypeVar("T")
+
+if TYPE_CHECKING:
+    Resolved = Annotated[T, "null before"]
+else:
+    Resolved = Optional
+"""A value that may be null in a file. Once the configuration is resolved, which it is wherever it
+is used, it has the type in brackets."""
+
+UNRESOLVED: Any = None
+"""Default of a value that follows from others, or from the dataset."""
 
 Rate = Annotated[float, Field(le=10)]
 """A step of Adam is about as long as its rate: ten units of a logarithm or a logit go from next to
@@ -26,6 +38,14 @@ class Section(BaseModel):
     """Frozen; unknown keys, infinities and silent conversions ("3" for 3) are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+SectionType = TypeVar("SectionType", bound=Section)
+
+
+def subsection(model: type[SectionType]) -> SectionType:
+    """Return a field whose default is the section with all defaults."""
+    return Field(default_factory=model)
 
 
 _RELATIONS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}

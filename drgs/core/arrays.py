@@ -1,8 +1,8 @@
 """Dr.Jit types that belong together, and row access to flat arrays.
 
-Every stage is written once for all array types (float32 and float64, LLVM and CUDA): it asks this
-module for the companions of the float type that it was given. Therefore arrays are ``Any`` in
-signatures; a comment says which type it is (Float, Array3f, ...), and of what shape and unit.
+Every stage is written once for all array types (float32 and float64, LLVM and CUDA): it gets the
+companions of its float type from this module. Signatures name the types of ``drgs.core.types``; a
+comment gives shape and unit.
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TypeVar
+from typing import Generic, TypeVar, cast
 
 import drjit as dr
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.core import types
+from drgs.core.types import Bool, Float, TensorXf, UInt32
 
-T = TypeVar("T")
+Array = TypeVar("Array", bound=dr.ArrayBase)
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class ArrayTypes:
 
 @cache
 def types_of(float_type: type) -> ArrayTypes:
-    """Companions of a flat Dr.Jit array type such as ``drjit.llvm.ad.Float`` or ``UInt32``."""
+    """Return the companions of a flat array type such as ``drjit.llvm.ad.Float`` or ``UInt32``."""
     module = sys.modules[float_type.__module__]
     if not dr.is_float_v(float_type):
         float_type = module.Float
@@ -68,13 +70,13 @@ def is_float64(float_type: type) -> bool:
     return dr.type_v(float_type) == dr.VarType.Float64
 
 
-def reinterpret(dtype: type[T], value: dr.ArrayBase) -> T:
+def reinterpret(dtype: type[Array], value: dr.ArrayBase) -> Array:
     """Return the same bits as another type of the same size."""
-    return dr.reinterpret_array(dtype, value)
+    return cast(Array, dr.reinterpret_array(dtype, value))
 
 
-def from_host(flat_type: type, values: Any) -> Any:
-    """A copy of numbers of the host, aligned as Dr.Jit's own memory is.
+def from_host(flat_type: type[Array], values: ArrayLike) -> Array:
+    """Copy numbers of the host to memory that is aligned as Dr.Jit's own is.
 
     Dr.Jit wraps numpy's memory on the CPU, and loads from memory that is not aligned are another
     kernel: whether one has to be compiled would depend on where numpy put the numbers.
@@ -86,7 +88,7 @@ def from_host(flat_type: type, values: Any) -> Any:
 
 
 def empty_on_host(flat_type: type, shape: tuple[int, ...]) -> np.ndarray:
-    """Memory of the host for numbers of this type, not initialised, aligned as Dr.Jit's own is."""
+    """Allocate memory of the host for numbers, not initialised, aligned as Dr.Jit's own is."""
     dtype = np.dtype(_NUMPY_TYPES[dr.type_v(flat_type)])
     size = math.prod(shape) * dtype.itemsize
     storage = np.empty(size + _ALIGNMENT, np.uint8)
@@ -94,8 +96,8 @@ def empty_on_host(flat_type: type, shape: tuple[int, ...]) -> np.ndarray:
     return storage[start : start + size].view(dtype).reshape(shape)
 
 
-def wrapped(flat_type: type, values: np.ndarray) -> Any:
-    """An array of these numbers, which Dr.Jit does not copy on the CPU: nobody may change them.
+def wrapped(flat_type: type[Array], values: np.ndarray) -> Array:
+    """Return an array of numbers which Dr.Jit does not copy on the CPU: nobody may change them.
 
     values: from :func:`empty_on_host`.
     """
@@ -112,22 +114,22 @@ _NUMPY_TYPES = {
 }
 
 
-def quotient(index: Any, divisor: int) -> Any:
-    """index // divisor, UInt32, by a divisor that is not compiled into the kernel.
+def quotient(index: UInt32, divisor: int) -> UInt32:
+    """Return index // divisor, by a divisor that is not compiled into the kernel.
 
     No machine divides vectors of integers. The product in double precision is off by less than
     2^-52 of itself, hence by less than 2^-20 / divisor, and (index + 1/2) / divisor is at least
     1 / (2 divisor) from an integer.
     """
-    Float64 = dr.float64_array_t(type(index))
+    Float64 = cast(type[Float], dr.float64_array_t(type(index)))
     reciprocal = dr.opaque(Float64, 1 / divisor)
     return type(index)((Float64(index) + 0.5) * reciprocal)
 
 
-def divide(index: Any, divisor: int, parts: int) -> tuple[Any, Any]:
-    """index // divisor, which is below ``parts``, and the rest; literal zeros of a single part.
+def divide(index: UInt32, divisor: int, parts: int) -> tuple[UInt32, UInt32]:
+    """Return index // divisor, which is below ``parts``, and the rest; for one part a literal zero.
 
-    Those make later products and sums vanish from the kernel.
+    That makes later products and sums vanish from the kernel.
     """
     if parts == 1:
         return type(index)(0), index
@@ -135,8 +137,8 @@ def divide(index: Any, divisor: int, parts: int) -> tuple[Any, Any]:
     return part, index - part * dr.opaque(type(index), divisor)
 
 
-def repeat_array(values: Any, count: int, step: int = 0) -> Any:
-    """``count`` copies of an array, each by ``step`` more than the one before it.
+def repeat_array(values: Array, count: int, step: int = 0) -> Array:
+    """Return ``count`` copies of an array, each by ``step`` more than the one before it.
 
     Not evaluated, if there are several.
     """
@@ -148,8 +150,8 @@ def repeat_array(values: Any, count: int, step: int = 0) -> Any:
     return copies + part * dr.opaque(UInt32, step) if step else copies
 
 
-def interleave(columns: list[Any]) -> Any:
-    """Columns of equal length as one row-major flat array, not evaluated.
+def interleave(columns: Sequence[Array]) -> Array:
+    """Return columns of equal length as one row-major flat array, not evaluated.
 
     Loop results must be evaluated before: storing them unevaluated runs the loop once more for
     each column.
@@ -158,8 +160,8 @@ def interleave(columns: list[Any]) -> Any:
     return scatter_rows(columns, dr.arange(types_of(type(columns[0])).UInt32, num_rows), num_rows)
 
 
-def scatter_rows(columns: list[Any], rows: Any, num_rows: int) -> Any:
-    """Columns as one row-major flat array of ``num_rows`` rows; lane i fills row ``rows[i]``.
+def scatter_rows(columns: Sequence[Array], rows: UInt32, num_rows: int) -> Array:
+    """Store columns as one row-major flat array of ``num_rows`` rows; lane i fills row ``rows[i]``.
 
     Rows that no lane fills are undefined; no two lanes may fill the same row. The same holds
     for loop results as in :func:`interleave`.
@@ -178,36 +180,39 @@ class Rows:
     of 8 and one of single numbers, where they are read in order.
     """
 
-    blocks: tuple[Any, ...]  # flat, row-major: the next columns of all rows
+    blocks: tuple[types.Float, ...]  # flat, row-major: the next columns of all rows
     width: int  # numbers in a row, without padding
 
     @property
-    def Float(self) -> type:  # noqa: N802 (it is a type)
+    def Float(self) -> type[types.Float]:  # noqa: N802 (it is a type)
         """Type of the numbers."""
         return type(self.blocks[0])
 
     @staticmethod
-    def empty(float_type: type, width: int, num_rows: int) -> Rows:
-        """Memory, not initialised."""
+    def empty(float_type: type[types.Float], width: int, num_rows: int) -> Rows:
+        """Allocate rows, not initialised."""
         blocks = tuple(dr.empty(float_type, num_rows * each) for each in block_widths(width))
         return Rows(blocks, width)
 
     @staticmethod
-    def of(columns: Sequence[Any]) -> Rows:
-        """Columns of equal length, not evaluated."""
+    def of(columns: Sequence[types.Float]) -> Rows:
+        """Return columns of equal length, not evaluated."""
         num_rows = dr.width(columns[0])
         rows = Rows.empty(type(columns[0]), len(columns), num_rows)
         rows.store(columns, dr.arange(types_of(rows.Float).UInt32, num_rows))
         return rows
 
-    def load(self, row: Any, active: Any = True) -> list[Any]:
-        """The numbers of a row a lane; 0 if not active."""
-        numbers, lanes, vector = [], dr.width(row), _dynamic_type(self.Float)
+    def load(self, row: UInt32, active: Bool | bool = True) -> list[types.Float]:
+        """Return the numbers of a row a lane; 0 if not active."""
+        numbers: list[types.Float] = []
+        lanes, vector = dr.width(row), _dynamic_type(self.Float)
         for block, width in zip(self.blocks, block_widths(self.width), strict=True):
             numbers.extend(dr.gather(vector, block, row, active, shape=(width, lanes)))
         return numbers[: self.width]
 
-    def store(self, numbers: Sequence[Any], row: Any, active: Any = True) -> None:
+    def store(
+        self, numbers: Sequence[types.Float], row: UInt32, active: Bool | bool = True
+    ) -> None:
         """Fill one row a lane; no two lanes may fill the same."""
         padding, start = [type(numbers[0])(0)] * 3, 0
         for block, width in zip(self.blocks, block_widths(self.width), strict=True):
@@ -230,10 +235,12 @@ PACKET = 4
 """Numbers in a packet of rows that are back to back."""
 
 
-def load_columns(flat: Any, row: Any, num_rows: Any, stride: int, width: int) -> list[Any]:
-    """The first ``width`` numbers of a row a lane, of rows of ``stride`` numbers back to back.
+def load_columns(
+    flat: Array, row: UInt32, num_rows: UInt32, stride: int, width: int
+) -> list[Array]:
+    """Load the first ``width`` numbers of a row a lane, of rows of ``stride`` back to back.
 
-    row: UInt32; num_rows: UInt32 (1,), evaluated, how many rows ``flat`` has.
+    num_rows: (1,), evaluated, the number of rows of ``flat``.
 
     Such rows begin anywhere in a packet: all packets that a row has part in are loaded, and its
     numbers are moved to their places. That takes less than half the time of single loads.
@@ -246,7 +253,7 @@ def load_columns(flat: Any, row: Any, num_rows: Any, stride: int, width: int) ->
     packets = _Packets(flat, first_numbers(flat, whole * PACKET), num_rows * stride)
     begin, shift = row * stride // PACKET, row * stride % PACKET
     always_whole = (stride - 1) // PACKET  # so many packets of a row, wherever it begins
-    numbers: list[Any] = []
+    numbers: list[Array] = []
     for k in range(-(-(width + PACKET - 1) // PACKET)):
         numbers.extend((packets.load if k < always_whole else packets.load_last)(begin + k))
     for step in (1, 2):
@@ -255,8 +262,8 @@ def load_columns(flat: Any, row: Any, num_rows: Any, stride: int, width: int) ->
     return numbers[:width]
 
 
-def store_columns(columns: Sequence[Any]) -> Any:
-    """The same as :func:`interleave`, in a third of the time where there are many columns.
+def store_columns(columns: Sequence[Array]) -> Array:
+    """Return the same as :func:`interleave`, in a third of the time where there are many columns.
 
     Packets that a row fills alone are stored as such, what is left at its ends number by number.
     The array may have up to three numbers more, undefined, for its last packet to be whole:
@@ -272,12 +279,12 @@ def store_columns(columns: Sequence[Any]) -> Any:
     return flat
 
 
-def first_numbers(flat: Any, size: int) -> Any:
-    """The first ``size`` numbers of an evaluated array: the same memory."""
+def first_numbers(flat: Array, size: int) -> Array:
+    """Return the first ``size`` numbers of an evaluated array: the same memory."""
     return dr.reshape(type(flat), flat, size, shrink=True)
 
 
-def _store_shifted(flat: Any, columns: list[Any]) -> None:
+def _store_shifted(flat: Array, columns: list[Array]) -> None:
     t, width = types_of(type(flat)), len(columns)
     first = dr.arange(t.UInt32, dr.width(columns)) * width
     begin, shift = first // PACKET, first % PACKET
@@ -303,30 +310,30 @@ def _store_shifted(flat: Any, columns: list[Any]) -> None:
         dr.scatter(flat, numbers[k], begin * PACKET + k, is_own, mode=alone)
 
 
-def _load_packets(flat: Any, index: Any, width: int) -> list[Any]:
+def _load_packets(flat: Array, index: UInt32, width: int) -> list[Array]:
     packet = types_of(type(flat)).Array4f
     packets = [dr.gather(packet, flat, index + k) for k in range(-(-width // PACKET))]
     return [number for each in packets for number in each][:width]
 
 
 @dataclass(frozen=True)
-class _Packets:
+class _Packets(Generic[Array]):
     """An array of any size as packets, the last of which may be a part of one.
 
     Dr.Jit loads packets from arrays alone that are whole packets. The last one is loaded number by
     number at any size, which is no literal: neither the size nor its remainder is in a kernel.
     """
 
-    flat: Any
-    others: Any  # the same memory without the last packet
-    size: Any  # UInt32 (1,), of ``flat``
+    flat: Array
+    others: Array  # the same memory without the last packet
+    size: UInt32  # (1,), of ``flat``
 
-    def load(self, index: Any) -> list[Any]:
-        """A whole packet a lane."""
+    def load(self, index: UInt32) -> list[Array]:
+        """Return a whole packet a lane."""
         return list(dr.gather(types_of(type(self.flat)).Array4f, self.others, index))
 
-    def load_last(self, index: Any) -> list[Any]:
-        """Any packet a lane; numbers beyond the array are not defined."""
+    def load_last(self, index: UInt32) -> list[Array]:
+        """Return any packet a lane; numbers beyond the array are not defined."""
         last = (self.size - 1) // PACKET
         packet = dr.gather(types_of(type(self.flat)).Array4f, self.others, index, index < last)
         for k in range(PACKET):
@@ -337,8 +344,8 @@ class _Packets:
         return list(packet)
 
 
-def with_aligned_stack(value: Any) -> Any:
-    """``value``, evaluated nowhere; kernels that need it keep what registers do not hold aligned.
+def with_aligned_stack(value: Array) -> Array:
+    """Return ``value`` such that kernels keep aligned what registers do not hold; not evaluated.
 
     LLVM aligns a function's stack as its variables ask for, but not for vectors that it puts there
     when it runs out of registers: such a vector lies in two cache lines. Here the value goes by way
@@ -350,7 +357,7 @@ def with_aligned_stack(value: Any) -> Any:
     return variable[dr.opaque(UInt32, 0)]
 
 
-def _dynamic_vector(columns: list[Any]) -> Any:
+def _dynamic_vector(columns: Sequence[Array]) -> dr.ArrayBase:
     return _dynamic_type(type(columns[0]))(columns)
 
 
@@ -365,18 +372,18 @@ _VECTORS = {
 }
 
 
-def planes_of(image: Any) -> list[Any]:
-    """The channels of a tensor (H, W, C), each Float (H * W,), detached."""
+def planes_of(image: TensorXf) -> list[Float]:
+    """Return the channels of an image (H, W, C), each (H * W,), detached."""
     flat, count = dr.detach(image).array, image.shape[2]
     pixel = dr.arange(types_of(type(flat)).UInt32, image.shape[0] * image.shape[1])
     return [dr.gather(type(flat), flat, pixel * count + k) for k in range(count)]
 
 
-def image_of(planes: list[Any], like: Any) -> Any:
-    """The tensor (H, W, C) of these channels; like: an image of H x W pixels."""
+def image_of(planes: list[Float], like: TensorXf) -> TensorXf:
+    """Return the image (H, W, C) of these channels; like: an image of H x W pixels."""
     return type(like)(interleave(planes), (*like.shape[:2], len(planes)))
 
 
-def tangent_of(parameter: Any) -> Any:
+def tangent_of(parameter: Array) -> Array:
     """Return the gradient set on a parameter; an empty one's own, as dr.grad drops its shape."""
     return dr.grad(parameter) if dr.width(parameter) > 0 else parameter

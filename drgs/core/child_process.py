@@ -16,9 +16,11 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import IO, Any
+from typing import IO, TypeVar
 
 from drgs.core.errors import UserError, one_line
+
+Result = TypeVar("Result")
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -37,7 +39,7 @@ class DeferredInterrupts:
     def __init__(self) -> None:
         self._arrived: int | None = None
         self._raises = False
-        self._previous: dict[int, Any] = {}
+        self._previous: dict[int, Callable[..., object] | int | None] = {}
 
     def __enter__(self) -> DeferredInterrupts:
         """Take over the signals, unless they are ignored."""
@@ -74,11 +76,11 @@ class DeferredInterrupts:
 
 
 def run_in_child(
-    function: Callable[..., Any],
+    function: Callable[..., Result],
     *arguments: object,
     watch: Callable[..., None],
     interrupts: DeferredInterrupts,
-) -> Any:
+) -> Result:
     """Return ``function(*arguments, report)``, called in a new process.
 
     function, arguments: can be pickled. watch: is called here with what the child gives to
@@ -96,6 +98,7 @@ def run_in_child(
             [sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=said,
             start_new_session=True,
         )  # fmt: skip
+        assert child.stdin is not None and child.stdout is not None, "both are pipes"
         try:
             with suppress(BrokenPipeError):  # it has ended: see below
                 _send(child.stdin, (function, arguments))

@@ -10,7 +10,8 @@ import difflib
 import re
 import sys
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -63,7 +64,7 @@ def root_cause(error: BaseException) -> BaseException:
 
 
 def reason_of_mitsuba(error: Exception) -> str:
-    """One line of Mitsuba's message: where, and the error itself, without a traceback between."""
+    """Shorten Mitsuba's message to one line: where, and the error itself, without a traceback."""
     head, *rest = re.sub(r"^\[[\w.]+:\d+\] ", "", str(error).strip() or "error").splitlines()
     head = head.removesuffix("Traceback (most recent call last):").strip()
     last = re.sub(r"^[\w.]*(Error|Exception): ", "", rest[-1].strip()) if rest else ""
@@ -98,30 +99,37 @@ def show_causes_last() -> None:
     text is "see above", which may be pages away. In scripts and, where this is called from one, in
     notebooks.
     """
-    if getattr(sys.excepthook, "shows_cause", False):
+    if getattr(sys.excepthook, "func", None) is _show_with_cause:
         return
-    show_before = sys.excepthook
-
-    def show(kind: type[BaseException], error: BaseException, tb: TracebackType | None) -> None:
-        show_before(kind, error, tb)
-        _show_cause(error)
-
-    show.shows_cause = True
-    sys.excepthook = show
+    sys.excepthook = partial(_show_with_cause, sys.excepthook)
     if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()) is not None:
         shell.set_custom_exc((RuntimeError,), _show_in_notebook)
 
 
-def _show_in_notebook(
-    shell: Any, kind: type, error: BaseException, tb: Any, tb_offset: int | None = None
+def _show_with_cause(
+    show: Callable[[type[BaseException], BaseException, TracebackType | None], object],
+    kind: type[BaseException],
+    error: BaseException,
+    tb: TracebackType | None,
 ) -> None:
-    """The handler of a notebook's RuntimeErrors, as IPython calls it."""
+    show(kind, error, tb)
+    _show_cause(error)
+
+
+def _show_in_notebook(
+    shell: Any,  # IPython's InteractiveShell
+    kind: type[BaseException],
+    error: BaseException,
+    tb: TracebackType | None,
+    tb_offset: int | None = None,
+) -> None:
+    """Handle a notebook's RuntimeErrors, called by IPython."""
     shell.showtraceback((kind, error, tb), tb_offset=tb_offset)
     _show_cause(error)
 
 
 def _show_cause(error: BaseException) -> None:
-    cause = error
+    cause: BaseException | None = error
     while cause is not None and not isinstance(cause, UserError):
         cause = cause.__cause__ or cause.__context__
     if cause is not None and cause is not error:

@@ -191,7 +191,7 @@ def is_temporary(name: str) -> bool:
 
 
 def why_refused(error: OSError) -> str:
-    """The file system's reason, and what to do about it where that is known."""
+    """Return the file system's reason, and what to do about it where that is known."""
     reason = error.strerror or str(error) or type(error).__name__
-    remedy = _REMEDIES.get(error.errno)
+    remedy = _REMEDIES.get(error.errno or 0)
     return f"{reason}; {remedy}" if remedy else reason

@@ -91,7 +91,9 @@ class FolderRecord:
         if not self.exists:
             return
         there = [name for name in self._content.files if (self.folder / name).is_file()]
-        files = {name: self._content.files[name] or digest(self.folder / name) for name in there}
+        files: dict[str, str | None] = {
+            name: self._content.files[name] or digest(self.folder / name) for name in there
+        }
         if files != self._content.files:
             self._write(_Content(files=files, paths=dict(self.paths)))
 

@@ -8,9 +8,9 @@ float64 numbers that travel beside it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Origin = tuple[float, float, float]
 """World position of zero, exact in float64."""
@@ -24,12 +24,13 @@ distance float32 resolves 6e-5 of the size, which costs a fit nothing that was m
 as far it costs 0.3 dB, a million times as far 5 dB."""
 
 
-def near_origin(middle: Sequence[float], size: float) -> Origin:
-    """The origin to which positions around ``middle`` are to be relative.
+def near_origin(middle: ArrayLike, size: float) -> Origin:
+    """Return the origin to which positions around ``middle`` are to be relative.
 
     middle: (3,) world; size: of what is there, world units. :data:`WORLD` unless that is far away;
     else ``middle``, rounded to as many decimal digits as do not matter beside ``size``.
     """
+    middle = np.asarray(middle)
     if not (size > 0 and np.abs(middle).max() > FAR * size):
         return WORLD
     digits = -math.floor(math.log10(size))
@@ -49,5 +50,5 @@ def near_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
 
 
 def shown_origin(origin: Origin) -> str:
-    """The origin as messages write it."""
+    """Format the origin as messages write it."""
     return f"({', '.join(f'{value:.15g}' for value in origin)})"

@@ -9,25 +9,31 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 
 from drgs.core.errors import UserError
+from drgs.core.types import UInt32
+
+if TYPE_CHECKING:
+    from drjit.opt import _LRCache
 
 
-def bucket_order(buckets: Any, block_size: int, num_buckets: int) -> Any:
-    """UInt32 (N,): a permutation that orders the lanes of each block stably by their bucket.
+def bucket_order(buckets: UInt32, block_size: int, num_buckets: int) -> UInt32:
+    """Return a permutation (N,) that orders the lanes of each block stably by their bucket.
 
-    buckets: UInt32 (N,), evaluated, each below ``num_buckets``; block_size: lanes that are ordered
+    buckets: (N,), evaluated, each below ``num_buckets``; block_size: lanes that are ordered
     together.
 
     Relies on ``dr.detail.block_mkperm`` being stable.
     """
-    return dr.detail.block_mkperm(buckets, block_size, num_buckets)
+    # The stub knows the types of each backend, not those of drjit.auto.
+    block_mkperm = cast("Callable[..., UInt32]", dr.detail.block_mkperm)
+    return block_mkperm(buckets, block_size, num_buckets)
 
 
-def same_variables(tree: Any, other: Any) -> bool:
+def same_variables(tree: object, other: object) -> bool:
     """Return whether two PyTrees consist of the same Dr.Jit variables, in the same order.
 
     Both are held, so that equal indices mean the same variable. Evaluates nothing.
@@ -37,8 +43,8 @@ def same_variables(tree: Any, other: Any) -> bool:
     return dr.detail.collect_indices(tree) == dr.detail.collect_indices(other)
 
 
-def same_memory(array: Any) -> Any:
-    """An evaluated array that Dr.Jit takes for another one, of the same memory; for LLVM alone.
+def same_memory(array: dr.ArrayBase) -> dr.ArrayBase:
+    """Return an evaluated array that Dr.Jit takes for another one, of the same memory; LLVM only.
 
     What is scattered to one of them is in the other, too. Waits for the device.
 
@@ -59,20 +65,20 @@ def llvm_version() -> tuple[int, ...]:
 
 
 def llvm_vector_width() -> int:
-    """Lanes of the vectors that Dr.Jit compiles for; 0 where this build of it does not tell.
+    """Return the lanes of the vectors that Dr.Jit compiles for; 0 if this build has no such query.
 
     Relies on ``jit_llvm_vector_width`` of drjit-core, which Dr.Jit's Python interface does not
     offer.
     """
     llvm_version()  # waits until the backend knows its processor
     try:
-        return _of_llvm_backend("_Z21jit_llvm_vector_widthv", ctypes.c_uint32)()
+        return _llvm_function("_Z21jit_llvm_vector_widthv", ctypes.c_uint32)()
     except (AttributeError, OSError):
         return 0
 
 
 def leave_out_avx512() -> None:
-    """From now on, compile for this processor as if it had AVX2 and no AVX-512.
+    """Compile from now on for this processor as if it had AVX2 and no AVX-512.
 
     To be called before the first kernel. Raises :class:`UserError` where there is no AVX-512, or no
     way to leave it out.
@@ -82,9 +88,9 @@ def leave_out_avx512() -> None:
     llvm_version()  # waits until the backend knows its processor
     place = "jit_llvm_set_target(): cannot leave out AVX-512"
     try:
-        processor = _of_llvm_backend("_Z19jit_llvm_target_cpuv", ctypes.c_char_p)()
-        features = _of_llvm_backend("_Z24jit_llvm_target_featuresv", ctypes.c_char_p)()
-        set_target = _of_llvm_backend("_Z19jit_llvm_set_targetPKcS0_j", None)
+        processor = _llvm_function("_Z19jit_llvm_target_cpuv", ctypes.c_char_p)()
+        features = _llvm_function("_Z24jit_llvm_target_featuresv", ctypes.c_char_p)()
+        set_target = _llvm_function("_Z19jit_llvm_set_targetPKcS0_j", None)
     except (AttributeError, OSError) as error:
         raise UserError(f"{place}: this build of Dr.Jit has no such function; omit it") from error
     names = (features or b"").decode().split(",")
@@ -95,7 +101,7 @@ def leave_out_avx512() -> None:
     set_target(processor, ",".join(rest).encode(), ctypes.c_uint32(8))
 
 
-def _of_llvm_backend(name: str, result: Any) -> Any:
+def _llvm_function(name: str, result: type | None) -> ctypes._NamedFuncPointer:
     library = next(iter(sorted(Path(dr.__file__).parent.glob("libdrjit-core.*"))), None)
     if library is None:
         raise OSError("no library of drjit-core")
@@ -110,14 +116,14 @@ def clear_memory_peak() -> None:
 
 
 def memory_peak() -> int:
-    """Bytes: most memory that arrays of the LLVM backend had at a time since the last clearing.
+    """Return the most memory, bytes, that arrays of the LLVM backend had since the last clearing.
 
     Relies on ``dr.detail.malloc_watermark``.
     """
     return dr.detail.malloc_watermark(dr.JitBackend.LLVM)
 
 
-def new_rate_cache() -> Any:
+def new_rate_cache() -> _LRCache:
     """Return the cache of scaled learning rates of ``drjit.opt.Adam._step`` for a step."""
     from drjit.opt import _LRCache
 

@@ -1,4 +1,4 @@
-"""One process among several, as ``mpiexec`` starts them: how the job speaks, starts and ends.
+"""Processes of a job that ``mpiexec`` starts: its start, its output and its end.
 
 Launchers describe a job by variables of the environment. MPI itself is imported by
 :func:`start_mpi` and by ``drgs.training.parallel`` alone.

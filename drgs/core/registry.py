@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from traceback import walk_tb
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Generic, Protocol, TypeVar, cast
 
 from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
 
@@ -117,7 +117,7 @@ class Registry(Generic[T]):
             others = (r for r in _registries if r is not self and name in r._extensions)
             if name not in self._shipped and (other := next(others, None)) is not None:
                 raise ValueError(f'a {other.kind} is called "{name}" already: names are sections')
-            self._extensions[name] = Extension(self.kind, name, value, section, module)
+            self._extensions[name] = Extension(self.kind, name, cast(T, value), section, module)
             return value
 
         return decorate
@@ -159,7 +159,14 @@ class Registry(Generic[T]):
         return self._extensions[name]
 
 
-class ClassRegistry(Registry[Any]):
+class _HasKind(Protocol):
+    kind: ClassVar[str]
+
+
+Base = TypeVar("Base")
+
+
+class ClassRegistry(Registry[type[Base]]):
     """A registry of classes, each of which has its name as the attribute ``kind``."""
 
     def register(
@@ -169,7 +176,7 @@ class ClassRegistry(Registry[Any]):
         decorate = super().register(name, section)
 
         def register_class(cls: Registered) -> Registered:
-            cls.kind = name
+            cast(type[_HasKind], cls).kind = name
             return decorate(cls)
 
         return register_class
@@ -200,7 +207,7 @@ def reporting_extensions() -> Iterator[None]:
         cause: BaseException | None = error
         while cause is not None:
             for frame, _ in walk_tb(cause.__traceback__):
-                extension = registered.get(frame.f_globals.get("__name__"))
+                extension = registered.get(frame.f_globals.get("__name__", ""))
                 if extension is not None and not extension.is_shipped:
                     raise extension.error(root_cause(error)) from error
             cause = cause.__cause__ or cause.__context__

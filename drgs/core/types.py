@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         Array3u,
         Array4f,
         Array4u,
+        ArrayXf,
         Bool,
         Float,
         Int32,
@@ -27,8 +28,11 @@ if TYPE_CHECKING:
         UInt64,
     )
 else:
-    Array2f = Array2u = Array3f = Array3u = Array4f = Array4u = Any
+    Array2f = Array2u = Array3f = Array3u = Array4f = Array4u = ArrayXf = Any
     Bool = Float = Int32 = Matrix3f = Matrix4f = TensorXf = UInt32 = UInt64 = Any
+
+Scalar = Float | float
+"""A Dr.Jit scalar or a number of the host."""
 
 __all__ = [
     "Array2f",
@@ -37,11 +41,13 @@ __all__ = [
     "Array3u",
     "Array4f",
     "Array4u",
+    "ArrayXf",
     "Bool",
     "Float",
     "Int32",
     "Matrix3f",
     "Matrix4f",
+    "Scalar",
     "TensorXf",
     "UInt32",
     "UInt64",

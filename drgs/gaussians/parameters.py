@@ -9,10 +9,10 @@ from it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Generic, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -22,36 +22,42 @@ from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, shown_origin
 from drgs.core.registry import HOW_TO_INSTALL
+from drgs.core.types import TensorXf
+
+Tensor = TypeVar("Tensor", bound=np.ndarray | dr.ArrayBase)
+"""``np.ndarray`` or ``TensorXf``."""
 
 PARAMETER_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(Generic[Tensor]):
     """N Gaussians. Raw, unconstrained values carry ``log_`` / ``logit_`` in their names.
 
     All are row-major tensors (``TensorXf`` / ``TensorXf64``, or numpy arrays), except
     ``logit_opacities``, a flat ``Float``.
     """
 
-    means: Any  # (N, 3) world
-    quats: Any  # (N, 4) wxyz, not normalised
-    log_scales: Any  # (N, 3) natural logarithm of the standard deviations, world units
-    logit_opacities: Any  # (N,)
-    sh0: Any  # (N, 1, 3) degree-0 coefficients, display space
-    shN: Any  # (N, K - 1, 3) coefficients of degree >= 1, K = (degree + 1)^2  # noqa: N815
-    smoothing: Any = (
+    means: Tensor  # (N, 3) world
+    quats: Tensor  # (N, 4) wxyz, not normalised
+    log_scales: Tensor  # (N, 3) natural logarithm of the standard deviations, world units
+    logit_opacities: Tensor  # (N,)
+    sh0: Tensor  # (N, 1, 3) degree-0 coefficients, display space
+    shN: Tensor  # (N, K - 1, 3) coefficients of degree >= 1, K = (degree + 1)^2  # noqa: N815
+    smoothing: Tensor | None = (
         None  # (N,) world units, not optimised: see drgs.effects.smoothing; None: there is none
     )
-    features: Any = None  # by name, (N, C) each: whatever else is to be composited; None: nothing
+    features: Mapping[str, Tensor] | None = (
+        None  # by name, (N, C) each: whatever else is to be composited; None: nothing
+    )
     rendered_with: Mapping[str, bool | int | float | str] | None = (
         None  # by name: approximations that a file says, or is to say, they are made for
     )
     origin: Origin = WORLD  # world: what the means are relative to
 
     @staticmethod
-    def load(path: str | Path) -> Gaussians:
-        """The Gaussians of a file, as numpy arrays: PLY, or another of ``drgs.io.formats``.
+    def load(path: str | Path) -> Gaussians[np.ndarray]:
+        """Read the Gaussians of a file, as numpy arrays: PLY, or another of ``drgs.io.formats``.
 
         float32, with the values and the SH degree that the file holds, and with what it says they
         are to be rendered with, as it stands there. Those of a format whose y axis is up are turned
@@ -63,7 +69,9 @@ class Gaussians:
 
         extension, arrays, rendered_with = read_gaussians(path)
         origin = pop_origin(path, rendered_with)
-        gaussians = Gaussians(**arrays, rendered_with=rendered_with or None, origin=origin)
+        gaussians = Gaussians(
+            **arrays, features=None, rendered_with=rendered_with or None, origin=origin
+        )
         return gaussians._turned(Z_TO_Y.T) if extension.value.up == "y" else gaussians
 
     def save(self, path: str | Path) -> None:
@@ -114,8 +122,8 @@ class Gaussians:
         scales: np.ndarray,
         opacities: np.ndarray,
         sh: np.ndarray,
-    ) -> Gaussians:
-        """Gaussians of float32 numpy arrays from activated values, as they are seen.
+    ) -> Gaussians[np.ndarray]:
+        """Return Gaussians of float32 numpy arrays from activated values, as they are seen.
 
         means: (N, 3) world; quats: (N, 4) wxyz, of any norm; scales: (N, 3) standard deviations,
         world units; opacities: (N,); sh: (N, K, 3) coefficients, display space, of degree 0 to 3,
@@ -164,41 +172,41 @@ class Gaussians:
         return {0: 0, 3: 1, 8: 2, 15: 3}[self.shN.shape[1]]
 
     @property
-    def scales(self) -> Any:
+    def scales(self) -> Tensor:
         """(N, 3) standard deviations, world units."""
         return _exp(self.log_scales)
 
     @property
-    def opacities(self) -> Any:
+    def opacities(self) -> Tensor:
         """(N,) in (0, 1)."""
-        return 1.0 / (1.0 + _exp(-self.logit_opacities))
+        return cast("Tensor", 1.0 / (1.0 + _exp(-self.logit_opacities)))
 
     @property
-    def sh(self) -> Any:
+    def sh(self) -> Tensor:
         """(N, K, 3) coefficients of all degrees, display space; K = (sh_degree + 1)^2."""
-        numpy = isinstance(self.sh0, np.ndarray)
-        return (np.concatenate if numpy else dr.concat)((self.sh0, self.shN), axis=1)
+        concat = np.concatenate if isinstance(self.sh0, np.ndarray) else dr.concat
+        return cast("Callable[..., Tensor]", concat)((self.sh0, self.shN), axis=1)
 
-    def numpy(self) -> Gaussians:
-        """The same Gaussians as numpy arrays on the host."""
+    def numpy(self) -> Gaussians[np.ndarray]:
+        """Return the same Gaussians as numpy arrays on the host."""
         features = self.features and {k: np.array(v) for k, v in self.features.items()}
         arrays = {name: np.array(getattr(self, name)) for name in self._names}
-        return replace(self, **arrays, features=features)
+        return cast("Gaussians[np.ndarray]", replace(self, **arrays, features=features))
 
-    def to(self, tensor_type: type) -> Gaussians:
+    def to(self, tensor_type: type[dr.ArrayBase]) -> Gaussians[TensorXf]:
         """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
         flat_type = dr.array_t(tensor_type)
 
-        def upload(values: Any) -> Any:
-            values = np.asarray(values)
+        def upload(array: Tensor) -> dr.ArrayBase:
+            values = np.asarray(array)
             flat = from_host(flat_type, values)
             return flat if values.ndim == 1 else tensor_type(flat, values.shape)
 
         features = self.features and {k: upload(v) for k, v in self.features.items()}
         tensors = {name: upload(getattr(self, name)) for name in self._names}
-        return replace(self, **tensors, features=features)
+        return cast("Gaussians[TensorXf]", replace(self, **tensors, features=features))
 
-    def _turned(self, rotation: np.ndarray) -> Gaussians:
+    def _turned(self: Gaussians[np.ndarray], rotation: np.ndarray) -> Gaussians[np.ndarray]:
         from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
         parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)
@@ -212,7 +220,7 @@ class Gaussians:
         return PARAMETER_NAMES if self.smoothing is None else (*PARAMETER_NAMES, "smoothing")
 
 
-def _exp(x: Any) -> Any:
+def _exp(x: Tensor) -> Tensor:
     if not isinstance(x, np.ndarray):
         return dr.exp(x)
     with np.errstate(over="ignore"):  # infinite: an opacity of 0, a scale beyond all numbers

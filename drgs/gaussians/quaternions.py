@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
 from drgs.core.arrays import types_of
+from drgs.core.types import Array3f, Array4f, Matrix3f
 
 
-def quat_to_rotation(quats: Any) -> Any:
-    """Rotation matrix (3 x 3) of ``quats`` (Array4f, wxyz, any norm).
+def quat_to_rotation(quats: Array4f) -> Matrix3f:
+    """Return the rotation matrix of ``quats`` (wxyz, any norm).
 
     The quaternion is first divided by its largest component, so that norms of 1e-20 and 1e20
     neither underflow nor overflow. A zero quaternion is the identity, with zero gradient.
@@ -30,8 +29,8 @@ def quat_to_rotation(quats: Any) -> Any:
     )
 
 
-def normalized(vector: Any) -> Any:
-    """Unit vector; a zero vector stays zero, with zero gradient."""
+def normalized(vector: Array3f) -> Array3f:
+    """Return the unit vector; a zero vector stays zero, with zero gradient."""
     squared_norm = dr.squared_norm(vector)
     usable = squared_norm > 0
     return vector * dr.select(usable, dr.rsqrt(dr.select(usable, squared_norm, 1)), 0)

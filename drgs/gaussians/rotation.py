@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from functools import cache
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drgs.core.errors import UserError
+from drgs.core.types import Array3f
 from drgs.gaussians.sh import num_coefficients, sh_basis
 
 MAX_QUATERNION = 1e30
@@ -88,7 +90,7 @@ def sh_rotation_generators(degree: int) -> list[list[np.ndarray]]:
     """
     directions, step = _directions(), 1e-20
     ahead = [directions - 1j * step * np.cross(axis, directions) for axis in np.eye(3)]
-    return [_projected(_basis(points, degree).imag / step, degree) for points in ahead]
+    return [_projected(np.imag(_basis(points, degree)) / step, degree) for points in ahead]
 
 
 def _projected(values: np.ndarray, degree: int) -> list[np.ndarray]:
@@ -120,5 +122,8 @@ def _directions() -> np.ndarray:
 def _basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """(N, (degree + 1)^2) values in unit directions (N, 3)."""
     x, y, z = directions.T
-    columns = sh_basis(SimpleNamespace(x=x, y=y, z=z), degree)
-    return np.stack([np.broadcast_to(column, x.shape) for column in columns], axis=1)
+    # The formulas are the same for numpy arrays, also complex ones.
+    columns = sh_basis(cast("Array3f", SimpleNamespace(x=x, y=y, z=z)), degree)
+    return np.stack(
+        [np.broadcast_to(cast("np.ndarray", column), x.shape) for column in columns], axis=1
+    )

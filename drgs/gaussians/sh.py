@@ -8,11 +8,10 @@ appendix A2, with the Condon-Shortley signs of the reference implementation).
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
 from drgs.core.constants import COLOR_MIN, SH_C0
+from drgs.core.types import Array3f, Scalar
 
 C1 = 0.4886025119029199
 C2 = (
@@ -34,25 +33,27 @@ C3 = (
 
 
 def num_coefficients(degree: int) -> int:
-    """Coefficients per colour channel up to and including ``degree``: (degree + 1)^2."""
+    """Return the coefficients per colour channel up to and including ``degree``."""
     return (degree + 1) ** 2
 
 
-def sh_basis(direction: Any, degree: int) -> list[Any]:
-    """The (degree + 1)^2 basis functions at a unit ``direction`` (Array3f, world)."""
-    basis = [SH_C0]
-    if degree >= 1:
-        x, y, z = direction.x, direction.y, direction.z
-        basis += [-C1 * y, C1 * z, -C1 * x]
-    if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
-        basis += [
-            C2[0] * (x * y),
-            C2[1] * (y * z),
-            C2[2] * (2 * zz - xx - yy),
-            C2[3] * (x * z),
-            C2[4] * (xx - yy),
-        ]
+def sh_basis(direction: Array3f, degree: int) -> list[Scalar]:
+    """Return the (degree + 1)^2 basis functions at a unit ``direction`` (world)."""
+    basis: list[Scalar] = [SH_C0]
+    if degree == 0:
+        return basis
+    x, y, z = direction.x, direction.y, direction.z
+    basis += [-C1 * y, C1 * z, -C1 * x]
+    if degree == 1:
+        return basis
+    xx, yy, zz = x * x, y * y, z * z
+    basis += [
+        C2[0] * (x * y),
+        C2[1] * (y * z),
+        C2[2] * (2 * zz - xx - yy),
+        C2[3] * (x * z),
+        C2[4] * (xx - yy),
+    ]
     if degree >= 3:
         basis += [
             C3[0] * y * (3 * xx - yy),
@@ -66,10 +67,10 @@ def sh_basis(direction: Any, degree: int) -> list[Any]:
     return basis
 
 
-def sh_color(coefficients: list[Any], direction: Any, degree: int) -> Any:
-    """Display-space colour max(0, sum_k basis_k(direction) c_k + 0.5), an Array3f.
+def sh_color(coefficients: list[Array3f], direction: Array3f, degree: int) -> Array3f:
+    """Return the display-space colour max(0, sum_k basis_k(direction) c_k + 0.5).
 
-    coefficients: (degree + 1)^2 of Array3f; direction: Array3f, unit, world, from the camera
+    coefficients: (degree + 1)^2; direction: unit, world, from the camera
     centre to the mean. Where the colour is clamped, its derivative is zero; at exactly 0 it passes.
     A NaN stays NaN: projection then drops the Gaussian.
     """

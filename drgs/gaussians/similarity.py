@@ -49,7 +49,7 @@ class Similarity:
         unmoved = not self.translation.any() and (self.rotation == np.eye(3)).all()
         return self.scale == 1 and bool(unmoved)
 
-    def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
+    def of_gaussians(self, gaussians: Gaussians[np.ndarray]) -> Gaussians[np.ndarray]:
         """Return Gaussians (numpy) moved, float32.
 
         Their origin is rotated and scaled, and the translation is added to the means.
@@ -70,7 +70,9 @@ class Similarity:
         return replace(g, **{name: to_float32(name, getattr(g, name)) for name in names})
 
 
-def turned_towards(gaussians: Gaussians, direction: np.ndarray, towards: np.ndarray) -> Gaussians:
+def turned_towards(
+    gaussians: Gaussians[np.ndarray], direction: np.ndarray, towards: np.ndarray
+) -> Gaussians[np.ndarray]:
     """Return the model (numpy) turned, the shortest way, so that ``direction`` becomes ``towards``.
 
     direction, towards: (3,) world, of length 1. Opposite ones: about the axis that is nearest to

@@ -32,6 +32,7 @@ from functools import cache
 from math import inf, pi, sqrt
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, Picture, Projection
@@ -44,8 +45,8 @@ BORDER_SAMPLES = 65
 Between two of 65, a border bent like a circle arc bulges 1 / 64^2 of its own bulge."""
 
 FOLD_RADII, FOLD_STEPS = (1e-3, 1e6), 1000
-"""Where a lens with tangential terms is searched for a fold: slopes, or angles in rad, in steps of
-two percent."""
+"""Range in which a lens with tangential terms is searched for a fold: slopes, or angles in rad, in
+steps of two percent."""
 
 REAL_ROOT = 1e-7
 """A root with a smaller imaginary part (relative) is real: a double root is found to within the
@@ -362,7 +363,7 @@ class Orthographic(Lens):
 
 def _jacobians(lens: OpenCV | ThinPrismFisheye, places: np.ndarray) -> np.ndarray:
     """Return (M, 2, 2): derivatives of ``lens.distorted`` at places (M, 2), by complex steps."""
-    columns = [lens.distorted(places + 1e-30j * axis).imag / 1e-30 for axis in np.eye(2)]
+    columns = [np.imag(lens.distorted(places + 1e-30j * axis)) / 1e-30 for axis in np.eye(2)]
     return np.stack(columns, axis=-1)
 
 
@@ -417,7 +418,7 @@ def _first_fold(lens: OpenCV | ThinPrismFisheye, radius: float) -> float:
         middle = (low + high) / 2
         is_folded = lens.least_eigenvalue(np.array([middle]))[0] <= 0
         low, high = (low, middle) if is_folded else (middle, high)
-    return low
+    return float(low)
 
 
 def _focal(camera: Camera) -> np.ndarray:
@@ -436,7 +437,7 @@ def _film_border(camera: Camera) -> np.ndarray:
     return np.concatenate([np.column_stack(edge) for edge in edges])
 
 
-def _first_positive_root(coefficients: Sequence[float]) -> float:
+def _first_positive_root(coefficients: ArrayLike) -> float:
     """Return the smallest u > 0 with 1 + c1 u + ... + cn u^n = 0, or inf; coefficients[0] is 1.
 
     It is 1 / v for the largest v with v^n + c1 v^(n - 1) + ... + cn = 0, which divides by no cn.
@@ -603,7 +604,7 @@ def render(
     gaussians: Gaussians,
     camera: Camera,
     lens: Lens = Pinhole(),
-    background: np.ndarray = (0.0, 0.0, 0.0),
+    background: ArrayLike = (0.0, 0.0, 0.0),
     antialiased: bool = False,
     defocus: ThinLens | None = None,
     degree: int | None = None,
@@ -627,7 +628,7 @@ def render_lens_samples(
     camera: Camera,
     defocus: ThinLens,
     num_samples: int,
-    background: np.ndarray = (0.0, 0.0, 0.0),
+    background: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the image (H, W, 3), display space, and alpha (H, W) of a camera with an aperture.
 
@@ -743,7 +744,7 @@ def render_motion_blur(
     camera_open: Camera,
     camera_close: Camera,
     num_samples: int,
-    background: np.ndarray = (0.0, 0.0, 0.0),
+    background: ArrayLike = (0.0, 0.0, 0.0),
     lens: Lens = Pinhole(),
 ) -> Picture:
     """Return the mean of n = num_samples pictures, at the times (k + 0.5) / n of the exposure."""
@@ -760,7 +761,7 @@ def render_rolling_shutter(
     gaussians: Gaussians,
     camera_open: Camera,
     camera_close: Camera,
-    background: np.ndarray = (0.0, 0.0, 0.0),
+    background: ArrayLike = (0.0, 0.0, 0.0),
     lens: Lens = Pinhole(),
 ) -> Picture:
     """Return the picture whose row j is row j of the picture at time (j + 0.5) / H."""

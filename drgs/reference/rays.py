@@ -41,14 +41,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from math import inf, isfinite
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 import pydantic
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, Picture
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+D = TypeVar("D", bound="DataclassInstance")
+
 
 MAX_PAIRS = 2**18
 """Pairs evaluated at a time: some 100 numbers each, so 200 MB, whatever the film and the scene."""
@@ -94,12 +101,14 @@ class ImageModel:
     order: Literal["center", "pixel", "entry"] = "center"
     sh_direction: Literal["mean", "pixel"] = "mean"
     stop: Literal["before", "after"] = "before"
-    alpha_max: float = Field(reference.ALPHA_MAX, gt=0, le=1)  # upper clamp of alpha; 1: none
-    alpha_cut: float = Field(reference.ALPHA_CUT, ge=0, lt=1)  # a smaller alpha does not exist
-    transmittance_stop: float = Field(reference.TRANSMITTANCE_STOP, ge=0, lt=1)  # 0: none
-    extent: float = Field(inf, gt=0)  # standard deviations beyond which a splat does not exist
-    step: float = Field(0.0, ge=0, lt=inf)  # world units along the ray
-    low_pass: float = Field(reference.LOW_PASS, ge=0, lt=inf)  # px^2; 0: none
+    alpha_max: float = Field(
+        default=reference.ALPHA_MAX, gt=0, le=1
+    )  # upper clamp of alpha; 1: none
+    alpha_cut: float = Field(default=reference.ALPHA_CUT, ge=0, lt=1)  # smaller: does not exist
+    transmittance_stop: float = Field(default=reference.TRANSMITTANCE_STOP, ge=0, lt=1)  # 0: none
+    extent: float = Field(default=inf, gt=0)  # standard deviations of a splat
+    step: float = Field(default=0.0, ge=0, lt=inf)  # world units along the ray
+    low_pass: float = Field(default=reference.LOW_PASS, ge=0, lt=inf)  # px^2; 0: none
     antialiased: bool = False  # opacities compensate for the low-pass (Mip-Splatting)
     sh_degree: int | None = None  # None: all that is stored
 
@@ -170,7 +179,7 @@ class _Pairs:
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    background: np.ndarray = (0.0, 0.0, 0.0),
+    background: ArrayLike = (0.0, 0.0, 0.0),
     model: ImageModel = DEFAULT_MODEL,
     region: tuple[slice, slice] | None = None,
     positions: np.ndarray | None = None,
@@ -666,7 +675,7 @@ def _follows_closely(keys: np.ndarray, width: float) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 
 
-def _rows(data: Any, chosen: np.ndarray) -> Any:
+def _rows(data: D, chosen: np.ndarray) -> D:
     """Return a dataclass of arrays (N, ...) with the rows that are ``chosen`` (N,) bool."""
     return type(data)(**{field.name: getattr(data, field.name)[chosen] for field in fields(data)})
 

@@ -32,6 +32,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # The two thresholds on alpha are the single-precision numbers of the CUDA rasterizer (0.99f and
 # 1.0f / 255.0f), not the decimals. For the clamp this decides pictures: behind one clamped
@@ -415,7 +416,7 @@ def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Footprint:
-    """One splat on the pixels of its bounding box of h x w pixels."""
+    """A splat on the pixels of its bounding box of h x w pixels."""
 
     box: tuple[slice, slice]  # rows and columns of the film
     dx: np.ndarray  # (1, w) px, from the splat's mean to the pixel centres
@@ -425,7 +426,7 @@ class _Footprint:
 
 
 def _footprint(
-    box: tuple[slice, slice], mean2d: np.ndarray, conic: np.ndarray, opacity: float
+    box: tuple[slice, slice], mean2d: np.ndarray, conic: np.ndarray, opacity: float | np.ndarray
 ) -> _Footprint:
     """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) in a box of pixels."""
     rows, columns = box
@@ -482,7 +483,7 @@ def composite(
     colors: np.ndarray,
     depths: np.ndarray,
     visible: np.ndarray,
-    background: np.ndarray,
+    background: ArrayLike,
     width: int,
     height: int,
     threshold_width: float = THRESHOLD_WIDTH,
@@ -516,7 +517,7 @@ def _composite_and_stops(
     colors: np.ndarray,
     depths: np.ndarray,
     visible: np.ndarray,
-    background: np.ndarray,
+    background: ArrayLike,
     width: int,
     height: int,
     threshold_width: float,
@@ -532,7 +533,7 @@ def _composite_and_stops(
     boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], smallest, width, height)
     never = len(order)
 
-    def is_near(values: np.ndarray, threshold: float) -> np.ndarray:
+    def is_near(values: np.ndarray, threshold: float | np.ndarray) -> np.ndarray:
         return np.abs(values - threshold) <= threshold_width * threshold
 
     image = np.zeros((height, width, 3))
@@ -567,7 +568,7 @@ def _composite_and_stops(
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    background: np.ndarray = (0.0, 0.0, 0.0),
+    background: ArrayLike = (0.0, 0.0, 0.0),
     sh_degree: int | None = None,
     antialiased: bool = False,
     threshold_width: float = THRESHOLD_WIDTH,
@@ -598,7 +599,7 @@ def composite_gradients(
     colors: np.ndarray,
     depths: np.ndarray,
     visible: np.ndarray,
-    background: np.ndarray,
+    background: ArrayLike,
     width: int,
     height: int,
     d_image: np.ndarray,
@@ -831,7 +832,7 @@ def sh_colors_gradients(
 def render_gradients(
     gaussians: Gaussians,
     camera: Camera,
-    background: np.ndarray,
+    background: ArrayLike,
     d_image: np.ndarray,
     d_alpha: np.ndarray | None = None,
     d_depth: np.ndarray | None = None,
@@ -874,7 +875,7 @@ def render_gradients(
 # ----------------------------------------------------------------------------------------------
 
 
-def _as_float64(*arrays: np.ndarray) -> list[np.ndarray]:
+def _as_float64(*arrays: ArrayLike) -> list[np.ndarray]:
     """Return the arrays in double precision, so that kernels' own splats may be composited."""
     return [np.asarray(array, dtype=np.float64) for array in arrays]
 

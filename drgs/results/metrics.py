@@ -37,7 +37,17 @@ class SplitMetrics(TypedDict):
     split: str
 
 
-class FitMetrics(TypedDict):
+class Circumstances(TypedDict):
+    """The entries of ``metrics.json`` about the machine, the time and the software."""
+
+    versions: dict[str, str]
+    variant: str
+    threads: int
+    processor: str
+    date: str  # when the results were written: ISO 8601, local time
+
+
+class FitMetrics(Circumstances):
     """The content of a fit's ``metrics.json``."""
 
     iterations: int
@@ -46,11 +56,6 @@ class FitMetrics(TypedDict):
     test: SplitMetrics
     viewers: NotRequired[SplitMetrics]  # of the file for viewers, rendered as these do
     seed: int
-    versions: dict[str, str]
-    variant: str
-    threads: int
-    processor: str
-    date: str  # when the results were written: ISO 8601, local time
     command: str  # the line that was typed
     config: dict[str, object]
 

@@ -386,7 +386,7 @@ class SplatFeatures:
         return num_stored
 
     def for_camera(self, camera: Camera) -> SplatFeatures:
-        """For one camera: nothing depends on it."""
+        """Return the features for one camera; here, nothing depends on it."""
         del camera
         return self
 
@@ -398,7 +398,7 @@ class SplatFeatures:
         return self
 
     def bind(self, lanes: Lanes, positions: Positions) -> SplatFeatures:
-        """For the lanes of one kernel: nothing depends on where the pixels are."""
+        """Return the features for the lanes of one kernel; here, nothing depends on the pixels."""
         del lanes, positions
         return self
 

@@ -67,7 +67,7 @@ class TileGrid:
 
 @dataclass(frozen=True)
 class Lanes:
-    """One lane per micro-tile, in the order in which Dr.Jit starts them."""
+    """Lanes, each a micro-tile, in the order in which Dr.Jit starts them."""
 
     micro_tile: UInt32  # tile among those of all samples * 16 + micro-tile within the tile
     micro: UInt32  # micro-tile within the tile

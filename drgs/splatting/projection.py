@@ -1,4 +1,4 @@
-"""From 3D Gaussians to 2D splats: culling, EWA projection, opacity and colour.
+"""Projection of 3D Gaussians to 2D splats: culling, EWA projection, opacity and colour.
 
 The first stage: ``Gaussians`` + ``Camera`` -> ``Splats2D``. One lane is one Gaussian; every line is
 plain arithmetic, so Dr.Jit differentiates it. The equations are those of Zwicker et al. 2002 ("EWA
@@ -11,7 +11,7 @@ module (``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, ClassVar
@@ -42,7 +42,7 @@ class RayTerms:
     scale: Float | None = None  # 1 / |a_c|, what the whitening is multiplied by; None: 1
 
     def numbers(self) -> list[Float]:
-        """All numbers that are set."""
+        """Return the numbers that are set."""
         numbers = [self.tilt_x, self.tilt_y, self.spread]
         return numbers if self.scale is None else [*numbers, self.scale]
 
@@ -135,7 +135,7 @@ class GaussianRows:
     sh: list[Array3f]  # (degree + 1)^2
     smoothing: Float | None = None  # see drgs.effects.smoothing; None: there is none
     dimming: Float | None = None  # factor of the opacity; None: 1
-    features: dict[str, list[Float]] | None = None  # by name; None: there are none
+    features: Mapping[str, list[Float]] | None = None  # by name; None: there are none
 
 
 def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:

@@ -44,12 +44,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
 from drgs.core.arrays import Rows, divide, quotient, reinterpret, scatter_rows, types_of
-from drgs.core.types import Array2f, Bool, Float, UInt32
+from drgs.core.types import Array2f, Bool, Float, Int32, UInt32
 from drgs.splatting.footprint import Alpha, SplatFeatures
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
 from drgs.splatting.lanes import (
@@ -214,7 +214,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
 
 def any_unfinished(transmittances: list[Float]) -> Bool:
     """Return lanes with a transmittance that is not negative, from the bits that all share."""
-    Int: Any = dr.int_array_t(type(transmittances[0]))
+    Int = cast("type[Int32]", dr.int_array_t(type(transmittances[0])))
     shared = reinterpret(Int, transmittances[0])
     for T in transmittances[1:]:
         shared &= reinterpret(Int, T)

@@ -25,7 +25,7 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
 from drgs.core.constants import LOW_PASS
-from drgs.core.types import Array2f, Bool, Float, UInt32
+from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting.feature_groups import in_groups
 from drgs.splatting.footprint import DEFAULT, FootprintModel
@@ -451,7 +451,7 @@ def _sum_of(a: Gaussians, b: Gaussians) -> Gaussians:
     total = {name: getattr(a, name) + getattr(b, name) for name in PARAMETER_NAMES}
     if a.smoothing is not None:
         total["smoothing"] = a.smoothing + b.smoothing
-    if a.features:
+    if a.features and b.features:
         total["features"] = {name: v + b.features[name] for name, v in a.features.items()}
     return Gaussians(**total)
 
@@ -565,17 +565,23 @@ def _as_tensors(
     stored = {name: store_columns(own) for name, own in columns.items()}
     dr.eval(stored, others)
 
-    def gradient(name: str, like: Any) -> Any:
+    def gradient(name: str, like: TensorXf | Float) -> TensorXf | Float:
         if name not in stored:
             return dr.zeros(t.TensorXf, like.shape)
         flat = first_numbers(stored[name], dr.width(like))
         return t.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
 
-    features = gaussians.features
-    parameters = {name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES}
+    smoothing, features = gaussians.smoothing, gaussians.features
+    parameters: dict[str, Any] = {
+        name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES
+    }
     return Gaussians(
         **parameters,
-        smoothing=gradient("smoothing", gaussians.smoothing) if "smoothing" in stored else None,
+        smoothing=(
+            gradient("smoothing", smoothing)
+            if smoothing is not None and "smoothing" in stored
+            else None
+        ),
         features=features and {name: gradient(name, like) for name, like in features.items()},
     )
 

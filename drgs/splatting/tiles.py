@@ -24,7 +24,7 @@ import drjit as dr
 from drgs.core.arrays import Rows, interleave, types_of
 from drgs.core.errors import UserError
 from drgs.core.private import bucket_order
-from drgs.core.types import Array2u, Float, UInt32
+from drgs.core.types import Float, UInt32
 from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
 from drgs.splatting.projection import Splats2D
@@ -203,7 +203,7 @@ def _make_entries(
     num_entries: int,
     grid: TileGrid,
     model: FootprintModel,
-) -> tuple[UInt32, Array2u]:
+) -> tuple[UInt32, UInt32]:
     """Return the tile of each entry, and two words: see :func:`_pack`.
 
     Entries of the padding touch nothing, in the last tile: a stable sort leaves them at the end.

@@ -22,8 +22,10 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.config.changes import changed, with_iterations
 from drgs.config.schema import FitConfig
@@ -31,9 +33,15 @@ from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.report import seconds_of_curves, seconds_of_results
+from drgs.training.density.strategy import DensityStrategy
+from drgs.training.effects.base import TrainingEffect
+from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.inputs import share_inputs
 from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 CURVES = Path(__file__).parent / "training_curves.csv"
 """Curves that ``scenes/studies/training.py`` measured."""
@@ -44,7 +52,7 @@ MIN_ITERATIONS = 50
 MIN_SIDE_PX = 32
 """Images of coarse stages are not smaller than SSIM's windows need."""
 
-WARM_UP, TIMED, REHEARSAL_VIEWS = 6, 20, 8
+WARM_UP_ITERATIONS, TIMED_ITERATIONS, REHEARSAL_VIEWS = 6, 20, 8
 """Iterations of a rehearsal, the first of which compile kernels; and its views."""
 
 REVISION_SHARE = 0.1
@@ -78,15 +86,16 @@ class Strategy:
             return False
         return self.share is None or target_of(config) is not None
 
-    def applied(self, config: FitConfig, num_points: int) -> FitConfig:
+    def apply(self, config: FitConfig, num_points: int) -> FitConfig:
         """Return ``config`` with this strategy; num_points: Gaussians at the start, the fewest."""
         changes: dict[str, object] = {}
         if self.half_size is not None:
             until = max(1, round(self.half_size * config.iterations))
             changes["coarse"] = [{"until": until, "factor": 2}]
-        if self.share is not None:
+        target = target_of(config)
+        if self.share is not None and target is not None:
             least = max(num_points, config.init.num_points or 0)
-            number = max(least, round(self.share * target_of(config)))
+            number = max(least, round(self.share * target))
             changes[f"densify.{config.densify.strategy}.gaussians"] = number
         return changed(config, changes)
 
@@ -133,8 +142,9 @@ class Curve:
         return _interpolate(math.log(iterations), np.log(self.iterations), self.psnr)
 
 
-def _interpolate(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+def _interpolate(x: float, xs: ArrayLike, ys: ArrayLike) -> float:
     """Interpolate linearly; beyond the ends as in the last piece."""
+    xs, ys = np.asarray(xs), np.asarray(ys)
     i = min(max(int(np.searchsorted(xs, x)), 1), len(xs) - 1)
     return float(ys[i - 1] + (x - xs[i - 1]) / (xs[i] - xs[i - 1]) * (ys[i] - ys[i - 1]))
 
@@ -224,9 +234,17 @@ def make_plan(
         )
     chosen = max(candidates, key=lambda candidate: candidate.psnr)
     planned = with_iterations(config, chosen.iterations)
-    planned = chosen.strategy.applied(planned, num_points)
+    planned = chosen.strategy.apply(planned, num_points)
     most = max(num_points, target_of(planned) or planned.densify.max_gaussians)
     return Plan(planned, chosen, tuple(candidates), seconds, start_s, most)
+
+
+class FitObjects(TypedDict):
+    """Objects that take part in a fit besides those of its configuration, for :class:`Trainer`."""
+
+    density: DensityStrategy | None
+    effects: Sequence[TrainingEffect]
+    loss: Loss | None
 
 
 @dataclass(frozen=True)
@@ -242,7 +260,7 @@ def rehearse(
     dataset: Dataset | None,
     gaussians: Gaussians,
     comm: Communicator | None = None,
-    **objects: object,
+    **objects: Unpack[FitObjects],
 ) -> Rehearsal:
     """Time a few iterations on a few of the views.
 
@@ -250,18 +268,19 @@ def rehearse(
     objects: given to :class:`Trainer`, copies of which take part.
     """
     comm = comm or Communicator()
-    if comm.is_root:
+    if config is not None and dataset is not None:
         config, dataset = _first_iterations(config, dataset)
     config, dataset = share_inputs(comm, config, dataset)
     trainer = Trainer(config, dataset, gaussians, comm, **deepcopy(objects))
     views_per_step = config.optimizer.views_per_step
     # Steps of several views are fewer.
-    warm_up, timed = (max(2, math.ceil(n / views_per_step)) for n in (WARM_UP, TIMED))
+    warm_up, timed = (
+        max(2, math.ceil(n / views_per_step)) for n in (WARM_UP_ITERATIONS, TIMED_ITERATIONS)
+    )
     for count in (warm_up, timed):
         start = time.perf_counter()
-        for _ in range(count):
-            report = trainer.step()
-        _ = report.loss  # waits for the device
+        reports = [trainer.step() for _ in range(count)]
+        _ = reports[-1].loss  # waits for the device
     return Rehearsal(trainer, (time.perf_counter() - start) / (timed * views_per_step))
 
 
@@ -270,7 +289,7 @@ def _first_iterations(config: FitConfig, dataset: Dataset) -> tuple[FitConfig, D
     views_per_step = config.optimizer.views_per_step
     count = max(REHEARSAL_VIEWS, views_per_step)
     views = dataset.train[:: max(1, len(dataset.train) // count)]
-    never = config.iterations + (WARM_UP + TIMED) * views_per_step
+    never = config.iterations + (WARM_UP_ITERATIONS + TIMED_ITERATIONS) * views_per_step
     still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
     return changed(config, {"coarse": [], **still}), replace(dataset, train=views[:count])
 
@@ -284,6 +303,7 @@ def plan_fit(
     """
     num_points, most = gaussians.num_gaussians, target_of(config) or 0
     scene, degree = rehearsal.trainer.full_scene(), config.model.sh_degree
+    assert scene is not None, "rank 0 plans"
     results = seconds_of_results(scene, dataset, max(num_points, most), degree)
     pictures = results.renders if config.output.save_renders else 0.0
     pictures += results.report + seconds_of_curves() if config.output.report else 0.0

@@ -27,15 +27,15 @@ from drgs.results.folder import load_run_config, write_run_config
 from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 
-PLACES = ("data.path", "data.source", "init.point_cloud")
+PATH_KEYS = ("data.path", "data.source", "init.point_cloud")
 """Values that say where something is: a project that was moved has others. The start point is
 needed no more; the data has a fingerprint."""
 
-MEANS = "means.value"
+MEANS_ARRAY = "means.value"
 """The array that has a row for each Gaussian."""
 
-FILTER = "smoothing/filter"
-"""Of an effect, with a number for each Gaussian; a trainer has none at its start."""
+SMOOTHING_ARRAY = "smoothing/filter"
+"""The array of an effect that has a number for each Gaussian; a trainer has none at its start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +59,17 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
         before = load_run_config(folder)
     except UserError:  # there is none, or the user is just editing it
         before = config
+    arrays = {
+        "config": np.array(_as_text(config)),
+        "config_before": np.array(_as_text(before)),
+        "history": checkpoint.history,
+        "density": checkpoint.density,
+        "wall_s": np.array(checkpoint.wall_s),
+        "data": np.frombuffer(checkpoint.data.to_bytes(), np.uint8),
+        **{f"trainer.{name}": values for name, values in checkpoint.trainer.items()},
+    }
     with atomic_path(folder / CHECKPOINT) as temporary:
-        np.savez(
-            temporary,
-            config=np.array(_as_text(config)),
-            config_before=np.array(_as_text(before)),
-            history=checkpoint.history,
-            density=checkpoint.density,
-            wall_s=np.array(checkpoint.wall_s),
-            data=np.frombuffer(checkpoint.data.to_bytes(), np.uint8),
-            **{f"trainer.{name}": values for name, values in checkpoint.trainer.items()},
-        )
+        np.savez(temporary, **arrays)  # pyright: ignore[reportArgumentType]  # allow_pickle=
     if before != config or not (folder / CONFIG).is_file():
         write_run_config(folder, config)
 
@@ -116,6 +116,7 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
 
     start: ``Trainer.state()`` of that trainer before its first iteration.
     """
+    assert checkpoint.config is not None, "it was read from a file"
     try:
         _check_state(checkpoint.trainer, start, checkpoint.config)
     except ValueError as error:
@@ -163,7 +164,7 @@ def _as_text(config: FitConfig) -> str:
 def _at_the_places_of(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
     """Return a checkpoint's configuration, with places and the section ``output`` of another."""
     places = {}
-    for key in PLACES:
+    for key in PATH_KEYS:
         section, name = key.split(".")
         places[key] = getattr(getattr(config, section), name)
     output = config.output.model_dump()
@@ -184,11 +185,11 @@ def _check_state(
     """
     if missing := [name for name in start if name not in state]:
         raise ValueError(f"{listed(missing)} missing")
-    num, most = len(np.atleast_1d(state[MEANS])), config.densify.max_gaussians
+    num, most = len(np.atleast_1d(state[MEANS_ARRAY])), config.densify.max_gaussians
     if not 1 <= num <= most:
         raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")
     expected = {name: (_shape(name, start, num), array.dtype) for name, array in start.items()}
-    expected[FILTER] = (num,), np.dtype(np.float32)
+    expected[SMOOTHING_ARRAY] = (num,), np.dtype(np.float32)
     values = [name for name in start if name.endswith(".value")]
     expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
     for name in filter(expected.__contains__, state):
@@ -207,7 +208,7 @@ def _shape(name: str, start: Mapping[str, np.ndarray], num: int) -> tuple[int, .
     of_effect = "/" in name and not name.startswith(DENSITY)
     if not shape or of_effect or name.endswith(".t"):
         return shape
-    return (shape[0] // len(start[MEANS]) * num, *shape[1:])
+    return (shape[0] // len(start[MEANS_ARRAY]) * num, *shape[1:])
 
 
 def _check_tables(checkpoint: Checkpoint) -> None:

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from drgs.core.errors import UserError
+from drgs.core.types import Float, UInt32
 from drgs.splatting.rendering import decode_fault
 
 
@@ -34,9 +34,9 @@ class WatchedIteration:
 
     number: int
     view: str
-    loss: Any  # Float (1,)
-    first_fault: Any  # UInt32 (1,), of the gradients: see drgs.splatting.rendering.decode_fault
-    numbers: Mapping[str, Any]  # Float, by name: of the view, optimised by effects
+    loss: Float  # (1,)
+    first_fault: UInt32  # (1,), of the gradients: see drgs.splatting.rendering.decode_fault
+    numbers: Mapping[str, dr.ArrayBase]  # by name: of the view, optimised by effects
 
     def faults(self) -> Iterator[str]:
         """Yield what is not finite; waits for the device."""
@@ -72,7 +72,10 @@ class GradientWatch:
 
 
 def check_values(
-    iteration: int, values: Mapping[str, Any], first_row: int = 0, views: Sequence[str] = ()
+    iteration: int,
+    values: Mapping[str, dr.ArrayBase | np.ndarray],
+    first_row: int = 0,
+    views: Sequence[str] = (),
 ) -> None:
     """Raise :class:`NonFiniteError` for the first value that is not finite; waits for the device.
 
@@ -96,4 +99,4 @@ def check_values(
 def _first_fault(array: np.ndarray) -> tuple[int, float] | None:
     """Return the first row, and in it the first value, that is not finite; None: all are."""
     faults = np.argwhere(~np.isfinite(array))
-    return (int(faults[0][0]), array[tuple(faults[0])]) if len(faults) else None
+    return (int(faults[0][0]), float(array[tuple(faults[0])])) if len(faults) else None

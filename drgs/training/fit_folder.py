@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -48,7 +48,14 @@ from drgs.results.folder import (
     write_run_config,
 )
 from drgs.results.history import write_density, write_history
-from drgs.results.metrics import FitMetrics, mean_of, mean_quality
+from drgs.results.metrics import (
+    Circumstances,
+    FitMetrics,
+    Quality,
+    SplitMetrics,
+    mean_of,
+    mean_quality,
+)
 from drgs.results.refined_cameras import write_views
 from drgs.results.report import Fitted, write_pictures, write_results
 from drgs.results.viewer import Shown, shows_as_fitted
@@ -147,7 +154,7 @@ class FitFolder:
             "iterations": config.iterations,
             "num_gaussians": gaussians.num_gaussians,
             "wall_s": round(wall_s, 2),
-            "test": {**vars(mean_of(scores)), "split": split},
+            "test": _split_metrics(mean_of(scores), split),
             "seed": config.seed,
             **_circumstances(),
             "command": self.command,
@@ -159,10 +166,12 @@ class FitFolder:
             other.save(out / GAUSSIANS_FOR_VIEWERS)
             images = zip(for_viewers.pictures(dataset.test), dataset.test, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
-            metrics["viewers"] = {**vars(quality), "split": split}
+            metrics["viewers"] = _split_metrics(quality, split)
         if output.report:
             shown = gaussians_on_page(gaussians, approximations, other)
-            fitted = Fitted(trainer.full_scene(), gaussians, render, shown)
+            scene = trainer.full_scene()
+            assert scene is not None, "rank 0 writes the results"
+            fitted = Fitted(scene, gaussians, render, shown)
             write_results(out, dataset, fitted, scores, history, metrics)
         self.finish(metrics)
         return metrics
@@ -179,7 +188,7 @@ class FitFolder:
             path = self.path / GAUSSIANS_FOR_VIEWERS
             lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
         lines.append(f"written: {self.path}")
-        if metrics["config"]["output"]["report"]:
+        if cast("dict[str, object]", metrics["config"]["output"])["report"]:
             lines.append(f"open {self.path / REPORT}")
         return "\n".join(lines)
 
@@ -223,18 +232,26 @@ def _without_filter(gaussians: Gaussians) -> Gaussians:
     return baked(gaussians)
 
 
-def _circumstances() -> dict[str, object]:
-    """Return the entries of ``metrics.json`` about the machine, the time and the software."""
+def _split_metrics(quality: Quality, split: str) -> SplitMetrics:
+    return {
+        "psnr": quality.psnr,
+        "ssim": quality.ssim,
+        "num_views": quality.num_views,
+        "split": split,
+    }
+
+
+def _circumstances() -> Circumstances:
     return {
         "versions": {
             "drgs": drgs.__version__,
-            "mitsuba": mi.__version__,
-            "drjit": dr.__version__,
+            "mitsuba": str(mi.__version__),
+            "drjit": dr.__version__,  # pyright: ignore[reportAttributeAccessIssue]  # not in the stub
             "numpy": np.__version__,
             "python": platform.python_version(),
             "llvm": ".".join(map(str, llvm_version())),
         },
-        "variant": mi.variant(),
+        "variant": mi.variant() or "",
         "threads": dr.thread_count(),
         "processor": processor(),
         "date": datetime.now().astimezone().isoformat(timespec="minutes"),

@@ -106,9 +106,11 @@ class StopCriterion(Protocol):
 
     def should_continue(self, trainer: Trainer) -> bool:
         """Return whether to run another iteration; may revise the trainer's configuration."""
+        ...
 
     def num_iterations(self, trainer: Trainer) -> int:
         """Return the number of iterations of the whole fit, as expected now."""
+        ...
 
 
 class AllIterations:
@@ -134,7 +136,7 @@ class RootDecides:
             continues = self.criterion.should_continue(trainer)
         config, is_revised = trainer.config, trainer.config is not before
         decision = continues, is_revised, config.iterations, config.densify.stop
-        continues, is_revised, *plan = map(int, self.comm.of_root(decision))
+        continues, is_revised, *plan = map(int, self.comm.broadcast_numbers(decision))
         if is_revised and not self.comm.is_root:
             trainer.reschedule(*plan)
         return bool(continues)
@@ -205,7 +207,9 @@ class HeldOutQuality:
         trainer.sync_scene()
         pairs = zip(trainer.images(self._views), self._views, strict=True)
         scores = [psnr(image, view.image, view.mask) for image, view in pairs]
-        history.add_test_psnr(float(trainer.comm.of_root(np.mean(scores) if scores else np.nan)))
+        history.add_test_psnr(
+            float(trainer.comm.broadcast_numbers(np.mean(scores) if scores else np.nan))
+        )
         history.leave_out(time.perf_counter() - start)
 
 

@@ -18,21 +18,22 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 
 from drgs.config.extensions import LOSS_TERMS, LOSSES, extensions_in_use, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import is_float64, types_of
+from drgs.core.types import ArrayXf, Bool, Float, TensorXf, UInt32
 
 C1, C2 = 0.01**2, 0.03**2
 """(K L)^2 with K1 = 0.01, K2 = 0.03, dynamic range L = 1 (Wang et al. 2004, section IV)."""
 
 TARGET_BYTES = 36
-"""Of a pixel: three numbers for each of three channels in single precision, see :class:`Target`."""
+"""Memory of a pixel: three numbers for each of three channels, float32; see :class:`Target`."""
 
 _TILE = 8  # pixels; 4 and 16 were measured to be slower
 _CHANNELS = 3
@@ -45,18 +46,18 @@ class Target:
     height: int
     width: int
     weights: tuple[float, ...]  # SSIM's window along one axis, unit sum
-    values: Any  # y, display space; row order
-    means: Any  # B y; column order
-    mean_squares: Any  # B y^2; column order
+    values: Float  # y, display space; row order
+    means: Float  # B y; column order
+    mean_squares: Float  # B y^2; column order
 
     @property
-    def image(self) -> Any:
+    def image(self) -> TensorXf:
         """The photograph, (H, W, 3) tensor, display space."""
         flat = _tiling(self).from_tiles(self.values)
         return types_of(type(flat)).TensorXf(flat, (self.height, self.width, _CHANNELS))
 
 
-def prepare_target(image: Any, window: int = 11, sigma: float = 1.5) -> Target:
+def prepare_target(image: TensorXf, window: int = 11, sigma: float = 1.5) -> Target:
     """Return the :class:`Target` of a photograph.
 
     image: (H, W, 3) tensor, display space. window: width of SSIM's Gaussian window, px, odd.
@@ -85,16 +86,17 @@ class Loss:
     @classmethod
     def from_config(cls, config: FitConfig, section: Any) -> Loss:
         """Return the loss of a fit; section: see ``TrainingEffect.from_config``."""
-        return cls() if section is None else cls(section)
+        make = cast("Callable[..., Loss]", cls)
+        return make() if section is None else make(section)
 
-    def __call__(self, image: Any, target: Target) -> Any:
+    def __call__(self, image: TensorXf, target: Target) -> Float:
         """Return the loss, a ``Float`` of one value; image: (H, W, 3) tensor, display space.
 
         ``target.image`` is the photograph. Differentiated in the image.
         """
         raise NotImplementedError
 
-    def with_squared_error(self, image: Any, target: Target) -> tuple[Any, Any]:
+    def with_squared_error(self, image: TensorXf, target: Target) -> tuple[Float, Float]:
         """Return the loss, and the mean over pixels and channels of (x - y)^2: Floats of one value.
 
         Not differentiated: the squared error.
@@ -109,12 +111,13 @@ class LossTerm:
     @classmethod
     def from_config(cls, config: FitConfig, section: Any) -> LossTerm:
         """Return the term of a fit; section: see ``TrainingEffect.from_config``."""
-        return cls() if section is None else cls(section)
+        make = cast("Callable[..., LossTerm]", cls)
+        return make() if section is None else make(section)
 
-    def of_image(self, image: Any, target: Target) -> Any:
+    def of_image(self, image: TensorXf, target: Target) -> Float | None:
         """Return a ``Float`` of one value, or None; see :class:`Loss` for the arguments."""
 
-    def of_gaussians(self, parameters: Mapping[str, Any], num_rows: int) -> Any:
+    def of_gaussians(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Float | None:
         """Return a ``Float`` of one value, or None.
 
         parameters: raw values by name, attached, of ``num_rows`` Gaussians in all. If several
@@ -147,12 +150,10 @@ class PhotometricLoss(Loss):
                 f"PhotometricLoss(): dssim_weight must be in [0, 1], got {self.dssim_weight}"
             )
 
-    def __call__(self, image: Any, target: Target) -> Any:
-        """Return the loss: see :class:`Loss`."""
+    def __call__(self, image: TensorXf, target: Target) -> Float:
         return self.with_squared_error(image, target)[0]
 
-    def with_squared_error(self, image: Any, target: Target) -> tuple[Any, Any]:
-        """Return the loss, and the mean of (x - y)^2: see :meth:`Loss.with_squared_error`."""
+    def with_squared_error(self, image: TensorXf, target: Target) -> tuple[Float, Float]:
         height, width = _film_size("PhotometricLoss()", image)
         if (height, width) != (target.height, target.width):
             raise ValueError(
@@ -179,7 +180,7 @@ def make_loss_terms(config: FitConfig) -> list[LossTerm]:
     return [each.value.from_config(config, section_of(each, config.extensions)) for each in used]
 
 
-def l1_loss(image: Any, target: Any) -> Any:
+def l1_loss(image: TensorXf, target: TensorXf) -> Float:
     """Return mean |x - y| of two tensors of equal shape as a ``Float`` of one value.
 
     The derivative at x = y is taken as 0. Not differentiated: the target.
@@ -191,7 +192,7 @@ def l1_loss(image: Any, target: Any) -> Any:
 class _PhotometricOp(dr.CustomOp):
     """Evaluates the loss and SSIM's partials by two blur passes, the gradient by two more."""
 
-    def eval(self, image: Any, target: Target, weight: float) -> tuple[Any, Any]:
+    def eval(self, image: TensorXf, target: Target, weight: float) -> tuple[Float, Float]:
         self.target, self.weight, self.shape = target, weight, image.shape
         self.tiling = _tiling(target)
         self.values = self.tiling.to_tiles(image.array)
@@ -201,40 +202,44 @@ class _PhotometricOp(dr.CustomOp):
         count = self.tiling.num_values
         return dr.sum(loss) / count, dr.sum(squared) / count
 
-    def gradient(self) -> Any:
+    def gradient(self) -> Float:
         """Return d loss / d image, flat, row-major."""
         blurred = _blur_partials_down_columns(self.tiling, self.partials)
         tiles = _assemble_gradient(self.tiling, blurred, self.values, self.target, self.weight)
         return self.tiling.from_tiles(tiles)
 
     def backward(self) -> None:
-        flat = self.gradient() * self.grad_out()[0]
+        d_loss, _ = cast("tuple[Float, Float]", self.grad_out())
+        flat = self.gradient() * d_loss
         self.set_grad_in("image", types_of(type(flat)).TensorXf(flat, self.shape))
 
     def forward(self) -> None:
-        tangent = dr.sum(self.gradient() * self.grad_in("image").array)
+        tangent = dr.sum(self.gradient() * cast(TensorXf, self.grad_in("image")).array)
         self.set_grad_out((tangent, dr.zeros(type(tangent))))
 
     def name(self) -> str:
         return "PhotometricLoss"
 
 
-def _blur_along_rows(tiling: _Tiling, values: Any, target: Target) -> tuple[list[Any], Any, Any]:
+def _blur_along_rows(
+    tiling: _Tiling, values: Float, target: Target
+) -> tuple[list[Float], Float, Float]:
     """Pass 1: x, x^2 and xy blurred along rows, column order; each row's |x - y| and (x - y)^2."""
     rows = tiling.rows
     x, y = rows.read(values), rows.read(target.values)
     maps = (x, _product(x, x), _product(x, y))
     blurred = [rows.store_across(_blur(z, tiling.weights)) for z in maps]
     differences = [x[k] - y[k] for k in range(_TILE)]  # beyond the image both are 0
-    absolute = sum(map(dr.abs, differences))
-    squared = sum(map(dr.square, differences))
+    zero = type(values)(0)
+    absolute = sum(map(dr.abs, differences), zero)
+    squared = sum(map(dr.square, differences), zero)
     dr.eval(blurred, absolute, squared)
     return blurred, absolute, squared
 
 
 def _ssim_and_partials(
-    tiling: _Tiling, maps: list[Any], absolute: Any, target: Target, weight: float
-) -> tuple[Any, list[Any]]:
+    tiling: _Tiling, maps: list[Float], absolute: Float, target: Target, weight: float
+) -> tuple[Float, list[Float]]:
     """Pass 2: each line's share of the loss, and dS/dmu_x, dS/dE[x^2], dS/dE[xy], column order.
 
     With mu = E[.] the windowed means, var and cov from E[x^2] - mu^2 and so on,
@@ -270,7 +275,7 @@ def _ssim_and_partials(
     return loss, stored
 
 
-def _blur_partials_down_columns(tiling: _Tiling, partials: list[Any]) -> list[Any]:
+def _blur_partials_down_columns(tiling: _Tiling, partials: list[Float]) -> list[Float]:
     """Pass 3: the partials blurred along columns, row order."""
     columns = tiling.columns
     blurred = [columns.store_across(_blur(columns.read(z), tiling.weights)) for z in partials]
@@ -279,8 +284,8 @@ def _blur_partials_down_columns(tiling: _Tiling, partials: list[Any]) -> list[An
 
 
 def _assemble_gradient(
-    tiling: _Tiling, partials: list[Any], values: Any, target: Target, weight: float
-) -> Any:
+    tiling: _Tiling, partials: list[Float], values: Float, target: Target, weight: float
+) -> Float:
     """Pass 4: d loss / d image, row order.
 
     The windowed means are linear in x, x^2 and xy, and the blur B is its own adjoint:
@@ -297,13 +302,13 @@ def _assemble_gradient(
     return rows.store(gradient)
 
 
-def _variance(mean: Any, mean_square: Any) -> Any:
+def _variance(mean: Float, mean_square: Float) -> Float:
     """Return E[x^2] - E[x]^2, which only rounding can make negative (it would, for x >> 1)."""
     variance = mean_square - mean * mean
     return dr.select(variance < 0, 0, variance)
 
 
-def _sign(x: Any) -> Any:
+def _sign(x: Float) -> Float:
     return dr.select(x > 0, 1, dr.select(x < 0, -1, type(x)(0)))
 
 
@@ -341,7 +346,7 @@ class _Tiling:
         """Rows (or columns) of all tiles of all channels."""
         return _CHANNELS * math.prod(self.grid) * _TILE
 
-    def to_tiles(self, flat: Any) -> Any:
+    def to_tiles(self, flat: Float) -> Float:
         """Bring a row-major (H, W, 3) image into tiles, row order; one lane a row, all channels."""
         lines = self.num_lines // _CHANNELS
         lane = dr.arange(self.index_type, lines)
@@ -358,7 +363,7 @@ class _Tiling:
             _store_packets(tiles, values, lane + channel * lines)
         return tiles
 
-    def from_tiles(self, tiles: Any) -> Any:
+    def from_tiles(self, tiles: Float) -> Float:
         """Bring tiles in row order back to a row-major (H, W, 3) image, not evaluated."""
         index = dr.arange(self.index_type, self.num_values)
         pixel, channel = index // _CHANNELS, index % _CHANNELS
@@ -367,7 +372,7 @@ class _Tiling:
         tile = (channel * rows + row // _TILE) * columns + column // _TILE
         return dr.gather(type(tiles), tiles, (tile * _TILE + row % _TILE) * _TILE + column % _TILE)
 
-    def split(self, tile: Any) -> tuple[Any, Any, Any]:
+    def split(self, tile: UInt32) -> tuple[UInt32, UInt32, UInt32]:
         """Channel, tile row and tile column of a tile's index."""
         rows, columns = self.grid
         strip = tile // columns
@@ -375,12 +380,12 @@ class _Tiling:
 
     @property
     def rows(self) -> _Lines:
-        """One lane a tile row."""
+        """Lanes of tile rows."""
         return _Lines(self, stride=1, axis=1)
 
     @property
     def columns(self) -> _Lines:
-        """One lane a tile column."""
+        """Lanes of tile columns."""
         return _Lines(self, stride=self.grid[1], axis=0)
 
 
@@ -393,10 +398,10 @@ class _Lines:
     stride: int  # from a tile to the next one along a line
 
     @property
-    def lane(self) -> Any:
+    def lane(self) -> UInt32:
         return dr.arange(self.tiling.index_type, self.tiling.num_lines)
 
-    def inside(self, k: int) -> Any:
+    def inside(self, k: int) -> Bool:
         """Return whether the line's k-th pixel belongs to the image."""
         line, (_, *tile) = self.lane % _TILE, self.tiling.split(self.lane // _TILE)
         along = tile[self.axis] * _TILE + k
@@ -404,11 +409,11 @@ class _Lines:
         size = self.tiling.height, self.tiling.width
         return (along < size[self.axis]) & (across < size[1 - self.axis])
 
-    def read_own(self, values: Any) -> Any:
+    def read_own(self, values: Float) -> ArrayXf:
         """Return the line's own 8 values; ``values`` contiguous along lines."""
         return self._read_packet(values, self.lane, True)
 
-    def read(self, values: Any) -> dict[int, Any]:
+    def read(self, values: Float) -> dict[int, Float]:
         """Return the inputs of the line's 8 outputs, over ``tiling.support``; 0 beyond the tiles.
 
         values: contiguous along lines.
@@ -416,13 +421,13 @@ class _Lines:
         packets = [self._read_packet(values, *self._neighbour(step)) for step in (-1, 0, 1)]
         return {k: packets[1 + k // _TILE][k % _TILE] for k in self.tiling.support}
 
-    def store(self, values: list[Any]) -> Any:
+    def store(self, values: list[Float]) -> Float:
         """Store each line's 8 values, contiguous along lines."""
         flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
         _store_packets(flat, values, self.lane)
         return flat
 
-    def store_across(self, values: list[Any]) -> Any:
+    def store_across(self, values: list[Float]) -> Float:
         """Store them contiguous across lines: rows in column order, columns in row order."""
         flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
         line = self.lane % _TILE
@@ -431,11 +436,11 @@ class _Lines:
             dr.scatter(flat, value, first + k * _TILE, mode=dr.ReduceMode.NoConflicts)
         return flat
 
-    def _read_packet(self, values: Any, line: Any, valid: Any) -> Any:
+    def _read_packet(self, values: Float, line: UInt32, valid: Bool | bool) -> ArrayXf:
         shape = (_TILE, self.tiling.num_lines)
         return dr.gather(_packet_type(type(values)), values, line, valid, shape=shape)
 
-    def _neighbour(self, step: int) -> tuple[Any, Any]:
+    def _neighbour(self, step: int) -> tuple[UInt32, Bool | bool]:
         """Return the same line in the tile ``step`` further along it, and whether there is one."""
         coordinate = self.tiling.split(self.lane // _TILE)[1 + self.axis]
         if step < 0:
@@ -445,7 +450,7 @@ class _Lines:
         return self.lane, True
 
 
-def _store_packets(flat: Any, values: list[Any], index: Any) -> None:
+def _store_packets(flat: Float, values: list[Float], index: UInt32) -> None:
     """Store 8 values a lane as packet ``index`` of an array, which no other lane fills.
 
     ``NoConflicts`` lets several stores into one array share a kernel.
@@ -453,11 +458,11 @@ def _store_packets(flat: Any, values: list[Any], index: Any) -> None:
     dr.scatter(flat, _packet_type(type(flat))(values), index, mode=dr.ReduceMode.NoConflicts)
 
 
-def _product(x: dict[int, Any], y: dict[int, Any]) -> dict[int, Any]:
+def _product(x: dict[int, Float], y: dict[int, Float]) -> dict[int, Float]:
     return {k: x[k] * y[k] for k in x}
 
 
-def _blur(values: dict[int, Any], weights: tuple[float, ...]) -> list[Any]:
+def _blur(values: dict[int, Float], weights: tuple[float, ...]) -> list[Float]:
     """Return a blurred map at the line's 8 pixels, from its values over ``tiling.support``."""
     radius = len(weights) // 2
     blurred = []
@@ -492,7 +497,7 @@ def _packet_type(float_type: type) -> type:
     return getattr(sys.modules[float_type.__module__], name)
 
 
-def _film_size(where: str, image: Any) -> tuple[int, int]:
+def _film_size(where: str, image: TensorXf) -> tuple[int, int]:
     shape = tuple(image.shape)
     if len(shape) != 3 or shape[2] != _CHANNELS or 0 in shape:
         raise ValueError(

@@ -25,23 +25,23 @@ from drgs.splatting.reduction import BAND_SLOTS
 from drgs.training.density.registry import density_strategy
 
 PROCESS_BYTES = 290_000_000
-"""Of interpreter, libraries, compiled kernels, and results."""
+"""Memory of interpreter, libraries, compiled kernels, and results."""
 
 NUMBER_BYTES, GAUSSIAN_BYTES, GROWTH_BYTES = 28, 100, 500
-"""Of each number of a Gaussian: itself, its gradient, two moments, and one successor at a time. Of
-each Gaussian besides: its splat, and derivatives. And more where the population changes: rows are
-copied, and arrays of sizes that will not come again are held a while."""
+"""Memory of each number of a Gaussian: itself, its gradient, two moments, and one successor at a
+time. Memory of each Gaussian besides: its splat, and derivatives. And more where the population
+changes: rows are copied, and arrays of sizes that will not come again are held a while."""
 
 ENTRY_BYTES, SLOT_BYTES = 150, 36
-"""Of each (splat, tile) entry; of each composited (entry, micro-tile) pair of a band."""
+"""Memory of each (splat, tile) entry; of each composited (entry, micro-tile) pair of a band."""
 
 PIXEL_BYTES, MEASURED_BYTES = 155, 130
-"""Of each pixel that is rendered; of each pixel of a test view that is measured."""
+"""Memory of each pixel that is rendered; of each pixel of a test view that is measured."""
 
 FITTED_REACH = 0.55
-"""Of fitted Gaussians, in units of the root of (pixels per Gaussian): N Gaussians in P pixels have
-about N (1 + FITTED_REACH sqrt(P / N))^2 entries. Counted in fits of the shipped scene with 23,000
-and 114,000 Gaussians at 200 to 800 px: 0.42 to 0.57."""
+"""Reach of fitted Gaussians, in units of the root of (pixels per Gaussian): N Gaussians in P pixels
+have about N (1 + FITTED_REACH sqrt(P / N))^2 entries. Counted in fits of the shipped scene with
+23,000 and 114,000 Gaussians at 200 to 800 px: 0.42 to 0.57."""
 
 FITTED_SLOTS = 2.7
 """Slots of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits."""
@@ -53,7 +53,7 @@ MAX_RADIUS_PX = 1e6
 """A larger radius covers any film."""
 
 USABLE_SHARE = 0.9
-"""Of the memory that is available: estimates are about so exact."""
+"""Share of the available memory that is used: estimates are about so exact."""
 
 MIN_WIDTH_PX = 16
 """No smaller images are advised."""

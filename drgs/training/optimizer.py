@@ -14,18 +14,30 @@ are left alone. A parameter of zero size, ``shN`` at degree 0, cannot be registe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-from drjit.opt import Adam
+from drjit.opt import Adam, LearningRate
 
-from drgs.core.arrays import types_of
+from drgs.core.arrays import Array, types_of
 from drgs.core.private import new_rate_cache, same_memory
+from drgs.core.types import UInt32
 
-LARGE = 1 << 20
+if TYPE_CHECKING:
+    from drjit.opt import _LRCache
+
+AdamState = tuple[
+    dr.ArrayBase,
+    bool,
+    LearningRate | None,
+    tuple[int, dr.ArrayBase, dr.ArrayBase, dr.ArrayBase | None],
+]
+"""The optimizer's entry of a parameter: ``(value, promoted, rate, (t, m, v, v_max))``."""
+
+LARGE_WIDTH = 1 << 20
 """Entries of an array from which on memory is worth saving."""
 
 
@@ -37,17 +49,17 @@ class _Moments:
     moments do. The former ones are therefore read under a name that Dr.Jit takes for other memory.
     """
 
-    arrays: list[Any]  # as in the optimizer's state
-    indices: list[int]  # of the arrays: an array has another one if it was assigned to
-    former: list[Any]  # of the same memory
+    arrays: Sequence[dr.ArrayBase]  # as in the optimizer's state
+    indices: Sequence[int]  # of the arrays: an array has another one if it was assigned to
+    former: tuple[dr.ArrayBase, dr.ArrayBase]  # of the same memory
 
     @staticmethod
-    def from_arrays(arrays: list[Any]) -> _Moments:
+    def from_arrays(first: dr.ArrayBase, second: dr.ArrayBase) -> _Moments:
         """Wait for the device, and take other names for the memory of arrays."""
-        former = [same_memory(array) for array in arrays]
-        return _Moments(arrays, [array.index for array in arrays], former)
+        former = same_memory(first), same_memory(second)
+        return _Moments((first, second), (first.index, second.index), former)
 
-    def are(self, arrays: list[Any]) -> bool:
+    def match(self, *arrays: dr.ArrayBase) -> bool:
         """Return whether these are the moments still."""
         pairs = zip(self.arrays, self.indices, arrays, strict=True)
         return all(own is array and index == array.index for own, index, array in pairs)
@@ -63,11 +75,17 @@ class LeanAdam(Adam):
     """
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
-        """For the arguments see ``drjit.opt.Adam``."""
+        """Take the arguments of ``drjit.opt.Adam``."""
         super().__init__(*arguments, **settings)
         self._moments: dict[str, _Moments] = {}
 
-    def step(self, *, eval: bool = True, grad_scale: Any = None, active: Any = None) -> None:
+    def step(
+        self,
+        *,
+        eval: bool = True,
+        grad_scale: LearningRate | None = None,
+        active: dr.ArrayBase | None = None,
+    ) -> None:
         """Take a step, and clear the gradients of large arrays.
 
         Waits for nothing, but in the first step after large moments were assigned. A step that is
@@ -79,42 +97,42 @@ class LeanAdam(Adam):
             super().step(eval=eval, grad_scale=grad_scale, active=active)
             return
         rates = new_rate_cache()
-        dr.eval([self._replaced(key, rates) for key in self.state])
+        dr.eval([self._update(key, rates) for key in self.state])
 
     def forget_moments(self) -> None:
         """Free memory of moments that are the parameters' no longer."""
         self._moments.clear()
 
-    def _replaced(self, key: str, rates: Any) -> list[Any]:
+    def _update(self, key: str, rates: _LRCache) -> list[dr.ArrayBase]:
         """Give a parameter its new state, not evaluated, and return what is to be evaluated."""
-        value, promoted, rate, (count, *moments, _) = self.state[key]
-        is_large = dr.width(value) >= LARGE and dr.backend_v(value) == dr.JitBackend.LLVM
-        former = moments
+        value, promoted, rate, (count, first, second, _) = self.state[key]
+        is_large = dr.width(value) >= LARGE_WIDTH and dr.backend_v(value) == dr.JitBackend.LLVM
+        former = first, second
         if is_large:
             known = self._moments.get(key)
-            if known is None or not known.are(moments):
-                self._moments[key] = known = _Moments.from_arrays(moments)
+            if known is None or not known.match(first, second):
+                self._moments[key] = known = _Moments.from_arrays(first, second)
             former = known.former
         rate_in_use = self.lr if rate is None else rate
         flat, gradient = dr.detach(value).array, value.grad.array
-        new, (count, *new_moments, _) = self._step(
+        new, (count, new_first, new_second, _) = self._step(
             rates, flat, gradient, rate_in_use, (count, *former, None)
         )
         new_value = type(value)(new, value.shape) if dr.is_tensor_v(value) else type(value)(new)
         dr.enable_grad(new_value)
         if not is_large:
-            self.state[key] = new_value, promoted, rate, (count, *new_moments, None)
-            return [*new_moments, new]
+            self.state[key] = new_value, promoted, rate, (count, new_first, new_second, None)
+            return [new_first, new_second, new]
         dr.clear_grad(value)
         element = dr.arange(types_of(type(new)).UInt32, dr.width(new))
-        for moment, new_moment in zip(moments, new_moments, strict=True):
-            dr.scatter(moment, new_moment, element)
-        self.state[key] = new_value, promoted, rate, (count, *moments, None)
+        dr.scatter(first, new_first, element)
+        dr.scatter(second, new_second, element)
+        self.state[key] = new_value, promoted, rate, (count, first, second, None)
         return [new]  # and by the same kernel the moments, which it reads
 
 
 def make_optimizer(
-    parameters: Mapping[str, Any],
+    parameters: Mapping[str, dr.ArrayBase],
     rates: Mapping[str, float],
     prefix: str = "",
     beta_1: float = 0.9,
@@ -153,7 +171,10 @@ def num_rows(optimizer: Adam, prefix: str = "") -> int:
 
 
 def edit_rows(
-    optimizer: LeanAdam, keep: Any, append: Mapping[str, Any] | None = None, prefix: str = ""
+    optimizer: LeanAdam,
+    keep: UInt32,
+    append: Mapping[str, dr.ArrayBase] | None = None,
+    prefix: str = "",
 ) -> None:
     """Keep some rows of every parameter, in the order given, and append new ones.
 
@@ -173,26 +194,26 @@ def edit_rows(
         raise ValueError("edit_rows(): at least one row must remain, but none is kept or appended")
     optimizer.forget_moments()
     for name in _names(optimizer, prefix):
-        value, promoted, rate, (step, *moments) = optimizer.state[prefix + name]
+        value, promoted, rate, (step, first, second, _) = optimizer.state[prefix + name]
         row_shape = tuple(value.shape[1:])
         width = math.prod(row_shape)
         elements = _elements(keep, width)
-        new_rows = dr.detach(append[name]).array if added else None
-        no_moments = dr.zeros(type(new_rows), added * width) if added else None
+        new_rows = no_moments = None
+        if append is not None and added > 0:
+            new_rows = dr.detach(append[name]).array
+            no_moments = dr.zeros(type(new_rows), added * width)
 
         flat = _gather_and_append(dr.detach(value).array, elements, new_rows)
-        moments = [
-            None if m is None else _gather_and_append(m, elements, no_moments) for m in moments
-        ]
+        first, second = (_gather_and_append(m, elements, no_moments) for m in (first, second))
         if dr.is_tensor_v(value):
             flat = type(value)(flat, (dr.width(flat) // width, *row_shape))
         dr.enable_grad(flat)
-        dr.schedule(flat, moments)
-        optimizer.state[prefix + name] = flat, promoted, rate, (step, *moments)
+        dr.schedule(flat, first, second)
+        optimizer.state[prefix + name] = flat, promoted, rate, (step, first, second, None)
     dr.eval()
 
 
-def take_rows(optimizer: Adam, rows: Any, prefix: str = "") -> dict[str, Any]:
+def take_rows(optimizer: Adam, rows: UInt32, prefix: str = "") -> dict[str, dr.ArrayBase]:
     """Return copies of some rows of every parameter by name, detached; rows: (M,) ``UInt32``."""
     result = {}
     for name in _names(optimizer, prefix):
@@ -205,20 +226,20 @@ def take_rows(optimizer: Adam, rows: Any, prefix: str = "") -> dict[str, Any]:
     return result
 
 
-def replace_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
+def replace_values(optimizer: Adam, name: str, value: dr.ArrayBase, prefix: str = "") -> None:
     """Give a parameter new values of the same shape, and moments of zero.
 
     The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
     correction does not start again.
     """
-    value, promoted, rate, (step, *moments) = _with_value(
+    new, promoted, rate, (step, first, second, _) = _with_value(
         "replace_values", optimizer, prefix + name, value
     )
-    moments = [None if m is None else dr.opaque(type(m), 0, m.shape) for m in moments]
-    optimizer.state[prefix + name] = value, promoted, rate, (step, *moments)
+    first, second = (dr.opaque(type(m), 0, m.shape) for m in (first, second))
+    optimizer.state[prefix + name] = new, promoted, rate, (step, first, second, None)
 
 
-def set_values(optimizer: Adam, name: str, value: Any, prefix: str = "") -> None:
+def set_values(optimizer: Adam, name: str, value: dr.ArrayBase, prefix: str = "") -> None:
     """Give a parameter new values of the same shape; moments, step count and rate stay.
 
     Detached; waits for nothing.
@@ -266,9 +287,9 @@ def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: 
         optimizer.state[prefix + name] = value, promoted, rate, extra
 
 
-def _with_value(caller: str, optimizer: Adam, key: str, value: Any) -> tuple[Any, ...]:
+def _with_value(caller: str, optimizer: Adam, key: str, value: dr.ArrayBase) -> AdamState:
     """Return the optimizer's entry of a parameter with other values, which are evaluated."""
-    old, *others = optimizer.state[key]
+    old, promoted, rate, extra = optimizer.state[key]
     if tuple(value.shape) != tuple(old.shape):
         raise ValueError(
             f"{caller}(): {key} has shape {tuple(old.shape)}, the new values "
@@ -277,7 +298,7 @@ def _with_value(caller: str, optimizer: Adam, key: str, value: Any) -> tuple[Any
     value = type(old)(dr.detach(value))
     dr.make_opaque(value)
     dr.enable_grad(value)
-    return value, *others
+    return value, promoted, rate, extra
 
 
 def _names(optimizer: Adam, prefix: str) -> list[str]:
@@ -285,7 +306,7 @@ def _names(optimizer: Adam, prefix: str) -> list[str]:
     return [key[len(prefix) :] for key in optimizer.state if key.startswith(prefix)]
 
 
-def _num_appended(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) -> int:
+def _num_appended(optimizer: Adam, rows: Mapping[str, dr.ArrayBase] | None, prefix: str) -> int:
     """Return the number of ``rows``, which must be given for every parameter in its shape."""
     if rows is None:
         return 0
@@ -300,7 +321,7 @@ def _num_appended(optimizer: Adam, rows: Mapping[str, Any] | None, prefix: str) 
     return count
 
 
-def _elements(rows: Any, width: int) -> Any:
+def _elements(rows: UInt32, width: int) -> UInt32:
     """Return the places of ``rows`` in a flat row-major array of ``width`` columns."""
     if dr.width(rows) == 0:
         return rows  # Dr.Jit does not compute with empty arrays
@@ -308,7 +329,7 @@ def _elements(rows: Any, width: int) -> Any:
     return dr.gather(type(rows), rows, element // width) * width + element % width
 
 
-def _gather_and_append(flat: Any, elements: Any, added: Any | None) -> Any:
+def _gather_and_append(flat: Array, elements: UInt32, added: Array | None) -> Array:
     kept = dr.gather(type(flat), flat, elements)
     if added is None:
         return kept

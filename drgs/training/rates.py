@@ -75,8 +75,10 @@ def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
     optimizer, others = config.optimizer, learning_rates(config.optimizer, extent)
     others.pop("means")
     longer = math.sqrt(optimizer.views_per_step)
-    ends = (longer * rate * extent for rate in (optimizer.means_lr, optimizer.means_lr_final))
-    means = ExponentialDecay(*ends, tuple(_rate_aims(config)))
+    first, last = (
+        longer * rate * extent for rate in (optimizer.means_lr, optimizer.means_lr_final)
+    )
+    means = ExponentialDecay(first, last, tuple(_rate_aims(config)))
     return LearningRates(means, others, optimizer.decay, optimizer.decay_from)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
@@ -34,7 +34,7 @@ from drgs.initialization.start import description_of_start, gaussians_at, start_
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import described
 from drgs.results.history import HistoryRow
-from drgs.training.budget import Budget, Deadline, Plan, plan_fit, rehearse
+from drgs.training.budget import Budget, Deadline, FitObjects, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.effects.base import TrainingEffect
@@ -80,7 +80,7 @@ class ProgressLine:
 
 @dataclass(eq=False)
 class FitSession:
-    """One fit, by one process or several, which all run the same session.
+    """A fit, by one process or several, which all run the same session.
 
     Rank 0 alone has a configuration, a folder and a terminal, and decides when to stop.
     """
@@ -104,9 +104,15 @@ class FitSession:
     _fingerprint: Fingerprint | None = field(init=False, default=None)
 
     @property
-    def _objects(self) -> dict[str, Any]:
+    def _objects(self) -> FitObjects:
         """The objects that take part, as arguments of :class:`Trainer`."""
         return {"density": self.strategy, "effects": self.effects, "loss": self.loss}
+
+    @property
+    def _inputs(self) -> tuple[FitConfig, Dataset]:
+        """Configuration and dataset: of rank 0, once they are loaded; later of each rank."""
+        assert self.config is not None and self.dataset is not None, "they are loaded"
+        return self.config, self.dataset
 
     def _print(self, text: str) -> None:
         if self.uses_terminal:
@@ -120,7 +126,7 @@ class FitSession:
                 return True
             plan = self.prepare()
             if folder is not None:
-                folder.take(self.config, self.dataset)
+                folder.take(*self._inputs)
             if plan is not None:
                 self._follow(plan)
             self.on_start(self)
@@ -134,11 +140,18 @@ class FitSession:
         return True
 
     def _is_finished(self) -> bool:
-        finished = self.folder is not None and self.folder.is_finished(self.config)
-        if finished:
-            self.folder.finish()  # a process that was killed after its last file has not
-            self._print(f"{self.folder.path}: this fit is finished; --overwrite does it again")
-        return bool(self.comm.of_root(finished))
+        finished, folder = False, self.folder
+        if folder is not None:
+            finished = folder.is_finished(self._given_config)
+            if finished:
+                folder.finish()  # a process that was killed after its last file has not
+                self._print(f"{folder.path}: this fit is finished; --overwrite does it again")
+        return bool(self.comm.broadcast_numbers(finished))
+
+    @property
+    def _given_config(self) -> FitConfig:
+        assert self.config is not None, "rank 0 has one"
+        return self.config
 
     def prepare(self) -> Plan | None:
         """Load the data, initialize the Gaussians, make the trainer; return the plan, if any.
@@ -154,38 +167,38 @@ class FitSession:
             gaussians = self._initial_gaussians()
         gaussians = share_gaussians(comm, gaussians)
         if self.budget is not None:
-            plan = self._plan(gaussians)
+            plan = self._plan(gaussians, self.budget)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
         self.trainer = Trainer(self.config, self.dataset, gaussians, comm, **self._objects)
         self.history = History()  # whose clock begins
-        if comm.of_root(checkpoint is not None):
+        if comm.broadcast_numbers(checkpoint is not None):
             self._restore(checkpoint)
         return plan
 
     def _load(self) -> Checkpoint | None:
         """Load the dataset and complete the configuration; return the checkpoint, if any."""
-        folder, checkpoint = self.folder, None
+        folder, config, checkpoint = self.folder, self._given_config, None
         if folder is not None:
-            checkpoint = folder.checkpoint_for(self.config, self.budget is not None)
-        config = self.config if checkpoint is None else checkpoint.config
+            checkpoint = folder.checkpoint_for(config, self.budget is not None)
+        if checkpoint is not None and checkpoint.config is not None:
+            config = checkpoint.config
         if self.dataset is None:
             self.dataset = load_dataset(config.data_for_training, sections=config.extensions)
         if folder is not None:
             self._fingerprint = fingerprint_of(self.dataset)
-        if checkpoint is not None:
-            before = checkpoint.data
-            check_same_data(folder.path, config.data.path, before, self._fingerprint)
+            if checkpoint is not None:
+                now = self._fingerprint
+                check_same_data(folder.path, config.data.path, checkpoint.data, now)
         self.config = resolve_defaults(config, self.dataset)
         return checkpoint
 
-    def _plan(self, gaussians: Gaussians) -> Plan | None:
+    def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
-        inputs = self.config, self.dataset, gaussians, self.comm
-        rehearsal = rehearse(*inputs, **self._objects)
+        rehearsal = rehearse(self.config, self.dataset, gaussians, self.comm, **self._objects)
         rehearsal.trainer.full_scene()  # gathered from all ranks
         if not self.comm.is_root:
             return None
-        plan = plan_fit(self.config, self.dataset, gaussians, self.budget.end, rehearsal)
+        plan = plan_fit(*self._inputs, gaussians, budget.end, rehearsal)
         self.config = plan.config
         self._print(plan.reasons)
         return plan
@@ -193,7 +206,7 @@ class FitSession:
     def _follow(self, plan: Plan) -> None:
         """End the fit when the time of its plan is up."""
         self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
-        if self.folder is not None:
+        if self.folder is not None and self.budget is not None:
             self.folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
 
     def _initial_gaussians(self) -> Gaussians:
@@ -201,7 +214,7 @@ class FitSession:
 
         Raises ``UserError`` for lenses that the projection cannot render.
         """
-        config, dataset = self.config, self.dataset
+        config, dataset = self._inputs
         self._print(dataset.description)
         self._print(
             f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
@@ -218,7 +231,7 @@ class FitSession:
     def _restore(self, checkpoint: Checkpoint | None) -> None:
         """Continue from the checkpoint of rank 0."""
         start, state = self.trainer.state(), {}
-        if checkpoint is not None:
+        if checkpoint is not None and self.folder is not None:
             check_fits(self.folder.path, checkpoint, start)
             past = checkpoint.history, checkpoint.density, checkpoint.wall_s
             state, self.history = checkpoint.trainer, History.from_arrays(*past)
@@ -234,7 +247,7 @@ class FitSession:
         trainer, comm = self.trainer, self.comm
         criterion, stop = RootDecides(self.criterion, comm), StopRequest()
         with ExitStack() as blocks:
-            observers: list[Observer] = [HeldOutQuality(self.dataset.test), *self.observers]
+            observers: list[Observer] = [HeldOutQuality(trainer.dataset.test), *self.observers]
             if self.uses_terminal:
                 total = criterion.num_iterations(trainer)
                 progress = RunProgress("iteration", total, trainer.iteration)
@@ -244,7 +257,7 @@ class FitSession:
                 self.check_ranges()
                 for observer in observers:
                     observer.after(trainer, self.history, done, lambda: stop.requested)
-                stops = bool(comm.of_root(stop.requested))
+                stops = bool(comm.broadcast_numbers(stop.requested))
                 if stops or self._is_checkpoint_due(done):
                     self._save_checkpoint()
                 if stops:
@@ -257,7 +270,7 @@ class FitSession:
 
     def _save_checkpoint(self) -> None:
         state, history = self.trainer.state(), self.history
-        if self.folder is not None:
+        if self.folder is not None and self._fingerprint is not None:
             past = *history.arrays(), history.wall_s
             checkpoint = Checkpoint(state, *past, self._fingerprint)
             save_checkpoint(self.folder.path, self.trainer.config, checkpoint)

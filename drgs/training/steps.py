@@ -11,22 +11,25 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from drgs.config.schema import FitConfig
+from drgs.core.arrays import Array
+from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.datasets.images import smaller_view
 from drgs.datasets.types import View
 from drgs.integrator.scene import make_sensors
+from drgs.integrator.types import SplatsIntegrator
 from drgs.training.effects.base import TrainingEffect, as_tensor
 from drgs.training.losses import TARGET_BYTES, Target, prepare_target
 from drgs.training.rates import LearningRates
 from drgs.training.views import TrainingView
 
 KEPT_BYTES = 1 << 30
-"""Of targets and effects' uploads that stay on the device until their view is drawn again: of 180
-images of 400 x 400 px. Without room, they are made anew, in a tenth of an iteration."""
+"""Memory of targets and effects' uploads that stay on the device until their view is drawn again:
+those of 180 images of 400 x 400 px. Without room, they are made anew, which takes a tenth of an
+iteration."""
 
 
 @dataclass(eq=False)
@@ -126,7 +129,7 @@ class Step:
 
     @property
     def last(self) -> int:
-        """Its last iteration."""
+        """The last iteration."""
         return self.iterations[-1]
 
 
@@ -186,28 +189,28 @@ def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) 
 class ViewGradients:
     """The backward pass of one view; N are the rows that this process has."""
 
-    means2d_grad: Any  # Array2f or tensor (N, 2): derivative of the step's loss, per px
-    visible: Any  # Bool (N,): the splat's extent touches the film
-    weighted_sums: Mapping[str, Any]  # Float (N,), by name: see DensityStrategy.pixel_weights
-    first_fault: Any  # UInt32 (1,): see drgs.splatting.rendering.decode_fault
+    means2d_grad: Array2f | TensorXf  # (N, 2): derivative of the step's loss, per px
+    visible: Bool  # (N,): the splat's extent touches the film
+    weighted_sums: Mapping[str, Float]  # (N,), by name: see DensityStrategy.pixel_weights
+    first_fault: UInt32  # (1,): see drgs.splatting.rendering.decode_fault
 
 
 @dataclass(frozen=True)
 class ViewLoss:
     """Loss and error of the view of an iteration."""
 
-    loss: Any  # one entry
-    squared_error: Any  # one entry: mean over pixels and channels
+    loss: Float  # one entry
+    squared_error: Float  # one entry: mean over pixels and channels
     counted: float  # share of the pixels that count
 
 
 class WholeGradients:
     """Steps of one view: see :class:`drgs.training.parallel.exchange.ViewExchange`."""
 
-    def __init__(self, integrator: Any) -> None:
+    def __init__(self, integrator: SplatsIntegrator) -> None:
         self.integrator = integrator
         self._views: Sequence[StepView] = ()
-        self._sums: Mapping[str, Any] = {}
+        self._sums: Mapping[str, Float] = {}
 
     def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
         self._views = views
@@ -215,7 +218,7 @@ class WholeGradients:
     def own_views(self) -> Sequence[StepView]:
         return self._views
 
-    def end_view(self, weights: Mapping[str, Any]) -> None:
+    def end_view(self, weights: Mapping[str, Float]) -> None:
         last = self.integrator.last
         self._sums = {name: last.weighted_sums(plane) for name, plane in weights.items()}
 
@@ -226,5 +229,5 @@ class WholeGradients:
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
         return list(losses.values())
 
-    def share(self, view: StepView, value: Any) -> Any:
+    def share(self, view: StepView, value: Array) -> Array:
         return value

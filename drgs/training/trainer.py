@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -19,10 +19,12 @@ import numpy as np
 
 from drgs.config.schema import FitConfig
 from drgs.core.memory import release_unused_memory
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
+from drgs.integrator.types import SplatsIntegrator
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.registry import density_strategy
 from drgs.training.density.strategy import (
@@ -132,7 +134,7 @@ class Trainer:
             dataset.background,
             **integrator_settings(self.effects),
         )
-        self.integrator = self.scene.integrator()
+        self.integrator = cast(SplatsIntegrator, self.scene.integrator())
         self.params = mi.traverse(self.scene)
         self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
         self.optimizer = make_optimizer(
@@ -192,8 +194,8 @@ class Trainer:
         fit = self._fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before(fit, view.view)
-        image = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
-        image, loss, error = self.compare(image, view.view)
+        rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
+        image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
         dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
         self.gradients.end_view(self._weight_planes(view, dr.detach(image)))
         return ViewLoss(dr.detach(loss), error, view.view.counted)
@@ -218,10 +220,10 @@ class Trainer:
         self.gradients.begin(step.views, place)
         return step
 
-    def _differentiate_penalties(self, step: Step) -> list[Any]:
+    def _differentiate_penalties(self, step: Step) -> Sequence[Float | np.ndarray]:
         """Add the derivatives of the strategy's terms of the loss; return the terms."""
 
-        def penalties(parameters: Mapping[str, Any]) -> list[Any]:
+        def penalties(parameters: Mapping[str, dr.ArrayBase]) -> list[Float]:
             count = self.num_gaussians
             terms = [term.of_gaussians(parameters, count) for term in self.terms]
             terms = [term for term in terms if term is not None]
@@ -235,7 +237,7 @@ class Trainer:
             dr.backward(total / weight if weight > 1 else total, flags=flags)
         return self.population.gather_terms(terms, penalties)
 
-    def compare(self, image: Any, view: TrainingView) -> tuple[Any, Any, Any]:
+    def compare(self, image: TensorXf, view: TrainingView) -> tuple[TensorXf, Float, Float]:
         """Return the image as a photograph of the view would be, its loss and squared error."""
         for effect in self.effects:
             image = effect.adjust(image, view)
@@ -247,7 +249,7 @@ class Trainer:
                 loss = loss + term
         return image, loss, error
 
-    def _weight_planes(self, view: StepView, image: Any) -> dict[str, Any]:
+    def _weight_planes(self, view: StepView, image: TensorXf) -> dict[str, Float]:
         """Return the planes by which the strategy weighs what it sees of Gaussians; by name."""
         weights = self._pixel_weights(view.iteration)
         return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
@@ -261,15 +263,18 @@ class Trainer:
         step: Step,
         found: Sequence[ViewGradients],
         losses: Mapping[int, ViewLoss],
-        penalties: Sequence[Any],
+        penalties: Sequence[Float | np.ndarray],
     ) -> list[ViewLoss]:
         """Return the losses of all views with the strategy's terms, and remember to check them."""
         shared, results = self.gradients.share_losses(losses), []
         first_row = self.population.first_row * len(PARAMETER_NAMES)
         for view, gradients, loss in zip(step.views, found, shared, strict=True):
-            total, fault = sum(penalties, loss.loss), gradients.first_fault
+            total = cast(Float, sum(penalties, loss.loss))
+            fault = gradients.first_fault
             if first_row:
-                fault = dr.select(fault == NO_FAULT, fault, fault + dr.opaque(mi.UInt32, first_row))
+                fault = dr.select(
+                    fault == NO_FAULT, fault, fault + dr.opaque(type(fault), first_row)
+                )
             numbers = {
                 f"{effect.name}.{name}": values
                 for effect in self.effects
@@ -331,13 +336,13 @@ class Trainer:
             begins_stage=step.begins_stage,
             rate_decay=self.rates.means(iteration) / self.rates.means.initial,
             integrator=self.integrator,
-            means=self.optimizer[PREFIX + "means"],
+            means=cast(TensorXf, self.optimizer[PREFIX + "means"]),
             views=step.stage.views,
             effects=self.effects,
         )
 
     @property
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, dr.ArrayBase]:
         """Raw values by name, as the optimizer has them: the rows of this process."""
         return {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
 
@@ -388,15 +393,19 @@ class Trainer:
             gaussians, scene = self.gaussians(), None
             if self.comm.is_root:
                 scene = make_scene(gaussians, self.config.model, self.dataset.background)
-                scene.integrator().sh_degree = self.integrator.sh_degree
+                cast(SplatsIntegrator, scene.integrator()).sh_degree = self.integrator.sh_degree
             self._full_scene = self.iteration, scene
         return self._full_scene[1]
 
     def images(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
-        """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
+        """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1].
+
+        All ranks call it; rank 0 alone gets images.
+        """
         for effect in self.effects:
             views = effect.measured(views)
-        return render_views(self.full_scene(), views)
+        scene = self.full_scene()
+        return iter(()) if scene is None else render_views(scene, views)
 
     def sensors(self) -> list[mi.Sensor]:
         """Return the sensors of the training views, where effects have them now."""

@@ -31,7 +31,7 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.parallel.inputs import share_gaussians
 from drgs.training.trainer import Trainer
 
-SHARE, TIME_SHARE = 0.08, 0.12
+ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12
 """Iterations that are added, as a share of the fit's; and their time: late ones take longer."""
 
 RATES = {
@@ -47,7 +47,7 @@ RATES = {
 """High, as few iterations have to do, and those of colours most of all."""
 
 NEGLIGIBLE_RATE = 1e-9
-"""For values that are to stay, where 0 is not a rate."""
+"""Rate of values that are to stay, where 0 is not a rate."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ForViewers:
 
 def num_iterations(config: FitConfig) -> int:
     """Return the number of iterations that are added to those of a fit."""
-    return math.ceil(SHARE * config.iterations)
+    return math.ceil(ITERATIONS_SHARE * config.iterations)
 
 
 def for_viewers(

@@ -1,4 +1,4 @@
-"""One training photograph: its sensor, what is rendered is compared with, and effects' uploads.
+"""A training photograph: its sensor, the target of its rendering, and effects' uploads.
 
 What depends on images is made when an iteration needs it, from what the dataset keeps, and stays on
 the device as long as there is room: see :class:`drgs.training.steps.Stage`.
@@ -26,7 +26,7 @@ class TrainingView:
         index: int,
         sensor: mi.Sensor,
         make_target: Callable[[], Target],
-        makers: Mapping[str, Callable[[], Any]],
+        makers: Mapping[str, Callable[[], object]],
     ) -> None:
         """index: among the training views; makers: by effect, make its upload."""
         self.name, self.width, self.height = view.name, view.width, view.height
@@ -60,11 +60,11 @@ class TrainingView:
 class Uploads(dict[str, Any]):
     """Device arrays of a view by effect, in any PyTree, made when they are needed."""
 
-    def __init__(self, makers: Mapping[str, Callable[[], Any]]) -> None:
+    def __init__(self, makers: Mapping[str, Callable[[], object]]) -> None:
         super().__init__()
         self._makers = makers
 
-    def __missing__(self, effect: str) -> Any:
+    def __missing__(self, effect: str) -> object:
         """Make the upload of an effect."""
         self[effect] = made = self._makers[effect]()
         return made

@@ -36,7 +36,7 @@ def subject():
 
 
 def image_of(subject, **approximations):
-    return accuracy.Renderer.from_rung(
+    return accuracy.RungRenderer.from_rung(
         accuracy.Rung("", approximations), subject, subject.cameras[0]
     ).image()
 
@@ -84,7 +84,7 @@ def test_a_measurement_is_what_its_columns_say(subject):
 
 
 def measurement(name, milliseconds, psnr, is_approximation=True):
-    return accuracy.Measurement(
+    return accuracy.AccuracyMeasurement(
         "scene", name, is_approximation, milliseconds, 2 * milliseconds, 1, psnr, 0.9, 0.1, None
     )
 

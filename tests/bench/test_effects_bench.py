@@ -49,7 +49,7 @@ def test_effects_add_operations_and_lower_degrees_take_some_away(small):
     """Of the kernels of a picture and its derivatives: what the table's last column says."""
     gaussians = scenes.bench_gaussians(150)
     cases = {(c.effect, c.variant): c for c in effects.rendering_cases()}
-    plain = effects.operations(effects.Renderer(cases["none", "none"], gaussians))
+    plain = effects.operations(effects.CaseRenderer(cases["none", "none"], gaussians))
     chosen = [
         ("view dependence", "SH degree 0", False),
         ("background", "environment", True),
@@ -59,7 +59,7 @@ def test_effects_add_operations_and_lower_degrees_take_some_away(small):
         ("camera refinement", "pose and focal lengths", True),
     ]
     for effect, name, adds in chosen:
-        count = effects.operations(effects.Renderer(cases[effect, name], gaussians))
+        count = effects.operations(effects.CaseRenderer(cases[effect, name], gaussians))
         assert (count > plain) == adds and count != plain, (effect, name, count, plain)
 
 
@@ -68,7 +68,7 @@ def test_every_case_is_another_picture(small):
     gaussians = scenes.bench_gaussians(150)
     images = {}
     for case in effects.rendering_cases():
-        image = np.array(effects.Renderer(case, gaussians)._render())
+        image = np.array(effects.CaseRenderer(case, gaussians)._render())
         assert image.shape == (32, 32, 3) and np.isfinite(image).all()
         images[case.effect, case.variant] = image
     plain = images["none", "none"]
@@ -79,14 +79,14 @@ def test_every_case_is_another_picture(small):
 
 def test_a_picture_is_never_reused(small):
     """Each is rendered: the second launches what the first did."""
-    renderer = effects.Renderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
+    renderer = effects.CaseRenderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
     counts = [effects.operations(renderer) for _ in range(2)]
     assert counts[0] == counts[1] > 1000
 
 
 def test_derivatives_do_not_add_up_over_rounds(small):
     cases = {c.effect: c for c in effects.rendering_cases()}
-    renderer = effects.Renderer(cases["camera refinement"], scenes.bench_gaussians(150))
+    renderer = effects.CaseRenderer(cases["camera refinement"], scenes.bench_gaussians(150))
     found = []
     for _ in range(2):
         renderer.both()

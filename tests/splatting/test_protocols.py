@@ -6,9 +6,11 @@ import pytest
 
 from drgs.accuracy import exact, pixel_lists, pixel_order, ray_colors
 from drgs.cameras import (
+    camera,
     distortion,
     fisheye,
     lens,
+    motion,
     orthographic,
     radial_tangential,
     thin_lens,
@@ -37,6 +39,8 @@ CLASSES = {
         thin_prism_fisheye.ThinPrismFisheye,
         orthographic.Orthographic,
     ),
+    camera.Aperture: (thin_lens.RoundAperture,),
+    camera.Shutter: (motion.MotionBlur, motion.RollingShutter),
     distortion.PlaneDistortion: (
         radial_tangential.RadialTangential,
         thin_prism_fisheye.ThinPrismFisheye,

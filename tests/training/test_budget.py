@@ -142,15 +142,15 @@ def test_too_short_a_time_is_refused():
 def test_a_share_of_the_gaussians_is_not_less_than_the_start():
     half = Strategy("x", share=0.5)
     growing = changed(CONFIG, {"densify.budget.gaussians": 400})
-    assert half.applied(growing, 50).densify.budget.gaussians == 200
-    assert half.applied(growing, 300).densify.budget.gaussians == 300
+    assert half.apply(growing, 50).densify.budget.gaussians == 200
+    assert half.apply(growing, 300).densify.budget.gaussians == 300
     capped = changed(growing, {"densify.max_gaussians": 160})
-    assert half.applied(capped, 50).densify.budget.gaussians == 80
+    assert half.apply(capped, 50).densify.budget.gaussians == 80
     mcmc = changed(growing, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600})
-    assert half.applied(mcmc, 50).densify.mcmc.gaussians == 300
+    assert half.apply(mcmc, 50).densify.mcmc.gaussians == 300
     # A hull may have fewer points than were asked for.
     more = changed(mcmc, {"init.num_points": 320})
-    assert half.applied(more, 310).densify.mcmc.gaussians == 320
+    assert half.apply(more, 310).densify.mcmc.gaussians == 320
 
 
 def test_a_share_is_planned_only_where_there_is_a_number():

@@ -12,7 +12,7 @@ from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training import optimizer as optimizer_module
 from drgs.training.optimizer import (
-    LARGE,
+    LARGE_WIDTH,
     edit_rows,
     make_optimizer,
     num_rows,
@@ -80,7 +80,7 @@ def test_make_optimizer_sets_rates_and_leaves_out_empty_parameters():
 def adam_and_ours(num):
     """Both optimizers with the same parameters, whose harmonics are large."""
     values = parameters(num)
-    assert dr.width(values["shN"]) > LARGE > dr.width(values["quats"])
+    assert dr.width(values["shN"]) > LARGE_WIDTH > dr.width(values["quats"])
     plain = Adam(lr=0.0, epsilon=1e-15)
     for name, value in values.items():
         plain[PREFIX + name] = value
@@ -106,8 +106,8 @@ def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
     """Also after they were assigned, and while somebody else holds them."""
     num, key = 25_000, PREFIX + "shN"
     results = []
-    for large in (LARGE, 1 << 40):
-        monkeypatch.setattr(optimizer_module, "LARGE", large)
+    for large in (LARGE_WIDTH, 1 << 40):
+        monkeypatch.setattr(optimizer_module, "LARGE_WIDTH", large)
         optimizer = make_optimizer(parameters(num), RATES, PREFIX)
         step(optimizer, 0, np.arange(num) % 100)
         edit_rows(optimizer, dr.arange(UInt32, num) ^ 1, parameters(7), PREFIX)

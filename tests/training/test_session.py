@@ -108,8 +108,8 @@ def test_other_ranks_end_and_revise_a_fit_as_rank_0_does():
         told.append(numbers)
         return np.array(numbers)
 
-    root = SimpleNamespace(is_root=True, of_root=ask)
-    other = SimpleNamespace(is_root=False, of_root=lambda numbers: np.array(told.pop(0)))
+    root = SimpleNamespace(is_root=True, broadcast_numbers=ask)
+    other = SimpleNamespace(is_root=False, broadcast_numbers=lambda numbers: np.array(told.pop(0)))
     trainers = [make_trainer(iterations=50, densify={"start": 3, "stop": 30}) for _ in range(2)]
     for trainer, comm in zip(trainers, (root, other), strict=True):
         criterion = RootDecides(Revises() if comm.is_root else None, comm)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
@@ -22,13 +22,15 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.core.types import Array2f, Float
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
+    NOT_BEGUN,
     DensityReport,
     DensityStrategy,
     Population,
     StepInfo,
-    displaced,
+    displace_means,
 )
 
 
@@ -39,8 +41,8 @@ class AdaptiveDensityControl(DensityStrategy):
 
     config: DensifyConfig
     white_background: bool = False
-    gradient_norms: Any = None  # Float (N,): sum over views of |d loss / d mean2d| in NDC units
-    views: Any = None  # Float (N,): number of views in which the Gaussian was visible
+    gradient_norms: Float = NOT_BEGUN  # (N,): sum over views of |d loss / d mean2d| in NDC units
+    views: Float = NOT_BEGUN  # (N,): number of views in which the Gaussian was visible
     by_row = ("gradient_norms", "views")
     start_share, stop_share, rate_decay = SCHEDULES["adc"]
 
@@ -68,7 +70,8 @@ class AdaptiveDensityControl(DensityStrategy):
         gradient = step.means2d_grad
         if dr.is_tensor_v(gradient):
             gradient = dr.unravel(types_of(type(gradient.array)).Array2f, gradient.array)
-        x, y = gradient.x * (0.5 * step.width), gradient.y * (0.5 * step.height)
+        means2d = cast(Array2f, gradient)
+        x, y = means2d.x * (0.5 * step.width), means2d.y * (0.5 * step.height)
         norm = dr.sqrt(dr.square(x) + dr.square(y))
         self.gradient_norms = self.gradient_norms + dr.select(step.visible, norm, 0)
         self.views = self.views + dr.select(step.visible, 1, 0)
@@ -207,7 +210,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
     def _new_rows(
         self, population: Population, chosen: _ChosenRows, iteration: int
-    ) -> dict[str, Any]:
+    ) -> dict[str, dr.ArrayBase]:
         """Return the clones, then ``split_count`` samples of each row that is split.
 
         A sample is drawn from its parent's own Gaussian: mean + R(q) (s * n), n standard normal. A
@@ -223,7 +226,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
         t = types_of(type(population.value("means").array))
         rows = population.take(population.rows(np.append(chosen.clone, samples_of)))
-        rows["means"] = displaced(rows, normals)
+        rows["means"] = displace_means(rows, normals)
         shrink = t.TensorXf(from_host(t.Float, log_shrink), normals.shape)
         rows["log_scales"] = rows["log_scales"] - shrink
         return rows

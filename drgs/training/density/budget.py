@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -34,24 +33,26 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import CoarseStage, FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.core.types import Float
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
+    NOT_BEGUN,
     DensityReport,
     DensityStrategy,
     PixelWeight,
     Population,
     StepInfo,
     absolute_errors,
-    displaced,
+    displace_means,
 )
 
-OFFSET = 1.35
-"""Of the halves' means from that of the Gaussian, in standard deviations of its longest axis."""
+HALF_OFFSET = 1.35
+"""Distance of the halves' means from the Gaussian's, in standard deviations of its longest axis."""
 
-LONG_SCALE, SHORT_SCALE = 0.55, 0.893
+HALF_LONG_SCALE, HALF_SHORT_SCALE = 0.55, 0.893
 """Factors of the halves' scales: along that axis, and along the two others."""
 
-OPACITY, OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
+HALF_OPACITY, HALF_OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
 """Factor of the halves' opacities, which overlap; and their range, so that logits stay small."""
 
 
@@ -62,7 +63,7 @@ class GrowthToNumber(DensityStrategy):
 
     config: DensifyConfig
     coarse: Sequence[CoarseStage] = ()
-    errors: Any = None  # Float (N,): sum over views of s; None until it begins
+    errors: Float = NOT_BEGUN  # (N,): sum over views of s
     first: int = 0  # Gaussians at the start
     by_row = ("errors",)
     start_share, stop_share, rate_decay = SCHEDULES["budget"]
@@ -151,11 +152,10 @@ class GrowthToNumber(DensityStrategy):
         self.first = int(state["first"])
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
-        """Return the number that the population grows to."""
         return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
 
 
-def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
+def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
     """Return two halves of each of ``rows``: all the first ones, then all the second ones.
 
     The halves' means lie on both sides of the Gaussian's, on its longest axis.
@@ -164,15 +164,17 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, Any]:
     new = population.take(population.rows(twice))
     longest = population.host("log_scales")[twice].argmax(axis=1)
     offsets = np.zeros((len(twice), 3))
-    offsets[np.arange(len(twice)), longest] = np.repeat([OFFSET, -OFFSET], len(rows))
-    factors = np.where(offsets != 0, LONG_SCALE, SHORT_SCALE)
-    opacities = np.clip(OPACITY * expit(population.host("logit_opacities")[twice]), *OPACITY_RANGE)
+    offsets[np.arange(len(twice)), longest] = np.repeat([HALF_OFFSET, -HALF_OFFSET], len(rows))
+    factors = np.where(offsets != 0, HALF_LONG_SCALE, HALF_SHORT_SCALE)
+    opacities = np.clip(
+        HALF_OPACITY * expit(population.host("logit_opacities")[twice]), *HALF_OPACITY_RANGE
+    )
 
     t = types_of(type(new["logit_opacities"]))
     log_factors = t.TensorXf(from_host(t.Float, np.log(factors)), factors.shape)
     return {
         **new,
-        "means": displaced(new, offsets),
+        "means": displace_means(new, offsets),
         "log_scales": new["log_scales"] + log_factors,
         "logit_opacities": from_host(t.Float, logit(opacities)),
     }

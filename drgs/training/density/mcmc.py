@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -22,16 +21,22 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
+from drgs.core.types import Array3f, Float, UInt32
 from drgs.datasets.types import Dataset
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Population, displaced
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    Population,
+    displace_means,
+)
 
 MAX_COPIES = 51
-"""In one place, of one Gaussian at a time; as in the paper's code. Binomials up to here are exact
-in double precision."""
+"""Most copies of a Gaussian in its place at a time, as in the paper's code. Binomials up to here
+are exact in double precision."""
 
 MAX_OPACITY = 1 - 2.0**-23
-"""Of copies: the largest opacity in float32 that has a logit."""
+"""Largest opacity of copies: the largest in float32 that has a logit."""
 
 NOISE_STEEPNESS = 100.0
 """Noise fades out over some 0.05 of opacity: the paper's equation 8."""
@@ -62,7 +67,7 @@ class MarkovChain(DensityStrategy):
         """Gaussians that the population grows to; one that starts with more stays as it is."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
-    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         """Yield the paper's equation 10: mean opacity, and mean scale in scene extents."""
         config, logits = self.config.mcmc, parameters["logit_opacities"]
         log_scales = parameters["log_scales"].array
@@ -86,8 +91,8 @@ class MarkovChain(DensityStrategy):
         )
         t = types_of(type(logits))
         strength = dr.opaque(t.Float, config.noise_lr * means_lr / self.extent**2)
-        iteration, seed = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
-        normal = normals(t.Float, population.row_numbers(), iteration, seed)
+        key = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
+        normal = normals(t.Float, population.row_numbers(), *key)
         opacity = 1 / (1 + dr.exp(-logits))
         fading = 1 / (1 + dr.exp(NOISE_STEEPNESS * (opacity - config.min_opacity)))
         rotation = quat_to_rotation(dr.unravel(t.Array4f, quats.array))
@@ -124,12 +129,12 @@ class MarkovChain(DensityStrategy):
         grown = max(int(before * (1 + config.growth)), before + (config.growth > 0))
         aim = max(num_alive, min(self.cap, grown))
         key = [population.seed, iteration]
-        copied = in_proportion(np.where(alive, opacities, 0), aim - num_alive, key)
+        copied = sample_in_proportion(np.where(alive, opacities, 0), aim - num_alive, key)
         if len(copied):
             drawn, rows = _copies(population, copied, opacities, config.min_opacity)
             offsets = np.random.default_rng([*key, 1]).standard_normal(rows["means"].shape)
             offsets[: len(drawn)] = 0
-            rows["means"] = displaced(rows, config.spread * offsets)
+            rows["means"] = displace_means(rows, config.spread * offsets)
             alive[drawn] = False
             population.edit(population.rows(np.flatnonzero(alive)), rows)
         elif num_alive < before:
@@ -147,7 +152,7 @@ class MarkovChain(DensityStrategy):
         return max(start, self.cap)
 
 
-def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def correct_copies(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return opacities of n coincident Gaussians that look like one, and factors of their scales.
 
     opacities: (M,) of the one; counts: (M,) of n, of which at most ``MAX_COPIES`` count. The
@@ -168,13 +173,13 @@ def corrected(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np
 
 def _copies(
     population: Population, copied: np.ndarray, opacities: np.ndarray, min_opacity: float
-) -> tuple[np.ndarray, dict[str, Any]]:
+) -> tuple[np.ndarray, dict[str, dr.ArrayBase]]:
     """Return the rows that are drawn, and their successors: themselves, corrected, then copies.
 
     copied: row numbers, ascending; opacities: (N,), of all rows.
     """
     drawn, counts = np.unique(copied, return_counts=True)
-    shared, factors = corrected(opacities[drawn], counts + 1)
+    shared, factors = correct_copies(opacities[drawn], counts + 1)
     shared = np.clip(shared, min_opacity, MAX_OPACITY)
     rows = population.take(population.rows(np.append(drawn, copied)))
     # Of each new row, the place of its source among those that were drawn.
@@ -188,12 +193,12 @@ def _copies(
     return drawn, rows
 
 
-def _mean(values: Any, weight: float, count: int) -> Any:
+def _mean(values: Float, weight: float, count: int) -> Float:
     """Return the weighted mean; no literals: the number of values changes."""
     return dr.sum(values) * dr.opaque(type(values), weight / count)
 
 
-def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray:
+def sample_in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray:
     """Return ``count`` row numbers, ascending, each as often as its weight requires.
 
     weights: (N,) of at least 0, not all of them 0; NaN counts as 0. key: of the random numbers.
@@ -206,7 +211,9 @@ def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray
     weights = np.where(weights > 0, weights, 0.0)
     ends = np.cumsum(weights)
     if not (len(ends) and 0 < ends[-1] < np.inf):
-        raise ValueError("in_proportion(): the sum of the weights must be positive and finite")
+        raise ValueError(
+            "sample_in_proportion(): the sum of the weights must be positive and finite"
+        )
     offset = np.random.default_rng(key).random()
     positions = (np.arange(count) + offset) * (ends[-1] / count if count else 0.0)
     # Rounding may put the last position onto the end, behind the last row of any weight.
@@ -214,7 +221,7 @@ def in_proportion(weights: np.ndarray, count: int, key: list[int]) -> np.ndarray
     return np.minimum(np.searchsorted(ends, positions, side="right"), last)
 
 
-def normals(float_type: type, rows: Any, iteration: Any, seed: Any) -> Any:
+def normals(float_type: type, rows: UInt32, iteration: UInt32, seed: UInt32) -> Array3f:
     """Return standard normal vectors, Array3f (N,), a function of iteration, seed and row.
 
     rows: UInt32 (N,); iteration, seed: UInt32 (1,), opaque, so that each value is no new kernel.
@@ -231,7 +238,7 @@ def normals(float_type: type, rows: Any, iteration: Any, seed: Any) -> Any:
     return t.Array3f(radius * cosine, radius * sine, other * dr.cos(dr.two_pi * fourth))
 
 
-def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+def pcg4d(x: UInt32, y: UInt32, z: UInt32, w: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
     """Return four random words of four numbers, UInt32 each."""
     x, y, z, w = (1664525 * v + 1013904223 for v in (x, y, z, w))
     x, y, z, w = _mix(x, y, z, w)
@@ -239,7 +246,7 @@ def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
     return _mix(x, y, z, w)
 
 
-def _mix(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+def _mix(x: UInt32, y: UInt32, z: UInt32, w: UInt32) -> tuple[UInt32, UInt32, UInt32, UInt32]:
     x = x + y * w
     y = y + z * x
     z = z + x * y

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -17,8 +16,10 @@ import numpy as np
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
+    NOT_BEGUN,
     DensityReport,
     DensityStrategy,
     PixelWeight,
@@ -27,13 +28,13 @@ from drgs.training.density.strategy import (
 )
 
 MAX_PRESSURE = 1.0
-"""Of logits, at one time: an opacity of 0.5 becomes 0.27. What Adam makes good within some ten
-iterations at four times the usual rate."""
+"""Most by which logits are lowered at one time: an opacity of 0.5 becomes 0.27, which Adam makes
+good within some ten iterations at four times the usual rate."""
 
 
 @dataclass(frozen=True)
 class PruneSchedule:
-    """When Gaussians are removed, and how many are to be left."""
+    """Iterations after which Gaussians are removed, and the number that is to be left."""
 
     start: int  # nothing changes until after this iteration
     stop: int  # the last change
@@ -44,6 +45,7 @@ class PruneSchedule:
     def from_config(config: FitConfig) -> PruneSchedule:
         """Return the schedule of a configuration, which may follow from the rest of it."""
         prune = config.densify.prune
+        assert prune.to is not None, "a fit without it has no last phase"
         return PruneSchedule(*config.densify.prune_window(config.iterations), prune.every, prune.to)
 
     def contains(self, iteration: int) -> bool:
@@ -94,7 +96,7 @@ class Importance(Pruning):
     """
 
     by_row = ("weights",)
-    scores: Any = None  # (N,) Float
+    scores: Float = NOT_BEGUN  # (N,)
 
     def begin(self, population: Population) -> None:
         float_type = type(population.value("means").array)
@@ -196,6 +198,6 @@ def keep_best(population: Population, scores: np.ndarray, count: int) -> Density
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)
 
 
-def _ones(image: Any, photograph: Any) -> Any:
+def _ones(image: TensorXf, photograph: TensorXf) -> Float:
     height, width, _ = image.shape
     return dr.opaque(type(image.array), 1, height * width)

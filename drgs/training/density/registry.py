@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import chain
-from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
+from drgs.core.types import Float
 from drgs.datasets.types import Dataset
 from drgs.training.density.strategy import (
     DensityReport,
@@ -40,19 +41,15 @@ def density_strategy(
     return Phases([growth, make(config.densify.prune.method)])
 
 
-@dataclass(frozen=True)
 class Phases(DensityStrategy):
     """Strategies that follow one another; names in their states differ.
 
     Where one of them changes rows, the others begin anew, without statistics.
     """
 
-    phases: Sequence[DensityStrategy]
-
-    @property
-    def by_row(self) -> Sequence[str]:
-        """The names of all phases."""
-        return [name for phase in self.phases for name in phase.by_row]
+    def __init__(self, phases: Sequence[DensityStrategy]) -> None:
+        self.phases = phases
+        self.by_row = [name for phase in phases for name in phase.by_row]
 
     def begin(self, population: Population) -> None:
         for phase in self.phases:
@@ -70,7 +67,7 @@ class Phases(DensityStrategy):
             if phase.needs_statistics(step.iteration):
                 phase.update_statistics(step)
 
-    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         """Return the terms of all phases."""
         return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
 

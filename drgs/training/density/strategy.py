@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import drjit as dr
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from drgs.config.density import DEFAULT_SCHEDULE
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
+from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
@@ -42,17 +43,20 @@ class StepInfo:
     iteration: int
     width: int  # px, of the film of the iteration's view
     height: int
-    means2d_grad: Any  # d loss / d mean2d, per px: Array2f, or a tensor (N, 2)
-    visible: Any  # Bool (N,)
-    weighted_sums: Mapping[str, Any]  # Float (N,): see DensityStrategy.pixel_weights
+    means2d_grad: Array2f | TensorXf  # (N, 2): d loss / d mean2d, per px
+    visible: Bool  # (N,)
+    weighted_sums: Mapping[str, Float]  # (N,): see DensityStrategy.pixel_weights
 
 
-PixelWeight = Callable[[Any, Any], Any]
+NOT_BEGUN: Any = None
+"""Statistics before :meth:`DensityStrategy.begin`."""
+
+PixelWeight = Callable[[TensorXf, TensorXf], Float]
 """Computes a plane, Float (H W,), from the rendered image and the photograph: tensors (H, W, 3) in
 display space."""
 
 
-def absolute_errors(image: Any, photograph: Any) -> Any:
+def absolute_errors(image: TensorXf, photograph: TensorXf) -> Float:
     """Return the mean absolute difference of each pixel's channels: Float (H W,)."""
     return dr.mean(dr.abs(image - photograph), axis=2).array
 
@@ -86,7 +90,7 @@ class Population:
         """The number of the first row of this process."""
         return 0
 
-    def value(self, name: str) -> Any:
+    def value(self, name: str) -> dr.ArrayBase:
         """Return a parameter as it is at the moment, on the device: the rows of this process."""
         return dr.detach(self.optimizer[self.prefix + name])
 
@@ -94,7 +98,7 @@ class Population:
         """Return a parameter of all rows on the host, float64; waits for the device."""
         return self.gather(self.value(name))
 
-    def gather(self, values: Any) -> np.ndarray:
+    def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
         """Return the values of all rows from those of this process: on the host, float64."""
         return np.array(values, dtype=np.float64)
 
@@ -102,11 +106,11 @@ class Population:
         """Return the values of the rows of this process from those of all rows."""
         return values
 
-    def rows(self, numbers: np.ndarray) -> Any:
+    def rows(self, numbers: np.ndarray) -> UInt32:
         """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
         return from_host(self._index_type, numbers.astype(np.uint32))
 
-    def row_numbers(self) -> Any:
+    def row_numbers(self) -> UInt32:
         """Return the numbers of the rows of this process: UInt32."""
         return dr.arange(self._index_type, self.num_local_rows)
 
@@ -114,11 +118,11 @@ class Population:
     def _index_type(self) -> type:
         return dr.uint32_array_t(type(self.value("means").array))
 
-    def take(self, rows: Any) -> dict[str, Any]:
+    def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
         """Return copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
         return take_rows(self.optimizer, rows, self.prefix)
 
-    def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
+    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
         """Keep some rows in the order given and append others.
 
         keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Kept rows
@@ -126,15 +130,17 @@ class Population:
         """
         edit_rows(self.optimizer, keep, append, self.prefix)
 
-    def replace(self, name: str, value: Any) -> None:
+    def replace(self, name: str, value: dr.ArrayBase) -> None:
         """Give a parameter new values of the same shape, and moments of zero."""
         replace_values(self.optimizer, name, value, self.prefix)
 
-    def set_values(self, name: str, value: Any) -> None:
+    def set_values(self, name: str, value: dr.ArrayBase) -> None:
         """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
         set_values(self.optimizer, name, value, self.prefix)
 
-    def gather_terms(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
+    def gather_terms(
+        self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
+    ) -> list[Float] | list[np.ndarray]:
         """Return terms of the loss over all rows, detached.
 
         terms: over the rows of this process; compute: computes them from parameters by name.
@@ -158,7 +164,7 @@ class Population:
         return state
 
 
-def displaced(rows: Mapping[str, Any], offsets: np.ndarray) -> Any:
+def displace_means(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> TensorXf:
     """Return means moved along their own axes: mean + R(q) (s * offset), tensor (M, 3).
 
     rows: of every parameter by name; offsets: (M, 3), in standard deviations.
@@ -181,14 +187,17 @@ class DensityStrategy(Protocol):
     """
 
     @classmethod
-    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: Any) -> Any:
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset | None, section: Any
+    ) -> DensityStrategy:
         """Return the strategy of a fit.
 
         section: the section that the strategy has registered, with the values of the
         configuration, or the model's defaults; by default the only argument of the class. None:
         the strategy has no section. dataset: None where only :meth:`max_num_gaussians` is called.
         """
-        return cls() if section is None else cls(section)
+        make = cast("Callable[..., DensityStrategy]", cls)
+        return make() if section is None else make(section)
 
     by_row: Sequence[str] = ()
     """Names in :meth:`state` of arrays with a row for each Gaussian."""
@@ -218,7 +227,7 @@ class DensityStrategy(Protocol):
     def update_statistics(self, step: StepInfo) -> None:
         """Add an iteration to the statistics, after its optimizer step."""
 
-    def penalties(self, parameters: Mapping[str, Any], num_rows: int) -> Iterator[Any]:
+    def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         """Yield terms of the loss, Float of one value each.
 
         parameters: raw values by name, with derivatives, of ``num_rows`` Gaussians or of some.

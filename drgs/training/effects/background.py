@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import drjit as dr
 import mitsuba as mi
@@ -11,12 +11,13 @@ import numpy as np
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.core.types import TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
 from drgs.training.views import TrainingView
 
-STREAM = 71
+RANDOM_STREAM = 71
 """Tells the random numbers of backgrounds from others of the same seed."""
 
 
@@ -29,7 +30,7 @@ def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:
 
 @EFFECTS.register("background")
 class RandomBackground(TrainingEffect):
-    """Another colour behind each image: nothing but an opaque splat can look like what is there.
+    """A new colour behind each image: nothing but an opaque splat can look like what is there.
 
     The colours are functions of seed and iteration.
     """
@@ -55,7 +56,7 @@ class RandomBackground(TrainingEffect):
         """
         self.seed, self.background, self.window = seed, np.array(background), (window, sigma)
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> TensorXf:
         """Return 1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
         transparent = 1 - np.asarray(view.alpha)
         if view.mask is not None:
@@ -63,7 +64,7 @@ class RandomBackground(TrainingEffect):
         return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
 
     def before(self, fit: FitState, view: TrainingView) -> None:
-        rng = np.random.default_rng([self.seed, STREAM, fit.iteration])
+        rng = np.random.default_rng([self.seed, RANDOM_STREAM, fit.iteration])
         color = rng.uniform(size=3)
         set_background(fit.integrator, color)
         # No literal, or every colour would be a new kernel.
@@ -73,8 +74,10 @@ class RandomBackground(TrainingEffect):
         channel = dr.arange(mi.UInt32, dr.width(transparent.array)) % 3
         shift = dr.select(channel == 0, shift.x, dr.select(channel == 1, shift.y, shift.z))
         image = view.photograph.image.array + transparent.array * shift
-        view.replacement = prepare_target(mi.TensorXf(image, transparent.shape), *self.window)
+        view.replacement = prepare_target(type(transparent)(image, transparent.shape), *self.window)
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(
+        self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
+    ) -> None:
         set_background(fit.integrator, self.background)
         view.replacement = None

@@ -5,11 +5,12 @@ A :class:`TrainingEffect` takes part in each iteration, of which it knows a :cla
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -17,7 +18,9 @@ from drgs.config.extensions import EFFECTS, extensions_in_use, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
+from drgs.integrator.types import SplatsIntegrator
 from drgs.training.views import TrainingView
 
 
@@ -29,8 +32,8 @@ class FitState:
     iterations_of_step: range
     begins_stage: bool  # whether the images have other sizes than in the step before
     rate_decay: float  # the means' learning rate, relative to the initial one
-    integrator: Any  # splats, which renders the fit
-    means: Any  # TensorXf (N, 3), world
+    integrator: SplatsIntegrator  # renders the fit
+    means: TensorXf  # (N, 3), world
     views: list[TrainingView]  # the training views, at the image size that is in use
     effects: Sequence[TrainingEffect]
 
@@ -57,13 +60,14 @@ class TrainingEffect(Protocol):
         return True
 
     @classmethod
-    def from_config(cls, config: FitConfig, dataset: Dataset, section: Any) -> Any:
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: Any) -> TrainingEffect:
         """Return the effect of a fit.
 
         section: the section that the effect has registered, with the values of the configuration;
         by default the only argument of the class. None: the effect has no section.
         """
-        return cls() if section is None else cls(section)
+        make = cast("Callable[..., TrainingEffect]", cls)
+        return make() if section is None else make(section)
 
     name = ""  # of its part of a checkpoint, and of its uploads
     moves_sensors = False  # whether it changes the parameters of sensors
@@ -71,7 +75,7 @@ class TrainingEffect(Protocol):
     upload_bytes = 0  # of a pixel: its upload of a view, at most
     by_row: frozenset[str] = frozenset()  # names in its state that have a row for each Gaussian
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> object:
         """Return what the effect needs of a view, on the device: see ``TrainingView.uploads``."""
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
@@ -87,22 +91,24 @@ class TrainingEffect(Protocol):
     def before(self, fit: FitState, view: TrainingView) -> None:
         """Called before the view is rendered."""
 
-    def adjust(self, image: Any, view: TrainingView) -> Any:
+    def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the image that is compared with the photograph, from the rendered one."""
         return image
 
-    def penalties(self, view: TrainingView) -> Iterator[Any]:
+    def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield terms of the loss, Float of one value each; called after :meth:`adjust`."""
         yield from ()
 
-    def leaves(self, view: TrainingView) -> dict[str, Any]:
+    def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         """Return the optimised numbers of a view, with derivatives, as :meth:`before` has them.
 
         Where several processes fit, each knows the numbers of all views.
         """
         return {}
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(
+        self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
+    ) -> None:
         """Take a step, when the derivatives of all views of the fit's step are known.
 
         derivatives: of the step's loss, with respect to the view's :meth:`leaves`. Called in the
@@ -122,7 +128,7 @@ class TrainingEffect(Protocol):
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write what was found for the training views into the output folder."""
 
-    def numbers_of(self, view: TrainingView) -> dict[str, Any]:
+    def numbers_of(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         """Return the optimised numbers of a view: Float by name, without derivatives."""
         return {}
 
@@ -134,7 +140,7 @@ class TrainingEffect(Protocol):
         """Return what the coming iterations depend on."""
         return {}
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from :meth:`state`."""
 
 
@@ -179,6 +185,11 @@ def integrator_settings(effects: Sequence[TrainingEffect]) -> dict[str, str]:
     return {"aovs": aovs} if aovs else {}
 
 
-def as_tensor(values: np.ndarray) -> mi.TensorXf:
+def as_numbers(values: np.ndarray) -> Float:
+    """Upload an array as a flat one."""
+    return cast(Float, from_host(mi.Float, values))
+
+
+def as_tensor(values: np.ndarray) -> TensorXf:
     """Upload an array of any shape."""
-    return mi.TensorXf(from_host(mi.Float, values), values.shape)
+    return cast(TensorXf, mi.TensorXf(from_host(mi.Float, values), values.shape))

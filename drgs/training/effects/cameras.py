@@ -8,10 +8,10 @@ principal point. Both poses of a camera that moves while it exposes are moved al
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +23,7 @@ from drgs.config.extensions import EFFECTS
 from drgs.config.schema import CamerasConfig, FitConfig
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
+from drgs.core.types import Array3f, Float
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
@@ -33,7 +34,7 @@ from drgs.training.views import TrainingView
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 MAX_FOCAL_FACTOR = 1000
-"""Of a focal length that was known when the fit began, up or down."""
+"""Largest factor, up or down, of a focal length that was known when the fit began."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class CameraRefinement(OptimisedEffect):
         shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
         values = {name: np.zeros(shape) for name, shape in shapes.items()}
         self.parameters = ViewParameters(values, rates | shared)
-        self.numbers: dict[int, dict[str, Any]] = {}  # of the step's sensors, by view
+        self.numbers: dict[int, dict[str, dr.ArrayBase]] = {}  # of the step's sensors, by view
 
     def upload(self, view: View) -> _Start:
         """Return the view's camera."""
@@ -97,10 +98,12 @@ class CameraRefinement(OptimisedEffect):
     def place(self, view: TrainingView) -> None:
         _put(view.sensor, dr.detach(self._camera_of(view)))
 
-    def leaves(self, view: TrainingView) -> dict[str, Any]:
+    def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         return self.numbers[view.index]
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(
+        self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
+    ) -> None:
         """Step the view's numbers, at the means' rate: cameras are refined against these."""
         del self.numbers[view.index]
         if not self._begun(fit):
@@ -113,14 +116,14 @@ class CameraRefinement(OptimisedEffect):
         dr.traverse(dr.ADMode.Backward)
         self.parameters.step(view.index, fit.rate_decay)
 
-    def _camera_of(self, view: TrainingView) -> dict[str, Any]:
+    def _camera_of(self, view: TrainingView) -> dict[str, dr.ArrayBase]:
         return self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
 
     @staticmethod
-    def _camera(start: _Start, leaves: dict[str, mi.Float]) -> dict[str, Any]:
+    def _camera(start: _Start, leaves: Mapping[str, Float]) -> dict[str, dr.ArrayBase]:
         """Return the sensor's parameters, from the numbers that are optimised."""
         turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
-        rotation = rotation_matrix(turn)
+        rotation = rotation_matrix(cast(Array3f, turn))
         rows = [[rotation[i, j] for j in range(3)] + [move[i]] for i in range(3)]
         moved = start.to_world @ mi.Matrix4f([*rows, [0, 0, 0, 1]])
         fx, fy, cx, cy = start.intrinsics
@@ -140,9 +143,12 @@ class CameraRefinement(OptimisedEffect):
         """Return the training views with their cameras as they are now."""
         numbers, result = self.parameters.numpy(), []
         for index, view in enumerate(views):
-            row = {name: mi.Float(v[min(index, len(v) - 1)]) for name, v in numbers.items()}
+            row = {
+                name: cast(Float, mi.Float(v[min(index, len(v) - 1)]))
+                for name, v in numbers.items()
+            }
             camera = self._camera(self.upload(view), row)
-            values = {name: float(camera[name][0]) for name in INTRINSICS}
+            values: dict[str, object] = {name: float(camera[name][0]) for name in INTRINSICS}
             if view.motion is not None:
                 close = _pose(camera["to_world_close"])
                 values["motion"] = replace(view.motion, close_to_world=close)
@@ -182,23 +188,28 @@ class CameraRefinement(OptimisedEffect):
             temporary.write_text(json.dumps(found, indent=1) + "\n")
 
 
-def _put(sensor: mi.Sensor, numbers: dict[str, Any]) -> None:
+def _put(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:
     """Set a sensor's parameters."""
     params = mi.traverse(sensor)
-    params["to_world"] = mi.AffineTransform4f(numbers["to_world"])
+    params["to_world"] = _transform(numbers["to_world"])
     for name in INTRINSICS:
         params[name] = numbers[name]
     params.update()
     if "to_world_close" in numbers:
         # By name it is announced as not differentiable: each iteration would warn.
-        sensor.to_world_close = mi.AffineTransform4f(numbers["to_world_close"])
+        pose = _transform(numbers["to_world_close"])
+        sensor.to_world_close = pose  # pyright: ignore[reportAttributeAccessIssue]  # a plugin's
 
 
-def _pose(to_world: mi.Matrix4f) -> np.ndarray:
+def _transform(to_world: dr.ArrayBase) -> mi.AffineTransform4f:
+    return mi.AffineTransform4f(cast("mi.Matrix4f", to_world))
+
+
+def _pose(to_world: dr.ArrayBase) -> np.ndarray:
     """Return a pose (4, 4) float64, OpenCV axes."""
     return np.array(to_world)[..., 0].astype(np.float64) @ OPENCV_TO_MITSUBA
 
 
-def _entries(values: mi.Float) -> list[mi.Float]:
+def _entries(values: Float) -> list[mi.Float]:
     """Return each number as an array of one."""
     return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(dr.width(values))]

@@ -10,9 +10,9 @@ has neither bond.) The background behind a transparent photograph stays as it is
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -20,21 +20,22 @@ import numpy as np
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import ColorConfig, FitConfig
-from drgs.core.arrays import from_host, image_of, planes_of, types_of
+from drgs.core.arrays import image_of, planes_of, types_of
 from drgs.core.files import atomic_path
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
-from drgs.training.effects.base import FitState, as_tensor
+from drgs.training.effects.base import FitState, as_numbers, as_tensor
 from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
 from drgs.training.views import TrainingView
 
 IDENTITY = np.eye(3, 4).reshape(1, 12)
-"""Row by row."""
+"""The identity, row by row."""
 
 
 @EFFECTS.register("colors")
 class ColorCorrection(OptimisedEffect):
-    """One 3 x 4 transform a view."""
+    """A 3 x 4 transform for each view."""
 
     name = "colors"
     upload_bytes = 12
@@ -46,14 +47,15 @@ class ColorCorrection(OptimisedEffect):
     def __init__(self, config: ColorConfig, num_views: int) -> None:
         """num_views: of the training split."""
         self.weight = config.identity_weight
+        assert config.lr is not None, "the effect is used where it is given"
         values = {"matrices": np.repeat(IDENTITY, num_views, axis=0)}
         self.parameters = ViewParameters(values, {"matrices": config.lr})
         # What all have in common, and do without: not differentiated.
-        self.common = dr.opaque(mi.Float, 0, IDENTITY.size)
+        self.common = cast(Float, dr.opaque(mi.Float, 0, IDENTITY.size))
         self.share = 1 / num_views
-        self.matrix: Any = None  # of the view that is rendered
+        self.matrix: Float  # (12,), of the view that is rendered
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> TensorXf | None:
         """Return the photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
         if view.alpha is None:
             return None
@@ -62,18 +64,20 @@ class ColorCorrection(OptimisedEffect):
     def before(self, fit: FitState, view: TrainingView) -> None:
         self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
 
-    def adjust(self, image: Any, view: TrainingView) -> Any:
+    def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the rendering with the colours of the photograph."""
-        seen = transform_colors(image, mi.TensorXf(self.matrix, (3, 4)))
+        seen = transform_colors(image, type(image)(self.matrix, (3, 4)))
         opaque = view.uploads[self.name]
         return seen if opaque is None else image + opaque * (seen - image)
 
-    def penalties(self, view: TrainingView) -> Iterator[Any]:
+    def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield the mean square by which the transform differs from the identity."""
-        difference = self.matrix - from_host(mi.Float, IDENTITY)
+        difference = self.matrix - as_numbers(IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
-    def after(self, fit: FitState, view: TrainingView, derivatives: dict[str, Any]) -> None:
+    def after(
+        self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
+    ) -> None:
         """Step the view's transform, and all a little back: their mean stays."""
         dr.set_grad(self.leaves(view), derivatives)
         before = self.numbers_of(view)["matrices"]
@@ -90,9 +94,9 @@ class ColorCorrection(OptimisedEffect):
     def state(self) -> dict[str, np.ndarray]:
         return {**super().state(), "common": np.array(self.common)}
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
         super().restore(state)
-        self.common = from_host(mi.Float, state["common"])
+        self.common = as_numbers(state["common"])
 
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``colors.json``: the transform of each training view, 3 x 4, by name."""
@@ -102,7 +106,7 @@ class ColorCorrection(OptimisedEffect):
             temporary.write_text(json.dumps(by_view, indent=1) + "\n")
 
 
-def transform_colors(image: Any, matrix: Any) -> Any:
+def transform_colors(image: TensorXf, matrix: TensorXf) -> TensorXf:
     """Return A y with y = (red, green, blue, 1) of each pixel.
 
     image: (H, W, 3); matrix: A, a tensor (3, 4). Differentiable in both.
@@ -111,33 +115,36 @@ def transform_colors(image: Any, matrix: Any) -> Any:
 
 
 class _TransformColors(dr.CustomOp):
-    def eval(self, image: Any, matrix: Any) -> Any:
+    def eval(self, image: TensorXf, matrix: TensorXf) -> TensorXf:
         self.image, self.matrix = dr.detach(image), dr.detach(matrix)
         return self._transform(planes_of(image), self._rows(self.matrix))
 
     def forward(self) -> None:
-        d_image, d_matrix = self.grad_in("image"), self.grad_in("matrix")
+        d_image, d_matrix = (cast(TensorXf, self.grad_in(name)) for name in ("image", "matrix"))
         rows = [[*row[:3], 0] for row in self._rows(self.matrix)]
         moved = self._transform(planes_of(d_image), rows)
         turned = self._transform(planes_of(self.image), self._rows(d_matrix))
         self.set_grad_out(moved + turned)
 
     def backward(self) -> None:
-        g = planes_of(self.grad_out())
+        g = planes_of(cast(TensorXf, self.grad_out()))
         rows, inputs = self._rows(self.matrix), planes_of(self.image)
-        d_planes = [sum(rows[i][j] * g[i] for i in range(3)) for j in range(3)]
+        zero = type(g[0])(0)
+        d_planes = [sum((rows[i][j] * g[i] for i in range(3)), zero) for j in range(3)]
         self.set_grad_in("image", image_of(d_planes, self.image))
         products = [d * x for d in g for x in (*inputs, 1)]
         dr.eval(products)
         d_matrix = dr.concat([dr.sum(product) for product in products])
         self.set_grad_in("matrix", type(self.matrix)(d_matrix, (3, 4)))
 
-    def _transform(self, planes: list[Any], rows: list[list[Any]]) -> Any:
-        moved = [sum(a * x for a, x in zip(row, (*planes, 1), strict=True)) for row in rows]
+    def _transform(self, planes: list[Float], rows: list[list[Float]]) -> TensorXf:
+        zero = type(planes[0])(0)
+        columns = (*planes, 1)
+        moved = [sum((a * x for a, x in zip(row, columns, strict=True)), zero) for row in rows]
         return image_of(moved, self.image)
 
     @staticmethod
-    def _rows(matrix: Any) -> list[list[Any]]:
+    def _rows(matrix: TensorXf) -> list[list[Float]]:
         """Return the numbers as arrays of one entry, that are not compiled into the kernel."""
         flat = matrix.array
         UInt32 = types_of(type(flat)).UInt32

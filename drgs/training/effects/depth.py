@@ -7,17 +7,17 @@ Dr.Jit differentiates a gather by adding atomically, in an order that no two run
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import cast
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import from_host, image_of, planes_of
+from drgs.core.arrays import image_of, planes_of
+from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
-from drgs.training.effects.base import TrainingEffect
+from drgs.training.effects.base import TrainingEffect, as_numbers
 from drgs.training.views import TrainingView
 
 
@@ -40,9 +40,10 @@ class DepthSupervision(TrainingEffect):
 
     def __init__(self, weight: float, extent: float) -> None:
         """weight: of the term, per scene extent."""
-        self.weight, self.depths = weight / extent, None
+        self.weight = weight / extent
+        self.depths: TensorXf  # depth and alpha, of the view that is rendered
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> tuple[Float, Float] | None:
         """Return depths, and weights of the pixels; None where a view has none that counts."""
         if view.depth is None:
             return None
@@ -53,39 +54,39 @@ class DepthSupervision(TrainingEffect):
         if not known.any():
             return None
         weights = self.weight * known / known.sum()
-        return from_host(mi.Float, depth), from_host(mi.Float, weights)
+        return as_numbers(depth), as_numbers(weights)
 
-    def adjust(self, image: Any, view: TrainingView) -> Any:
+    def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the colours; depth and alpha are kept for the penalty."""
         image, self.depths = split(image, 3)
         return image
 
-    def penalties(self, view: TrainingView) -> Iterator[Any]:
+    def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield the difference in depth."""
         if (known := view.uploads[self.name]) is not None:
             yield depth_error(self.depths, *known)
 
 
-def split(image: Any, count: int) -> tuple[Any, Any]:
+def split(image: TensorXf, count: int) -> tuple[TensorXf, TensorXf]:
     """Return the first ``count`` channels of an image (H, W, C), and the others."""
     return dr.custom(_Split, image=image, count=count)
 
 
 class _Split(dr.CustomOp):
-    def eval(self, image: Any, count: int) -> tuple[Any, Any]:
+    def eval(self, image: TensorXf, count: int) -> tuple[TensorXf, TensorXf]:
         self.count = count
         planes = planes_of(image)
         return image_of(planes[:count], image), image_of(planes[count:], image)
 
     def forward(self) -> None:
-        self.set_grad_out(self.eval(self.grad_in("image"), self.count))
+        self.set_grad_out(self.eval(cast(TensorXf, self.grad_in("image")), self.count))
 
     def backward(self) -> None:
-        first, rest = self.grad_out()
+        first, rest = cast("tuple[TensorXf, TensorXf]", self.grad_out())
         self.set_grad_in("image", image_of(planes_of(first) + planes_of(rest), first))
 
 
-def depth_error(depths: Any, target: Any, weights: Any) -> Any:
+def depth_error(depths: TensorXf, target: Float, weights: Float) -> Float:
     """Return sum_i w_i |D_i - A_i d_i| over pixels, a Float of one value.
 
     depths: (H, W, 2), the composited depth D and alpha A; target: d, Float (H * W,), in the units
@@ -96,7 +97,7 @@ def depth_error(depths: Any, target: Any, weights: Any) -> Any:
 
 
 class _DepthError(dr.CustomOp):
-    def eval(self, depths: Any, target: Any, weights: Any) -> Any:
+    def eval(self, depths: TensorXf, target: Float, weights: Float) -> Float:
         self.like, self.target, self.weights = dr.detach(depths), target, weights
         depth, alpha = planes_of(depths)
         difference = dr.fma(-alpha, target, depth)
@@ -104,9 +105,9 @@ class _DepthError(dr.CustomOp):
         return dr.sum(weights * dr.abs(difference))
 
     def forward(self) -> None:
-        d_depth, d_alpha = planes_of(self.grad_in("depths"))
+        d_depth, d_alpha = planes_of(cast(TensorXf, self.grad_in("depths")))
         self.set_grad_out(dr.sum(self.slope * dr.fma(-d_alpha, self.target, d_depth)))
 
     def backward(self) -> None:
-        g = self.slope * self.grad_out()
+        g = self.slope * cast(Float, self.grad_out())
         self.set_grad_in("depths", image_of([g, -g * self.target], self.like))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from drgs.config.extensions import EFFECTS
+from drgs.core.types import TensorXf
 from drgs.datasets.types import View
 from drgs.training.effects.base import TrainingEffect, as_tensor
 from drgs.training.views import TrainingView
@@ -22,7 +21,7 @@ class Masks(TrainingEffect):
     name = "masks"
     upload_bytes = 12
 
-    def upload(self, view: View) -> Any:
+    def upload(self, view: View) -> TensorXf | None:
         """Return the mask, (H, W, 3); None where a view has none."""
         if view.mask is None:
             return None
@@ -31,7 +30,7 @@ class Masks(TrainingEffect):
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
         return image if view.mask is None else image * np.asarray(view.mask)[:, :, None]
 
-    def adjust(self, image: Any, view: TrainingView) -> Any:
+    def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the rendering without what the mask leaves out."""
         mask = view.uploads[self.name]
         return image if mask is None else image * mask

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import cast
+
 import mitsuba as mi
 import numpy as np
 
 from drgs.config.extensions import EFFECTS
+from drgs.core.types import Float
 from drgs.effects.smoothing import smoothing_of
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.training.effects.base import FitState, TrainingEffect
 
-EVERY = 100
+UPDATE_EVERY = 100
 """Iterations (as in Mip-Splatting's code); also where another stage begins, and after each change
 of the population."""
 
@@ -23,10 +27,10 @@ class TrainingSmoothing(TrainingEffect):
     by_row = frozenset({"filter"})
 
     def __init__(self) -> None:
-        self.filter: mi.Float | None = None
+        self.filter: Float | None = None
 
     def begin(self, fit: FitState) -> None:
-        is_due = any(iteration % EVERY == 1 for iteration in fit.iterations_of_step)
+        is_due = any(iteration % UPDATE_EVERY == 1 for iteration in fit.iterations_of_step)
         if self.filter is None or fit.begins_stage or is_due:
             self.filter = _smoothing(fit)
         fit.integrator.smoothing = self.filter
@@ -41,10 +45,10 @@ class TrainingSmoothing(TrainingEffect):
     def state(self) -> dict[str, np.ndarray]:
         return {} if self.filter is None else {"filter": np.array(self.filter)}
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        self.filter = mi.Float(state["filter"]) if "filter" in state else None
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        self.filter = cast(Float, mi.Float(state["filter"])) if "filter" in state else None
 
 
-def _smoothing(fit: FitState) -> mi.Float:
+def _smoothing(fit: FitState) -> Float:
     states = (read_sensor(sensor, fit.integrator.near) for sensor in fit.sensors())
     return smoothing_of(fit.means, map(camera_from_sensor, states))

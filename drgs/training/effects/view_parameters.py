@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
+from drgs.core.types import Float
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
 from drgs.training.views import TrainingView
@@ -24,16 +26,18 @@ class ViewParameters:
     def __init__(self, values: Mapping[str, np.ndarray], rates: Mapping[str, float]) -> None:
         """values: (V, K) each, or (1, K) for all views; rates: per step."""
         self.rates = dict(rates)
-        self.optimizers: dict[str, list[Adam]] = {
-            name: [make_optimizer({name: mi.Float(row)}, rates) for row in np.float32(value)]
+        self.optimizers: dict[str, Sequence[Adam]] = {
+            name: [make_optimizer({name: mi.Float(row)}, rates) for row in value.astype(np.float32)]
             for name, value in values.items()
         }
 
-    def leaves(self, index: int) -> dict[str, mi.Float]:
+    def leaves(self, index: int) -> dict[str, Float]:
         """Return the numbers (K,) of a view, with derivatives enabled."""
-        return {name: optimizer[name] for name, optimizer in self._of_view(index).items()}
+        return {
+            name: cast(Float, optimizer[name]) for name, optimizer in self._of_view(index).items()
+        }
 
-    def numbers(self, index: int) -> dict[str, mi.Float]:
+    def numbers(self, index: int) -> dict[str, Float]:
         """Return the same without derivatives."""
         return dr.detach(self.leaves(index))
 
@@ -76,10 +80,10 @@ class OptimisedEffect(TrainingEffect):
 
     parameters: ViewParameters
 
-    def leaves(self, view: TrainingView) -> dict[str, mi.Float]:
+    def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         return self.parameters.leaves(view.index)
 
-    def numbers_of(self, view: TrainingView) -> dict[str, mi.Float]:
+    def numbers_of(self, view: TrainingView) -> dict[str, Float]:
         return self.parameters.numbers(view.index)
 
     def values(self) -> dict[str, np.ndarray]:

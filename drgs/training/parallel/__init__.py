@@ -1,4 +1,4 @@
-"""One fit, or one set of pictures, on several processes: MPI.
+"""A fit, or a set of images, on several processes: MPI.
 
 Imported where a command was started by ``mpiexec``, and by nobody else.
 """

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.core.errors import UserError
 from drgs.training.finite_checks import NonFiniteError
@@ -26,6 +27,18 @@ NEVER = 2**62
 """Iteration of an error that did not occur."""
 
 T = TypeVar("T")
+
+
+class Request(Protocol):
+    """A communication that has begun, and may not be done: see ``mpi4py.MPI.Request``."""
+
+    def Test(self) -> bool:
+        """Return whether it is done."""
+        ...
+
+
+Buffers = np.ndarray | list[np.ndarray]
+"""An array, or a list that begins with one and describes its parts."""
 
 
 class SingleProcess:
@@ -40,8 +53,8 @@ class SingleProcess:
     def Ibcast(self, array: np.ndarray, root: int) -> None:
         """Leave the array as it is."""
 
-    def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
-        """Copy the numbers: ``sent`` and ``received`` are arrays, or lists that begin with one."""
+    def Iallgather(self, sent: Buffers, received: Buffers, root: int = 0) -> None:
+        """Copy the numbers."""
         sent, received = (b[0] if isinstance(b, list) else b for b in (sent, received))
         received[:] = sent
 
@@ -103,7 +116,7 @@ class Communicator:
         wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, sizes)))
         return gathered
 
-    def of_root(self, numbers: Any) -> np.ndarray:
+    def broadcast_numbers(self, numbers: ArrayLike) -> np.ndarray:
         """Return the numbers of rank 0; other ranks give as many, of the same type."""
         return self.all_gather(np.array(numbers))[0]
 
@@ -159,7 +172,8 @@ class Communicator:
         """
         if self.size == 1:
             return call()
-        result, error = None, None
+        result: T | None = None
+        error: UserError | None = None
         try:
             result = call()
         except UserError as caught:
@@ -169,20 +183,20 @@ class Communicator:
         first = int(errors[:, 0].argmin())
         iteration, is_non_finite = errors[first]
         if iteration == NEVER:
-            return result
+            return cast(T, result)
         text = self.broadcast_text("" if error is None else str(error), first)
         raise NonFiniteError(text, int(iteration)) if is_non_finite else UserError(text)
 
-    def send(self, array: np.ndarray, to: int, tag: int) -> Any:
+    def send(self, array: np.ndarray, to: int, tag: int) -> Request:
         """Begin to send an array, which must not change until the returned request is done."""
         return self.comm.Isend(_bytes(array), dest=to, tag=tag)
 
-    def receive(self, into: np.ndarray, source: int, tag: int) -> Any:
+    def receive(self, into: np.ndarray, source: int, tag: int) -> Request:
         """Begin to receive into an array."""
         return self.comm.Irecv(_bytes(into), source=source, tag=tag)
 
 
-def wait(*requests: Any) -> None:
+def wait(*requests: Request | None) -> None:
     """Wait until all requests are done; None stands for one that is."""
     pending, polls = [request for request in requests if request is not None], 0
     while not all([request.Test() for request in pending]):
@@ -196,7 +210,7 @@ def _bytes(array: np.ndarray) -> np.ndarray:
     return array.reshape(-1).view(np.uint8)
 
 
-def _parts(array: np.ndarray, sizes: Sequence[int]) -> list[Any]:
+def _parts(array: np.ndarray, sizes: Iterable[int]) -> list[object]:
     """Return the memory of an array, divided among ranks; sizes: bytes."""
     return [_bytes(array), [int(size) for size in sizes], None, "B"]
 

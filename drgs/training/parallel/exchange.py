@@ -14,19 +14,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import add, or_
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.camera import Camera, cameras_in_time
-from drgs.core.arrays import Rows, block_widths, empty_on_host, from_host, types_of, wrapped
+from drgs.core.arrays import Array, Rows, block_widths, empty_on_host, from_host, types_of, wrapped
 from drgs.core.constants import MAX_SHUTTER_SAMPLES
+from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.sensor_render import accumulate_in_sensor
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.types import SplatsIntegrator
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
@@ -42,7 +44,7 @@ from drgs.splatting.rendering import (
     weighted_sums,
 )
 from drgs.splatting.tiles import Footprints
-from drgs.training.parallel.communicator import Communicator, wait
+from drgs.training.parallel.communicator import Communicator, Request, wait
 from drgs.training.parallel.population import renderer_of
 from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
@@ -80,7 +82,7 @@ class LocalProjection:
         return dr.width(self.boxes.blocks[0]) // BOX_NUMBERS
 
     @property
-    def visible(self) -> Any:
+    def visible(self) -> Bool:
         """Bool by row: its box has tiles of the film."""
         t = types_of(self.boxes.Float)
         return self.boxes.load(dr.arange(t.UInt32, self.num_rows))[-1] > 0
@@ -101,7 +103,7 @@ class LocalProjection:
         rows, boxes = Rows(tuple(stored), self.num_stored), Rows((box,), BOX_NUMBERS)
         return Footprints(boxes, rows, depths, self.num_features, self.num_keys)
 
-    def gradients(self, columns: list[Any]) -> SplatGradients:
+    def gradients(self, columns: list[Float]) -> SplatGradients:
         """Divide columns of derivatives into those of geometry and of features."""
         num_geometry = len(columns) - self.num_features
         return SplatGradients(columns[:num_geometry], columns[num_geometry:])
@@ -112,14 +114,14 @@ class PackedProjection:
     """This rank's rows that are on the film of a view that another rank renders."""
 
     local: LocalProjection
-    rows: Any  # UInt32 (M,), ascending
+    rows: UInt32  # (M,), ascending
     count: int  # M
     blocks: Blocks  # of these rows; empty once they are sent
 
     @staticmethod
     def from_footprints(local: LocalProjection, found: Footprints) -> PackedProjection:
         """Pack what is on the film. The host reads the number of splats."""
-        rows = dr.compress(local.visible)
+        rows = cast(UInt32, dr.compress(local.visible))
         count, float_type = dr.width(rows), found.rows.Float
         blocks = _empty_blocks(0, local.widths, float_type)
         if count > 0:
@@ -130,7 +132,7 @@ class PackedProjection:
             blocks = [each.numpy().reshape(count, -1) for each in flat]
         return PackedProjection(local, rows, count, blocks)
 
-    def unpack(self, blocks: Blocks, width: int) -> list[Any]:
+    def unpack(self, blocks: Blocks, width: int) -> list[Float]:
         """Return columns for all rows of this rank: numbers of those on the film, 0 for others."""
         t = types_of(self.local.boxes.Float)
         num_rows = self.local.num_rows
@@ -171,7 +173,7 @@ class ViewMessages:
 
     def __init__(self, comm: Communicator) -> None:
         self.comm = comm
-        self._sending: list[tuple[list[Any], Blocks]] = []  # requests, and what they send
+        self._sending: list[tuple[list[Request], Blocks]] = []  # requests, and what they send
 
     def send(self, blocks: Blocks, to: int, place: int, time: int) -> None:
         """Begin to send rows to a rank."""
@@ -195,16 +197,20 @@ class _View:
 
     view: StepView
     renderer: int  # the rank that renders it
-    counts: Any = None  # (ranks, times): splats that each rank sends to the renderer
+    counts: np.ndarray = field(
+        init=False
+    )  # (ranks, times): splats that each rank sends to the renderer
     packed: list[PackedProjection] = field(default_factory=list)  # by time, for another renderer
     local: list[LocalProjection] = field(default_factory=list)  # by time
     frames: list[Frame] = field(default_factory=list)  # by time, until the backward pass has ended
     gradients: list[SplatGradients] = field(default_factory=list)  # by time, of own rows; until
     # they are added
-    means2d: Any = None  # Array2f, derivatives with respect to own rows' places on the film
-    sums: dict[str, Any] = field(default_factory=dict)  # by name: see DensityStrategy.pixel_weights
+    means2d: Array2f = field(init=False)  # derivatives with respect to own rows' places on the film
+    sums: dict[str, Float] = field(
+        default_factory=dict
+    )  # by name: see DensityStrategy.pixel_weights
     needs_camera: bool = False
-    first_fault: Any = None
+    first_fault: UInt32 = field(init=False)
 
     def num_splats(self, rank: int, time: int) -> int:
         """Return the number of splats that a rank contributes to the rendered view."""
@@ -221,7 +227,7 @@ class ViewExchange:
     def __init__(
         self,
         comm: Communicator,
-        integrator: Any,
+        integrator: SplatsIntegrator,
         params: mi.SceneParameters,
         prefix: str,
         views_per_step: int,
@@ -270,9 +276,10 @@ class ViewExchange:
                 yield each.view
         self._current = None
 
-    def end_view(self, weights: Mapping[str, Any]) -> None:
+    def end_view(self, weights: Mapping[str, Float]) -> None:
         """End the backward pass of a view; weights: planes for weighted sums, by name."""
         each = self._current
+        assert each is not None, "a view is rendered"
         for name, plane in weights.items():
             sums = []
             for time, frame in enumerate(each.frames):
@@ -314,7 +321,7 @@ class ViewExchange:
         rows = zip(loss[:, None], error[:, None], numbers[:, 2], strict=True)
         return [ViewLoss(*row) for row in rows]
 
-    def share(self, view: StepView, value: Any) -> Any:
+    def share(self, view: StepView, value: Array) -> Array:
         """Return an array of the rank that renders a view; others give one of the same size."""
         if self.comm.size == 1:
             return value
@@ -373,7 +380,7 @@ class ViewExchange:
                 each.local.append(LocalProjection.from_footprints(camera, of_camera, found))
                 each.packed.append(PackedProjection.from_footprints(each.local[-1], found))
 
-    def _divide(self, each: _View, time: int, columns: list[Any]) -> list[Any]:
+    def _divide(self, each: _View, time: int, columns: list[Float]) -> list[Float]:
         """Send numbers of a rendered view's splats to their ranks; return those of this rank."""
         if self.comm.size == 1:
             return columns
@@ -408,7 +415,7 @@ class ViewExchange:
 
     def _receive_columns(
         self, packed: PackedProjection, source: int, place: int, time: int, width: int
-    ) -> list[Any]:
+    ) -> list[Float]:
         blocks = _empty_blocks(packed.count, block_widths(width), packed.local.boxes.Float)
         if packed.count > 0:
             self.messages.receive(blocks, source, place, time)
@@ -468,6 +475,7 @@ class ViewExchange:
                     sums = [dr.sum(from_host(type(of_rows[0]), column)) for column in rows.T]
                     of_cameras.append(sums)
             total = reduce(sum_of_gradients, found)
+        assert total.parameters is not None, "they are asked for"
         self._accumulate(total.parameters)
         each.first_fault = total.first_fault
         if of_cameras:

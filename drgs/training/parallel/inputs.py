@@ -14,6 +14,7 @@ import platform
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +30,7 @@ from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
 from drgs.datasets.images import without_images
 from drgs.datasets.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.types import SplatsIntegrator
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import own_views
 
@@ -43,9 +45,10 @@ def share_inputs(
 
     Raises ``UserError`` where a rank reads other photographs than rank 0, or has other versions.
     """
-    if comm.size == 1:
-        return config, dataset
     if comm.is_root:
+        assert config is not None and dataset is not None, "rank 0 has read them"
+        if comm.size == 1:
+            return config, dataset
         names = [view.name for view in dataset.train]
         comm.broadcast_text(json.dumps([config.model_dump_json(), names, versions()]))
         # Made while the others read.
@@ -69,6 +72,7 @@ def share_inputs(
 def share_gaussians(comm: Communicator, gaussians: Gaussians | None) -> Gaussians:
     """Return the Gaussians of rank 0 (numpy arrays); other ranks may give None."""
     if comm.size == 1:
+        assert gaussians is not None, "a process that is alone has made them"
         return gaussians
     given = [getattr(gaussians, name) for name in PARAMETER_NAMES] if comm.is_root else []
     described = json.loads(comm.broadcast_text(json.dumps([[a.dtype.str, a.shape] for a in given])))
@@ -81,13 +85,13 @@ def versions() -> dict[str, str]:
     """Return versions and the vector width that the bytes of a result depend on, by name."""
     return {
         "drgs": drgs.__version__,
-        "Mitsuba": mi.__version__,
-        "Dr.Jit": dr.__version__,
+        "Mitsuba": str(mi.__version__),
+        "Dr.Jit": dr.__version__,  # pyright: ignore[reportAttributeAccessIssue]  # not in the stub
         "numpy": np.__version__,
         "Pillow": PIL.__version__,
         "LLVM": ".".join(map(str, llvm_version())),
         "the vector width": str(llvm_vector_width()),
-        "the variant": mi.variant(),
+        "the variant": mi.variant() or "",
     }
 
 
@@ -122,12 +126,12 @@ def check_scene(
     files: for the message, the origin of ``cameras`` and ``background``, and of the ``model``.
     Called by all processes; returns when all have agreed.
     """
-    integrator = scene.integrator()
+    integrator = cast(SplatsIntegrator, scene.integrator())
     own = versions()
     parameters = {**mi.traverse(integrator), "smoothing": integrator.smoothing}
     for name, value in parameters.items():
         array = np.asarray(value)  # an object, where it is no array
-        own[name] = str(value) if array.dtype == object else _digest(array)
+        own[name] = str(value) if array.dtype == object else _digest(array.tobytes())
     own |= {"settings": str(integrator), "cameras": _digest_of_cameras(views)}
     first = json.loads(comm.broadcast_text(json.dumps(own)))
     check_versions({name: first[name] for name in versions()})
@@ -153,5 +157,5 @@ def _digest_of_cameras(views: Sequence[Viewpoint]) -> str:
     return _digest(json.dumps(cameras).encode())
 
 
-def _digest(content: bytes | np.ndarray) -> str:
+def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()

@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -19,6 +18,7 @@ import numpy as np
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
+from drgs.core.types import Float, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.training.density.strategy import Population
 from drgs.training.optimizer import LeanAdam, take_rows
@@ -118,16 +118,16 @@ class ShardedPopulation(Population):
     def first_row(self) -> int:
         return self.shard.local.start
 
-    def gather(self, values: Any) -> np.ndarray:
+    def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
         return self.comm.all_gather_rows(np.array(values)).astype(np.float64)
 
     def local(self, values: np.ndarray) -> np.ndarray:
         return values[self.shard.local]
 
-    def row_numbers(self) -> Any:
+    def row_numbers(self) -> UInt32:
         return super().row_numbers() + dr.opaque(self._index_type, self.first_row)
 
-    def take(self, rows: Any) -> dict[str, Any]:
+    def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
         wanted = np.array(rows)
         owners = self.shard.owners(wanted)
         place = np.argsort(owners, kind="stable")
@@ -140,7 +140,7 @@ class ShardedPopulation(Population):
             taken[name] = _on_device(values, result)
         return taken
 
-    def edit(self, keep: Any, append: Mapping[str, Any] | None = None) -> None:
+    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
         kept, optimizer = np.array(keep), self.optimizer
         num_appended = 0 if append is None else append["means"].shape[0]
         after = replace(self.shard, total=len(kept) + num_appended)
@@ -155,15 +155,18 @@ class ShardedPopulation(Population):
                 appended = np.array(append[key.removeprefix(self.prefix)])[first:end]
             rows = np.concatenate([move(np.array(dr.detach(value))), appended])
             none = np.zeros_like(appended)
-            moved = [np.array(moment).reshape(value.shape) for moment in moments]
-            moments = [
-                from_host(type(moment), np.concatenate([move(former), none]))
-                for moment, former in zip(moments, moved, strict=True)
-            ]
+            first_moment, second_moment = (
+                from_host(
+                    type(moment),
+                    np.concatenate([move(np.array(moment).reshape(value.shape)), none]),
+                )
+                for moment in moments
+            )
             new_value = _on_device(value, rows)
-            dr.make_opaque(new_value, moments)
+            dr.make_opaque(new_value, first_moment, second_moment)
             dr.enable_grad(new_value)
-            optimizer.state[key] = new_value, promoted, rate, (step, *moments, maximum)
+            extra = step, first_moment, second_moment, maximum
+            optimizer.state[key] = new_value, promoted, rate, extra
         self.shard.total = after.total
 
     def _row_moves(self, after: Shard, kept: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -183,7 +186,9 @@ class ShardedPopulation(Population):
 
         return move
 
-    def gather_terms(self, terms: list[Any], compute: Callable[[Any], list[Any]]) -> list[Any]:
+    def gather_terms(
+        self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
+    ) -> list[np.ndarray]:
         """Return terms of the loss over all rows.
 
         They are computed again: the sum of what the ranks have would be rounded otherwise.
@@ -234,20 +239,20 @@ class ShardedPopulation(Population):
         return own
 
 
-def _on_device(like: Any, rows: np.ndarray) -> Any:
+def _on_device(like: dr.ArrayBase, rows: np.ndarray) -> dr.ArrayBase:
     """Return rows as the tensor, or array, that other rows of a parameter are in."""
     flat = from_host(type(dr.detach(like).array), rows)
     return type(like)(flat, rows.shape) if dr.is_tensor_v(like) else flat
 
 
-class _AllRows(dict[str, Any]):
+class _AllRows(dict[str, dr.ArrayBase]):
     """Parameters of the Gaussians of all processes by name, gathered when they are read."""
 
     def __init__(self, population: ShardedPopulation) -> None:
         super().__init__()
         self._population = population
 
-    def __missing__(self, name: str) -> Any:
+    def __missing__(self, name: str) -> dr.ArrayBase:
         """Return a tensor of all rows."""
         value = self._population.value(name)
         self[name] = type(value)(self._population.comm.all_gather_rows(np.array(value)))

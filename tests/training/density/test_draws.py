@@ -6,7 +6,7 @@ import pytest
 from drjit.llvm.ad import Float, Float64, UInt32
 from scipy import stats
 
-from drgs.training.density.mcmc import in_proportion, normals, pcg4d
+from drgs.training.density.mcmc import normals, pcg4d, sample_in_proportion
 
 
 def test_rows_are_drawn_as_often_as_their_weights_call_for():
@@ -14,7 +14,7 @@ def test_rows_are_drawn_as_often_as_their_weights_call_for():
     weights = random.random(500) * (random.random(500) < 0.8)
     expected = 3000 * weights / weights.sum()
     for seed in range(5):
-        counts = np.bincount(in_proportion(weights, 3000, [seed, 7]), minlength=500)
+        counts = np.bincount(sample_in_proportion(weights, 3000, [seed, 7]), minlength=500)
         assert counts.sum() == 3000
         assert np.abs(counts - expected).max() < 1
         assert not counts[weights == 0].any()
@@ -25,7 +25,9 @@ def test_over_many_keys_the_mean_is_the_weight():
     # keys, six standard deviations of the mean of such a variable.
     weights = np.arange(1, 41) / np.arange(1, 41).sum()
     keys = 4000
-    drawn = [np.bincount(in_proportion(weights, 20, [3, i]), minlength=40) for i in range(keys)]
+    drawn = [
+        np.bincount(sample_in_proportion(weights, 20, [3, i]), minlength=40) for i in range(keys)
+    ]
     shares = 20 * weights
     deviation = np.sqrt((shares % 1) * (1 - shares % 1) / keys)
     assert (np.abs(np.mean(drawn, axis=0) - shares) <= 6 * deviation + 1e-12).all()
@@ -33,18 +35,18 @@ def test_over_many_keys_the_mean_is_the_weight():
 
 def test_equal_keys_draw_the_same_and_others_do_not():
     weights = np.random.default_rng(1).random(1000)
-    first = in_proportion(weights, 100, [0, 5])
-    np.testing.assert_array_equal(in_proportion(weights, 100, [0, 5]), first)
-    assert (in_proportion(weights, 100, [0, 6]) != first).any()
-    assert (in_proportion(weights, 100, [1, 5]) != first).any()
+    first = sample_in_proportion(weights, 100, [0, 5])
+    np.testing.assert_array_equal(sample_in_proportion(weights, 100, [0, 5]), first)
+    assert (sample_in_proportion(weights, 100, [0, 6]) != first).any()
+    assert (sample_in_proportion(weights, 100, [1, 5]) != first).any()
 
 
 def test_weights_that_are_no_numbers_are_none():
     weights = np.array([np.nan, 0.0, 1e-300, -1.0, np.nan])
-    np.testing.assert_array_equal(in_proportion(weights, 3, [0, 0]), [2, 2, 2])
+    np.testing.assert_array_equal(sample_in_proportion(weights, 3, [0, 0]), [2, 2, 2])
     with pytest.raises(ValueError, match="must be positive and finite"):
-        in_proportion(np.array([0.0, np.nan]), 1, [0, 0])
-    assert in_proportion(weights, 0, [0, 0]).size == 0
+        sample_in_proportion(np.array([0.0, np.nan]), 1, [0, 0])
+    assert sample_in_proportion(weights, 0, [0, 0]).size == 0
 
 
 def test_the_hash_is_that_of_the_paper():

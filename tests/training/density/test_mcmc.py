@@ -14,7 +14,7 @@ from drgs.config.density import DensifyConfig
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.training.density.mcmc import MAX_COPIES, MarkovChain, corrected
+from drgs.training.density.mcmc import MAX_COPIES, MarkovChain, correct_copies
 
 SIZE, DEAD = 0.05, 0.001
 
@@ -36,7 +36,7 @@ def act(optimizer, iteration=600, seed=0, **config):
 @pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
 def test_copies_composite_to_what_they_are_copies_of(opacity, count):
-    (copies,), (factor,) = corrected(np.array([opacity]), np.array([count]))
+    (copies,), (factor,) = correct_copies(np.array([opacity]), np.array([count]))
     assert 1 - (1 - copies) ** count == pytest.approx(opacity, rel=1e-12)
     # Along a line through the centre, x in standard deviations of the copies: as much in all.
     composited, _ = quad(
@@ -46,12 +46,12 @@ def test_copies_composite_to_what_they_are_copies_of(opacity, count):
 
 
 def test_more_copies_count_as_many_as_are_exact():
-    for numbers in corrected(np.array([0.7] * 2), np.array([1000, MAX_COPIES])):
+    for numbers in correct_copies(np.array([0.7] * 2), np.array([1000, MAX_COPIES])):
         assert numbers[0] == numbers[1]
 
 
 def test_an_opacity_that_has_no_logit_has_copies():
-    copies, factors = corrected(np.array([1.0]), np.array([2]))
+    copies, factors = correct_copies(np.array([1.0]), np.array([2]))
     assert 0.99 < copies[0] < 1
     assert 0 < factors[0] < 1
 
@@ -78,7 +78,7 @@ def test_transparent_gaussians_become_copies_of_opaque_ones():
     for name in ("means", "quats", "sh0", "shN"):
         np.testing.assert_array_equal(after[name], before[name][sources])
     opacities = expit(before["logit_opacities"])[sources]
-    expected, factors = corrected(opacities, counts[sources])
+    expected, factors = correct_copies(opacities, counts[sources])
     np.testing.assert_allclose(expit(after["logit_opacities"]), expected, rtol=1e-12)
     np.testing.assert_allclose(
         np.exp(after["log_scales"] - before["log_scales"][sources]),
@@ -116,7 +116,7 @@ def test_copies_are_spread_over_what_they_are_copies_of():
     assert act(optimizer, growth=1.0, spread=0.5).num_added == num
     after = values(optimizer)["means"]
     np.testing.assert_array_equal(after[:num], before["means"])  # all are drawn once
-    _, factors = corrected(np.array([opacity]), np.array([2]))
+    _, factors = correct_copies(np.array([opacity]), np.array([2]))
     covariances = reference.covariances(before["quats"], before["log_scales"])
     whiten = np.linalg.inv(np.linalg.cholesky((0.5 * factors[0]) ** 2 * covariances))
     normal = (whiten @ (after[num:] - before["means"])[..., None])[..., 0]

@@ -1,0 +1,39 @@
+"""The plugin ``splats`` in annotations: Mitsuba's classes exist once a variant is set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeGuard
+
+import mitsuba as mi
+
+from drgs.core.types import Float
+from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.state import BackwardResult, SplatsState
+from drgs.splatting.rendering import Pipeline, ProjectionStage
+
+if TYPE_CHECKING:
+
+    class SplatsIntegrator(mi.Integrator):
+        """The part of ``plugins/splats.py`` that other modules use."""
+
+        state: SplatsState
+        gaussians: Gaussians
+        sh_degree: int
+        smoothing: Float | None
+        near: float
+        ignore: Sequence[str]
+        pipeline: Pipeline
+        last: BackwardResult  # after a backward pass
+
+        def use_projection(self, stage: ProjectionStage) -> None: ...
+        def forget_frames(self) -> None: ...
+        def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str: ...
+
+else:
+    SplatsIntegrator = Any
+
+
+def is_splats(node: object) -> TypeGuard[SplatsIntegrator]:
+    """Return whether an object of Mitsuba is the integrator ``splats``."""
+    return isinstance(getattr(node, "state", None), SplatsState)
