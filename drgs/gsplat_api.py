@@ -416,15 +416,15 @@ class _View:
         dr.eval(d_planes)
         return d_planes
 
-    def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf]:
+    def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
         """Return derivatives with respect to the inputs from those with respect to the planes."""
         dr.eval(d_planes)
         found = frames_adjoint(
             self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
         )
         d, t = found.parameters, self.types
-        assert d is not None, "found here, as this process has projected"
-        gradients = {
+        assert d is not None and d.features is not None, "of self.gaussians, projected here"
+        gradients: dict[str, TensorXf | Float] = {
             "means": d.means,
             "quats": d.quats,
             "scales": d.features["scales"],
@@ -458,7 +458,7 @@ class _View:
             features=features,
         )
 
-    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, TensorXf]:
+    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Float]:
         """Return derivatives with respect to the matrices from those of a camera's numbers.
 
         The centre is c = -R^-1 t, hence dc = -R^-1 (dt + dR c).

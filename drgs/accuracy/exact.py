@@ -81,7 +81,7 @@ LARGEST_EXPONENT = 1e4
 
 
 def exact_shape(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Project to the shape that :class:`RayFalloff` evaluates; its slopes are not clamped.
 
@@ -112,7 +112,7 @@ def closest_on_film(camera: Camera, x: Float, y: Float) -> Array2f:
 
 
 def ewa_with_depth(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Project as ``projection.ewa``, with the terms of the depth at a pixel: kappa (2) and h."""
     slopes = camera.lens.clamped_slopes(camera, position)
@@ -126,7 +126,7 @@ def _seen_along(
     camera: Camera,
     position: Array3f,
     slopes: list[Float] | None,
-    low_pass: float,
+    low_pass: Float | float,
 ) -> tuple[Array3f, tuple[Float, Float], Float]:
     """Return U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)

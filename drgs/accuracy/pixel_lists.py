@@ -91,7 +91,7 @@ class WithAffineDepth:
     shape: Projection
 
     def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
         """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
         film = self.shape(rows, camera, position, low_pass)

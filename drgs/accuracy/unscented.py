@@ -47,7 +47,7 @@ where slopes are clamped. Such splats are projected by the affine approximation.
 
 
 def unscented_shape(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Return the unscented transform; not differentiated: where :data:`NEAREST` decides."""
     points = _sigma_points(camera.lens, rows, camera, position)

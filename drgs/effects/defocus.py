@@ -27,10 +27,11 @@ class Defocused:
     shape: Projection
 
     def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float
+        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
         """Return the blurred shape, whose ``dimming`` keeps the integral."""
         film = self.shape(rows, camera, position, low_pass)
+        assert camera.aperture is not None, "see with_effects"
         spread = camera.aperture.variance(camera, position.z)
         blurred = self.shape(rows, camera, position, low_pass + spread)
         return replace(

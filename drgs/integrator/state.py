@@ -303,8 +303,9 @@ class SplatsState:
             self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
             return
         own = self.own.gaussians
+        features = own.features or {}
         pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
-        pairs += [(own.features[name], d) for name, d in (gradients.features or {}).items()]
+        pairs += [(features[name], d) for name, d in (gradients.features or {}).items()]
         for parameter, gradient in pairs:
             if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
                 dr.accum_grad(parameter, gradient)

@@ -83,7 +83,7 @@ def summary_of_sensors(
     of_cameras = [
         effect("lens", lambda camera: _lens_words(camera.lens)),
         effect("depth of field", lambda camera: None if camera.aperture is None else "a thin lens"),
-        effect("motion", lambda camera: camera.shutter and camera.shutter.label),
+        effect("motion", lambda camera: None if camera.shutter is None else camera.shutter.label),
     ]
     surfaces = SimulatedEffect(
         "surfaces",

@@ -25,7 +25,7 @@ import drjit as dr
 
 from drgs.core.arrays import ArrayTypes, Rows, types_of
 from drgs.core.constants import COLOR_MIN
-from drgs.core.types import Array3f, Bool, Float, UInt32
+from drgs.core.types import Array3f, Bool, Float, Scalar, UInt32
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.gaussians.sh import num_coefficients, sh_basis
 from drgs.light.grid import Ellipsoids, SplatGrid, build_grid
@@ -196,7 +196,7 @@ class RaySplats:
         exist = [one.is_stopped for one in draws]
         return [t.Array3f(color) for color in found], exist, T
 
-    def _color(self, row: UInt32, basis: list[Float], active: Bool) -> list[Float]:
+    def _color(self, row: UInt32, basis: list[Scalar], active: Bool) -> list[Float]:
         t = types_of(self.shapes.Float)
         numbers = self.colors.load(row, active)[: 3 * num_coefficients(self.sh_degree)]
         color = []
@@ -376,7 +376,7 @@ class _Walk:
         )
 
     def composite(
-        self, window: list[list], basis: list[Float], T: Float, color: list[Float]
+        self, window: list[list], basis: list[Scalar], T: Float, color: list[Float]
     ) -> tuple[Float, list[Float], list]:
         """Composite what was kept; returns T, negative where the ray is finished, colour, last."""
         t = types_of(self.splats.shapes.Float)

@@ -97,7 +97,7 @@ class FilmShape:
         return dr.abs(p * s)
 
 
-Projection = Callable[["GaussianRows", Camera, Array3f, float], FilmShape]
+Projection = Callable[["GaussianRows", Camera, Array3f, Float | float], FilmShape]
 """From rows, camera, means (Array3f, camera axes) and low-pass (px^2) to shapes on the film."""
 
 
@@ -111,7 +111,9 @@ class ProjectionModel:
     shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
 
     @staticmethod
-    def shape(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float) -> FilmShape:
+    def shape(
+        rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+    ) -> FilmShape:
         """Project; see :data:`Projection`."""
         raise NotImplementedError
 
@@ -213,7 +215,9 @@ def project(
     )
 
 
-def ewa(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float) -> FilmShape:
+def ewa(
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+) -> FilmShape:
     """The affine approximation of the projection at the mean (Zwicker et al. 2002, section 4).
 
     position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
@@ -232,7 +236,7 @@ class Ewa(ProjectionModel):
 
 
 def whiten(
-    means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: float
+    means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: Float | float
 ) -> FilmShape:
     """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
 
