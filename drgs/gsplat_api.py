@@ -352,13 +352,13 @@ class _Planes(dr.CustomOp):
         return planes, self._entries(inputs)
 
     def forward(self) -> None:
-        """Hand on tangents of the inputs."""
+        """Propagate tangents of the inputs."""
         directions = cast(dict[str, TensorXf], self.grad_in("inputs"))
         tangents = [view.tangents(directions) for view in self.views]
         self.set_grad_out((tangents, self._entries(directions)))
 
     def backward(self) -> None:
-        """Hand back derivatives with respect to the inputs."""
+        """Propagate derivatives to the inputs."""
         grad_out: Any = self.grad_out()  # as of :meth:`eval`
         all_d_planes, d_backgrounds = grad_out
         found: dict[str, list] = {name: [] for name in self.inputs}
@@ -416,15 +416,15 @@ class _View:
         dr.eval(d_planes)
         return d_planes
 
-    def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf]:
+    def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
         """Return derivatives with respect to the inputs from those with respect to the planes."""
         dr.eval(d_planes)
         found = frames_adjoint(
             self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
         )
         d, t = found.parameters, self.types
-        assert d is not None and d.features is not None, "this process has projected"
-        gradients = {
+        assert d is not None and d.features is not None, "of self.gaussians, projected here"
+        gradients: dict[str, TensorXf | Float] = {
             "means": d.means,
             "quats": d.quats,
             "scales": d.features["scales"],

@@ -30,10 +30,10 @@ PROPERTIES = {
 }
 
 UNBOUNDED = 0xFFFFFFFF
-"""What Mitsuba's integrators take a ``max_depth`` of -1 for."""
+"""Limit that Mitsuba's integrators use for a ``max_depth`` of -1."""
 
 MOST_LIKELY = 0.95
-"""With which a path goes on, at most: as in Mitsuba's ``path``."""
+"""Largest probability with which a path goes on, as in Mitsuba's ``path``."""
 
 
 class SplatPathIntegrator(RBIntegrator):

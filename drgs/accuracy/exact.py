@@ -55,7 +55,7 @@ from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
-from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
+from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions, flat_columns
 from drgs.splatting.projection import (
     FilmShape,
@@ -81,7 +81,7 @@ LARGEST_EXPONENT = 1e4
 
 
 def exact_shape(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Project to the shape that :class:`RayFalloff` evaluates; its slopes are not clamped.
 
@@ -112,7 +112,7 @@ def closest_on_film(camera: Camera, x: Float, y: Float) -> Array2f:
 
 
 def ewa_with_depth(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Project as ``projection.ewa``, with the terms of the depth at a pixel: kappa (2) and h."""
     slopes = camera.lens.clamped_slopes(camera, position)
@@ -126,7 +126,7 @@ def _seen_along(
     camera: Camera,
     position: Array3f,
     slopes: list[Float] | None,
-    low_pass: Scalar,
+    low_pass: Float | float,
 ) -> tuple[Array3f, tuple[Float, Float], Float]:
     """Return U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
@@ -205,7 +205,7 @@ class RayFalloff(GaussianFalloff):
         return Array2f(x, y), dr.sqrt(reach) * half_sizes
 
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
-        """Centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
+        """Return centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
 
         |e| <= sqrt(q) (1 - kappa . e) is (e - c)^T (I - q kappa kappa^T) (e - c) <= q / g^2 with
         g^2 = 1 - q |kappa|^2 and c = -q kappa / g^2. I - q kappa kappa^T = V^T V with V upper
@@ -273,7 +273,7 @@ class RayFalloff(GaussianFalloff):
     def moments(
         self, footprint: Footprint, weights: list[Float], positions: Positions
     ) -> list[Float]:
-        """Sums over the 16 pixels of w = d loss / d ln(alpha) times each of these.
+        """Sum over the 16 pixels w = d loss / d ln(alpha) times each of these.
 
         1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B (x - c); B^2. With f = |e|^2 / D,
 

@@ -1,4 +1,4 @@
-"""From approximations to the pipeline that renders with them, importing what is chosen."""
+"""Pipelines that render with given approximations; imports what is chosen."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drgs.splatting.projection import (
 from drgs.splatting.rendering import Feature, Pipeline, color_features
 
 LEAST_STOP = 1e-30
-"""Where no stop is asked for: past it float32 has no transmittance to go back from."""
+"""Stop where none is set: past it float32 has no transmittance to go back from."""
 
 
 def pipeline_of(

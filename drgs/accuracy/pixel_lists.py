@@ -17,7 +17,7 @@ from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import reinterpret, types_of
 from drgs.core.constants import WHITENING_SCALE
-from drgs.core.types import Array3f, Float, Scalar, UInt32
+from drgs.core.types import Array3f, Float, UInt32
 from drgs.splatting.footprint import Footprint, GaussianFalloff, flat_columns
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
@@ -91,7 +91,7 @@ class WithAffineDepth:
     shape: Projection
 
     def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
+        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
         """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
         film = self.shape(rows, camera, position, low_pass)

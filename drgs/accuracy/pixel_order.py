@@ -367,7 +367,7 @@ def _totals(
 def _pairs(
     inputs: _WalkInputs, totals: list[tuple[Float, Float]], g: list[list[Float]]
 ) -> list[Float]:
-    """Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat."""
+    """Walk again for each pair's weight and d loss / d ln(alpha), at the place of its splat."""
     t = types_of(inputs.bins.rows.Float)
     pairs = [dr.zeros(t.Float, inputs.num_places * PIXELS) for _ in range(2)]
     dr.eval(pairs)

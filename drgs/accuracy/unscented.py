@@ -19,7 +19,7 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
-from drgs.core.types import Array3f, Bool, Float, Scalar
+from drgs.core.types import Array3f, Bool, Float
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
@@ -34,20 +34,20 @@ SPREAD = math.sqrt(3)
 """Standard deviations from the mean to a sigma point: sqrt(n + lambda), lambda = 0."""
 
 CENTER_WEIGHT = 2.0
-"""Of the mean in the covariance, lambda / (n + lambda) + 1 - alpha^2 + beta; its weight in the mean
-of the points is 0."""
+"""Weight of the mean in the covariance, lambda / (n + lambda) + 1 - alpha^2 + beta; its weight in
+the mean of the points is 0."""
 
 WEIGHT = 1 / 6
-"""Of each other point, in both."""
+"""Weight of each other point, in both."""
 
 NEAREST = 1 / 3
-"""Of the mean's depth: where a point would be nearer, a Gaussian has neither mean nor covariance on
+"""Part of the mean's depth: where a point would be nearer, a Gaussian has no mean or covariance on
 the film, or ones that have nothing to do with its middle. The same holds far outside the film,
 where slopes are clamped. Such splats are projected by the affine approximation."""
 
 
 def unscented_shape(
-    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Return the unscented transform; not differentiated: where :data:`NEAREST` decides."""
     points = _sigma_points(camera.lens, rows, camera, position)

@@ -60,9 +60,8 @@ def normal_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> lis
     first, second = (a <= b) & (a <= c), b <= c
 
     def shortest(row: int) -> Float:
-        return dr.select(
-            first, rotation[row][0], dr.select(second, rotation[row][1], rotation[row][2])
-        )
+        x, y, z = rotation[row]
+        return dr.select(first, x, dr.select(second, y, z))
 
     normal = t.Array3f([shortest(row) for row in range(3)])
     direction = camera.lens.view_direction(camera, rows.means - camera.center)

@@ -14,7 +14,7 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
-from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
+from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions
 from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
@@ -27,11 +27,11 @@ class Defocused:
     shape: Projection
 
     def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar
+        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
         """Return the blurred shape, whose ``dimming`` keeps the integral."""
         film = self.shape(rows, camera, position, low_pass)
-        assert camera.aperture is not None, "without one nothing is blurred"
+        assert camera.aperture is not None, "see with_effects"
         spread = camera.aperture.variance(camera, position.z)
         blurred = self.shape(rows, camera, position, low_pass + spread)
         return replace(

@@ -34,7 +34,7 @@ from drgs.splatting.lanes import load_pixels
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One surface at each pixel: the nearest, or the next one that is seen through others."""
+    """A surface at each pixel: the nearest, or the next one that is seen through others."""
 
     depth: Float  # (H * W,): as that of the splats, scene units; the largest where nothing is
     coverage: Float  # (H * W,) in [0, 1]: p, the part of all light that it stops

@@ -36,7 +36,7 @@ from drgs.splatting.projection import (
 )
 
 VARIANCE = 0.2
-"""Of the filter, in squared distances between samples (Mip-Splatting, equation 9 and its code)."""
+"""Variance of the filter, in squared distances between samples (Mip-Splatting, equation 9)."""
 
 FILM_MARGIN = 0.15
 """Parts of the film's size by which a camera is taken to see beyond it (Mip-Splatting's code)."""
@@ -104,7 +104,7 @@ KEPT_VARIANCE = 0.04
 derivatives by their scales."""
 
 USUAL = Approximations()
-"""What viewers do."""
+"""Approximations of viewers."""
 
 
 def baked_for_viewers(

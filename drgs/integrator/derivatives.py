@@ -63,7 +63,7 @@ class Parameter:
         return [owner for owner in self.owners if isinstance(owner, mi.BSDF)]
 
     def name_in(self, bsdf: mi.BSDF) -> str:
-        """The parameter, or the texture that it belongs to, as the material names it."""
+        """Return the material's name of the parameter, or of the texture that it belongs to."""
         depth = self.owners.index(bsdf)
         return self.name.split(".")[-1 - depth]
 
@@ -133,7 +133,7 @@ def parameter_value(params: mi.SceneParameters, name: str) -> object:
 
 
 def type_of(integrator: mi.Integrator) -> str:
-    """Name of its class; those that are written in Python have one name for Mitsuba."""
+    """Return the name of its class; those that are written in Python have one name for Mitsuba."""
     if isinstance(integrator, TransportIntegrator):
         return SPLATPATH
     name = integrator.class_name()

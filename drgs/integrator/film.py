@@ -49,18 +49,18 @@ def pixel_corners(film: mi.Film, samples: int = 1) -> mi.Point2f:
     return mi.Point2f(pixel - row * width, row)
 
 
-def samples_in(film: mi.Film, x: Float | float) -> int:
+def num_samples(film: mi.Film, x: Float | float) -> int:
     """Return the number of samples of a pixel in a plane; x may be a number for all pixels."""
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
 
-def offsets_of(positions: Positions) -> tuple[Float | float, Float | float]:
+def sample_offsets(positions: Positions) -> tuple[Float | float, Float | float]:
     """Return x and y of sample positions from their pixels' upper left corners, px."""
     return (positions.x, positions.y) if isinstance(positions, SamplePoints) else (0.5, 0.5)
 
 
 class CenterSamples:
-    """One sample per pixel, at its centre. Exact for films whose filter is a box."""
+    """A single sample per pixel, at its centre. Exact for films whose filter is a box."""
 
     positions: Sequence[Positions] = (PixelCenters(),)  # by pass
     key: object = None  # equal for equal positions
@@ -68,7 +68,7 @@ class CenterSamples:
     def __init__(
         self, film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str] = ()
     ) -> None:
-        """maps: remembers the linear maps of films, by their description; aovs: channels' names."""
+        """Sample a film; maps: linear maps of films by description; aovs: channels' names."""
         self.film, self.maps, self.aovs = film, maps, list(aovs)
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
@@ -118,11 +118,11 @@ def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) ->
     """Return the linear map that a film applies to each pixel: (developed channels, channels)."""
     key = f"{film} {', '.join(aovs)}"
     if key not in maps:
-        maps[key] = _found_map(film, aovs)
+        maps[key] = _measure_map(film, aovs)
     return maps[key]
 
 
-def _found_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
+def _measure_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
     count = num_colors(film) + len(aovs)
     num_pixels = film.crop_size()[0] * film.crop_size()[1]
 
@@ -147,12 +147,12 @@ PIXELS_PER_PASS = 1 << 17
 """Most pixels of a pass of several samples: a launch of fewer costs more than what it computes."""
 
 SAMPLES_PER_KERNEL = 16
-"""Of more samples per pixel, the sums of a box filter are evaluated in between: compilers take
-longer than proportionally to a kernel's length. Of other filters, which reach over many
-pixels, each pass is evaluated by itself."""
+"""Samples per pixel after which the sums of a box filter are evaluated: compilers take longer than
+proportionally to a kernel's length. With other filters, which reach over many pixels, each pass is
+evaluated by itself."""
 
 
-def in_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePoints, ...]:
+def split_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePoints, ...]:
     """Divide samples into passes; points: of all, those of a pixel are neighbours."""
     at_once = min(max(PIXELS_PER_PASS // num_pixels, 1), count)
     passes = []
@@ -165,7 +165,9 @@ def in_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePo
     return tuple(passes)
 
 
-def by_sample(positions: Sequence[SamplePoints], passes: Sequence[Channels]) -> Iterator[Channels]:
+def split_samples(
+    positions: Sequence[SamplePoints], passes: Sequence[Channels]
+) -> Iterator[Channels]:
     """Divide the channels of passes into those of each sample, Float (H * W,)."""
     for points, channels in zip(positions, passes, strict=True):
         if points.samples == 1:
@@ -199,7 +201,7 @@ class DrawnSamples(CenterSamples):
         num_pixels = size[0] * size[1]
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, num_pixels * spp)
-        self.points = in_passes(sampler.next_2d(), spp, num_pixels)
+        self.points = split_passes(sampler.next_2d(), spp, num_pixels)
         self.positions = self.points
         dr.eval([(p.x, p.y) for p in self.points])
         self.key = (seed, spp, str(sensor.sampler()))
@@ -209,7 +211,7 @@ class DrawnSamples(CenterSamples):
         if film.rfilter().is_box_filter():
             count = sum(point.samples for point in self.points)
             sums = [mi.Float(0)] * len(passes[0])
-            for number, channels in enumerate(by_sample(self.points, passes), 1):
+            for number, channels in enumerate(split_samples(self.points, passes), 1):
                 sums = [total + plane for total, plane in zip(sums, channels, strict=True)]
                 if number % SAMPLES_PER_KERNEL == 0 and number < count:
                     dr.eval(sums)

@@ -1,4 +1,4 @@
-"""All Gaussians of a picture, put together of those of splat objects and of shapes.
+"""Gaussians of an image, put together of those of splat objects and of shapes.
 
 Imported when a scene has more than the Gaussians of one integrator where they are. Each
 :class:`Part` converts what is stored of some Gaussians to raw parameters in world space; Dr.Jit
@@ -59,10 +59,10 @@ from drgs.gaussians.rotation import (
 from drgs.gaussians.sh import num_coefficients
 from drgs.gaussians.similarity import Similarity
 
-Arrays = dict[str, Any]
+ParameterArrays = dict[str, Any]
 """Arrays by name: a TensorXf or Float for each parameter, a Matrix4f for ``to_world``."""
 
-Columns = dict[str, list[Float]]
+ParameterColumns = dict[str, list[Float]]
 """Columns of parameters by name."""
 
 TO_WORLD = "to_world"
@@ -74,7 +74,7 @@ class Part(Protocol):
     """Conversion of stored Gaussians to raw parameters in world space."""
 
     @property
-    def values(self) -> Arrays:
+    def values(self) -> ParameterArrays:
         """Arrays by name; a gathered part holds them, so that their indices are not reused."""
         ...
 
@@ -94,14 +94,14 @@ class Part(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """All Gaussians of a rendering, by part."""
+    """Gaussians of a rendering, by part."""
 
     parts: list[Part]  # detached
     sizes: list[tuple[int, int]]  # by part: number of Gaussians, degree
     gaussians: Gaussians  # detached and evaluated
 
     def matches(self, parts: Sequence[Part]) -> bool:
-        """True if gathering these would give the same Gaussians."""
+        """Return whether gathering these would give the same Gaussians."""
         return same_variables(
             [part.values for part in self.parts], [part.values for part in parts]
         ) and [part.fixed for part in self.parts] == [part.fixed for part in parts]
@@ -136,7 +136,7 @@ class Gathered:
             moved = copy.gaussians()
             dr.forward_to(moved)
             found.append(_gaussians({k: tangent_of(v) for k, v in _arrays(moved).items()}))
-        return _joined(found, self.gaussians.sh_degree)
+        return _concatenate(found, self.gaussians.sh_degree)
 
 
 def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
@@ -150,12 +150,12 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
         return last
     converted = [part.gaussians() for part in parts]
     sizes = [(part.num_gaussians, part.sh_degree) for part in converted]
-    gaussians = _joined(converted, max(degree for _, degree in sizes))
+    gaussians = _concatenate(converted, max(degree for _, degree in sizes))
     dr.eval(gaussians)
     return Gathered(parts, sizes, gaussians)
 
 
-def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
+def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
     found = [(part.num_gaussians, _arrays(part)) for part in parts if part.num_gaussians > 0]
     shapes = {k: v.shape[1:] for _, arrays in found for k, v in arrays.items()}
     shapes["shN"] = _sh_shape(degree)
@@ -164,7 +164,7 @@ def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
         blocks = [_block(arrays.get(name), 0, num, num, row) for num, arrays in found]
         filled = [block for block in blocks if dr.width(block) > 0]  # dr.concat takes no others
         flat = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
-        whole[name] = _shaped(flat, sum(num for num, _ in found), row)
+        whole[name] = _reshape(flat, sum(num for num, _ in found), row)
     return _gaussians(whole)
 
 
@@ -174,23 +174,23 @@ def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
     shapes = {k: v.shape[1:] for k, v in arrays.items()} | {"shN": _sh_shape(degree)}
     total = gaussians.num_gaussians
     blocks = {k: _block(v, start, num, total, shapes[k]) for k, v in arrays.items()}
-    return _gaussians({k: _shaped(v, num, shapes[k]) for k, v in blocks.items()})
+    return _gaussians({k: _reshape(v, num, shapes[k]) for k, v in blocks.items()})
 
 
 def _sh_shape(degree: int) -> tuple[int, int]:
     return num_coefficients(degree) - 1, 3
 
 
-def _shaped(flat: Float, num: int, row: tuple[int, ...]) -> mi.TensorXf | Float:
+def _reshape(flat: Float, num: int, row: tuple[int, ...]) -> mi.TensorXf | Float:
     return mi.TensorXf(flat, (num, *row)) if row else flat
 
 
-def _arrays(part: Gaussians) -> Arrays:
+def _arrays(part: Gaussians) -> ParameterArrays:
     named = {name: getattr(part, name) for name in (*PARAMETER_NAMES, "smoothing")}
     return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
 
 
-def _gaussians(arrays: Arrays) -> Gaussians:
+def _gaussians(arrays: ParameterArrays) -> Gaussians:
     features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
     own = {k: v for k, v in arrays.items() if k not in features}
     return Gaussians(**own, features=features or None)
@@ -214,7 +214,7 @@ def _block(
 
 
 def columns(flat: Float, width: int) -> list[Float]:
-    """Return the columns of rows of ``width`` numbers; see :func:`interleaved`."""
+    """Return the columns of rows of ``width`` numbers; see :func:`interleave_columns`."""
     if width == 0:
         return []
     UInt32 = types_of(type(flat)).UInt32
@@ -222,12 +222,12 @@ def columns(flat: Float, width: int) -> list[Float]:
     return [dr.gather(type(flat), flat, row + k, mode=dr.ReduceMode.Permute) for k in range(width)]
 
 
-def interleaved(values: list[Float]) -> Float:
+def interleave_columns(values: list[Float]) -> Float:
     """Return columns as rows again, flat; of no columns, an empty array."""
     return interleave(values) if values else mi.Float()
 
 
-def number_of(flat: Float, index: int) -> Float:
+def entry(flat: Float, index: int) -> Float:
     """Return one entry of an array, in no kernel: other numbers need no other one."""
     return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))
 
@@ -235,7 +235,7 @@ def number_of(flat: Float, index: int) -> Float:
 def product(matrix: Float, vector: list[Float], start: int = 0) -> list[Float]:
     """Multiply by a square matrix, flat from ``start`` on."""
     rows = [
-        [number_of(matrix, start + j * len(vector) + k) for k in range(len(vector))]
+        [entry(matrix, start + j * len(vector) + k) for k in range(len(vector))]
         for j in range(len(vector))
     ]
     terms = [[a * x for a, x in zip(row, vector, strict=True)] for row in rows]
@@ -283,7 +283,7 @@ class Turn:
 class Placement:
     """The move of an object into the scene: see :class:`Part`."""
 
-    values: Arrays  # of the object's Gaussians, and its to_world
+    values: ParameterArrays  # of the object's Gaussians, and its to_world
     fixed: str  # name of the parameter to_world, in messages
 
     def detached(self) -> Placement:
@@ -305,7 +305,7 @@ class Placement:
     def _place(self) -> Similarity:
         return similarity_of(self.values[TO_WORLD], self.fixed)
 
-    def _moved(self, arrays: Arrays) -> Arrays:
+    def _moved(self, arrays: ParameterArrays) -> ParameterArrays:
         place, split = self._place, {k: _columns_of(arrays[k]) for k in ("means", "quats", "shN")}
         turned = {
             "means": product(_device(place.scale * place.rotation), split["means"]),
@@ -313,20 +313,20 @@ class Placement:
             "shN": Turn.by(place.rotation).of(split["shN"]),
         }
         scale = _device(np.array([place.scale, np.log(place.scale)]))
-        log_scales = [c + number_of(scale, 1) for c in _columns_of(arrays["log_scales"])]
-        moved: Columns = turned | {"log_scales": log_scales}
+        log_scales = [c + entry(scale, 1) for c in _columns_of(arrays["log_scales"])]
+        moved: ParameterColumns = turned | {"log_scales": log_scales}
         if "smoothing" in arrays:
-            moved["smoothing"] = [arrays["smoothing"] * number_of(scale, 0)]
+            moved["smoothing"] = [arrays["smoothing"] * entry(scale, 0)]
         if dr.grad_enabled(self.values[TO_WORLD]):
             moved = self._with_motion(moved)
         translation = _device(place.translation)
-        moved["means"] = [c + number_of(translation, k) for k, c in enumerate(moved["means"])]
+        moved["means"] = [c + entry(translation, k) for k, c in enumerate(moved["means"])]
         self._check_finite(split, moved)
         smoothing = {k: moved.pop(k)[0] for k in list(moved) if k == "smoothing"}
-        tensors = {k: mi.TensorXf(interleaved(v), arrays[k].shape) for k, v in moved.items()}
+        tensors = {k: mi.TensorXf(interleave_columns(v), arrays[k].shape) for k, v in moved.items()}
         return tensors | smoothing
 
-    def _check_finite(self, own: Columns, moved: Columns) -> None:
+    def _check_finite(self, own: ParameterColumns, moved: ParameterColumns) -> None:
         pairs = zip(own["means"] + own["quats"], moved["means"] + moved["quats"], strict=True)
         dr.eval(moved["means"], moved["quats"])
         beyond = [dr.isfinite(before) & ~dr.isfinite(after) for before, after in pairs]
@@ -337,7 +337,7 @@ class Placement:
                 "scale the object"
             )
 
-    def _with_motion(self, moved: Columns) -> Columns:
+    def _with_motion(self, moved: ParameterColumns) -> ParameterColumns:
         """Attach Gaussians, turned about the object's origin, to a change of the matrix.
 
         Numbers that are not finite, of Gaussians that are not visible, do not move: they would make
@@ -368,7 +368,7 @@ class Placement:
         matrix, place = self.values[TO_WORLD], self._place
         change = matrix - dr.detach(matrix)
         inverse = _device(place.rotation.T / place.scale)
-        inverse = mi.Matrix3f([number_of(inverse, k) for k in range(9)])
+        inverse = mi.Matrix3f([entry(inverse, k) for k in range(9)])
         d = mi.Matrix3f([change[i, k] for i in range(3) for k in range(3)]) @ inverse
         zero = dr.opaque(mi.Float, 0, num)
         return (
@@ -410,7 +410,7 @@ HIDDEN = -1e4
 # ----------------------------------------------------------------------------------------------
 
 
-def read(shape: mi.Shape) -> Arrays:
+def read(shape: mi.Shape) -> ParameterArrays:
     """Read the shape's arrays, attached. Raises PluginError that names what does not fit."""
     values = mi.traverse(shape)
     where = f"splats: the {_name(shape)}"
@@ -445,7 +445,7 @@ def _name(shape: mi.Shape) -> str:
 class Conversion:
     """The conversion of a shape's arrays to raw parameters; see ``gathering.Part``."""
 
-    values: Arrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
+    values: ParameterArrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
     fixed: Turn | None  # of the harmonics, which is not differentiated
 
     def detached(self) -> Conversion:
@@ -468,7 +468,7 @@ class Conversion:
             log_scales=mi.TensorXf(interleave(log_scales), (num, 3)),
             logit_opacities=dr.select(is_visible, logits, HIDDEN),
             sh0=mi.TensorXf(interleave(sh[:3]), (num, 1, 3)),
-            shN=mi.TensorXf(interleaved(higher), (num, len(sh) // 3 - 1, 3)),
+            shN=mi.TensorXf(interleave_columns(higher), (num, len(sh) // 3 - 1, 3)),
         )
 
     def _opacity(self, is_visible: mi.Bool) -> mi.Float:

@@ -92,13 +92,13 @@ class ImageRender:
         image = self._image_of_splats()
         if self.hybrid is None:
             return image
-        return self.hybrid.insertion.develop(image, self.hybrid.pictures())
+        return self.hybrid.insertion.develop(image, self.hybrid.images())
 
     def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
         """Return derivatives with respect to the Gaussians; accumulate all others."""
         d_nested: list[mi.TensorXf] = []
         if self.hybrid is not None:
-            own, nested = self._image_of_splats(), self.hybrid.pictures()
+            own, nested = self._image_of_splats(), self.hybrid.images()
             grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
         d_passes = self.samples.adjoint(grad_in)
         gradients = [
@@ -122,13 +122,13 @@ class ImageRender:
             if constant is not None:
                 dr.set_grad(constant, dr.grad(splats.background))
             image = self._developed(planes, constant)
-            # The nested integrator, and other pictures of the same pass, read the gradients of
+            # The nested integrator, and other images of the same pass, read the gradients of
             # parameters again, also of those that are computed from others.
             dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
             d_image = dr.grad(image)
         if self.hybrid is None:
             return d_image
-        nested = self.hybrid.pictures()
+        nested = self.hybrid.images()
         d_nested = self.hybrid.tangents(params, nested)
         return self.hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
 
@@ -137,8 +137,8 @@ class ImageRender:
         return self._developed([view.planes() for view in self.views], constant)
 
     def _developed(self, planes: list[Planes], constant: mi.Color3f | None) -> mi.TensorXf:
-        pictures = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
-        passes = pictures[0] if self.batch is None else self.batch.put_together(pictures)
+        images = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
+        passes = images[0] if self.batch is None else self.batch.concatenate(images)
         return self.samples.develop(passes)
 
 

@@ -108,7 +108,7 @@ class RaysBehind:
     rays: StraightRays
     count: int
 
-    def moved(self, ray: Ray, active: mi.Bool) -> tuple[Ray, mi.Float]:
+    def advance(self, ray: Ray, active: mi.Bool) -> tuple[Ray, mi.Float]:
         """Return the rays, which may have differentials, and their weights. Not differentiated."""
         with dr.suspend_grad():
             rest, active = mi.Ray3f(ray), dr.full(mi.Bool, True, dr.width(ray)) & active
@@ -135,7 +135,7 @@ def _sensor_type(variant: str) -> type:
     del variant
 
     class SensorBehind(mi.Sensor):
-        """Another sensor's rays, without their beginning."""
+        """Rays of another sensor, without their beginning."""
 
         def __init__(
             self, sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind
@@ -175,7 +175,7 @@ def _sensor_type(variant: str) -> type:
                 own = sensor.sample_ray_differential(time, sample1, point, sample3, active)
                 found = own if found is None else dr.select(place >= k, own, found)
             assert found is not None, "a batch has sensors"
-            ray, passes = self.behind.moved(found[0], mi.Bool(active))
+            ray, passes = self.behind.advance(found[0], mi.Bool(active))
             return ray, found[1] * passes
 
         def to_string(self) -> str:

@@ -37,7 +37,7 @@ def make_scene(
         tensors["smoothing"] = uploaded.smoothing
     integrator = {
         "type": "splats",
-        "background": _picture(background) if isinstance(background, Path) else list(background),
+        "background": _bitmap(background) if isinstance(background, Path) else list(background),
         "near": model.near_plane,
         **model.approximations.others_than_default,
         "srgb_primitives": False,
@@ -47,7 +47,7 @@ def make_scene(
     return mi.load_dict({"type": "scene", "integrator": integrator})
 
 
-def _picture(path: Path) -> dict[str, object]:
+def _bitmap(path: Path) -> dict[str, object]:
     return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
 
 
@@ -83,12 +83,12 @@ def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[m
     for view in views:
         size = (view.width, view.height)
         if size not in films:
-            films[size] = mi.load_dict(film_of(*size))
+            films[size] = mi.load_dict(film_description(*size))
         sensors.append(mi.load_dict({**_sensor(view, calibrated), "film": films[size]}))
     return sensors
 
 
-def film_of(width: int, height: int) -> dict[str, object]:
+def film_description(width: int, height: int) -> dict[str, object]:
     """Describe the film of one image (px) for ``mi.load_dict``: RGB, with a box filter."""
     return {
         "type": "hdrfilm",

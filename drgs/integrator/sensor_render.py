@@ -21,7 +21,7 @@ from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import Channels, offsets_of, pixel_corners, samples_in
+from drgs.integrator.film import Channels, num_samples, pixel_corners, sample_offsets
 from drgs.integrator.sensors import SensorState, camera_from_sensor, depth_range, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
@@ -29,7 +29,7 @@ from drgs.splatting.footprint import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.surfaces import Hybrid
-    from drgs.integrator.visible_surfaces import Layers
+    from drgs.integrator.visible_surfaces import SurfaceLayers
 
 
 Passes = list[Channels]
@@ -125,11 +125,11 @@ class SensorRender:
         self,
         behind: _Behind,
         planes: list[Float],
-        layers: Layers | None,
+        layers: SurfaceLayers | None,
         color: mi.Color3f,
         radiance: mi.Color3f | None,
     ) -> Channels:
-        """Channels of one sample; layers: surfaces that it sees, None where there are none."""
+        """Return channels of a sample; layers: surfaces that it sees, None if there are none."""
         if layers is None:
             return self._composited(planes, mi.Float(1), behind, color)
         from drgs.integrator.visible_surfaces import rest_behind
@@ -158,7 +158,7 @@ class SensorRender:
         color_behind: mi.Color3f,
         of_surfaces: Callable[[str], Channels | None] = lambda kind: None,
     ) -> Channels:
-        """Planes of pixels: red, green, blue, perhaps alpha, AOVs.
+        """Turn planes of pixels into channels: red, green, blue, perhaps alpha, AOVs.
 
         whole: sum of the weights of splats and background, 1 less the shares of surfaces;
         of_surfaces: what surfaces contribute to the channels of an AOV of this kind.
@@ -219,7 +219,9 @@ class SensorRender:
 
         return self.splats.cache.find(f"frames {self.index}", *key, render).value
 
-    def _traced_surfaces(self, hybrid: Hybrid, state: SensorState) -> Cached[list[list[Layers]]]:
+    def _traced_surfaces(
+        self, hybrid: Hybrid, state: SensorState
+    ) -> Cached[list[list[SurfaceLayers]]]:
         from drgs.integrator.visible_surfaces import trace_surfaces
 
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
@@ -244,7 +246,7 @@ class SensorRender:
 
     @property
     def _offsets(self) -> list[tuple[Float | float, Float | float]]:
-        return [offsets_of(positions) for positions in self.positions]
+        return [sample_offsets(positions) for positions in self.positions]
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)
@@ -304,7 +306,7 @@ def _render(
     camera: Camera,
     pipeline: rendering.Pipeline,
     positions: Sequence[Positions],
-    surfaces: Sequence[Layers] | None,
+    surfaces: Sequence[SurfaceLayers] | None,
 ) -> list[rendering.Frame]:
     """Render a frame for each pass; surfaces: the visible ones of each."""
     pipeline = with_effects(pipeline, gaussians, camera)
@@ -354,9 +356,9 @@ def _accumulate_through(values: list[list[Float]], gradients: list[list[mi.Float
 
 
 LENS_POINTS = 16
-"""At which an aperture is sampled, for each place on the film: always the same, so that nothing is
-random. What is much brighter than its surroundings and smaller than the gaps between them is seen
-as so many pictures of itself."""
+"""Points at which an aperture is sampled, for each place on the film: always the same, so that
+nothing is random. What is much brighter than its surroundings and smaller than the gaps between
+the points is seen as so many images of itself."""
 
 
 def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f) -> mi.Color3f:
@@ -390,7 +392,7 @@ def background_radiance(
 
     cameras: of each time; offsets: of each pass, x and y from the pixel's upper left corner, px.
     """
-    places = [pixel_corners(film, samples_in(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
+    places = [pixel_corners(film, num_samples(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
     if isinstance(background, mi.Texture):
         found = [stretched_radiance(background, film, place) for place in places]
         return [found] * len(cameras)

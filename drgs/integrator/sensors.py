@@ -22,7 +22,7 @@ Pair = tuple[Float, Float]
 
 @dataclass(frozen=True)
 class SensorState:
-    """All that the camera of a Mitsuba sensor depends on, film and crop included.
+    """State that the camera of a Mitsuba sensor depends on, film and crop included.
 
     Holding it keeps the variables of ``device`` alive, so that equal indices mean equal values.
     """
@@ -42,7 +42,7 @@ class SensorState:
 
     @property
     def settings(self) -> tuple[object, ...]:
-        """All besides the device's numbers, compared by ==."""
+        """State besides the device's numbers, compared by ==."""
         return self.make, self.host
 
 
@@ -174,8 +174,8 @@ _PROJECTIVE = {
     "ThinLensCamera": (("to_world", "x_fov", "aperture_radius", "focus_distance"), _thin_lens),
     "OrthographicCamera": (("to_world",), _orthographic),
 }
-"""By the name of Mitsuba's class, which has no type in Python: the parameters that the camera
-depends on, and what makes it."""
+"""Parameters that a camera depends on, and the function that makes it, by the name of Mitsuba's
+class, which has no type in Python."""
 
 
 def opaque_host(state: SensorState) -> list[Float]:
@@ -243,7 +243,7 @@ class SideBySide:
 
     @staticmethod
     def of(batch: mi.Sensor) -> SideBySide:
-        """Raises PluginError if the batch's film has a crop window."""
+        """Read a batch; PluginError if its film has a crop window."""
         sensors, film = _children(batch), batch.film()
         if list(film.crop_size()) != list(film.size()):
             raise PluginError("splats: the film of a batch sensor must not have a crop window")
@@ -262,11 +262,11 @@ class SideBySide:
         """Cut the part of one image out of the channels for the film, by pass."""
         return [[self._cut(plane, index) for plane in channels] for channels in passes]
 
-    def put_together(self, pictures: Sequence[Sequence[Channels]]) -> list[Channels]:
-        """Return the channels for the film, by pass; pictures: by sensor, each by pass."""
+    def concatenate(self, images: Sequence[Sequence[Channels]]) -> list[Channels]:
+        """Return the channels for the film, by pass; images: by sensor, each by pass."""
         return [
             [self._joined(planes) for planes in zip(*of_pass, strict=True)]
-            for of_pass in zip(*pictures, strict=True)
+            for of_pass in zip(*images, strict=True)
         ]
 
     def _cut(self, plane: mi.Float, index: int) -> mi.Float:

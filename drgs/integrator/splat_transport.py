@@ -60,11 +60,11 @@ else:  # Dr.Jit evaluates annotations
 
 
 DECODING = (0.012522878, 0.682171111, 0.305306011)
-"""Of the first three powers of a display-encoded colour, whose sum is nearly linear radiance
+"""Factors of the first three powers of an encoded colour, whose sum is nearly linear radiance
 (Chapman, "sRGB approximations for HLSL", 2012)."""
 
 DECODED_WITHIN = 2e-3
-"""Of a colour in 0..1, decoded by :data:`DECODING`."""
+"""Largest error of a colour in 0..1, decoded by :data:`DECODING`."""
 
 LEAST_SAMPLES = 3
 """Splats that a ray draws, at least: for the third power."""
@@ -111,7 +111,7 @@ class RayTransport:
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
         seed, n = reinterpret(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
-        drawn, exist, T = self.splats.sampled(segment, seed, n)
+        drawn, exist, T = self.splats.sample_splats(segment, seed, n)
         colors = [
             dr.select(is_open & ~exists, 0, mi.Color3f(color))
             for color, exists in zip(drawn, exist, strict=True)
@@ -126,7 +126,7 @@ class RayTransport:
         return whole * (a * mean + b * square + c * cube), coverage
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """An estimate of that of the splats along segments.
+        """Estimate the transmittance of the splats along segments.
 
         Below :data:`ROULETTE`, Russian roulette: a ray that lets through less than ``sample`` (in
         0..1) times that is dark, and all others let through as much as that.
@@ -138,7 +138,7 @@ class RayTransport:
 
 
 def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: int) -> RaySplats:
-    """Gaussians as rays meet them, their smoothing filter included."""
+    """Prepare Gaussians for rays, their smoothing filter included."""
     rows = load_rows(gaussians, degree)
     if rows.smoothing is not None:
         from drgs.effects.smoothing import smoothed
@@ -179,7 +179,7 @@ TOO_CLOSE = (
 )
 
 NOBODY = 0xFFFFFFFF
-"""In place of a probe's number."""
+"""Number in place of a probe's, where there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +299,7 @@ def _probes(
             from drgs.effects.smoothing import smoothed
 
             pipeline = replace(pipeline, rows=smoothed)
-        probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
+        probes = Probes.of(gaussians, pipeline, centers, splats.near, _decode, planes)
         _warn_of_close(splats, objects, flat, probes)
         return probes
 
@@ -393,10 +393,10 @@ def _center(node: mi.Emitter | mi.Shape) -> list[float]:
 
 
 def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
-    """D(C), of A D(C / A) and A: with black as the last splat."""
+    """Decode with black as the last splat: return D(C), given A D(C / A) and A."""
     display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
     return mi.math.srgb_to_linear(coverage * display)
 
 
-def _decoded(color: list[mi.Float]) -> list[mi.Float]:
+def _decode(color: list[mi.Float]) -> list[mi.Float]:
     return [mi.math.srgb_to_linear(channel) for channel in color]

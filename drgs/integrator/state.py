@@ -150,7 +150,7 @@ class SplatsState:
 
     @property
     def objects(self) -> dict[str, SplatObject]:
-        """All objects that have Gaussians, by the prefix of their parameters' names."""
+        """Objects that have Gaussians, by the prefix of their parameters' names."""
         own = {"": self.own} if self.own.has_gaussians else {}
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
@@ -246,13 +246,13 @@ class SplatsState:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All rendered Gaussians, world space; attached where they are the parameters."""
+        """Rendered Gaussians, world space; attached where they are the parameters."""
         shaded = self.cache.shaded
         return self.unshaded_gaussians if shaded is None else shaded
 
     @property
     def unshaded_gaussians(self) -> Gaussians:
-        """All rendered Gaussians, without the shadows of surfaces."""
+        """Rendered Gaussians, without the shadows of surfaces."""
         if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
             self.cache.gathered = _gather_parts(self._placements(), None)
         gathered = self.cache.gathered
@@ -303,8 +303,8 @@ class SplatsState:
             self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
             return
         own = self.own.gaussians
-        pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
         features = own.features or {}
+        pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
         pairs += [(features[name], d) for name, d in (gradients.features or {}).items()]
         for parameter, gradient in pairs:
             if dr.width(parameter) > 0 and dr.grad_enabled(parameter):

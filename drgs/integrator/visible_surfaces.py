@@ -17,7 +17,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.core.types import Float
 from drgs.effects.occlusion import Surface
-from drgs.integrator.film import pixel_corners, samples_in
+from drgs.integrator.film import num_samples, pixel_corners
 from drgs.integrator.rays import INVISIBLE, StraightRays
 
 EDGE_GRID = 4
@@ -34,7 +34,7 @@ FAR_AWAY = 1e30
 
 @dataclass(frozen=True, eq=False)
 class VisibleSurface(Surface):
-    """One visible surface at each pixel."""
+    """A visible surface at each pixel."""
 
     normal: mi.Normal3f | None  # world, times the coverage; None where no AOV needs it
 
@@ -58,7 +58,7 @@ class VisibleSurface(Surface):
         return None
 
 
-Layers = list[VisibleSurface]
+SurfaceLayers = list[VisibleSurface]
 """The surfaces of each pixel, nearest first."""
 
 
@@ -77,7 +77,7 @@ def trace_surfaces(
     cameras: Sequence[Camera],
     within: Sequence[tuple[Float | float, Float | float]],
     with_normals: bool,
-) -> list[list[Layers]]:
+) -> list[list[SurfaceLayers]]:
     """Return what is seen of the surfaces, by time and by pass, evaluated.
 
     far: depth of the farthest surfaces; cameras: of each time; within: of each pass, x and y from
@@ -88,15 +88,15 @@ def trace_surfaces(
     if len(within) == 1 and dr.width(within[0]) == 1:  # the same place in all pixels
         seen = [[tracer.trace_with_edges(camera, film, *within[0])] for camera in cameras]
     else:
-        places = [(pixel_corners(film, samples_in(film, x)), x, y) for x, y in within]
+        places = [(pixel_corners(film, num_samples(film, x)), x, y) for x, y in within]
         seen = [[tracer.trace(camera, *place) for place in places] for camera in cameras]
     most = max(len(layers) for of_time in seen for layers in of_time)
-    seen = [[_padded(layers, most) for layers in of_time] for of_time in seen]
+    seen = [[_pad(layers, most) for layers in of_time] for of_time in seen]
     dr.eval(seen)
     return seen
 
 
-def _padded(layers: Layers, count: int) -> Layers:
+def _pad(layers: SurfaceLayers, count: int) -> SurfaceLayers:
     first = layers[0]
     zero = dr.zeros(mi.Float, dr.width(first.coverage))
     far = zero + FAR_AWAY
@@ -114,7 +114,7 @@ class _Tracer:
 
     def trace(
         self, camera: Camera, corner: mi.Point2f, x: Float | float, y: Float | float
-    ) -> Layers:
+    ) -> SurfaceLayers:
         """Return what rays meet at x, y from the corners of pixels, px."""
         place = corner + mi.Point2f(x, y)
         camera = camera.at_row(place.y)
@@ -163,7 +163,7 @@ class _Tracer:
 
     def trace_with_edges(
         self, camera: Camera, film: mi.Film, x: Float | float, y: Float | float
-    ) -> Layers:
+    ) -> SurfaceLayers:
         """Trace at one place of each pixel, or at several where coverage changes next to it.
 
         Around the crop window is a row of pixels more, so that its edges are those of the film.
@@ -191,7 +191,7 @@ class _Tracer:
         places = [(k + 0.5) / EDGE_GRID for k in range(EDGE_GRID)]
         hits = [self.trace(camera, corner, x, y) for y in places for x in places]
         most = max(map(len, [layers, *hits]))
-        layers, hits = _padded(layers, most), [_padded(found, most) for found in hits]
+        layers, hits = _pad(layers, most), [_pad(found, most) for found in hits]
         return [
             _with_means(surface, [found[k] for found in hits], edge)
             for k, surface in enumerate(layers)

@@ -20,7 +20,7 @@ from drgs.core.types import Array3f, Array3u, Bool, Float, UInt32
 from drgs.splatting.tiles import lower_bounds
 
 CELLS_PER_GAUSSIAN = 2.0
-"""Of the innermost cube. With more, lists are shorter, and a ray passes more cells."""
+"""Cells of the innermost cube for each Gaussian. More shorten the lists and lengthen the walk."""
 
 RESOLUTIONS = (8, 128)
 """Least and most cells along an edge. All are multiples of 4: the middle half is a finer cube."""
@@ -32,7 +32,7 @@ MOST_LEVELS = 24
 """Cubes; what is farther out than 2^23 times the innermost one's size is in no list."""
 
 MOST_ENTRIES = 32
-"""For each Gaussian, and :data:`FREE_ENTRIES` more: cells become larger until there are no more."""
+"""Entries for each Gaussian, besides :data:`FREE_ENTRIES`: cells grow until there are no more."""
 
 FREE_ENTRIES = 1 << 20
 
@@ -227,7 +227,7 @@ class _Boxes:
         t = types_of(Float)
         first, number = self._ranges(level, resolution)
         counts = dr.prod(number)
-        row, local = _expanded(counts)
+        row, local = _expand(counts)
         if dr.width(row) == 0:
             return t.UInt32(), t.UInt32()
         nx, ny = (dr.gather(t.UInt32, number[k], row) for k in (0, 1))
@@ -265,7 +265,7 @@ class _Boxes:
         return touches
 
 
-def _expanded(counts: UInt32) -> tuple[UInt32, UInt32]:
+def _expand(counts: UInt32) -> tuple[UInt32, UInt32]:
     """List for each of ``counts[row]`` items of each row: the row, and the item's number in it."""
     UInt32 = type(counts)
     size = dr.width(counts)

@@ -53,10 +53,10 @@ BORDER = 1
 """Texels around each picture that show what the neighbours do, for interpolation."""
 
 LEAST_REACH = 0.1
-"""Of the distance to the nearest splats: the first steps of a ray that starts at the centre."""
+"""Part of the distance to the nearest splats: the first steps of a ray from the centre."""
 
 MARGIN = 0.98
-"""Of the distance before a step, from which on what is seen behind it is met."""
+"""Part of the distance before a step, from which on what is seen behind it is met."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Probes:
-    """Several probes, whose texels follow each other: by probe, level, face, row and column."""
+    """Probes, whose texels follow each other: by probe, level, face, row and column."""
 
     centers: Array3f  # world, by probe
     normals: Array3f  # of the planes beyond which they see, by probe; 0: there is none
@@ -99,14 +99,14 @@ class Probes:
         for center, plane in zip(centers, planes, strict=True):
             beyond = _beyond(t, plane, pipeline)
             faces = [_face(center, k, gaussians, beyond, near, decode) for k in range(6)]
-            levels = [_joined(faces)]
+            levels = [_concatenate(faces)]
             for level in range(1, LEVELS):
-                levels.append(_halved(levels[-1], SIZE >> level))
-            texels.append(_joined(levels))
+                levels.append(_halve(levels[-1], SIZE >> level))
+            texels.append(_concatenate(levels))
             coverage, nearness = levels[0][3:]
             distance = dr.select(coverage > SOLID, coverage / nearness, dr.inf)
             nearest.append(dr.select(dr.min(distance) < dr.inf, dr.min(distance), 1))
-        columns = _joined(texels)
+        columns = _concatenate(texels)
         index = dr.arange(t.UInt32, dr.width(columns[0]))
         colors, places = (dr.empty(t.Float, n * dr.width(columns[0])) for n in (4, 2))
         dr.scatter(colors, t.Array4f(*columns[:3], 0), index)
@@ -308,13 +308,13 @@ def _face(
     return columns
 
 
-def _joined(parts: list[list[Float]]) -> list[Float]:
+def _concatenate(parts: list[list[Float]]) -> list[Float]:
     columns = [dr.concat(columns) for columns in zip(*parts, strict=True)]
     dr.eval(columns)
     return columns
 
 
-def _halved(columns: list[Float], size: int) -> list[Float]:
+def _halve(columns: list[Float], size: int) -> list[Float]:
     """Make a cube of ``size`` texels an edge from twice as many: means of four places each."""
     t = types_of(type(columns[0]))
     edge, larger = size + 2 * BORDER, _Cube(t.UInt32(0), t.UInt32(2 * size))

@@ -128,7 +128,7 @@ class RaySplats:
         )
         return t.Array3f(color), dr.abs(T)
 
-    def sampled(
+    def sample_splats(
         self, segment: Segment, seed: UInt32, count: int
     ) -> tuple[list[Array3f], list[Bool], Float]:
         """Draw ``count`` splats that segments show, with their weights.

@@ -22,7 +22,7 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import load_columns, types_of
 from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
-from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, Scalar, TensorXf
+from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, TensorXf
 from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import normalized, quat_to_rotation
@@ -97,7 +97,7 @@ class FilmShape:
         return dr.abs(p * s)
 
 
-Projection = Callable[["GaussianRows", Camera, Array3f, Scalar], FilmShape]
+Projection = Callable[["GaussianRows", Camera, Array3f, Float | float], FilmShape]
 """From rows, camera, means (Array3f, camera axes) and low-pass (px^2) to shapes on the film."""
 
 
@@ -111,7 +111,9 @@ class ProjectionModel:
     shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
 
     @staticmethod
-    def shape(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar) -> FilmShape:
+    def shape(
+        rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+    ) -> FilmShape:
         """Project; see :data:`Projection`."""
         raise NotImplementedError
 
@@ -213,7 +215,9 @@ def project(
     )
 
 
-def ewa(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Scalar) -> FilmShape:
+def ewa(
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+) -> FilmShape:
     """The affine approximation of the projection at the mean (Zwicker et al. 2002, section 4).
 
     position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
@@ -232,7 +236,7 @@ class Ewa(ProjectionModel):
 
 
 def whiten(
-    means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: Scalar
+    means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: Float | float
 ) -> FilmShape:
     """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
 
