@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 
@@ -27,9 +27,6 @@ from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import normalized, quat_to_rotation
 from drgs.splatting.cutoffs import Cutoffs
-
-if TYPE_CHECKING:
-    from drgs.splatting.footprint import GaussianFalloff
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,7 @@ class ProjectionModel:
     A subclass has a :data:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
     """
 
-    falloff: ClassVar[type[GaussianFalloff] | None] = None  # one of its own; None: as is configured
+    falloff: ClassVar[type | None] = None  # its own falloff; None: as is configured
     shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
 
     @staticmethod
