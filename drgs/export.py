@@ -53,10 +53,10 @@ SNAPPED = np.cos(np.radians(5))
 
 
 @dataclass(frozen=True)
-class Source:
+class ExportSource:
     """Gaussians to export."""
 
-    gaussians: Gaussians  # numpy, without a smoothing filter
+    gaussians: Gaussians[np.ndarray]  # without a smoothing filter
     path: Path  # of the file
     folder: Path | None  # of the fit; None: a file was named
     is_turned: bool = False  # then the fit's cameras are no longer where they were
@@ -79,7 +79,7 @@ class ExportTarget:
 
     suffix: str  # of files, in small letters
     text: str  # what it is, one phrase
-    encode: Callable[[Source], bytes]  # equal Gaussians give equal bytes
+    encode: Callable[[ExportSource], bytes]  # equal Gaussians give equal bytes
     up: np.ndarray  # (3,) what programs take for up
     has_axes: bool = False  # whether the format says so: then models are always turned
     honoured: Honoured | None = None  # None: nothing is
@@ -101,7 +101,7 @@ def targets() -> dict[str, ExportTarget]:
     return {**found, "html": PAGE}
 
 
-def _page(source: Source) -> bytes:
+def _page(source: ExportSource) -> bytes:
     """Encode a page with the first view and the background of the fit; black if there is none."""
     gaussians, folder = source.gaussians, source.folder
     title, background, cameras = source.path.name, (0.0, 0.0, 0.0), None
@@ -227,7 +227,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"written: {out} ({len(content) / 1e6:.1f} MB)")
 
 
-def load_source(what: Path, honoured: Honoured | None = None) -> Source:
+def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
     """Load the Gaussians of a fit's folder that are meant for other programs, or those of a file.
 
     honoured: by the target. The fit's own Gaussians are taken where that is all that they need.
@@ -244,8 +244,10 @@ def load_source(what: Path, honoured: Honoured | None = None) -> Source:
                 f"{what}: must be the output folder of a fit that has ended, but there is no "
                 f"{CONFIG if names else GAUSSIANS} in it"
             )
-        fitted = load_run_config(what).model.approximations if honoured else None
-        shows_own = fitted and fitted.others_than_default.keys() <= honoured(fitted)
+        shows_own = False
+        if honoured is not None:
+            fitted = load_run_config(what).model.approximations
+            shows_own = fitted.others_than_default.keys() <= honoured(fitted)
         path = what / (names[-1] if shows_own else names[0])
     gaussians = Gaussians.load(path)
     said = said_by(str(path), gaussians.rendered_with or {})
@@ -259,7 +261,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> Source:
         )
         warnings.warn(UserNote(note), stacklevel=2)
     gaussians = baked(replace(gaussians, rendered_with=others or None))
-    return Source(gaussians, path, what if what.is_dir() else None)
+    return ExportSource(gaussians, path, what if what.is_dir() else None)
 
 
 def _destination(args: argparse.Namespace) -> tuple[str, Path]:
@@ -291,14 +293,14 @@ def _target_of(path: Path) -> str | None:
 
 
 def kept_by(
-    gaussians: Gaussians,
+    gaussians: Gaussians[np.ndarray],
     box: Sequence[float] | None = None,
     min_opacity: float | None = None,
     max_scale: float | None = None,
 ) -> dict[str, np.ndarray]:
     """Return which Gaussians (N,) each criterion that is given keeps.
 
-    gaussians: numpy; box: two opposite corners, world, of the means; max_scale: largest standard
+    box: two opposite corners, world, of the means; max_scale: largest standard
     deviation, world units.
     """
     kept = {}
@@ -314,15 +316,15 @@ def kept_by(
     return kept
 
 
-def take(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    """Return some of the Gaussians (numpy); rows: indices, or (N,) of truth values."""
+def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:
+    """Return some of the Gaussians; rows: indices, or (N,) of truth values."""
     values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
     arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
     features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
     return replace(gaussians, **arrays, features=features)
 
 
-def _selected(source: Source, args: argparse.Namespace) -> Gaussians:
+def _selected(source: ExportSource, args: argparse.Namespace) -> Gaussians[np.ndarray]:
     found = kept_by(source.gaussians, args.crop, args.min_opacity, args.max_size)
     if not found:
         return source.gaussians
@@ -334,7 +336,7 @@ def _selected(source: Source, args: argparse.Namespace) -> Gaussians:
     return take(source.gaussians, kept)
 
 
-def _up(args: argparse.Namespace, source: Source, target: ExportTarget) -> np.ndarray | None:
+def _up(args: argparse.Namespace, source: ExportSource, target: ExportTarget) -> np.ndarray | None:
     """Return the direction (3,) that is up, and print it; None: the model is not to be turned."""
     words = args.up
     if words is None and not target.has_axes:

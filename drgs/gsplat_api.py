@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -22,6 +22,7 @@ from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
 from drgs.core.memory import why_too_large
+from drgs.core.types import Float, TensorXf
 from drgs.effects.compose import NamedFeature
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import GaussianRows, load_rows
@@ -33,6 +34,9 @@ from drgs.splatting.rendering import (
     frames_tangent,
     render,
 )
+
+Array = np.ndarray | TensorXf
+"""Arrays of the caller: numpy arrays, or tensors of Dr.Jit."""
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -75,9 +79,9 @@ UNSUPPORTED_GSPLAT_ARGUMENTS = {
     "rolling_shutter": MITSUBA_CAMERAS,
     "viewmats_rs": MITSUBA_CAMERAS,
 }
-"""Parameters of gsplat that there are not, and what to do instead."""
+"""Parameters of gsplat that drgs does not have, and remedies."""
 
-SHAPES = {
+SHAPES: dict[str, list[tuple[str | int, ...]]] = {
     "means": [("N", 3)],
     "viewmats": [("C", 4, 4)],
     "quats": [("N", 4)],
@@ -89,30 +93,30 @@ SHAPES = {
 }
 """Shapes that arrays may have; a letter is the same number everywhere, set where it is first."""
 
-COEFFICIENTS = [("N", "K", 3), ("C", "N", "K", 3)]
+COEFFICIENTS: list[tuple[str | int, ...]] = [("N", "K", 3), ("C", "N", "K", 3)]
 """Shapes of ``colors`` with ``sh_degree``."""
 
 
 def rasterization(
-    means: Any,
-    quats: Any,
-    scales: Any,
-    opacities: Any,
-    colors: Any,
-    viewmats: Any,
-    Ks: Any,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    colors: Array,
+    viewmats: Array,
+    Ks: Array,
     width: int,
     height: int,
     *,
     near_plane: float = 0.01,
     eps2d: float = LOW_PASS,
     sh_degree: int | None = None,
-    backgrounds: Any = None,
+    backgrounds: Array | None = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
     **approximations: str | float,
-) -> tuple[Any, Any, dict[str, Any]]:
-    """Pictures of N Gaussians as C pinhole cameras see them: (colors, alphas, meta).
+) -> tuple[Array, Array, dict[str, Any]]:
+    """Render N Gaussians through C pinhole cameras: (colors, alphas, meta).
 
     Names, defaults, conventions and the order of results are those of gsplat 1.x. Arrays are numpy
     arrays (results then are) or Dr.Jit tensors; all is computed in the type of ``means``, float32
@@ -194,7 +198,7 @@ def _require(holds: bool, name: str, expected: str, got: object) -> None:
 
 
 def _approximations(
-    others: Mapping[str, str | float], eps2d: float, rasterize_mode: str, sh_degree: int | None
+    others: Mapping[str, Any], eps2d: float, rasterize_mode: str, sh_degree: int | None
 ) -> Approximations:
     expected = f"one of {RASTERIZE_MODES}"
     _require(rasterize_mode in RASTERIZE_MODES, "rasterize_mode", expected, rasterize_mode)
@@ -219,21 +223,22 @@ def _approximations(
         raise ValueError(f"rasterization(): {reason}") from None
 
 
-def _tensor_type(means: Any) -> type:
-    """The type of all tensors: that of ``means``."""
+def _tensor_type(means: Array) -> type[TensorXf]:
+    """Return the type of all tensors: that of ``means``."""
     if dr.is_tensor_v(means) and dr.is_float_v(means):
-        return type(means)
+        return cast(type[TensorXf], type(means))
     if dr.is_array_v(means):
         raise TypeError(
             f"rasterization(): means must be a tensor (N, 3) of floats, got {type(means).__name__}"
         )
     from drjit import llvm
 
-    return llvm.ad.TensorXf64 if np.asarray(means).dtype == np.float64 else llvm.ad.TensorXf
+    is_double = np.asarray(means).dtype == np.float64
+    return cast(type[TensorXf], llvm.ad.TensorXf64 if is_double else llvm.ad.TensorXf)
 
 
-def _tensor(name: str, value: Any, tensor_type: type) -> Any:
-    """``value`` as a tensor, still attached."""
+def _tensor(name: str, value: Any, tensor_type: type[TensorXf]) -> TensorXf:
+    """Return ``value``, an array of any kind, as a tensor, still attached."""
     if type(value) is tensor_type:
         return value
     flat_type = dr.array_t(tensor_type)
@@ -247,7 +252,7 @@ def _tensor(name: str, value: Any, tensor_type: type) -> Any:
     raise TypeError(f"rasterization(): {name} must be a tensor, got {type(value).__name__}")
 
 
-def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
+def _check_shapes(inputs: Mapping[str, TensorXf], sh_degree: int | None) -> None:
     sizes: dict[str | int, int] = {}  # by letter
     for name, value in inputs.items():
         is_sh = name == "colors" and sh_degree is not None
@@ -258,7 +263,7 @@ def _check_shapes(inputs: Mapping[str, Any], sh_degree: int | None) -> None:
         _require(bool(fitting), name, f"of shape {expected}", value.shape)
         _require(value.shape[0] >= 1, name, "of one row at least", value.shape)
         sizes |= zip(allowed[fitting[0]], value.shape, strict=True)
-        if is_sh:
+        if is_sh and sh_degree is not None:
             least, sizes["D"] = (sh_degree + 1) ** 2, 3
             expected = f"of K >= {least} coefficients for sh_degree {sh_degree}"
             _require(sizes["K"] >= least, name, expected, sizes["K"])
@@ -286,7 +291,8 @@ def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
 
 
 def activated(rows: GaussianRows) -> GaussianRows:
-    """Gaussians whose scales and opacities are given as they are, among their features."""
+    """Take scales and opacities of Gaussians as they are, from their features."""
+    assert rows.features is not None, "see _View._gaussians"
     t = types_of(type(rows.logit_opacities))
     sizes = [dr.abs(scale) for scale in rows.features["scales"]]
     logs = [dr.log(dr.select(size > LEAST_SCALE, size, LEAST_SCALE)) for size in sizes]
@@ -302,7 +308,9 @@ class _Film:
     is_camera_attached: bool  # whether derivatives with respect to cameras are needed
 
 
-def _images(views: list[_View], inputs: Mapping[str, Any], mode: str) -> tuple[Any, Any]:
+def _images(
+    views: list[_View], inputs: dict[str, TensorXf], mode: str
+) -> tuple[TensorXf, TensorXf]:
     """Return images (C, H, W, X) and alphas (C, H, W, 1), attached to ``inputs``."""
     images, alphas = [], []
     all_planes, backgrounds = dr.custom(_Planes, views, inputs)
@@ -325,7 +333,7 @@ def _images(views: list[_View], inputs: Mapping[str, Any], mode: str) -> tuple[A
     return _stacked(images, shape), _stacked(alphas, shape)
 
 
-def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
+def _stacked(parts: list[Float], shape: tuple[int, ...]) -> TensorXf:
     """Return one flat array per camera as a tensor of this shape and one axis more."""
     flat = parts[0] if len(parts) == 1 else dr.concat(parts)
     return types_of(type(flat)).TensorXf(flat, (*shape, dr.width(flat) // math.prod(shape)))
@@ -334,7 +342,9 @@ def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
 class _Planes(dr.CustomOp):
     """Planes of all cameras (transmittance, features), and each number of the backgrounds."""
 
-    def eval(self, views: list[_View], inputs: dict[str, Any]) -> tuple[list[list[Any]], list[Any]]:
+    def eval(
+        self, views: list[_View], inputs: dict[str, TensorXf]
+    ) -> tuple[list[list[Float]], list[Float]]:
         """Return what the views have rendered from ``inputs``, detached."""
         self.views, self.inputs = views, inputs
         planes = [view.frame.planes() for view in views]
@@ -342,15 +352,16 @@ class _Planes(dr.CustomOp):
         return planes, self._entries(inputs)
 
     def forward(self) -> None:
-        """Hand on tangents of the inputs."""
-        directions = self.grad_in("inputs")
+        """Propagate tangents of the inputs."""
+        directions = cast(dict[str, TensorXf], self.grad_in("inputs"))
         tangents = [view.tangents(directions) for view in self.views]
         self.set_grad_out((tangents, self._entries(directions)))
 
     def backward(self) -> None:
-        """Hand back derivatives with respect to the inputs."""
-        all_d_planes, d_backgrounds = self.grad_out()
-        found: dict[str, list[Any]] = {name: [] for name in self.inputs}
+        """Propagate derivatives to the inputs."""
+        grad_out: Any = self.grad_out()  # as of :meth:`eval`
+        all_d_planes, d_backgrounds = grad_out
+        found: dict[str, list] = {name: [] for name in self.inputs}
         for view, d_planes in zip(self.views, all_d_planes, strict=True):
             for name, gradient in view.gradients(d_planes).items():
                 found[name].append(gradient)
@@ -359,14 +370,14 @@ class _Planes(dr.CustomOp):
             found["backgrounds"] = d_backgrounds
         gradients = {}
         for name, parts in found.items():
-            shape, flat = self.inputs[name].shape, [dr.ravel(part) for part in parts]
+            shape, flat = self.inputs[name].shape, [cast(Float, dr.ravel(part)) for part in parts]
             is_shared = dr.width(flat[0]) == math.prod(shape)
             total = sum(flat[1:], flat[0]) if is_shared else dr.concat(flat)
             gradients[name] = type(self.inputs[name])(total, shape)
         self.set_grad_in("inputs", gradients)
 
-    def _entries(self, values: Mapping[str, Any]) -> list[Any]:
-        """Each number of the backgrounds, Float (1,)."""
+    def _entries(self, values: Mapping[str, TensorXf]) -> list[Float]:
+        """Return each number of the backgrounds, (1,)."""
         if "backgrounds" not in values:
             return []
         flat = values["backgrounds"].array
@@ -383,7 +394,7 @@ class _View:
     """Planes of one camera, and their derivatives."""
 
     def __init__(
-        self, film: _Film, pipeline: Pipeline, inputs: Mapping[str, Any], index: int
+        self, film: _Film, pipeline: Pipeline, inputs: Mapping[str, TensorXf], index: int
     ) -> None:
         """Render; inputs: detached; index: of the camera among them."""
         self.film, self.pipeline, self.inputs, self.index = film, pipeline, inputs, index
@@ -397,7 +408,7 @@ class _View:
         self.gaussians = self._gaussians(inputs)
         self.frame = render(self.gaussians, camera, pipeline)
 
-    def tangents(self, directions: Mapping[str, Any]) -> list[Any]:
+    def tangents(self, directions: Mapping[str, TensorXf]) -> list[Float]:
         """Return directional derivatives of the planes along tangents of the inputs."""
         d_gaussians = self._gaussians(directions)
         d_camera = self._camera_tangents(directions) if self.film.is_camera_attached else None
@@ -405,14 +416,15 @@ class _View:
         dr.eval(d_planes)
         return d_planes
 
-    def gradients(self, d_planes: list[Any]) -> dict[str, Any]:
+    def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
         """Return derivatives with respect to the inputs from those with respect to the planes."""
         dr.eval(d_planes)
         found = frames_adjoint(
             self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
         )
         d, t = found.parameters, self.types
-        gradients = {
+        assert d is not None and d.features is not None, "of self.gaussians, projected here"
+        gradients: dict[str, TensorXf | Float] = {
             "means": d.means,
             "quats": d.quats,
             "scales": d.features["scales"],
@@ -421,12 +433,12 @@ class _View:
             "viewmats": dr.zeros(t.Float, 16),
             "Ks": dr.zeros(t.Float, 9),
         }
-        if self.film.is_camera_attached:
+        if found.camera is not None:
             gradients |= self._camera_gradients(np.array([number[0] for number in found.camera]))
         return gradients
 
-    def _gaussians(self, values: Mapping[str, Any]) -> Gaussians:
-        """Values, or tangents, of the Gaussians that the kernels see."""
+    def _gaussians(self, values: Mapping[str, TensorXf]) -> Gaussians:
+        """Return values, or tangents, of the Gaussians that the kernels see."""
         num, t, colors = values["means"].shape[0], self.types, values["colors"]
         if len(colors.shape) == (3 if self.film.sh_degree is None else 4):
             colors = colors[self.index]
@@ -446,7 +458,7 @@ class _View:
             features=features,
         )
 
-    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Any]:
+    def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Float]:
         """Return derivatives with respect to the matrices from those of a camera's numbers.
 
         The centre is c = -R^-1 t, hence dc = -R^-1 (dt + dR c).
@@ -460,7 +472,7 @@ class _View:
         Float = self.types.Float
         return {"viewmats": from_host(Float, d_viewmat), "Ks": from_host(Float, d_K)}
 
-    def _camera_tangents(self, directions: Mapping[str, Any]) -> list[Any]:
+    def _camera_tangents(self, directions: Mapping[str, TensorXf]) -> list[Float]:
         d_viewmat = np.array(directions["viewmats"], np.float64)[self.index]
         d_K = np.array(directions["Ks"], np.float64)[self.index]
         moved = d_viewmat[:3, 3] + d_viewmat[:3, :3] @ self.center
@@ -473,7 +485,7 @@ class _View:
 
 def _meta(views: list[_View]) -> dict[str, Any]:
     """Return the intermediate values of each splat, by gsplat's names."""
-    columns: dict[str, list[Any]] = {}
+    columns: dict[str, list[Float]] = {}
     for view in views:
         rows = load_rows(view.gaussians, view.pipeline.sh_degree)
         splats = view.pipeline.project(rows, view.frame.camera)
@@ -490,7 +502,9 @@ def _meta(views: list[_View]) -> dict[str, Any]:
             columns.setdefault(name, []).append(interleave(values))
     dr.eval(columns)
     film, num = views[0].film, views[0].gaussians.num_gaussians
-    meta = {name: _stacked(flat, (len(views), num)) for name, flat in columns.items()}
+    meta: dict[str, Any] = {
+        name: _stacked(flat, (len(views), num)) for name, flat in columns.items()
+    }
     meta |= {name: meta[name][:, :, 0] for name in ("depths", "opacities")}
     meta["radii"] = dr.int32_array_t(type(meta["radii"]))(meta["radii"])
     return {**meta, "width": film.width, "height": film.height, "n_cameras": len(views)}

@@ -29,6 +29,7 @@ def register(variant: str) -> None:
         spec = importlib.util.spec_from_file_location(
             module_name, Path(__file__).with_name(f"{name}.py")
         )
+        assert spec is not None and spec.loader is not None, "of a Python file"
         module = importlib.util.module_from_spec(spec)
         sys.modules[module_name] = module
         try:
@@ -38,5 +39,5 @@ def register(variant: str) -> None:
             raise
 
 
-if mi.variant() is not None:
-    register(mi.variant())
+if (variant := mi.variant()) is not None:
+    register(variant)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +14,7 @@ from drgs.cameras.lens import LENSES, Lens
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 from drgs.core.environment import check_variant
 from drgs.core.errors import PluginError, UserError
+from drgs.core.types import Bool, Float
 from drgs.integrator.properties import (
     integer,
     matrix,
@@ -74,7 +75,8 @@ class CalibratedSensor(mi.Sensor):
         check_variant("calibrated", mi.variant())
         if "to_world_close" in props and "shutter_close" not in props:
             # Integrators that trace rays choose their times within these two.
-            props["shutter_close"] = props.get("shutter_open", 0.0) + 1.0
+            opens = read(props, {"shutter_open": number(0.0)})["shutter_open"]
+            props["shutter_close"] = opens + 1.0
         super().__init__(props)
         self.m_needs_sample_3 = False  # no aperture
         width, height = self.film().size()
@@ -96,17 +98,17 @@ class CalibratedSensor(mi.Sensor):
         self.shutter, self.shutter_samples = values["shutter"], values["shutter_samples"]
         refuse_unknown(props, (*KNOWN, *self.lens.coefficient_names()))
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        super().traverse(callback)
-        callback.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        super().traverse(cb)
+        cb.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
         for name in ("fx", "fy", "cx", "cy"):
-            callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+            cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
         for name, value in self.coefficients.items():
-            callback.put(name, value, mi.ParamFlags.Differentiable)
+            cb.put(name, value, mi.ParamFlags.Differentiable)
         if self.to_world_close is not None:
-            callback.put("to_world_close", self.to_world_close, mi.ParamFlags.NonDifferentiable)
+            cb.put("to_world_close", self.to_world_close, mi.ParamFlags.NonDifferentiable)
 
-    def parameters_changed(self, keys: list[str]) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not keys or set(keys) & set(self.coefficients):
             values = {name: float(value[0]) for name, value in self.coefficients.items()}
             self.lens = _with_coefficients(type(self.lens), values) if values else self.lens
@@ -143,15 +145,20 @@ class CalibratedSensor(mi.Sensor):
         camera = on_crop_window(state, opaque_host(state), device["to_world"], focal, principal)
         if self.to_world_close is None:
             return camera
-        from drgs.cameras.motion import CameraMotion, MotionBlur, RollingShutter
+        from drgs.cameras.motion import Motion, MotionBlur, RollingShutter
 
-        motion = CameraMotion.between(camera, *pose_from_to_world(device["to_world_close"]))
+        motion = Motion.between(camera, *pose_from_to_world(device["to_world_close"]))
         if self.shutter == "rolling":
             return replace(camera, shutter=RollingShutter(*motion))
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
 
     def sample_ray(
-        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        self,
+        time: Float,
+        sample1: Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: Bool | bool = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         del sample3
         place = sample2 * mi.Vector2f(self.film().crop_size())
@@ -178,8 +185,8 @@ class CalibratedSensor(mi.Sensor):
         )
         return ray, weight & seen
 
-    def _time_of(self, camera: Camera, time: Any, y: Any) -> Any:
-        """From 0, the first pose, to 1, the second, of a ray that starts in the row ``y``, px."""
+    def _time_of(self, camera: Camera, time: Float, y: Float) -> Float:
+        """Return when a ray starts in the row ``y`` (px), from 0, the first pose, to 1."""
         if self.shutter == "rolling":
             return (y - camera.film_start.y) / (camera.film_end.y - camera.film_start.y)
         if self.shutter_open_time() == 0:
@@ -187,7 +194,12 @@ class CalibratedSensor(mi.Sensor):
         return (mi.Float(time) - self.shutter_open()) / self.shutter_open_time()
 
     def sample_ray_differential(
-        self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        self,
+        time: Float,
+        sample1: Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: Bool | bool = True,
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -34,17 +32,17 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         check_variant("splats_minimal", mi.variant())
         super().__init__(props)
-        gaussians = Gaussians.load(props["filename"]).to(mi.TensorXf)
+        gaussians = Gaussians.load(str(props["filename"])).to(mi.TensorXf)
         for name in PARAMETER_NAMES:
             setattr(self, name, getattr(gaussians, name))
         self.pipeline = Pipeline(gaussians.sh_degree)
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         for name in PARAMETER_NAMES:
-            callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+            cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
     def render(
-        self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
         with dr.suspend_grad():
@@ -52,8 +50,8 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
             return develop_pixels(film, _channels(film, layers.planes()), [])
 
     def render_backward(
-        self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
-        sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, params: object, grad_in: mi.TensorXf,
+        sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
     ) -> None:  # fmt: skip
         with dr.suspend_grad():
             film, camera, bins, records, layers = self._composited(scene, sensor)
@@ -90,7 +88,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
 
 
 def _channels(film: mi.Film, planes: list[mi.Float]) -> list[mi.Float]:
-    """Linear red, green and blue of display-encoded colours, and alpha if the film has it."""
+    """Return linear red, green and blue of encoded colours, and alpha if the film has it."""
     transmittance, *colors = planes
     linear = list(mi.math.srgb_to_linear(mi.Color3f(colors)))
     return linear + [1 - transmittance] * mi.has_flag(film.flags(), mi.FilmFlags.Alpha)

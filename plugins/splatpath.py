@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.ad.integrators.common import RBIntegrator, mis_weight, solid_angle_to_area_jacobian
+from mitsuba.ad.integrators.common import (  # pyright: ignore[reportMissingImports]  no stub
+    RBIntegrator,
+    mis_weight,
+    solid_angle_to_area_jacobian,
+)
 
 from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
@@ -17,6 +21,8 @@ from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_part
 if TYPE_CHECKING:
     from drgs.integrator.rays import SplatTransport
 
+T = TypeVar("T")
+
 PROPERTIES = {
     "max_depth": integer(-1, least=-1),
     "rr_depth": integer(5, least=1),
@@ -24,10 +30,10 @@ PROPERTIES = {
 }
 
 UNBOUNDED = 0xFFFFFFFF
-"""What Mitsuba's integrators take a ``max_depth`` of -1 for."""
+"""Limit that Mitsuba's integrators use for a ``max_depth`` of -1."""
 
 MOST_LIKELY = 0.95
-"""With which a path goes on, at most: as in Mitsuba's ``path``."""
+"""Largest probability with which a path goes on, as in Mitsuba's ``path``."""
 
 
 class SplatPathIntegrator(RBIntegrator):
@@ -69,7 +75,7 @@ class SplatPathIntegrator(RBIntegrator):
         active: mi.Bool,
         **others: Any,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], mi.Spectrum]:
-        """Radiance along rays, or its derivatives; see ``RBIntegrator.sample``, also for others.
+        """Estimate radiance along rays, or its derivatives; others: see ``RBIntegrator.sample``.
 
         Path replay (Vicini et al. 2021): the second walk takes the same path, and knows of each
         vertex what radiance is still to come, as the first one has left the sum.
@@ -229,6 +235,11 @@ class SplatPathIntegrator(RBIntegrator):
         return path.throughput * radiance, path.throughput * let_through
 
 
+def _replace_grad(values: T, gradient: T) -> T:
+    """Return ``values`` with the derivatives of ``gradient``."""
+    return cast(T, dr.replace_grad(values, gradient))  # which the stub says to return nothing
+
+
 @dataclass  # not frozen: ``dr.syntax`` carries it through a loop
 class _Path:
     """A path at a vertex."""
@@ -268,11 +279,11 @@ class _Path:
             )
             here = dr.detach(si)
             moved = here.to_local(dr.normalize(last.p - here.p))
-            si.wi = dr.replace_grad(si.wi, dr.select(self.depth >= 1, moved, si.wi))
+            si.wi = _replace_grad(si.wi, dr.select(self.depth >= 1, moved, si.wi))
         return si
 
     def after(self, step: _Step, si: mi.SurfaceInteraction3f) -> _Path:
-        """At the next vertex."""
+        """Return the path at the next vertex."""
         passes = step.is_null
         length = self.length + dr.dot(step.ray.o - self.ray.o, self.ray.d)
         return _Path(
@@ -313,7 +324,7 @@ class _Step:
         return mi.has_flag(self.type, mi.BSDFFlags.Delta)
 
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
-        """1, attached: how what the vertex reflects of the next segment changes, relatively."""
+        """Return 1, attached to the relative change of what the vertex reflects of the segment."""
         bsdf, is_delta = si.bsdf(ray), self.is_delta
         next_si = self.hit.compute_surface_interaction(
             self.ray, ray_flags=mi.RayFlags.Minimal, active=self.active
@@ -323,7 +334,7 @@ class _Step:
         hits = self.active & next_si.is_valid() & ~is_delta
         jacobian = solid_angle_to_area_jacobian(si.p, next_si.p, next_si.n, hits)
         moved = dr.select(next_si.is_valid(), dr.normalize(next_si.p - si.p), self.ray.d)
-        wo = si.to_local(dr.replace_grad(self.ray.d, moved))
+        wo = si.to_local(_replace_grad(self.ray.d, moved))
         value = bsdf.eval(mi.BSDFContext(), si, wo, self.active & ~is_delta)
         # A perfect reflection evaluates to 0; the same numbers sample it again.
         again, weight = bsdf.sample(mi.BSDFContext(), si, *self.numbers, self.active & is_delta)
@@ -355,14 +366,14 @@ def _attached(
     # A lamp without a surface is sampled where it is: the same numbers find it again.
     again, of_lamp = scene.sample_emitter_direction(si, numbers, False, active & ds.delta)
     moved.d = dr.select(ds.delta, again.d, moved.d)
-    ds = dr.replace_grad(ds, moved)
+    ds = _replace_grad(ds, moved)
     # Samples are points of the emitter: a vertex that moves sees them in another solid angle.
     jacobian = solid_angle_to_area_jacobian(
         si.p, dr.detach(ds.p), dr.detach(ds.n), active & is_surface
     )
     emitted = scene.eval_emitter_direction(si, ds, active)
     density = dr.select(ds.pdf != 0, dr.rcp(dr.detach(ds.pdf)), 0)
-    weight = dr.replace_grad(weight, dr.select(ds.delta, of_lamp, emitted * density))
+    weight = _replace_grad(weight, dr.select(ds.delta, of_lamp, emitted * density))
     return ds, weight * dr.relative_grad(jacobian)
 
 

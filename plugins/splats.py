@@ -7,9 +7,9 @@ derivatives. Read ``minimal.py`` first: the same without options, on one page.
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import attrgetter
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +17,7 @@ import mitsuba as mi
 from drgs.core.arrays import interleave
 from drgs.core.environment import check_variant
 from drgs.core.errors import PluginError, UnsupportedError
+from drgs.core.types import Bool
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
@@ -84,7 +85,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     # Parameters
     # ------------------------------------------------------------------------------------------
 
-    def traverse(self, callback: mi.TraversalCallback) -> None:
+    def traverse(self, cb: mi.TraversalCallback) -> None:
         state, own = self.state, self.state.own
         found = {name: getattr(own.gaussians, name) for name in PARAMETER_NAMES}
         found = {name: value for name, value in found.items() if dr.width(value) > 0}
@@ -97,11 +98,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
             if state.nested is not None:
                 found["nested"] = state.nested
         for name, value in found.items():
-            callback.put(name, value, mi.ParamFlags.Differentiable)
+            cb.put(name, value, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: list[str]) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check that parameters fit together; forget frames, also if written in place."""
-        if keys != ["background"]:
+        if list(keys) != ["background"]:
             self.forget_frames()
         self.state.parameters_changed(keys, self._is_object)
 
@@ -165,7 +166,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     # ------------------------------------------------------------------------------------------
 
     def render(
-        self, scene: mi.Scene, sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
         sensor = _resolve_sensor(scene, sensor)
@@ -178,8 +179,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return image if develop else mi.TensorXf()
 
     def render_backward(
-        self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf,
-        sensor: Any = 0, seed: Any = 0, spp: int = 0,
+        self, scene: mi.Scene, params: object, grad_in: mi.TensorXf,
+        sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
     ) -> None:  # fmt: skip
         """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
         sensor = _resolve_sensor(scene, sensor)
@@ -201,7 +202,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it may hold an attached block
 
     def render_forward(
-        self, scene: mi.Scene, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+        self,
+        scene: mi.Scene,
+        params: object,
+        sensor: int | mi.Sensor = 0,
+        seed: int | mi.UInt32 = 0,
+        spp: int = 0,
     ) -> mi.TensorXf:
         """Return the directional derivative of the image along gradients set on parameters."""
         sensor = _resolve_sensor(scene, sensor)
@@ -214,8 +220,14 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it holds an attached block
         return d_image
 
-    def sample(
-        self, *, scene: mi.Scene, sampler: mi.Sampler, ray: Any, active: Any, **others: Any
+    def sample(  # pyright: ignore[reportIncompatibleMethodOverride]  called by keyword
+        self,
+        *,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        active: Bool,
+        **others: object,
     ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
         """Render along the rays of a whole image, for ``aov``: see ``drgs.integrator.aov_rays``."""
         from drgs.integrator.aov_rays import ImageRays
@@ -226,6 +238,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         attached = any(dr.grad_enabled(value) for one in nodes for _, value in mi.traverse(one))
         with dr.suspend_grad():
             rays = ImageRays.of(sensor, self.state.near, dr.detach(ray))
+            assert sensor is not None, "refused by ImageRays.of"
             if self.state.aovs and attached:
                 raise UnsupportedError(
                     "splats: inside 'aov', derivatives with 'aovs' of this integrator are not "

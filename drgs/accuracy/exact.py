@@ -46,7 +46,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
 
 import drjit as dr
 
@@ -56,6 +55,7 @@ from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
+from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions, flat_columns
 from drgs.splatting.projection import (
     FilmShape,
@@ -80,8 +80,10 @@ LARGEST_EXPONENT = 1e4
 """2^-1e4 is 0 in either precision."""
 
 
-def exact_shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
-    """The shape that :class:`RayFalloff` evaluates; the slopes of its Jacobian are not clamped.
+def exact_shape(
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+) -> FilmShape:
+    """Project to the shape that :class:`RayFalloff` evaluates; its slopes are not clamped.
 
     Its whitening is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
     where the anchor is, which makes no difference.
@@ -103,14 +105,16 @@ def exact_shape(rows: GaussianRows, camera: Camera, position: Any, low_pass: flo
     return replace(film, whitening=film.whitening * (denominator / a), ray=ray)
 
 
-def closest_on_film(camera: Camera, x: Any, y: Any) -> Any:
-    """The point of the film, Array2f, that is closest to a point of its plane, px."""
+def closest_on_film(camera: Camera, x: Float, y: Float) -> Array2f:
+    """Return the point of the film that is closest to a point of its plane, px."""
     t = types_of(type(x))
     return dr.clip(t.Array2f(x, y), camera.film_start, camera.film_end)
 
 
-def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: float) -> FilmShape:
-    """As ``projection.ewa``, and what is needed for the depth at a pixel: kappa (2) and h."""
+def ewa_with_depth(
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+) -> FilmShape:
+    """Project as ``projection.ewa``, with the terms of the depth at a pixel: kappa (2) and h."""
     slopes = camera.lens.clamped_slopes(camera, position)
     film = ewa(rows, camera, position, low_pass)
     _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)
@@ -118,9 +122,13 @@ def ewa_with_depth(rows: GaussianRows, camera: Camera, position: Any, low_pass: 
 
 
 def _seen_along(
-    rows: GaussianRows, camera: Camera, position: Any, slopes: list[Any], low_pass: float
-) -> tuple[Any, tuple[Any, Any], Any]:
-    """U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
+    rows: GaussianRows,
+    camera: Camera,
+    position: Array3f,
+    slopes: list[Float] | None,
+    low_pass: Float | float,
+) -> tuple[Array3f, tuple[Float, Float], Float]:
+    """Return U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
     film = whiten(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     p, _, s = film.whitening
@@ -140,12 +148,12 @@ def _seen_along(
 class RayFootprint(Footprint):
     """The same, with what the derivatives of |e|^2 / D need, at the 16 pixels."""
 
-    along: list[Any]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
-    exponent: list[Any]  # B = |e|^2 / D, base 2
+    along: list[Float]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
+    exponent: list[Float]  # B = |e|^2 / D, base 2
     from_anchor: tuple[list, list]  # grids of x - c, px
 
     @property
-    def coordinates(self) -> list[tuple[Any, Any]]:
+    def coordinates(self) -> list[tuple[Float, Float]]:
         """e = (u, v)."""
         return list(zip(flat_columns(self.u), flat_columns(self.v), strict=True))
 
@@ -158,10 +166,15 @@ class RayFalloff(GaussianFalloff):
     them, U and h scaled to base 2.
     """
 
-    num_geometry: ClassVar[int] = 9
-    num_moments: ClassVar[int] = 9
-
     camera: Camera | None = None
+
+    @property
+    def num_geometry(self) -> int:
+        return 9
+
+    @property
+    def num_moments(self) -> int:
+        return 9
 
     def for_camera(self, camera: Camera) -> RayFalloff:
         """Bind to a camera, whose film has the anchors; UnsupportedError unless it is a pinhole."""
@@ -172,23 +185,27 @@ class RayFalloff(GaussianFalloff):
             )
         return RayFalloff(camera)
 
-    def geometry(self, splats: Splats2D) -> list[Any]:
+    def geometry(self, splats: Splats2D) -> list[Float]:
         ray = splats.ray
+        assert ray is not None, "as exact_shape makes them"
         own = [ray.tilt_x, ray.tilt_y, ray.spread / WHITENING_SCALE**2]
         return [*super().geometry(splats), *own]
 
-    def differentiable(self, splats: Splats2D) -> list[Any]:
+    def differentiable(self, splats: Splats2D) -> list[Float]:
         ray = splats.ray
+        assert ray is not None, "as exact_shape makes them"
         return [*super().differentiable(splats), ray.tilt_x, ray.tilt_y, ray.spread]
 
-    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+    def bounds(
+        self, splats: Splats2D, geometry: list[Float], reach: Float
+    ) -> tuple[Array2f, Array2f]:
         x, y, p, r, s = self.outline(geometry, reach)
         Array2f = types_of(type(p)).Array2f
         half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
         return Array2f(x, y), dr.sqrt(reach) * half_sizes
 
-    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
-        """Centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
+    def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
+        """Return centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
 
         |e| <= sqrt(q) (1 - kappa . e) is (e - c)^T (I - q kappa kappa^T) (e - c) <= q / g^2 with
         g^2 = 1 - q |kappa|^2 and c = -q kappa / g^2. I - q kappa kappa^T = V^T V with V upper
@@ -196,6 +213,7 @@ class RayFalloff(GaussianFalloff):
         """
         x, y, p, r, s, _, gx, gy, h = geometry
         # At the mean a is 1, and g = -U^T kappa, before they are divided.
+        assert self.camera is not None, "bound by for_camera"
         anchor, sign = closest_on_film(self.camera, x, y), _sign(p)
         at_mean = sign * dr.fma(gx, x - anchor.x, dr.fma(gy, y - anchor.y, sign))
         kx = -sign * gx / p
@@ -224,9 +242,12 @@ class RayFalloff(GaussianFalloff):
         ]
         return [dr.select(bounded, a, b) for a, b in zip(ellipse, everywhere, strict=True)]
 
-    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> RayFootprint:
+    def footprint(
+        self, geometry: list[Float], offsets_from: Offsets, active: Bool | bool
+    ) -> RayFootprint:
         affine = super().footprint(geometry[: super().num_geometry], offsets_from, active)
         log2_opacity = dr.select(active, self.log2_opacity(geometry), -dr.inf)
+        assert self.camera is not None, "bound by for_camera"
         from_anchor = offsets_from(*closest_on_film(self.camera, *geometry[:2]))
         pixels = zip(*map(flat_columns, (affine.u, affine.v, *from_anchor)), strict=True)
         along, exponent, log2_alpha = [], [], []
@@ -250,14 +271,15 @@ class RayFalloff(GaussianFalloff):
         )
 
     def moments(
-        self, footprint: RayFootprint, weights: list[Any], positions: Positions
-    ) -> list[Any]:
-        """Sums over the 16 pixels of w = d loss / d ln(alpha) times each of these.
+        self, footprint: Footprint, weights: list[Float], positions: Positions
+    ) -> list[Float]:
+        """Sum over the 16 pixels w = d loss / d ln(alpha) times each of these.
 
         1; A^2 u, A^2 u dx, A^2 u dy; A^2 v, A^2 v dy; A B (x - c); B^2. With f = |e|^2 / D,
 
             df = 2 A^2 e . de - 2 A B da - B^2 dh
         """
+        assert isinstance(footprint, RayFootprint), "made by self.footprint"
         dx, dy = footprint.dx, footprint.dy
         anchor_x, anchor_y = footprint.from_anchor
         x, y, z, bb = [], [], [], []
@@ -281,8 +303,8 @@ class RayFalloff(GaussianFalloff):
             positions.sum(bb),
         ]
 
-    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
-        """From moments to the derivatives of what :meth:`differentiable` lists.
+    def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
+        """Turn moments into the derivatives of what :meth:`differentiable` lists.
 
         log2_alpha = log2_opacity - f, e = (p dx + r dy, s dy), dx = x - mean, a = +-1 + g (x - c).
         """
@@ -301,13 +323,14 @@ class RayFalloff(GaussianFalloff):
             math.log(2) / WHITENING_SCALE**2 * bb,
         ]
 
-    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
         count = super().num_geometry
         return super().pack_tangents(geometry, tangents[:count]) + list(tangents[count:])
 
     def tangent(
-        self, geometry: list[Any], footprint: RayFootprint, d_geometry: list[Any]
-    ) -> list[Any]:
+        self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
+    ) -> list[Float]:
+        assert isinstance(footprint, RayFootprint), "made by self.footprint"
         _, _, p, r, s = geometry[:5]
         d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_h = d_geometry
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
@@ -338,14 +361,16 @@ class Exact(ProjectionModel):
     shape = shape_with_depth = staticmethod(exact_shape)
 
 
-def ray_denominator(geometry: list[Any], u: Any, v: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
-    """|e|^2, a and D at a pixel with e = (u, v), at (x, y) from the anchor."""
+def ray_denominator(
+    geometry: list[Float], u: Float, v: Float, x: Float, y: Float
+) -> tuple[Float, Float, Float]:
+    """Return |e|^2, a and D at a pixel with e = (u, v), at (x, y) from the anchor."""
     _, _, p, _, _, _, gx, gy, h, *_ = geometry
     squared = dr.fma(u, u, v * v)
     a = dr.fma(gx, x, dr.fma(gy, y, _sign(p)))
     return squared, a, dr.fma(a, a, h * squared)
 
 
-def _sign(p: Any) -> Any:
-    """Of a_c: that of U."""
-    return dr.copysign(type(p)(1), p)
+def _sign(p: Float) -> Float:
+    """Return the sign of a_c, which is that of U."""
+    return type(p)(dr.copysign(type(p)(1), p))

@@ -1,4 +1,4 @@
-"""From approximations to the pipeline that renders with them, importing what is chosen."""
+"""Pipelines that render with given approximations; imports what is chosen."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from drgs.core.errors import UnsupportedError
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.footprint import DEFAULT, FootprintModel, GaussianFalloff
 from drgs.splatting.projection import (
-    ProjectionModel,
     color_at_mean,
     compensated_opacity,
     plain_opacity,
@@ -17,7 +16,7 @@ from drgs.splatting.projection import (
 from drgs.splatting.rendering import Feature, Pipeline, color_features
 
 LEAST_STOP = 1e-30
-"""Where no stop is asked for: past it float32 has no transmittance to go back from."""
+"""Stop where none is set: past it float32 has no transmittance to go back from."""
 
 
 def pipeline_of(
@@ -25,7 +24,7 @@ def pipeline_of(
     sh_degree: int,
     features: tuple[Feature, ...] = (color_features,),
 ) -> Pipeline:
-    """What renders ``features`` with ``approximations``, colours of ``sh_degree`` (0 to 3)."""
+    """Create the pipeline that renders ``features``; sh_degree: of colours, 0 to 3."""
     stop = max(approximations.transmittance_stop, LEAST_STOP)
     cutoffs = Cutoffs(
         approximations.alpha_max, approximations.alpha_cut, stop, approximations.extent
@@ -34,7 +33,8 @@ def pipeline_of(
     projection = PROJECTIONS.get(approximations.projection).value
     falloff = FALLOFFS.get(approximations.falloff).value
     if projection.falloff is not None:
-        falloff = _own_falloff(approximations, projection)
+        _check_no_falloff(approximations)
+        falloff = projection.falloff
     if falloff is not GaussianFalloff:
         model = replace(model, falloff=falloff())
     shape, order = ORDERS.get(approximations.order).value.create(projection, approximations)
@@ -55,12 +55,9 @@ def pipeline_of(
     )
 
 
-def _own_falloff(
-    approximations: Approximations, projection: type[ProjectionModel]
-) -> type[GaussianFalloff]:
+def _check_no_falloff(approximations: Approximations) -> None:
     if approximations.falloff != FALLOFFS.shipped[0]:
         raise UnsupportedError(
             f"splats: projection '{approximations.projection}' has a falloff of its own, got "
             f"falloff '{approximations.falloff}'; use another projection, or no falloff"
         )
-    return projection.falloff

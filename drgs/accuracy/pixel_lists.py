@@ -9,14 +9,15 @@ falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import cast
 
 import drjit as dr
 
 from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import types_of
+from drgs.core.arrays import reinterpret, types_of
 from drgs.core.constants import WHITENING_SCALE
+from drgs.core.types import Array3f, Float, UInt32
 from drgs.splatting.footprint import Footprint, GaussianFalloff, flat_columns
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
@@ -36,21 +37,22 @@ from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 class AffineDepths:
     """Base of depths at a pixel, for a falloff that does not know them: stores kappa and h."""
 
-    bounds: tuple[Any, Any] | None = None  # nearest and farthest, Float (H * W,), scene units
-    bound: list[tuple[Any, Any]] = field(default_factory=list)  # the same, at the 16 of a lane
+    bounds: tuple[Float, Float] | None = None  # nearest and farthest, (H * W,), scene units
+    bound: list[tuple[Float, Float]] = field(default_factory=list)  # the same, at the 16 of a lane
 
     def for_camera(self, camera: Camera) -> AffineDepths:
         """Bind to a camera, whose rays may be parallel."""
         return ParallelDepths(self.bounds) if camera.lens.parallel else self
 
-    def keys(self, splats: Splats2D) -> list[Any]:
+    def keys(self, splats: Splats2D) -> list[Float]:
         """Return columns from which depths are computed: kappa, h (to base 2); last, their unit."""
         ray, scale = splats.ray, WHITENING_SCALE
+        assert ray is not None, "as the projection makes them"
         return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
 
     def at(
-        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
-    ) -> tuple[Any, Any]:
+        self, falloff: GaussianFalloff, geometry: list[Float], keys: list[Float], x: Float, y: Float
+    ) -> tuple[Float, Float]:
         """Return a and D at a point of the film, px: the depth is a / D in the unit, if a > 0."""
         return self._at(keys, *falloff.coordinates(geometry, x, y))
 
@@ -61,7 +63,7 @@ class AffineDepths:
         near, far = (load_pixels(bound, lanes, grid) for bound in self.bounds)
         return replace(self, bound=list(zip(near, far, strict=True)))
 
-    def along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
+    def along(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
         """Return depths in the unit at the 16 pixels; not positive where there is none."""
         found, unit = self._along(footprint, keys), keys[-1]
         if not self.bound:
@@ -71,12 +73,12 @@ class AffineDepths:
             for along, (near, far) in zip(found, self.bound, strict=True)
         ]
 
-    def _along(self, footprint: Footprint, keys: list[Any]) -> list[Any]:
+    def _along(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
         coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
         return [a / denominator for a, denominator in (self._at(keys, *e) for e in coordinates)]
 
     @staticmethod
-    def _at(keys: list[Any], u: Any, v: Any) -> tuple[Any, Any]:
+    def _at(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
         kx, ky, h = keys[:3]
         a = dr.fma(-kx, u, dr.fma(-ky, v, 1))
         return a, dr.fma(a, a, h * dr.fma(u, u, v * v))
@@ -89,7 +91,7 @@ class WithAffineDepth:
     shape: Projection
 
     def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
         """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
         film = self.shape(rows, camera, position, low_pass)
@@ -107,7 +109,7 @@ class ParallelDepths(AffineDepths):
     """The same for rays that are parallel."""
 
     @staticmethod
-    def _at(keys: list[Any], u: Any, v: Any) -> tuple[Any, Any]:
+    def _at(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
         kx, ky = keys[:2]
         return dr.fma(kx, u, dr.fma(ky, v, 1)), type(u)(1)
 
@@ -121,20 +123,24 @@ class RayDepths(AffineDepths):
     def for_camera(self, camera: Camera) -> RayDepths:
         return replace(self, camera=camera)
 
-    def keys(self, splats: Splats2D) -> list[Any]:
-        return [splats.depths * splats.ray.scale]
+    def keys(self, splats: Splats2D) -> list[Float]:
+        ray = splats.ray
+        assert ray is not None and ray.scale is not None, "as exact_shape makes them"
+        return [splats.depths * ray.scale]
 
     def at(
-        self, falloff: GaussianFalloff, geometry: list[Any], keys: list[Any], x: Any, y: Any
-    ) -> tuple[Any, Any]:
+        self, falloff: GaussianFalloff, geometry: list[Float], keys: list[Float], x: Float, y: Float
+    ) -> tuple[Float, Float]:
         del keys
         u, v = falloff.coordinates(geometry, x, y)
+        assert self.camera is not None, "bound by for_camera"
         anchor = closest_on_film(self.camera, *geometry[:2])
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
-    def _along(self, footprint: RayFootprint, keys: list[Any]) -> list[Any]:
+    def _along(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
         del keys
+        assert isinstance(footprint, RayFootprint), "made by RayFalloff"
         return footprint.along
 
 
@@ -146,19 +152,20 @@ FARTHEST = 4.0
 class PixelLists:
     """Sorted entries of each micro-tile, front to back. An *item* is a pair of the two."""
 
-    entries: Any  # UInt32 (items,): place in the lists -> sorted entry
-    order: Any  # UInt32 (items,): place in the lists -> item as made
-    first_item: Any  # UInt32 (N + 1,): rank -> first of its items as made
-    start: Any  # UInt32 (tiles * 16 + 1,): micro-tile -> first place
+    entries: UInt32  # (items,): place in the lists -> sorted entry
+    order: UInt32  # (items,): place in the lists -> item as made
+    first_item: UInt32  # (N + 1,): rank -> first of its items as made
+    start: UInt32  # (tiles * 16 + 1,): micro-tile -> first place
     count: int  # items
 
-    def range(self, lanes: Lanes) -> tuple[Any, Any]:
-        """First place, and one behind the last, of each lane."""
+    def range(self, lanes: Lanes) -> tuple[UInt32, UInt32]:
+        """Return the first place, and one behind the last, of each lane."""
         UInt32, number = type(self.start), lanes.tile * MICROS + lanes.micro
-        return tuple(dr.gather(UInt32, self.start, number + k) for k in (0, 1))
+        first = dr.gather(UInt32, self.start, number)
+        return first, dr.gather(UInt32, self.start, number + 1)
 
-    def places(self) -> Any:
-        """UInt32 (items,): item as made -> place in the lists."""
+    def places(self) -> UInt32:
+        """Return the map from an item as made to its place in the lists, (items,)."""
         UInt32, size = type(self.order), dr.width(self.order)
         places = dr.empty(UInt32, size)
         dr.scatter(places, dr.arange(UInt32, size), self.order)
@@ -199,11 +206,11 @@ _LEVELS = 1 << 14
 are in the order of their means, and the window sorts what is left."""
 
 
-def _levels(depths: Any) -> Any:
-    """Which of ``_LEVELS`` parts of their range positive depths are in; nearly logarithmic."""
+def _levels(depths: Float) -> UInt32:
+    """Quantize positive depths to ``_LEVELS`` parts of their range; nearly logarithmic."""
     # The bits of positive single-precision numbers are ordered as they are.
-    Single = dr.float32_array_t(type(depths))
-    bits = dr.reinterpret_array(dr.uint32_array_t(Single), Single(depths))
+    Single = cast(type[Float], dr.float32_array_t(type(depths)))
+    bits = reinterpret(types_of(Single).UInt32, Single(depths))
     first = dr.min(bits)
     scale = (_LEVELS - 1) / Single(dr.max(bits) - first + 1)
     level = type(bits)(Single(bits - first) * scale)
@@ -214,11 +221,11 @@ def _items(
     bins: TileBins,
     records: Records,
     depths: AffineDepths,
-    entry: Any,
-    masks: Any,
-    item: Any,
+    entry: UInt32,
+    masks: UInt32,
+    item: UInt32,
     count: int,
-) -> tuple[Any, Any, Any]:
+) -> tuple[Float, UInt32, UInt32]:
     """Make items: the depths of peaks at the middle of micro-tiles, micro-tiles, and entries.
 
     entry: sorted entries; masks: their micro-tiles; item: the first of each one's items.
@@ -237,7 +244,7 @@ def _items(
     x = t.Float((tile - row * columns) * TILE) + MICRO / 2
     y = t.Float(row * TILE) + MICRO / 2
 
-    def body(masks: Any, item: Any) -> tuple:
+    def body(masks: UInt32, item: UInt32) -> tuple:
         micro = dr.tzcnt(masks)
         middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
         a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)

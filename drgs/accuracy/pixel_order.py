@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeVar
 
 import drjit as dr
 
@@ -34,6 +34,7 @@ from drgs.accuracy.pixel_lists import AffineDepths, PixelLists, RayDepths, WithA
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
+from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.footprint import Alpha, Footprint, FootprintModel, flat_columns
 from drgs.splatting.grid import PIXELS, Lanes
 from drgs.splatting.lanes import grouped_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
@@ -51,6 +52,8 @@ from drgs.splatting.rasterize import (
 from drgs.splatting.reduction import sum_runs
 from drgs.splatting.rendering import CenterOrder
 from drgs.splatting.tiles import TileBins
+
+S = TypeVar("S")
 
 UNORDERED_ALPHA = 1e-4
 """A smaller alpha, which only a smaller alpha cut lets in, is composited when it is met, before all
@@ -82,7 +85,7 @@ class PixelOrder(CenterOrder):
     def for_camera(self, camera: Camera) -> PixelOrder:
         return replace(self, depths=self.depths.for_camera(camera))
 
-    def keys(self, splats: Splats2D) -> list[Any]:
+    def keys(self, splats: Splats2D) -> list[Float]:
         return self.depths.keys(splats)
 
     def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
@@ -92,18 +95,20 @@ class PixelOrder(CenterOrder):
         self,
         bins: TileBins,
         records: Records,
-        layers: _OrderedLayers,
-        d_features: list[Any],
-        d_transmittance: Any,
+        layers: Layers,
+        d_features: list[Float],
+        d_transmittance: Float,
         samples: range = ONE_SAMPLE,
         before: SplatGradients | None = None,
     ) -> SplatGradients:
+        assert isinstance(layers, _OrderedLayers), "made by self.composite"
         inputs = _WalkInputs.of(bins, records, layers.lists, self, samples)
         return _adjoint(inputs, layers, d_features, d_transmittance, before)
 
     def tangent(
-        self, bins: TileBins, records: Records, layers: _OrderedLayers, tangents: SplatGradients
+        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
     ) -> Layers:
+        assert isinstance(layers, _OrderedLayers), "made by self.composite"
         return _tangent(bins, records, layers, tangents, self)
 
 
@@ -116,18 +121,18 @@ class PixelOrder(CenterOrder):
 class _Met:
     """A splat that the lanes meet."""
 
-    place: Any  # UInt32: in the lists
-    entry: Any  # UInt32: sorted
-    active: Any  # Bool: there is one
-    geometry: list[Any]
-    features: list[Any]
+    place: UInt32  # in the lists
+    entry: UInt32  # sorted
+    active: Bool  # there is one
+    geometry: list[Float]
+    features: list[Float]
     footprint: Footprint
     alphas: list[Alpha]
 
 
 @dataclass(frozen=True)
 class _WalkInputs:
-    """What a walk reads: the lanes, the list of each, and what its splats are."""
+    """Inputs of a walk: the lanes, the list of each, and its splats."""
 
     bins: TileBins
     records: Records
@@ -145,7 +150,7 @@ class _WalkInputs:
         order: PixelOrder,
         samples: range | None = None,
     ) -> _WalkInputs:
-        """Lanes with lists of similar length together; samples: None for all."""
+        """Group lanes with lists of similar length; samples: None for all."""
         samples = range(bins.grid.samples) if samples is None else samples
         tiles = bins.grid.tiles_of(samples)
         begin, end = lists.range(make_lanes(bins.rows.Float, bins.grid, tiles=tiles))
@@ -159,10 +164,11 @@ class _WalkInputs:
         """Places in the lists of all samples, one at least."""
         return max(len(self.samples) * self.lists.count, 1)
 
-    def first_place(self) -> Any:
+    def first_place(self) -> UInt32:
         """Return the first place of each lane's sample."""
-        start, count = self.samples.start, self.lists.count
-        start, count = (dr.opaque(type(self.lanes.sample), number) for number in (start, count))
+        UInt32 = type(self.lanes.sample)
+        start = dr.opaque(UInt32, self.samples.start)
+        count = dr.opaque(UInt32, self.lists.count)
         return (self.lanes.sample - start) * count
 
     @property
@@ -175,14 +181,14 @@ class _WalkInputs:
         """The last transmittance that a pixel may have."""
         return self.model.cutoffs.transmittance_stop
 
-    def transmittance(self) -> list[Any]:
-        """Of the 16 pixels before the first splat; those off the film are finished."""
+    def transmittance(self) -> list[Float]:
+        """Return that of the 16 pixels before the first splat; those off the film are finished."""
         Float = self.bins.rows.Float
         inside = [inside for _, inside in pixels_of(self.lanes, self.bins.grid)]
         return [dr.select(of_pixel, Float(1), -1) for of_pixel in inside]
 
-    def zeros(self, planes: int) -> list[list[Any]]:
-        """By plane: of the 16 pixels."""
+    def zeros(self, planes: int) -> list[list[Float]]:
+        """Return zeros by plane, for the 16 pixels."""
         Float = self.bins.rows.Float
         zero = dr.zeros(Float, self.size)
         return [[Float(zero) for _ in range(PIXELS)] for _ in range(planes)]
@@ -190,11 +196,11 @@ class _WalkInputs:
 
 def _walk(
     inputs: _WalkInputs,
-    carry: Callable[[_Met, int], list[Any]],
-    visit: Callable[[Any, list[list[Any]]], Any],
-    state: Any,
-    nothing: list[Any],
-) -> Any:
+    carry: Callable[[_Met, int], list],
+    visit: Callable[[S, list[list]], tuple[S, Bool]],
+    state: S,
+    nothing: list,
+) -> S:
     """Visit each pixel's splats in their order; returns the last state.
 
     carry: the numbers that a splat brings along at a pixel; visit: from a state and, for each
@@ -206,7 +212,7 @@ def _walk(
     t = types_of(records.rows.Float)
     begin, end = lists.range(lanes)
 
-    def body(place: Any, queue: list, state: Any, go_on: Any) -> tuple:
+    def body(place: UInt32, queue: list, state: S, go_on: Bool) -> tuple:
         active = place < end
         entry = dr.gather(t.UInt32, lists.entries, place, active)
         geometry, features = records.load(entry, active)
@@ -243,7 +249,7 @@ def _walk(
     return state
 
 
-def _insert(places: list[list[Any]], item: list[Any]) -> tuple[list[list[Any]], list[Any]]:
+def _insert(places: list[list[Float]], item: list[Float]) -> tuple[list[list[Float]], list[Float]]:
     """Insert into places sorted by their first number, stably; also return the first of all."""
     places = list(places)
     for k in reversed(range(len(places))):
@@ -261,7 +267,7 @@ def _insert(places: list[list[Any]], item: list[Any]) -> tuple[list[list[Any]], 
 
 @dataclass(frozen=True)
 class _OrderedLayers(Layers):
-    """What the adjoint and the tangent use again."""
+    """Layers with the lists, which the adjoint and the tangent use again."""
 
     lists: PixelLists
 
@@ -273,7 +279,7 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
     lanes, model, size = inputs.lanes, inputs.model, inputs.size
     count = model.features.num_planes(bins.num_features)
 
-    def visit(state: tuple, visited: list[list[Any]]) -> tuple:
+    def visit(state: tuple, visited: list[list[Float]]) -> tuple:
         T, C = list(state[0]), [list(plane) for plane in state[1]]
         for pixel, (alpha, *features) in enumerate(visited):
             weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
@@ -309,8 +315,8 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
 def _adjoint(
     inputs: _WalkInputs,
     layers: _OrderedLayers,
-    d_features: list[Any],
-    d_transmittance: Any,
+    d_features: list[Float],
+    d_transmittance: Float,
     before: SplatGradients | None,
 ) -> SplatGradients:
     g = [load_pixels(plane, inputs.lanes, inputs.bins.grid) for plane in d_features]
@@ -319,19 +325,21 @@ def _adjoint(
     return _sum_items(inputs, _sum_pixels(inputs, pairs, g), before)
 
 
-def _feature_gradient(inputs: _WalkInputs, met: _Met, pixel: int, g: list[list[Any]]) -> Any:
-    """c . g of a splat at a pixel; g: [plane][pixel] derivative of the loss."""
+def _feature_gradient(
+    inputs: _WalkInputs, met: _Met, pixel: int, g: list[list[Float]]
+) -> Float | int:
+    """Return c . g of a splat at a pixel; g: [plane][pixel] derivative of the loss."""
     features = inputs.model.features
     return features.feature_gradient(met.features, pixel, [plane[pixel] for plane in g])
 
 
 def _totals(
-    inputs: _WalkInputs, layers: _OrderedLayers, g: list[list[Any]], d_transmittance: Any
-) -> list[tuple[Any, Any]]:
-    """First walk: b in front of all splats of each pixel, in two numbers."""
+    inputs: _WalkInputs, layers: _OrderedLayers, g: list[list[Float]], d_transmittance: Float
+) -> list[tuple[Float, Float]]:
+    """Walk first to find b in front of all splats of each pixel, in two numbers."""
     t = types_of(inputs.bins.rows.Float)
 
-    def add_up(state: tuple, visited: list[list[Any]]) -> tuple:
+    def add_up(state: tuple, visited: list[list[Float]]) -> tuple:
         T, high, low = (list(column) for column in state)
         for pixel, (alpha, seen) in enumerate(visited):
             weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
@@ -356,15 +364,17 @@ def _totals(
     return totals
 
 
-def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]]) -> list[Any]:
-    """Second walk: each pair's weight and d loss / d ln(alpha), at the place of its splat."""
+def _pairs(
+    inputs: _WalkInputs, totals: list[tuple[Float, Float]], g: list[list[Float]]
+) -> list[Float]:
+    """Walk again for each pair's weight and d loss / d ln(alpha), at the place of its splat."""
     t = types_of(inputs.bins.rows.Float)
     pairs = [dr.zeros(t.Float, inputs.num_places * PIXELS) for _ in range(2)]
     dr.eval(pairs)
     first_place = inputs.first_place()
     alpha_max = inputs.model.cutoffs.alpha_max
 
-    def store(state: tuple, visited: list[list[Any]]) -> tuple:
+    def store(state: tuple, visited: list[list[Float]]) -> tuple:
         T, high, low = (list(column) for column in state)
         for pixel, (alpha, seen, place) in enumerate(visited):
             weight, T[pixel], goes_on = composite_step(T[pixel], alpha, inputs.stop)
@@ -391,8 +401,8 @@ def _pairs(inputs: _WalkInputs, totals: list[tuple[Any, Any]], g: list[list[Any]
     return pairs
 
 
-def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Rows:
-    """Third walk: the sums of ``pairs`` over the 16 pixels of each item, rows by place."""
+def _sum_pixels(inputs: _WalkInputs, pairs: list[Float], g: list[list[Float]]) -> Rows:
+    """Walk again for the sums of ``pairs`` over the 16 pixels of each item, rows by place."""
     bins, records, lists = inputs.bins, inputs.records, inputs.lists
     lanes, model = inputs.lanes, inputs.model
     t = types_of(bins.rows.Float)
@@ -400,7 +410,7 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Any], g: list[list[Any]]) -> Ro
     begin, end = lists.range(lanes)
     first_place = inputs.first_place()
 
-    def body(place: Any) -> tuple:
+    def body(place: UInt32) -> tuple:
         entry = dr.gather(t.UInt32, lists.entries, place)
         geometry, features = records.load(entry, True)
         footprint = model.footprint(geometry, lanes, True)
@@ -425,10 +435,10 @@ def _sum_items(
     lists, places = inputs.lists, inputs.lists.places()
     UInt32 = type(places)
 
-    def totals(rank: Any, sample: Any) -> list[Any]:
+    def totals(rank: UInt32, sample: UInt32) -> list[Float]:
         first_place = sample * dr.opaque(UInt32, lists.count)
 
-        def load(item: Any) -> list[Any]:
+        def load(item: UInt32) -> list[Float]:
             return partials.load(first_place + dr.gather(UInt32, places, item))
 
         return sum_runs(partials.Float, lists.first_item, rank, load)
@@ -436,7 +446,7 @@ def _sum_items(
     return splat_gradients(inputs.bins, totals, len(inputs.samples), before)
 
 
-def _add_product(high: Any, low: Any, a: Any, b: Any) -> tuple[Any, Any]:
+def _add_product(high: Float, low: Float, a: Float, b: Float) -> tuple[Float, Float]:
     """Return high + low + a b to twice the precision (Dekker 1971; Knuth, TAOCP 2, 4.2.2)."""
     product = a * b
     rest = dr.fma(a, b, -product)
@@ -462,7 +472,7 @@ def _tangent(
     model, size = inputs.model, inputs.size
     d_records, count = pack_tangents(bins, tangents), layers.count
 
-    def carry(met: _Met, pixel: int) -> list[Any]:
+    def carry(met: _Met, pixel: int) -> list[Float]:
         d_geometry, d_features = d_records.load(met.entry, met.active)
         d_log_alpha = model.falloff.tangent(met.geometry, met.footprint, d_geometry)[pixel]
         alpha = met.alphas[pixel]
@@ -472,7 +482,7 @@ def _tangent(
             *model.features.tangents(met.features, d_features, pixel),
         ]
 
-    def visit(state: tuple, visited: list[list[Any]]) -> tuple:
+    def visit(state: tuple, visited: list[list[Float]]) -> tuple:
         T, dT = list(state[0]), list(state[1])
         dC = [list(plane) for plane in state[2]]
         for pixel, (alpha, d_alpha, *features) in enumerate(visited):

@@ -7,13 +7,13 @@ functions depend on the pixel alone and are computed once per lane.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.constants import COLOR_MIN
 from drgs.core.errors import UnsupportedError
+from drgs.core.types import Array3f, Float
 from drgs.gaussians.sh import num_coefficients, sh_basis
 from drgs.splatting.footprint import Positions, SplatFeatures
 from drgs.splatting.grid import Lanes
@@ -22,8 +22,8 @@ from drgs.splatting.projection import GaussianRows
 CHANNELS = 3
 
 
-def stored_coefficients(rows: GaussianRows, direction: Any, sh_degree: int) -> list[Any]:
-    """What is stored of a splat's colour: its coefficients, three colours each."""
+def stored_coefficients(rows: GaussianRows, direction: Array3f, sh_degree: int) -> list[Float]:
+    """Return what is stored of a splat's colour: its coefficients, three colours each."""
     del direction
     return [value for c in rows.sh[: num_coefficients(sh_degree)] for value in c]
 
@@ -34,7 +34,7 @@ class RayColors(SplatFeatures):
 
     sh_degree: int
     camera: Camera | None = None
-    basis: tuple[list[Any], ...] = ()  # by pixel, for the lanes of one kernel
+    basis: tuple[list[Float], ...] = ()  # by pixel, for the lanes of one kernel
 
     @property
     def num_coefficients(self) -> int:
@@ -57,21 +57,23 @@ class RayColors(SplatFeatures):
         return Weighing(self.sh_degree, self.camera)
 
     def bind(self, lanes: Lanes, positions: Positions) -> RayColors:
+        assert self.camera is not None, "bound by for_camera"
         points = positions.points(lanes, type(self.camera.near))
         basis = tuple(sh_basis(self._direction(x, y), self.sh_degree) for x, y in points)
         return replace(self, basis=basis)
 
-    def _direction(self, x: Any, y: Any) -> Any:
+    def _direction(self, x: Float, y: Float) -> Array3f:
+        assert self.camera is not None, "bound by for_camera"
         camera = self.camera.at_row(y)
         return dr.normalize(camera.rotation.T @ camera.lens.ray(camera, x, y))
 
-    def at(self, stored: list[Any], pixel: int) -> list[Any]:
+    def at(self, stored: list[Float], pixel: int) -> list[Float]:
         colors = [
             dr.select(value < COLOR_MIN, COLOR_MIN, value) for value in self._sums(stored, pixel)
         ]
         return colors + stored[self.num_coefficients :]
 
-    def _sums(self, stored: list[Any], pixel: int) -> list[Any]:
+    def _sums(self, stored: list[Float], pixel: int) -> list[Float]:
         sums = [type(stored[0])(0.5)] * CHANNELS
         for k, basis in enumerate(self.basis[pixel]):
             coefficients = stored[CHANNELS * k : CHANNELS * (k + 1)]
@@ -79,8 +81,8 @@ class RayColors(SplatFeatures):
         return sums
 
     def add_derivatives(
-        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
-    ) -> list[Any]:
+        self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
+    ) -> list[Float]:
         d_colors = [
             dr.select(value < COLOR_MIN, 0, weight * derivative)
             for value, derivative in zip(self._sums(stored, pixel), g[:CHANNELS], strict=True)
@@ -94,7 +96,7 @@ class RayColors(SplatFeatures):
             for total, derivative in zip(others, g[CHANNELS:], strict=True)
         ]
 
-    def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
+    def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         d_colors = [type(d_stored[0])(0)] * CHANNELS
         for k, basis in enumerate(self.basis[pixel]):
             d = d_stored[CHANNELS * k : CHANNELS * (k + 1)]
@@ -110,7 +112,7 @@ class Weighing(RayColors):
     """The same, with the weights of compositing as derivatives of the first coefficient."""
 
     def add_derivatives(
-        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
-    ) -> list[Any]:
+        self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
+    ) -> list[Float]:
         del stored, pixel
         return [dr.fma(weight, g[0], totals[0]), *totals[1:]]

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import singledispatch
-from typing import Any
 
 import drjit as dr
 
@@ -20,6 +19,7 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
+from drgs.core.types import Array3f, Bool, Float
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
@@ -34,20 +34,20 @@ SPREAD = math.sqrt(3)
 """Standard deviations from the mean to a sigma point: sqrt(n + lambda), lambda = 0."""
 
 CENTER_WEIGHT = 2.0
-"""Of the mean in the covariance, lambda / (n + lambda) + 1 - alpha^2 + beta; its weight in the mean
-of the points is 0."""
+"""Weight of the mean in the covariance, lambda / (n + lambda) + 1 - alpha^2 + beta; its weight in
+the mean of the points is 0."""
 
 WEIGHT = 1 / 6
-"""Of each other point, in both."""
+"""Weight of each other point, in both."""
 
 NEAREST = 1 / 3
-"""Of the mean's depth: where a point would be nearer, a Gaussian has neither mean nor covariance on
+"""Part of the mean's depth: where a point would be nearer, a Gaussian has no mean or covariance on
 the film, or ones that have nothing to do with its middle. The same holds far outside the film,
 where slopes are clamped. Such splats are projected by the affine approximation."""
 
 
 def unscented_shape(
-    rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Return the unscented transform; not differentiated: where :data:`NEAREST` decides."""
     points = _sigma_points(camera.lens, rows, camera, position)
@@ -59,7 +59,7 @@ def unscented_shape(
     shift = types_of(type(position.z)).Array2f(points.mean)
     means2d = camera.lens.project_point(camera, position) + shift
     affine = ewa(rows, camera, position, low_pass)
-    return dr.select(points.usable, whiten(means2d, *columns, low_pass), affine)
+    return dr.select(points.usable, whiten(means2d, columns[0], columns[1], low_pass), affine)
 
 
 @PROJECTIONS.register("unscented")
@@ -73,18 +73,20 @@ class Unscented(ProjectionModel):
 class _SigmaPoints:
     """The six points besides the mean, on the film."""
 
-    offsets: list[list[Any]]  # by side of the film: six places, px, from the mean's
-    mean: list[Any]  # by side: the mean of the offsets
-    usable: Any  # Bool
+    offsets: list[list[Float]]  # by side of the film: six places, px, from the mean's
+    mean: list[Float]  # by side: the mean of the offsets
+    usable: Bool | bool
 
 
 @singledispatch
-def _sigma_points(lens: Lens, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
-    """Through any lens: as it projects points."""
+def _sigma_points(
+    lens: Lens, rows: GaussianRows, camera: Camera, position: Array3f
+) -> _SigmaPoints:
+    """Project the sigma points through any lens, as it projects points."""
     center, slopes = lens.project_point(camera, position), lens.true_slopes(camera, position)
     not_nearer = replace(camera, near=NEAREST * lens.visibility(camera, position)[2])
     usable = _same(slopes, lens.clamped_slopes(camera, position))
-    offsets = [[], []]
+    offsets: list[list[Float]] = [[], []]
     for axis in world_axes(rows):
         for c in (SPREAD, -SPREAD):
             seen, point, _ = lens.visibility(not_nearer, position + c * (camera.rotation @ axis))
@@ -97,8 +99,8 @@ def _sigma_points(lens: Lens, rows: GaussianRows, camera: Camera, position: Any)
 
 
 @_sigma_points.register
-def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Any) -> _SigmaPoints:
-    """Through a pinhole: by formulas that do not cancel."""
+def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Array3f) -> _SigmaPoints:
+    """Project the sigma points through a pinhole, by formulas that do not cancel."""
     slopes = lens.true_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
     far_enough = dr.max(dr.abs(n)) <= (1 - NEAREST) / SPREAD  # no point is too near
@@ -109,14 +111,14 @@ def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Any) -> _Sigm
     )
 
 
-def _same(slopes: list[Any] | None, clamped: list[Any] | None) -> Any:
-    if slopes is None:
+def _same(slopes: list[Float] | None, clamped: list[Float] | None) -> Bool | bool:
+    if slopes is None or clamped is None:
         return True
     return (slopes[0] == clamped[0]) & (slopes[1] == clamped[1])
 
 
-def _sigma_offsets(m: Any, n: Any) -> list[Any]:
-    """Places of the six points besides the mean, px, along one side of the film, from the mean's.
+def _sigma_offsets(m: Array3f, n: Array3f) -> list[Float]:
+    """Return the places of the six points along one side of the film, px, from the mean's.
 
     m, n: half axes on the film and in depth. With c = +-sqrt(3), a point's depth is z (1 + c n) and
     its place c m / (1 + c n): a difference that does not cancel.
@@ -126,8 +128,8 @@ def _sigma_offsets(m: Any, n: Any) -> list[Any]:
     ]
 
 
-def _mean_offset(m: Any, n: Any) -> Any:
-    """The weighted mean of these places: two of opposite c add up to -2 c^2 m n / (1 - c^2 n^2)."""
+def _mean_offset(m: Array3f, n: Array3f) -> Float:
+    """Return their weighted mean: two of opposite c add up to -2 c^2 m n / (1 - c^2 n^2)."""
     terms = [
         m_k * n_k / (_depth(SPREAD * n_k) * _depth(-SPREAD * n_k))
         for m_k, n_k in zip(m, n, strict=True)
@@ -135,7 +137,7 @@ def _mean_offset(m: Any, n: Any) -> Any:
     return -2 * SPREAD**2 * WEIGHT * sum(terms[1:], terms[0])
 
 
-def _depth(change: Any) -> Any:
-    """Of a point, relative to the mean's. One that is too near is not used, but stays finite."""
+def _depth(change: Float) -> Float:
+    """Return a point's depth, relative to the mean's; finite also where it is not used."""
     nearest, depth = NEAREST / 2, 1 + change
     return dr.select(depth > nearest, depth, nearest)

@@ -23,7 +23,7 @@ SLOWEST = 1e-4
 
 
 @dataclass(frozen=True)
-class CameraMotion(Shutter):
+class Motion(Shutter):
     """The motion of a camera from the first pose to the second while its shutter is open."""
 
     travel: Array3f  # world: of the centre
@@ -56,7 +56,7 @@ class CameraMotion(Shutter):
 
 
 @dataclass(frozen=True)
-class MotionBlur(CameraMotion):
+class MotionBlur(Motion):
     """The mean of images at ``samples`` times."""
 
     label: ClassVar[str] = "blurred"
@@ -72,7 +72,7 @@ class MotionBlur(CameraMotion):
 
 
 @dataclass(frozen=True)
-class RollingShutter(CameraMotion):
+class RollingShutter(Motion):
     """The film's rows are read from the first, at time 0, to the last, at time 1."""
 
     label: ClassVar[str] = "rolling shutter"

@@ -7,11 +7,11 @@ import math
 import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from drgs.cli.ending import (
     exit_on_interrupt,
@@ -33,7 +33,7 @@ MAX_PORT = 65535
 
 
 class Subcommand(NamedTuple):
-    """One of several commands: what it does, and the module that does it."""
+    """A command among several: what it does, and the module that does it."""
 
     text: str  # one phrase, in small letters
     module: str  # has a function add_arguments(parser), which sets run(args) as a default
@@ -45,7 +45,7 @@ class CommandParser(argparse.ArgumentParser):
     A list of commands with their help therefore imports none of them.
     """
 
-    def __init__(self, *, module: str | None = None, **settings: object) -> None:
+    def __init__(self, *, module: str | None = None, **settings: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
         self._module = module
         self._subcommands: tuple[str, ...] = ()
@@ -56,7 +56,6 @@ class CommandParser(argparse.ArgumentParser):
         self._more_help = text
 
     def format_help(self) -> str:
-        """Return the help."""
         more = self._more_help()
         return super().format_help() + (f"\n{more}\n" if more else "")
 
@@ -72,20 +71,20 @@ class CommandParser(argparse.ArgumentParser):
             description = f"{text[0].upper()}{text[1:]}."
             subparsers.add_parser(name, help=text, description=description, module=module)
 
-    def parse_known_args(
-        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]  # overloads
+        self, args: Iterable[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse as argparse does; called for a subcommand as well, once it has been named."""
         if self._module is not None:
             module, self._module = self._module, None
             import_module(module).add_arguments(self)
-        words = sys.argv[1:] if args is None else args
+        words = sys.argv[1:] if args is None else list(args)
         name = next((word for word in words if not word.startswith("-")), None)
         if self._subcommands and name is not None and name not in self._subcommands:
             *others, last = self._subcommands
             nearest = did_you_mean(name, self._subcommands, cutoff=0.5)
             self.error(f"there is no command {name}, only {', '.join(others)} and {last}{nearest}")
-        return super().parse_known_args(args, namespace)
+        return super().parse_known_args(words, namespace or argparse.Namespace())
 
     def error(self, message: str) -> NoReturn:
         """Raise :class:`UserError`, which says in one line what is wrong with the command line.

@@ -1,4 +1,4 @@
-"""How a command ends and prints: a user's error, Ctrl-C, SIGTERM; notes; names in any encoding."""
+"""The end and the output of a command: a user's error, Ctrl-C, SIGTERM; notes; any encoding."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from types import FrameType
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import why_refused
@@ -37,7 +37,7 @@ MAX_ERROR_CHARACTERS = 800
 
 @contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Around (or, as a decorator, on) a command: print the error without a traceback, exit with 2.
+    """Print an error of the block, or of the decorated command, in a line, and exit with 2.
 
     Only errors that the user can repair, packages that cannot be imported, exhausted memory, and
     what the file system refuses of a file that it names; any other keeps its traceback. Where
@@ -100,7 +100,7 @@ class Terminated(KeyboardInterrupt):
 
 @contextmanager
 def exit_on_interrupt() -> Iterator[None]:
-    """Around a command: Ctrl-C ends it with status 130, SIGTERM with 143, without a traceback.
+    """End the block on Ctrl-C with status 130, on SIGTERM with 143, without a traceback.
 
     Not SIGTERM where it is one of several processes: with it, ``mpiexec`` ends those that wait.
     """
@@ -122,7 +122,7 @@ def exit_on_interrupt() -> Iterator[None]:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Around imports within a command: Ctrl-C and SIGTERM end the process at once.
+    """Let Ctrl-C and SIGTERM end the process at once while the block imports.
 
     Extension modules may abort, or hide what was raised, where it is raised while they are
     imported. To be used where nothing is being written.
@@ -172,7 +172,7 @@ def _exit_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
 
 @contextmanager
 def printable_anywhere() -> Iterator[None]:
-    """Within the block, what the standard streams' encoding cannot express is printed escaped.
+    """Print escaped, within the block, what the standard streams' encoding cannot express.
 
     Names of files may be no UTF-8, and a terminal may know nothing but ASCII: neither is a reason
     to end a fit.
@@ -191,17 +191,22 @@ def printable_anywhere() -> Iterator[None]:
 
 @contextmanager
 def notes_printed() -> Iterator[None]:
-    """Within the block, each :class:`UserNote` is a line of the output; Pillow's are left out."""
+    """Print each :class:`UserNote` of the block as a line; leave out Pillow's warnings."""
     with warnings.catch_warnings():
         show = warnings.showwarning
 
         def show_plainly(
-            message: Warning | str, category: type[Warning], *where: object, **options: object
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
         ) -> None:
             if issubclass(category, UserNote):
                 print(f"note: {message}", flush=True)
             else:
-                show(message, category, *where, **options)
+                show(message, category, filename, lineno, file, line)
 
         warnings.showwarning = show_plainly
         warnings.simplefilter("always", UserNote)

@@ -1,4 +1,4 @@
-"""How Dr.Jit runs a command: on how many threads, and with range checks or without.
+"""Settings of Dr.Jit for a command: the number of threads, and range checks.
 
 The bytes of a result depend on neither. These are settings of the process and of the calling
 thread; a command gives them back when it ends.
@@ -10,7 +10,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
-from typing import TextIO
+from typing import TextIO, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -78,7 +78,7 @@ def executing(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
             return
         reports, tracer = _RangeReports(sys.stderr), sys.gettrace()  # debug mode installs its own
         try:
-            with redirect_stderr(reports), dr.scoped_set_flag(dr.JitFlag.Debug):
+            with redirect_stderr(cast("TextIO", reports)), dr.scoped_set_flag(dr.JitFlag.Debug):
                 yield reports.check
                 reports.check()
         finally:

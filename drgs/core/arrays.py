@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drgs.core import types
-from drgs.core.types import Bool, Float, TensorXf, UInt32
+from drgs.core.types import Bool, Float, UInt32
 
 Array = TypeVar("Array", bound=dr.ArrayBase)
 
@@ -114,7 +114,7 @@ _NUMPY_TYPES = {
 }
 
 
-def quotient(index: UInt32, divisor: int) -> UInt32:
+def quotient(index: Array, divisor: int) -> Array:
     """Return index // divisor, by a divisor that is not compiled into the kernel.
 
     No machine divides vectors of integers. The product in double precision is off by less than
@@ -126,7 +126,7 @@ def quotient(index: UInt32, divisor: int) -> UInt32:
     return type(index)((Float64(index) + 0.5) * reciprocal)
 
 
-def divide(index: UInt32, divisor: int, parts: int) -> tuple[UInt32, UInt32]:
+def divide(index: Array, divisor: int, parts: int) -> tuple[Array, Array]:
     """Return index // divisor, which is below ``parts``, and the rest; for one part a literal zero.
 
     That makes later products and sums vanish from the kernel.
@@ -372,14 +372,14 @@ _VECTORS = {
 }
 
 
-def planes_of(image: TensorXf) -> list[Float]:
+def planes_of(image: dr.ArrayBase) -> list[Float]:
     """Return the channels of an image (H, W, C), each (H * W,), detached."""
     flat, count = dr.detach(image).array, image.shape[2]
     pixel = dr.arange(types_of(type(flat)).UInt32, image.shape[0] * image.shape[1])
     return [dr.gather(type(flat), flat, pixel * count + k) for k in range(count)]
 
 
-def image_of(planes: list[Float], like: TensorXf) -> TensorXf:
+def image_of(planes: Sequence[dr.ArrayBase], like: Array) -> Array:
     """Return the image (H, W, C) of these channels; like: an image of H x W pixels."""
     return type(like)(interleave(planes), (*like.shape[:2], len(planes)))
 

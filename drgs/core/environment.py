@@ -16,7 +16,7 @@ VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 """Variants that can render and differentiate Gaussians; the first is the default."""
 
 
-def check_variant(plugin: str, variant: str) -> None:
+def check_variant(plugin: str, variant: str | None) -> None:
     """Raise PluginError that begins with the plugin's name for any other variant."""
     if variant not in VARIANTS:
         raise PluginError(

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         Array2f,
         Array2u,
         Array3f,
+        Array3u,
         Array4f,
         Array4u,
         ArrayXf,
@@ -21,13 +22,14 @@ if TYPE_CHECKING:
         Float,
         Int32,
         Matrix3f,
+        Matrix4f,
         TensorXf,
         UInt32,
         UInt64,
     )
 else:
-    Array2f = Array2u = Array3f = Array4f = Array4u = ArrayXf = Any
-    Bool = Float = Int32 = Matrix3f = TensorXf = UInt32 = UInt64 = Any
+    Array2f = Array2u = Array3f = Array3u = Array4f = Array4u = ArrayXf = Any
+    Bool = Float = Int32 = Matrix3f = Matrix4f = TensorXf = UInt32 = UInt64 = Any
 
 Scalar = Float | float
 """A Dr.Jit scalar or a number of the host."""
@@ -36,6 +38,7 @@ __all__ = [
     "Array2f",
     "Array2u",
     "Array3f",
+    "Array3u",
     "Array4f",
     "Array4u",
     "ArrayXf",
@@ -43,6 +46,7 @@ __all__ = [
     "Float",
     "Int32",
     "Matrix3f",
+    "Matrix4f",
     "Scalar",
     "TensorXf",
     "UInt32",

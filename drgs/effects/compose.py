@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
 from drgs.core.arrays import types_of
+from drgs.core.types import Float
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.splatting.projection import GaussianRows, Splats2D
@@ -32,7 +32,7 @@ def with_effects(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pi
 
 
 IGNORABLE = ("distortion", "defocus", "motion", "smoothing")
-"""What a sensor or a file calls for and one may decide not to simulate; the last is no camera's."""
+"""Effects of a sensor or a file that can be left out; the last is no camera's."""
 
 
 def without_effects(camera: Camera, ignored: Collection[str]) -> Camera:
@@ -46,8 +46,8 @@ def without_effects(camera: Camera, ignored: Collection[str]) -> Camera:
     return camera
 
 
-def normal_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
-    """The normals of flat Gaussians, in the world: three planes.
+def normal_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
+    """Return the normals of flat Gaussians, in the world: three planes.
 
     A Gaussian's normal is its shortest axis, a unit vector that points to the camera. What is
     composited is the alpha-weighted sum, whose length is at most alpha. Differentiable in the
@@ -59,10 +59,9 @@ def normal_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> lis
     a, b, c = dr.detach(rows.log_scales)
     first, second = (a <= b) & (a <= c), b <= c
 
-    def shortest(row: int) -> Any:
-        return dr.select(
-            first, rotation[row, 0], dr.select(second, rotation[row, 1], rotation[row, 2])
-        )
+    def shortest(row: int) -> Float:
+        x, y, z = rotation[row]
+        return dr.select(first, x, dr.select(second, y, z))
 
     normal = t.Array3f([shortest(row) for row in range(3)])
     direction = camera.lens.view_direction(camera, rows.means - camera.center)
@@ -72,10 +71,11 @@ def normal_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> lis
 
 @dataclass(frozen=True)
 class NamedFeature:
-    """Numbers that each Gaussian has under a name: as many planes as there are."""
+    """Numbers of Gaussians under a name, composited as one plane each."""
 
     name: str
 
-    def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Any]:
+    def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
         del splats, camera
+        assert rows.features is not None, "a pipeline composites what there is"
         return list(rows.features[self.name])

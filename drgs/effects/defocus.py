@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
+from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions
 from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
@@ -27,10 +27,11 @@ class Defocused:
     shape: Projection
 
     def __call__(
-        self, rows: GaussianRows, camera: Camera, position: Any, low_pass: float
+        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
         """Return the blurred shape, whose ``dimming`` keeps the integral."""
         film = self.shape(rows, camera, position, low_pass)
+        assert camera.aperture is not None, "see with_effects"
         spread = camera.aperture.variance(camera, position.z)
         blurred = self.shape(rows, camera, position, low_pass + spread)
         return replace(
@@ -58,47 +59,52 @@ class DimmedFalloff(GaussianFalloff):
     def for_camera(self, camera: Camera) -> DimmedFalloff:
         return replace(self, of=self.of.for_camera(camera))
 
-    def log2_opacity(self, geometry: list[Any]) -> Any:
+    def log2_opacity(self, geometry: list[Float]) -> Float:
         return self.of.log2_opacity(geometry[:-1])
 
-    def log2_floor(self, geometry: list[Any], cutoffs: Cutoffs) -> Any:
+    def log2_floor(self, geometry: list[Float], cutoffs: Cutoffs) -> Float:
         log2_dimming = geometry[-1]
         floor = cutoffs.log2_floor(self.log2_opacity(geometry) - log2_dimming) + log2_dimming
         least = math.log2(NEGLIGIBLE_ALPHA)
         return dr.select(floor > least, floor, least)
 
-    def geometry(self, splats: Splats2D) -> list[Any]:
+    def geometry(self, splats: Splats2D) -> list[Float]:
+        assert splats.dimming is not None, "see Defocused"
         return [*self.of.geometry(splats), dr.log2(splats.dimming)]
 
-    def differentiable(self, splats: Splats2D) -> list[Any]:
+    def differentiable(self, splats: Splats2D) -> list[Float]:
+        assert splats.dimming is not None, "see Defocused"
         return [*self.of.differentiable(splats), dr.detach(splats.dimming)]
 
-    def bounds(self, splats: Splats2D, geometry: list[Any], reach: Any) -> tuple[Any, Any]:
+    def bounds(
+        self, splats: Splats2D, geometry: list[Float], reach: Float
+    ) -> tuple[Array2f, Array2f]:
         return self.of.bounds(splats, geometry[:-1], reach)
 
-    def outline(self, geometry: list[Any], reach: Any) -> list[Any]:
-        """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
+    def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
         return self.of.outline(geometry[:-1], reach)
 
-    def coordinates(self, geometry: list[Any], x: Any, y: Any) -> tuple[Any, Any]:
+    def coordinates(self, geometry: list[Float], x: Float, y: Float) -> tuple[Float, Float]:
         return self.of.coordinates(geometry[:-1], x, y)
 
-    def footprint(self, geometry: list[Any], offsets_from: Offsets, active: Any) -> Footprint:
+    def footprint(
+        self, geometry: list[Float], offsets_from: Offsets, active: Bool | bool
+    ) -> Footprint:
         return self.of.footprint(geometry[:-1], offsets_from, active)
 
-    def moments(self, footprint: Footprint, weights: list[Any], positions: Positions) -> list[Any]:
-        """Sums over the 16 pixels."""
+    def moments(
+        self, footprint: Footprint, weights: list[Float], positions: Positions
+    ) -> list[Float]:
         return self.of.moments(footprint, weights, positions)
 
-    def derivatives(self, geometry: list[Any], totals: list[Any]) -> list[Any]:
-        """From moments to the derivatives of what :meth:`differentiable` lists."""
+    def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
         derivatives = self.of.derivatives(geometry[:-1], totals)
         return [*derivatives, dr.zeros(type(totals[0]), dr.width(totals[0]))]
 
-    def pack_tangents(self, geometry: list[Any], tangents: list[Any]) -> list[Any]:
+    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
         return [*self.of.pack_tangents(geometry[:-1], tangents[:-1]), tangents[-1]]
 
     def tangent(
-        self, geometry: list[Any], footprint: Footprint, d_geometry: list[Any]
-    ) -> list[Any]:
+        self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
+    ) -> list[Float]:
         return self.of.tangent(geometry[:-1], footprint, d_geometry[:-1])

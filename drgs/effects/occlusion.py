@@ -22,11 +22,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import drjit as dr
 
 from drgs.cameras.camera import Camera
+from drgs.core.types import Float
 from drgs.splatting.footprint import FeatureGroup, FootprintModel, Positions, SplatFeatures
 from drgs.splatting.grid import PIXELS, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
@@ -34,10 +34,10 @@ from drgs.splatting.lanes import load_pixels
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One surface at each pixel: the nearest, or the next one that is seen through others."""
+    """A surface at each pixel: the nearest, or the next one that is seen through others."""
 
-    depth: Any  # Float (H * W,): as that of the splats, scene units; the largest where nothing is
-    coverage: Any  # Float (H * W,) in [0, 1]: p, the part of all light that it stops
+    depth: Float  # (H * W,): as that of the splats, scene units; the largest where nothing is
+    coverage: Float  # (H * W,) in [0, 1]: p, the part of all light that it stops
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class OccludedFeatures(SplatFeatures):
     features: SplatFeatures
     surfaces: tuple[Surface, ...]  # nearest first
     grid: TileGrid
-    bound: list[Any] = field(default_factory=list)  # at the 16 pixels of a lane: (z, rest behind)
+    bound: list[tuple] = field(default_factory=list)  # at the 16 pixels of a lane: (z, rest behind)
 
     def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
         depth, end = num_stored - 1, self.num_planes(num_stored)
@@ -83,20 +83,22 @@ class OccludedFeatures(SplatFeatures):
             bound=list(zip(*bound, strict=True)),
         )
 
-    def at(self, stored: list[Any], pixel: int) -> list[Any]:
+    def at(self, stored: list[Float], pixel: int) -> list[Float]:
         *others, depth = stored
         seen = self._seen(depth, pixel)
         values = [seen * value for value in self.features.at(others, pixel)]
         return values + self._in_front(type(depth)(1), depth, pixel)
 
-    def add(self, planes: list[Any], stored: list[Any], pixel: int, weight: Any) -> list[Any]:
+    def add(
+        self, planes: list[Float], stored: list[Float], pixel: int, weight: Float
+    ) -> list[Float]:
         *others, depth = stored
         own, fronts = self._split(planes)
         seen = self.features.add(own, others, pixel, self._seen(depth, pixel) * weight)
         pairs = zip(fronts, self._in_front(weight, depth, pixel), strict=True)
         return [*seen, *(front + more for front, more in pairs)]
 
-    def feature_gradient(self, stored: list[Any], pixel: int, g: list[Any]) -> Any:
+    def feature_gradient(self, stored: list[Float], pixel: int, g: list[Float]) -> Float:
         *others, depth = stored
         own, fronts = self._split(g)
         gradient = self._seen(depth, pixel) * self.features.feature_gradient(others, pixel, own)
@@ -106,25 +108,25 @@ class OccludedFeatures(SplatFeatures):
         )
 
     def add_derivatives(
-        self, totals: list[Any], stored: list[Any], pixel: int, weight: Any, g: list[Any]
-    ) -> list[Any]:
+        self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
+    ) -> list[Float]:
         *others, depth = stored
         *totals, nothing = totals
         weight = self._seen(depth, pixel) * weight
         sums = self.features.add_derivatives(totals, others, pixel, weight, self._split(g)[0])
         return [*sums, nothing]
 
-    def tangents(self, stored: list[Any], d_stored: list[Any], pixel: int) -> list[Any]:
+    def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         *others, depth = stored
         seen = self._seen(depth, pixel)
         tangents = self.features.tangents(others, d_stored[:-1], pixel)
         return [seen * value for value in tangents] + [type(depth)(0)] * len(self.surfaces)
 
-    def _split(self, planes: list[Any]) -> tuple[list[Any], list[Any]]:
+    def _split(self, planes: list[Float]) -> tuple[list[Float], list[Float]]:
         count = len(self.surfaces)
         return planes[:-count], planes[-count:]
 
-    def _seen(self, depth: Any, pixel: int) -> Any:
+    def _seen(self, depth: Float, pixel: int) -> Float:
         """Return s, the part of a splat that surfaces in front of it let through."""
         Float = type(depth)
         farther_first = reversed(self.bound[pixel])
@@ -134,7 +136,7 @@ class OccludedFeatures(SplatFeatures):
             seen = dr.select(depth <= z, rest, seen)
         return seen
 
-    def _in_front(self, value: Any, depth: Any, pixel: int) -> list[Any]:
+    def _in_front(self, value: Float, depth: Float, pixel: int) -> list[Float]:
         return [dr.select(depth <= z, value, 0) for z, _ in self.bound[pixel]]
 
 

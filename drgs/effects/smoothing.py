@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -25,6 +24,7 @@ import numpy as np
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import Approximations
 from drgs.core.arrays import types_of
+from drgs.core.types import Array3f, Float, TensorXf
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import (
     GaussianRows,
@@ -36,7 +36,7 @@ from drgs.splatting.projection import (
 )
 
 VARIANCE = 0.2
-"""Of the filter, in squared distances between samples (Mip-Splatting, equation 9 and its code)."""
+"""Variance of the filter, in squared distances between samples (Mip-Splatting, equation 9)."""
 
 FILM_MARGIN = 0.15
 """Parts of the film's size by which a camera is taken to see beyond it (Mip-Splatting's code)."""
@@ -44,14 +44,15 @@ FILM_MARGIN = 0.15
 
 def smoothed(rows: GaussianRows) -> GaussianRows:
     """Widen the covariance of Gaussians by ``rows.smoothing``^2, and dim them in proportion."""
+    assert rows.smoothing is not None, "composed where there is a filter"
     variance = dr.square(rows.smoothing)
     log_scales = dr.log(dr.exp(2 * rows.log_scales) + variance) / 2
     dimming = dr.exp(dr.sum(rows.log_scales - log_scales))
     return replace(rows, log_scales=log_scales, smoothing=None, dimming=dimming)
 
 
-def smoothing_of(means: Any, cameras: Iterable[Camera]) -> Any:
-    """The filter's standard deviation (N,), scene units, of Gaussians that ``cameras`` look at.
+def smoothing_of(means: TensorXf, cameras: Iterable[Camera]) -> Float:
+    """Return the standard deviation of the filter, (N,), scene units, as ``cameras`` need it.
 
     means: (N, 3). A mean that no camera sees gets the widest filter of all that one sees. Detached.
     """
@@ -67,7 +68,7 @@ def smoothing_of(means: Any, cameras: Iterable[Camera]) -> Any:
     return math.sqrt(VARIANCE) / dr.select(rates > 0, rates, lowest)
 
 
-def _rates(points: Any, camera: Camera) -> Any:
+def _rates(points: Array3f, camera: Camera) -> Float:
     lens = camera.lens
     seen, position, depth = lens.visibility(camera, camera.rotation @ (points - camera.center))
     film = lens.project_point(camera, position)
@@ -103,13 +104,13 @@ KEPT_VARIANCE = 0.04
 derivatives by their scales."""
 
 USUAL = Approximations()
-"""What viewers do."""
+"""Approximations of viewers."""
 
 
 def baked_for_viewers(
     gaussians: Gaussians, cameras: Iterable[Camera], fitted: Approximations
 ) -> Gaussians:
-    """Gaussians (numpy) that look about the same without ``fitted.low_pass`` and ``antialiased``.
+    """Return Gaussians (numpy) that look the same without ``low_pass`` and ``antialiased``.
 
     With l and L the low-pass of the fit and that of viewers, and nu the largest rate (px per scene
     unit) of the ``cameras`` that see a Gaussian,
@@ -142,7 +143,7 @@ def baked_for_viewers(
 def _integrals(
     gaussians: Gaussians, cameras: Iterable[Camera], approximations: Approximations
 ) -> np.ndarray:
-    """Over the film, of each splat's alpha, over 2 pi: summed over ``cameras``; (N,) float64."""
+    """Integrate each splat's alpha over the film, over 2 pi, summed over ``cameras``: (N,)."""
     rule = compensated_opacity if approximations.antialiased else plain_opacity
     rows = load_rows(gaussians, 0)
     total = dr.zeros(type(rows.logit_opacities), gaussians.num_gaussians)
@@ -152,7 +153,7 @@ def _integrals(
     return np.array(total, np.float64)
 
 
-def _integral(rows: GaussianRows, camera: Camera, rule: OpacityRule, low_pass: float) -> Any:
+def _integral(rows: GaussianRows, camera: Camera, rule: OpacityRule, low_pass: float) -> Float:
     splats = project(rows, camera, 0, rule, low_pass=low_pass, least_alpha=0.0)
     beside = (splats.means2d < camera.film_start) | (splats.means2d > camera.film_end)
     p, _, s = splats.whitening

@@ -1,4 +1,4 @@
-"""One picture as Mitsuba wants it: sensors, film, samples, background, surfaces.
+"""Rendering of images for Mitsuba: sensors, film, samples, background, surfaces.
 
 May import ``accuracy``, ``effects``, ``splatting``, ``data``, ``io``, ``config``, ``gaussians``,
 ``cameras`` and ``core``.

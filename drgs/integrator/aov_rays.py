@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +17,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import interleave
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.film import Channels, SamplePoints, by_sample, in_passes, pixel_corners
+from drgs.integrator.film import Channels, SamplePoints, pixel_corners, split_passes, split_samples
 from drgs.integrator.image_render import hybrid_of
 from drgs.integrator.sensor_render import SensorRender, constant_background
 from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
@@ -38,14 +38,14 @@ SLACK = 1 / 16
 """px: how far outside of its pixel a ray may be found. Single precision finds it to 1e-3."""
 
 ROUNDING = 1e-5
-"""How far a ray may pass by the camera's centre, relative to the numbers that say where it is."""
+"""Largest distance of a ray from the camera's centre, relative to their coordinates."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageRays:
     """Rays of a whole picture, and where they start. Equality is identity."""
 
-    ray: Any  # RayDifferential3f (H * W * count,): those of a pixel are neighbours
+    ray: mi.RayDifferential3f  # (H * W * count,): those of a pixel are neighbours
     count: int  # rays per pixel
     positions: tuple[SamplePoints, ...]  # by pass
 
@@ -68,8 +68,8 @@ class ImageRays:
         inside = (dr.min(within) > -SLACK) & (dr.max(within) < 1 + SLACK)
         if not dr.all(inside & on_camera):
             raise UnsupportedError(_unknown(sensor))
-        within = dr.clip(within, 0, 1 - dr.epsilon(mi.Float))
-        positions = in_passes(within, count, width * height)
+        within = mi.Point2f(dr.clip(within, 0, 1 - dr.epsilon(mi.Float)))
+        positions = split_passes(within, count, width * height)
         dr.eval([(p.x, p.y) for p in positions])
         return ImageRays(ray, count, positions)
 
@@ -96,7 +96,7 @@ class ImageRays:
             hybrid=hybrid,
         )
         if hybrid is not None:
-            hybrid = hybrid.with_surfaces(view.num_surfaces())
+            hybrid = hybrid.with_surfaces(view.num_surfaces(hybrid))
             view = replace(view, hybrid=hybrid)
         channels = self._gathered(view.channels(view.planes(), constant_background(splats)))
         for kind in ("frames", "surfaces"):
@@ -106,7 +106,7 @@ class ImageRays:
         return channels
 
     def _gathered(self, passes: Sequence[Channels]) -> Channels:
-        samples = by_sample(self.positions, passes[: len(self.positions)])
+        samples = split_samples(self.positions, passes[: len(self.positions)])
         planes = zip(*samples, strict=True)
         return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
 
@@ -117,8 +117,8 @@ class ImageRays:
         insertion = hybrid.insertion
         aovs, own = channels[3 : -len(insertion.channels)], channels[-len(insertion.channels) :]
         behind = own[2 * insertion.num_surfaces :] or [mi.Float(0)] * 3
-        pictures = [*map(list, hybrid.radiances(self.ray, sampler, active)), behind]
-        shown = insertion.shown(own, pictures)
+        images = [*map(list, hybrid.radiances(self.ray, sampler, active)), behind]
+        shown = insertion.shown(own, images)
         return [*(s + c for s, c in zip(shown, channels[:3], strict=True)), *aovs]
 
 

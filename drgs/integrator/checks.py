@@ -64,12 +64,12 @@ def check_degree(degree: int, gaussians: Gaussians) -> None:
 
 
 def ellipsoids_in(scene: mi.Scene) -> list[mi.Shape]:
-    """Shapes whose Gaussians are rendered as splats."""
+    """Return the shapes whose Gaussians are rendered as splats."""
     return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
 
 
 def surfaces_in(scene: mi.Scene) -> list[mi.Shape]:
-    """All other shapes."""
+    """Return all other shapes."""
     return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, listed
 from drgs.integrator.checks import ellipsoids_in
-from drgs.integrator.rays import passes_splats
+from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.state import SplatsState
 
 ATTACHED = ("PathIntegrator", "DirectIntegrator")
@@ -48,7 +47,7 @@ class Parameter:
     name: str  # as mi.traverse has it
     key: str  # the same within its object
     owners: list[mi.Object]  # its object, the one that this belongs to, and so on
-    value: Any  # attached
+    value: object  # attached
     has_nested: bool  # whether the material that it belongs to has others in it
 
     @property
@@ -64,7 +63,7 @@ class Parameter:
         return [owner for owner in self.owners if isinstance(owner, mi.BSDF)]
 
     def name_in(self, bsdf: mi.BSDF) -> str:
-        """The parameter, or the texture that it belongs to, as the material names it."""
+        """Return the material's name of the parameter, or of the texture that it belongs to."""
         depth = self.owners.index(bsdf)
         return self.name.split(".")[-1 - depth]
 
@@ -127,15 +126,15 @@ def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
         yield Parameter(name, name.rpartition(".")[2], owners, value, has_nested)
 
 
-def parameter_value(params: mi.SceneParameters, name: str) -> Any:
+def parameter_value(params: mi.SceneParameters, name: str) -> object:
     """Return ``params[name]``, which fails where ``hair`` has no value for a parameter."""
     value, kind, node, _ = params.properties[name]
     return value if kind is None else mi.get_property(value, kind, node)
 
 
 def type_of(integrator: mi.Integrator) -> str:
-    """Name of its class; those that are written in Python have one name for Mitsuba."""
-    if passes_splats(integrator):
+    """Return the name of its class; those that are written in Python have one name for Mitsuba."""
+    if isinstance(integrator, TransportIntegrator):
         return SPLATPATH
     name = integrator.class_name()
     return type(integrator).__name__ if name == "SamplingIntegrator" else name
@@ -154,7 +153,11 @@ def _why_not(parameter: Parameter, splats: SplatsState) -> str | None:
         return "how surfaces shade splats, which changes with it, is not; leave out shadows"
     if parameter.bsdfs:
         return _why_not_of_bsdf(parameter, kind)
-    if parameter.is_geometry and kind in (SPLATPATH, *ATTACHED, *REPLAYED):
+    if (
+        isinstance(owner, mi.Shape)
+        and parameter.is_geometry
+        and kind in (SPLATPATH, *ATTACHED, *REPLAYED)
+    ):
         return _why_not_of_geometry(owner, kind)
     if isinstance(owner, mi.Emitter) and parameter.key in ("position", "to_world"):
         if kind in (ATTACHED if owner.is_environment() else REPLAYED):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -20,46 +20,47 @@ import numpy as np
 
 from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
 from drgs.core.errors import UnsupportedError
+from drgs.core.types import Float
 from drgs.splatting.footprint import PixelCenters, Positions, flat_columns, total
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 
-Channels = list[Any]
-"""Channels of one pass for a film, each Float (samples * H * W,): red, green, blue, perhaps alpha,
+Channels = list[Float]
+"""Channels of one pass for a film, each (samples * H * W,): red, green, blue, perhaps alpha,
 then what the integrator puts out besides (AOVs)."""
 
 
 def num_colors(film: mi.Film) -> int:
-    """Channels of colour that a film gets: with or without alpha."""
+    """Return the number of colour channels that a film gets: with or without alpha."""
     return 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
 
 
-def with_weight(film: mi.Film, channels: Channels, weight: Any) -> Channels:
-    """The channels of a block of this film: the weight is behind the colours."""
+def with_weight(film: mi.Film, channels: Channels, weight: Float) -> Channels:
+    """Return the channels of a block of this film: the weight is behind the colours."""
     count = num_colors(film)
     return [*channels[:count], weight, *channels[count:]]
 
 
 def pixel_corners(film: mi.Film, samples: int = 1) -> mi.Point2f:
-    """The upper left corners of the crop window's pixels, row by row, px; again for each sample."""
+    """Return the upper left corners of pixels, row by row, px; again for each sample."""
     width, height = film.crop_size()
     _, pixel = divide(dr.arange(mi.UInt32, samples * width * height), width * height, samples)
     row = quotient(pixel, width)
     return mi.Point2f(pixel - row * width, row)
 
 
-def samples_in(film: mi.Film, x: Any) -> int:
-    """How many samples of each pixel a plane has; x may be a number for all pixels."""
+def num_samples(film: mi.Film, x: Float | float) -> int:
+    """Return the number of samples of a pixel in a plane; x may be a number for all pixels."""
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
 
-def offsets_of(positions: Positions) -> tuple[Any, Any]:
+def sample_offsets(positions: Positions) -> tuple[Float | float, Float | float]:
     """Return x and y of sample positions from their pixels' upper left corners, px."""
-    return (0.5, 0.5) if isinstance(positions, PixelCenters) else (positions.x, positions.y)
+    return (positions.x, positions.y) if isinstance(positions, SamplePoints) else (0.5, 0.5)
 
 
 class CenterSamples:
-    """One sample per pixel, at its centre. Exact for films whose filter is a box."""
+    """A single sample per pixel, at its centre. Exact for films whose filter is a box."""
 
     positions: Sequence[Positions] = (PixelCenters(),)  # by pass
     key: object = None  # equal for equal positions
@@ -67,7 +68,7 @@ class CenterSamples:
     def __init__(
         self, film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str] = ()
     ) -> None:
-        """maps: remembers the linear maps of films, by their description; aovs: channels' names."""
+        """Sample a film; maps: linear maps of films by description; aovs: channels' names."""
         self.film, self.maps, self.aovs = film, maps, list(aovs)
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
@@ -94,7 +95,7 @@ def develop_pixels(film: mi.Film, channels: Channels, aovs: Sequence[str]) -> mi
 def pixels_adjoint(
     film: mi.Film, maps: dict[str, np.ndarray], grad_in: mi.TensorXf, aovs: Sequence[str]
 ) -> Channels:
-    """The adjoint of :func:`develop_pixels`.
+    """Compute the adjoint of :func:`develop_pixels`.
 
     A film develops each pixel by the same linear map, found once by developing unit images.
     (The derivative of ``develop`` itself would be scattered by atomic additions.)
@@ -117,11 +118,11 @@ def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) ->
     """Return the linear map that a film applies to each pixel: (developed channels, channels)."""
     key = f"{film} {', '.join(aovs)}"
     if key not in maps:
-        maps[key] = _found_map(film, aovs)
+        maps[key] = _measure_map(film, aovs)
     return maps[key]
 
 
-def _found_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
+def _measure_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
     count = num_colors(film) + len(aovs)
     num_pixels = film.crop_size()[0] * film.crop_size()[1]
 
@@ -146,12 +147,12 @@ PIXELS_PER_PASS = 1 << 17
 """Most pixels of a pass of several samples: a launch of fewer costs more than what it computes."""
 
 SAMPLES_PER_KERNEL = 16
-"""Of more samples per pixel, the sums of a box filter are evaluated in between: compilers take
-longer than proportionally to a kernel's length. Of other filters, which reach over many
-pixels, each pass is evaluated by itself."""
+"""Samples per pixel after which the sums of a box filter are evaluated: compilers take longer than
+proportionally to a kernel's length. With other filters, which reach over many pixels, each pass is
+evaluated by itself."""
 
 
-def in_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePoints, ...]:
+def split_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePoints, ...]:
     """Divide samples into passes; points: of all, those of a pixel are neighbours."""
     at_once = min(max(PIXELS_PER_PASS // num_pixels, 1), count)
     passes = []
@@ -159,11 +160,14 @@ def in_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePo
         samples = min(at_once, count - first)
         sample, pixel = divide(dr.arange(mi.UInt32, samples * num_pixels), num_pixels, samples)
         place = pixel * dr.opaque(mi.UInt32, count) + sample + dr.opaque(mi.UInt32, first)
-        passes.append(SamplePoints(*dr.gather(mi.Point2f, points, place), samples))
+        point = dr.gather(mi.Point2f, points, place)
+        passes.append(SamplePoints(point.x, point.y, samples))
     return tuple(passes)
 
 
-def by_sample(positions: Sequence[SamplePoints], passes: Sequence[Channels]) -> Iterator[Channels]:
+def split_samples(
+    positions: Sequence[SamplePoints], passes: Sequence[Channels]
+) -> Iterator[Channels]:
     """Divide the channels of passes into those of each sample, Float (H * W,)."""
     for points, channels in zip(positions, passes, strict=True):
         if points.samples == 1:
@@ -188,7 +192,8 @@ class DrawnSamples(CenterSamples):
         aovs: Sequence[str] = (),
     ) -> None:
         super().__init__(sensor.film(), maps, aovs)
-        seed = int(seed[0]) if dr.is_jit_v(seed) else seed  # its owner may change it in place
+        # The owner of an array may change it in place.
+        seed = seed if isinstance(seed, (int, np.integer)) else int(seed[0])
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # some round it up
@@ -196,24 +201,24 @@ class DrawnSamples(CenterSamples):
         num_pixels = size[0] * size[1]
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, num_pixels * spp)
-        points = sampler.next_2d()
-        self.positions = in_passes(points, spp, num_pixels)
-        dr.eval([(p.x, p.y) for p in self.positions])
+        self.points = split_passes(sampler.next_2d(), spp, num_pixels)
+        self.positions = self.points
+        dr.eval([(p.x, p.y) for p in self.points])
         self.key = (seed, spp, str(sensor.sampler()))
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
         film = self.film
         if film.rfilter().is_box_filter():
-            count = sum(point.samples for point in self.positions)
+            count = sum(point.samples for point in self.points)
             sums = [mi.Float(0)] * len(passes[0])
-            for number, channels in enumerate(by_sample(self.positions, passes), 1):
+            for number, channels in enumerate(split_samples(self.points, passes), 1):
                 sums = [total + plane for total, plane in zip(sums, channels, strict=True)]
                 if number % SAMPLES_PER_KERNEL == 0 and number < count:
                     dr.eval(sums)
             return develop_pixels(film, [total / count for total in sums], self.aovs)
         film.prepare(self.aovs)
         block = film.create_block()
-        for point, channels in zip(self.positions, passes, strict=True):
+        for point, channels in zip(self.points, passes, strict=True):
             values = with_weight(film, channels, mi.Float(1))
             corner = pixel_corners(film, point.samples) + mi.Vector2f(film.crop_offset())
             block.put(corner + mi.Point2f(point.x, point.y), values)
@@ -223,16 +228,16 @@ class DrawnSamples(CenterSamples):
 
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
         if self.film.rfilter().is_box_filter():
-            count = sum(point.samples for point in self.positions)
+            count = sum(point.samples for point in self.points)
             averaged = pixels_adjoint(self.film, self.maps, grad_in, self.aovs)
             of_sample = [d / count for d in averaged]
             dr.eval(of_sample)
-            return [[repeat_array(d, point.samples) for d in of_sample] for point in self.positions]
+            return [[repeat_array(d, point.samples) for d in of_sample] for point in self.points]
         # The image is linear in the channels: their values do not matter.
         num_channels = num_colors(self.film) + len(self.aovs)
         passes = [
             [dr.opaque(mi.Float, 0, dr.width(point.x)) for _ in range(num_channels)]
-            for point in self.positions
+            for point in self.points
         ]
         with dr.resume_grad():
             dr.enable_grad(passes)
@@ -252,45 +257,51 @@ class SamplePoints(Positions):
 
     margin: ClassVar[float] = 0.5
 
-    x: Any = None  # Float (samples * H * W,) in [0, 1): from the pixel's left border, px
-    y: Any = None  # the same, from its upper border
+    x: Float  # (samples * H * W,) in [0, 1): from the pixel's left border, px
+    y: Float  # the same, from its upper border
     samples: int = 1
-    bound: tuple[list[Any], list[Any]] | None = None  # the 16 of each lane
 
-    def bind(self, lanes: Lanes, grid: TileGrid) -> SamplePoints:
-        bound = tuple(load_pixels(plane, lanes, grid) for plane in (self.x, self.y))
-        return SamplePoints(bound=bound)
+    def bind(self, lanes: Lanes, grid: TileGrid) -> LanePoints:
+        return LanePoints(load_pixels(self.x, lanes, grid), load_pixels(self.y, lanes, grid))
 
-    def points(self, lanes: Lanes, Float: type) -> list[tuple[Any, Any]]:
+
+@dataclass(frozen=True)
+class LanePoints(Positions):
+    """Points in the 16 pixels of each lane."""
+
+    x: list[Float]  # in [0, 1): from the pixel's left border, px
+    y: list[Float]  # the same, from its upper border
+
+    def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
         x, y = Float(lanes.x), Float(lanes.y)
         return [
             (x + (pixel % MICRO) + px, y + (pixel // MICRO) + py)
-            for pixel, (px, py) in enumerate(zip(*self.bound, strict=True))
+            for pixel, (px, py) in enumerate(zip(self.x, self.y, strict=True))
         ]
 
-    def offsets(self, lanes: Lanes, x: Any, y: Any) -> tuple[list, list]:
+    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
         Float = types_of(type(x)).Float
         first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
-        dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.bound[0])]
-        dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.bound[1])]
+        dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.x)]
+        dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.y)]
         return _grid(dx), _grid(dy)
 
-    def sum(self, values: list[Any]) -> Any:
+    def sum(self, values: list[Float]) -> Float:
         return total(values)
 
-    def sum_dx(self, values: list[Any], dx: list) -> Any:
+    def sum_dx(self, values: list[Float], dx: list) -> Float:
         return total(_products(values, dx))
 
-    def sum_dy(self, values: list[Any], dy: list) -> Any:
+    def sum_dy(self, values: list[Float], dy: list) -> Float:
         return total(_products(values, dy))
 
-    def sum_dy_dy(self, values: list[Any], dy: list) -> Any:
+    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         return total(_products(_products(values, dy), dy))
 
 
-def _products(values: list[Any], grid: list[list[Any]]) -> list[Any]:
+def _products(values: list[Float], grid: list[list[Float]]) -> list[Float]:
     return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
 
 
-def _grid(values: list[Any]) -> list[list[Any]]:
+def _grid(values: list[Float]) -> list[list[Float]]:
     return [values[MICRO * j : MICRO * j + MICRO] for j in range(MICRO)]

@@ -1,4 +1,4 @@
-"""All Gaussians of a picture, put together of those of splat objects and of shapes.
+"""Gaussians of an image, put together of those of splat objects and of shapes.
 
 Imported when a scene has more than the Gaussians of one integrator where they are. Each
 :class:`Part` converts what is stored of some Gaussians to raw parameters in world space; Dr.Jit
@@ -49,6 +49,7 @@ import numpy as np
 from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
+from drgs.core.types import Float, Matrix4f
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.rotation import (
     left_multiplication_matrix,
@@ -58,6 +59,12 @@ from drgs.gaussians.rotation import (
 from drgs.gaussians.sh import num_coefficients
 from drgs.gaussians.similarity import Similarity
 
+ParameterArrays = dict[str, Any]
+"""Arrays by name: a TensorXf or Float for each parameter, a Matrix4f for ``to_world``."""
+
+ParameterColumns = dict[str, list[Float]]
+"""Columns of parameters by name."""
+
 TO_WORLD = "to_world"
 
 PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
@@ -66,27 +73,35 @@ PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
 class Part(Protocol):
     """Conversion of stored Gaussians to raw parameters in world space."""
 
-    values: dict[str, Any]  # arrays by name; detached in a gathered part, which holds them so that
-    # their indices are not reused
+    @property
+    def values(self) -> ParameterArrays:
+        """Arrays by name; a gathered part holds them, so that their indices are not reused."""
+        ...
 
     @property
     def fixed(self) -> object:
         """Anything else that the conversion depends on; equal if the same."""
+        ...
 
     def gaussians(self) -> Gaussians:
         """Return all parameters, differentiable with respect to ``values``."""
+        ...
+
+    def detached(self) -> Part:
+        """Return the same conversion of detached values."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """All Gaussians of a rendering, by part."""
+    """Gaussians of a rendering, by part."""
 
     parts: list[Part]  # detached
     sizes: list[tuple[int, int]]  # by part: number of Gaussians, degree
     gaussians: Gaussians  # detached and evaluated
 
     def matches(self, parts: Sequence[Part]) -> bool:
-        """True if gathering these would give the same Gaussians."""
+        """Return whether gathering these would give the same Gaussians."""
         return same_variables(
             [part.values for part in self.parts], [part.values for part in parts]
         ) and [part.fixed for part in self.parts] == [part.fixed for part in parts]
@@ -97,7 +112,7 @@ class Gathered:
         for part, own, (num, degree) in zip(parts, self.parts, self.sizes, strict=True):
             attached = {k: v for k, v in part.values.items() if dr.width(v) and dr.grad_enabled(v)}
             if attached and num > 0:
-                copy = replace(own, values=dr.detach(own.values))
+                copy = own.detached()
                 dr.enable_grad([copy.values[name] for name in attached])
                 rows = _arrays(_rows(gradients, start, num, degree))
                 found = _arrays(copy.gaussians())
@@ -114,14 +129,14 @@ class Gathered:
         """Return derivatives of all Gaussians along those set on the same parts, attached."""
         found = []
         for part, own in zip(parts, self.parts, strict=True):
-            copy = replace(own, values=dr.detach(own.values))
+            copy = own.detached()
             dr.enable_grad(copy.values)
             for name, values in part.values.items():
                 dr.set_grad(copy.values[name], tangent_of(values))
             moved = copy.gaussians()
             dr.forward_to(moved)
             found.append(_gaussians({k: tangent_of(v) for k, v in _arrays(moved).items()}))
-        return _joined(found, self.gaussians.sh_degree)
+        return _concatenate(found, self.gaussians.sh_degree)
 
 
 def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
@@ -130,17 +145,17 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     last: the result of the last call, which is returned again while nothing has changed. Features
     and coefficients that a part lacks are zeros, and so is a smoothing filter.
     """
-    parts = [replace(part, values=dr.detach(part.values)) for part in parts]
+    parts = [part.detached() for part in parts]
     if last is not None and last.matches(parts):
         return last
     converted = [part.gaussians() for part in parts]
     sizes = [(part.num_gaussians, part.sh_degree) for part in converted]
-    gaussians = _joined(converted, max(degree for _, degree in sizes))
+    gaussians = _concatenate(converted, max(degree for _, degree in sizes))
     dr.eval(gaussians)
     return Gathered(parts, sizes, gaussians)
 
 
-def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
+def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
     found = [(part.num_gaussians, _arrays(part)) for part in parts if part.num_gaussians > 0]
     shapes = {k: v.shape[1:] for _, arrays in found for k, v in arrays.items()}
     shapes["shN"] = _sh_shape(degree)
@@ -149,7 +164,7 @@ def _joined(parts: Sequence[Gaussians], degree: int) -> Gaussians:
         blocks = [_block(arrays.get(name), 0, num, num, row) for num, arrays in found]
         filled = [block for block in blocks if dr.width(block) > 0]  # dr.concat takes no others
         flat = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
-        whole[name] = _shaped(flat, sum(num for num, _ in found), row)
+        whole[name] = _reshape(flat, sum(num for num, _ in found), row)
     return _gaussians(whole)
 
 
@@ -159,29 +174,31 @@ def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
     shapes = {k: v.shape[1:] for k, v in arrays.items()} | {"shN": _sh_shape(degree)}
     total = gaussians.num_gaussians
     blocks = {k: _block(v, start, num, total, shapes[k]) for k, v in arrays.items()}
-    return _gaussians({k: _shaped(v, num, shapes[k]) for k, v in blocks.items()})
+    return _gaussians({k: _reshape(v, num, shapes[k]) for k, v in blocks.items()})
 
 
 def _sh_shape(degree: int) -> tuple[int, int]:
     return num_coefficients(degree) - 1, 3
 
 
-def _shaped(flat: Any, num: int, row: tuple[int, ...]) -> Any:
+def _reshape(flat: Float, num: int, row: tuple[int, ...]) -> mi.TensorXf | Float:
     return mi.TensorXf(flat, (num, *row)) if row else flat
 
 
-def _arrays(part: Gaussians) -> dict[str, Any]:
+def _arrays(part: Gaussians) -> ParameterArrays:
     named = {name: getattr(part, name) for name in (*PARAMETER_NAMES, "smoothing")}
     return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
 
 
-def _gaussians(arrays: dict[str, Any]) -> Gaussians:
+def _gaussians(arrays: ParameterArrays) -> Gaussians:
     features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
     own = {k: v for k, v in arrays.items() if k not in features}
     return Gaussians(**own, features=features or None)
 
 
-def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) -> Any:
+def _block(
+    values: mi.TensorXf | Float | None, start: int, num: int, total: int, row: tuple[int, ...]
+) -> Float:
     """Return ``num`` rows of ``total``, flat: cut to ``row``, or filled with zeros."""
     flat = mi.Float() if values is None else values.array  # an array is its own
     kept, width = math.prod(row), dr.width(flat) // total
@@ -196,8 +213,8 @@ def _block(values: Any, start: int, num: int, total: int, row: tuple[int, ...]) 
     return dr.gather(type(flat), flat, (at + first) * width + column, column < width)
 
 
-def columns(flat: Any, width: int) -> list[Any]:
-    """Return the columns of rows of ``width`` numbers; see :func:`interleaved`."""
+def columns(flat: Float, width: int) -> list[Float]:
+    """Return the columns of rows of ``width`` numbers; see :func:`interleave_columns`."""
     if width == 0:
         return []
     UInt32 = types_of(type(flat)).UInt32
@@ -205,20 +222,20 @@ def columns(flat: Any, width: int) -> list[Any]:
     return [dr.gather(type(flat), flat, row + k, mode=dr.ReduceMode.Permute) for k in range(width)]
 
 
-def interleaved(values: list[Any]) -> Any:
+def interleave_columns(values: list[Float]) -> Float:
     """Return columns as rows again, flat; of no columns, an empty array."""
     return interleave(values) if values else mi.Float()
 
 
-def number_of(flat: Any, index: int) -> Any:
+def entry(flat: Float, index: int) -> Float:
     """Return one entry of an array, in no kernel: other numbers need no other one."""
     return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))
 
 
-def product(matrix: Any, vector: list[Any], start: int = 0) -> list[Any]:
+def product(matrix: Float, vector: list[Float], start: int = 0) -> list[Float]:
     """Multiply by a square matrix, flat from ``start`` on."""
     rows = [
-        [number_of(matrix, start + j * len(vector) + k) for k in range(len(vector))]
+        [entry(matrix, start + j * len(vector) + k) for k in range(len(vector))]
         for j in range(len(vector))
     ]
     terms = [[a * x for a, x in zip(row, vector, strict=True)] for row in rows]
@@ -229,7 +246,7 @@ def product(matrix: Any, vector: list[Any], start: int = 0) -> list[Any]:
 class Turn:
     """A linear map of the coefficients of degree 1 to 3 by one matrix per degree."""
 
-    matrices: Any  # Float (9 + 25 + 49,)
+    matrices: Float  # (9 + 25 + 49,)
 
     @staticmethod
     def by(rotation: np.ndarray) -> Turn:
@@ -245,7 +262,7 @@ class Turn:
     def _from(matrices: Sequence[np.ndarray]) -> Turn:
         return Turn(from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices])))
 
-    def of(self, columns: list[Any]) -> list[Any]:
+    def of(self, columns: list[Float]) -> list[Float]:
         """Turn columns of the coefficients of degree 1 and above, three a coefficient."""
         turned, start = [], 0
         for degree in range(1, PER_DEGREE[len(columns) // 3 + 1] + 1):
@@ -266,11 +283,14 @@ class Turn:
 class Placement:
     """The move of an object into the scene: see :class:`Part`."""
 
-    values: dict[str, Any]  # arrays of the object's Gaussians, and its to_world: Matrix4f
+    values: ParameterArrays  # of the object's Gaussians, and its to_world
     fixed: str  # name of the parameter to_world, in messages
 
+    def detached(self) -> Placement:
+        return replace(self, values=dr.detach(self.values))
+
     @staticmethod
-    def of(gaussians: Gaussians, to_world: Any, name: str) -> Placement:
+    def of(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
         """Place Gaussians by a matrix of one lane."""
         return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
 
@@ -285,7 +305,7 @@ class Placement:
     def _place(self) -> Similarity:
         return similarity_of(self.values[TO_WORLD], self.fixed)
 
-    def _moved(self, arrays: dict[str, Any]) -> dict[str, Any]:
+    def _moved(self, arrays: ParameterArrays) -> ParameterArrays:
         place, split = self._place, {k: _columns_of(arrays[k]) for k in ("means", "quats", "shN")}
         turned = {
             "means": product(_device(place.scale * place.rotation), split["means"]),
@@ -293,31 +313,31 @@ class Placement:
             "shN": Turn.by(place.rotation).of(split["shN"]),
         }
         scale = _device(np.array([place.scale, np.log(place.scale)]))
-        log_scales = [c + number_of(scale, 1) for c in _columns_of(arrays["log_scales"])]
-        moved = turned | {"log_scales": log_scales}
+        log_scales = [c + entry(scale, 1) for c in _columns_of(arrays["log_scales"])]
+        moved: ParameterColumns = turned | {"log_scales": log_scales}
         if "smoothing" in arrays:
-            moved["smoothing"] = [arrays["smoothing"] * number_of(scale, 0)]
+            moved["smoothing"] = [arrays["smoothing"] * entry(scale, 0)]
         if dr.grad_enabled(self.values[TO_WORLD]):
             moved = self._with_motion(moved)
         translation = _device(place.translation)
-        moved["means"] = [c + number_of(translation, k) for k, c in enumerate(moved["means"])]
+        moved["means"] = [c + entry(translation, k) for k, c in enumerate(moved["means"])]
         self._check_finite(split, moved)
         smoothing = {k: moved.pop(k)[0] for k in list(moved) if k == "smoothing"}
-        tensors = {k: mi.TensorXf(interleaved(v), arrays[k].shape) for k, v in moved.items()}
+        tensors = {k: mi.TensorXf(interleave_columns(v), arrays[k].shape) for k, v in moved.items()}
         return tensors | smoothing
 
-    def _check_finite(self, own: dict[str, Any], moved: dict[str, Any]) -> None:
+    def _check_finite(self, own: ParameterColumns, moved: ParameterColumns) -> None:
         pairs = zip(own["means"] + own["quats"], moved["means"] + moved["quats"], strict=True)
         dr.eval(moved["means"], moved["quats"])
         beyond = [dr.isfinite(before) & ~dr.isfinite(after) for before, after in pairs]
-        rows = dr.compress(reduce(operator.or_, beyond))
+        rows = mi.UInt32(dr.compress(reduce(operator.or_, beyond)))
         if dr.width(rows) > 0:
             raise PluginError(
                 f"{self.fixed} moves Gaussian {rows[0]} beyond the end of float32, 3.4e38; crop or "
                 "scale the object"
             )
 
-    def _with_motion(self, moved: dict[str, Any]) -> dict[str, Any]:
+    def _with_motion(self, moved: ParameterColumns) -> ParameterColumns:
         """Attach Gaussians, turned about the object's origin, to a change of the matrix.
 
         Numbers that are not finite, of Gaussians that are not visible, do not move: they would make
@@ -348,7 +368,7 @@ class Placement:
         matrix, place = self.values[TO_WORLD], self._place
         change = matrix - dr.detach(matrix)
         inverse = _device(place.rotation.T / place.scale)
-        inverse = mi.Matrix3f([number_of(inverse, k) for k in range(9)])
+        inverse = mi.Matrix3f([entry(inverse, k) for k in range(9)])
         d = mi.Matrix3f([change[i, k] for i in range(3) for k in range(3)]) @ inverse
         zero = dr.opaque(mi.Float, 0, num)
         return (
@@ -358,7 +378,7 @@ class Placement:
         )
 
 
-def similarity_of(to_world: Any, name: str) -> Similarity:
+def similarity_of(to_world: Matrix4f, name: str) -> Similarity:
     """Return the similarity nearest to a Matrix4f; PluginError unless it is close to one."""
     matrix = np.array(dr.detach(to_world), np.float64)
     if matrix.size != 16:
@@ -370,7 +390,7 @@ def _device(values: np.ndarray) -> mi.Float:
     return from_host(mi.Float, values.ravel())
 
 
-def _columns_of(tensor: Any) -> list[Any]:
+def _columns_of(tensor: mi.TensorXf) -> list[Float]:
     return columns(tensor.array, math.prod(tensor.shape[1:]))
 
 
@@ -390,7 +410,7 @@ HIDDEN = -1e4
 # ----------------------------------------------------------------------------------------------
 
 
-def read(shape: mi.Shape) -> dict[str, Any]:
+def read(shape: mi.Shape) -> ParameterArrays:
     """Read the shape's arrays, attached. Raises PluginError that names what does not fit."""
     values = mi.traverse(shape)
     where = f"splats: the {_name(shape)}"
@@ -425,8 +445,11 @@ def _name(shape: mi.Shape) -> str:
 class Conversion:
     """The conversion of a shape's arrays to raw parameters; see ``gathering.Part``."""
 
-    values: dict[str, Any]  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
+    values: ParameterArrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
     fixed: Turn | None  # of the harmonics, which is not differentiated
+
+    def detached(self) -> Conversion:
+        return replace(self, values=dr.detach(self.values))
 
     def gaussians(self) -> Gaussians:
         num = dr.width(self.values["opacities"])
@@ -445,7 +468,7 @@ class Conversion:
             log_scales=mi.TensorXf(interleave(log_scales), (num, 3)),
             logit_opacities=dr.select(is_visible, logits, HIDDEN),
             sh0=mi.TensorXf(interleave(sh[:3]), (num, 1, 3)),
-            shN=mi.TensorXf(interleaved(higher), (num, len(sh) // 3 - 1, 3)),
+            shN=mi.TensorXf(interleave_columns(higher), (num, len(sh) // 3 - 1, 3)),
         )
 
     def _opacity(self, is_visible: mi.Bool) -> mi.Float:

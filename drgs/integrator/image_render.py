@@ -18,7 +18,7 @@ import mitsuba as mi
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_image
 from drgs.integrator.film import CenterSamples
-from drgs.integrator.rays import passes_splats
+from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.sensor_render import Planes, SensorRender, constant_background
 from drgs.integrator.sensors import is_batch, num_poses, sensors_of
 from drgs.integrator.state import SplatsState
@@ -82,7 +82,8 @@ class ImageRender:
     def _with_surfaces(self) -> ImageRender:
         if self.hybrid is None:
             return self
-        hybrid = self.hybrid.with_surfaces(max(view.num_surfaces() for view in self.views))
+        count = max(view.num_surfaces(self.hybrid) for view in self.views)
+        hybrid = self.hybrid.with_surfaces(count)
         self.samples.aovs += hybrid.insertion.channels
         return replace(self, views=[replace(v, hybrid=hybrid) for v in self.views], hybrid=hybrid)
 
@@ -91,12 +92,13 @@ class ImageRender:
         image = self._image_of_splats()
         if self.hybrid is None:
             return image
-        return self.hybrid.insertion.develop(image, self.hybrid.pictures())
+        return self.hybrid.insertion.develop(image, self.hybrid.images())
 
     def backward(self, params: object, grad_in: mi.TensorXf) -> rendering.GaussianGradients:
         """Return derivatives with respect to the Gaussians; accumulate all others."""
+        d_nested: list[mi.TensorXf] = []
         if self.hybrid is not None:
-            own, nested = self._image_of_splats(), self.hybrid.pictures()
+            own, nested = self._image_of_splats(), self.hybrid.images()
             grad_in, d_nested = self.hybrid.insertion.adjoint(own, nested, grad_in)
         d_passes = self.samples.adjoint(grad_in)
         gradients = [
@@ -120,13 +122,13 @@ class ImageRender:
             if constant is not None:
                 dr.set_grad(constant, dr.grad(splats.background))
             image = self._developed(planes, constant)
-            # The nested integrator, and other pictures of the same pass, read the gradients of
+            # The nested integrator, and other images of the same pass, read the gradients of
             # parameters again, also of those that are computed from others.
             dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
             d_image = dr.grad(image)
         if self.hybrid is None:
             return d_image
-        nested = self.hybrid.pictures()
+        nested = self.hybrid.images()
         d_nested = self.hybrid.tangents(params, nested)
         return self.hybrid.insertion.tangent(dr.detach(image), nested, d_image, d_nested)
 
@@ -135,8 +137,8 @@ class ImageRender:
         return self._developed([view.planes() for view in self.views], constant)
 
     def _developed(self, planes: list[Planes], constant: mi.Color3f | None) -> mi.TensorXf:
-        pictures = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
-        passes = pictures[0] if self.batch is None else self.batch.put_together(pictures)
+        images = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
+        passes = images[0] if self.batch is None else self.batch.concatenate(images)
         return self.samples.develop(passes)
 
 
@@ -151,16 +153,19 @@ def hybrid_of(
 
     cache, hide_emitters = splats.cache, splats.hide_emitters
     surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
+    nested: mi.SamplingIntegrator
+    adjoint: mi.SamplingIntegrator
     if splats.light == "none":
-        nested = adjoint = splats.nested
-        if nested is None:
+        if splats.nested is not None:
+            nested = adjoint = splats.nested
+        else:
             # The same paths, whose derivatives are right for more of their parameters, and which
             # see lamps through what lets light pass straight on.
             adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
             nested = adjoint
             if not surfaces.is_transparent:
                 nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
-        if passes_splats(nested):
+        if isinstance(nested, TransportIntegrator):
             nested.use_transport(None)  # another integrator may have given it one
     else:
         from drgs.integrator.splat_transport import nested_with_transport

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
+from drgs.accuracy.pixel_order import PixelOrder
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
@@ -34,7 +35,7 @@ TEXELS_PER_PIXEL = 2
 """Texels of a small film's pixel, along either axis."""
 
 FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
-"""Texels of all pictures together, 20 bytes each, from which on there are fewer of a pixel; and
+"""Texels of all images together, 20 bytes each, from which on there are fewer of a pixel; and
 from which on there are fewer than one."""
 
 BORDER = 8
@@ -68,10 +69,10 @@ class Plane:
     offset: mi.Float
 
     def height(self, point: mi.Vector3f) -> mi.Float:
-        """Signed distance of a point."""
+        """Return the signed distance of a point."""
         return dr.dot(self.normal, point) - self.offset
 
-    def at(self, mirror: mi.UInt32, active: mi.Bool = True) -> Plane:
+    def at(self, mirror: mi.UInt32, active: mi.Bool | bool = True) -> Plane:
         """Gather the planes of some of the mirrors."""
         normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
         return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
@@ -126,12 +127,14 @@ class FlatMirror:
 
 
 def _points(shape: mi.Shape) -> np.ndarray:
-    """Points (N, 3) of a shape, world, that tell whether it is flat; none if it cannot be."""
-    if shape.is_mesh():
+    """Return points (N, 3) of a shape, world, on one plane if it is flat; none if it cannot be."""
+    if isinstance(shape, mi.Mesh):
         return np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     if shape.class_name() != "Disk":
         return np.zeros((0, 3))
-    matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+    to_world = mi.traverse(shape)["to_world"]
+    assert isinstance(to_world, mi.AffineTransform4f), "of a disk"
+    matrix = np.array(to_world.matrix, np.float64).reshape(4, 4)
     return np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1]]) @ matrix[:3].T
 
 
@@ -171,15 +174,15 @@ class Mirrors:
         num_pixels = max(1, len(mirrors) * sum(c.width * c.height for c in cameras))
         fine, least = (math.sqrt(most / num_pixels) for most in (FINE_TEXELS, MAX_TEXELS))
         scale = min(TEXELS_PER_PIXEL, max(1.0, fine), least)
-        cameras = [_enlarged(camera, scale) for camera in cameras]
+        cameras = [_enlarge(camera, scale) for camera in cameras]
         views = []
         for camera in cameras:
             pipeline = _pipeline(approximations, sh_degree, camera.lens)
-            pictures = [
-                _picture(camera, every.at(mi.UInt32(k)), scene, gaussians, pipeline)
+            images = [
+                _render_mirror(camera, every.at(mi.UInt32(k)), scene, gaussians, pipeline)
                 for k in range(len(mirrors))
             ]
-            colors, ends = (dr.concat(parts) for parts in zip(*pictures, strict=True))
+            colors, ends = (dr.concat(parts) for parts in zip(*images, strict=True))
             size = mi.Vector2u(*(dr.opaque(mi.UInt32, n) for n in (camera.width, camera.height)))
             views.append(_View(camera, size, colors, ends))
         dr.make_opaque(every, views)
@@ -250,7 +253,7 @@ class _View:
 
 
 def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
-    """Tell whether a ray, as long to the mirror and as far from there, ends at ``end``."""
+    """Return whether a ray, as long to the mirror and as far from there, ends at ``end``."""
     of_far, of_distance = SAME_END
     is_near = dr.abs(distance + far - end) <= of_far * far + of_distance * distance
     return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
@@ -265,7 +268,7 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
     return pipeline_of(replace(approximations, projection=projection, **along_rays), sh_degree)
 
 
-def _enlarged(camera: Camera, scale: float) -> Camera:
+def _enlarge(camera: Camera, scale: float) -> Camera:
     factor = dr.opaque(mi.Float, scale)
     changes = {
         name: factor * getattr(camera, name) + BORDER
@@ -282,7 +285,7 @@ def _enlarged(camera: Camera, scale: float) -> Camera:
     return camera
 
 
-def _picture(
+def _render_mirror(
     camera: Camera,
     plane: Plane,
     scene: mi.Scene,
@@ -296,6 +299,7 @@ def _picture(
     dr.make_opaque(plane, camera)
     nearest, farthest, ends = _trace(camera, plane, scene)
     pipeline = with_effects(pipeline, gaussians, camera)
+    assert isinstance(pipeline.order, PixelOrder), "see _pipeline"
     depths = replace(pipeline.order.depths, bounds=(nearest, farthest))
     order = replace(pipeline.order, depths=depths)
     frame = rendering.render(gaussians, camera, replace(pipeline, order=order))
@@ -303,7 +307,7 @@ def _picture(
     coverage = 1 - T
     color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
     color = coverage * mi.math.srgb_to_linear(color)
-    colors = dr.ravel(mi.Vector4f(*color, coverage))
+    colors = mi.Float(dr.ravel(mi.Vector4f(*color, coverage)))
     dr.eval(colors, ends)
     return colors, ends
 

@@ -24,7 +24,7 @@ from drgs.core.origin import WORLD, shown_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.checks import check_shapes
-from drgs.integrator.rays import passes_splats
+from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
@@ -99,7 +99,7 @@ def _checked(props: mi.Properties, name: str, declared: Property) -> Any:
 
 def matrix(props: mi.Properties, name: str) -> np.ndarray:
     """Return a transform that is given: (4, 4) float64."""
-    value = props[name]
+    value: Any = props[name]
     if props.type(name) != mi.Properties.Type.Transform:
         raise PluginTypeError(
             f"{props.plugin_name()}: {name} must be a transform, got {type(value).__name__}"
@@ -156,7 +156,9 @@ UNNAMED = "_arg_"
 
 
 def read_state(
-    props: mi.Properties, objects: Mapping[str, SplatObject], nested: Sequence[mi.Integrator]
+    props: mi.Properties,
+    objects: Mapping[str, SplatObject],
+    nested: Sequence[mi.SamplingIntegrator],
 ) -> SplatsState:
     """Return the state of ``splats``; objects: nested ones, nested: the other integrators."""
     if len(nested) > 1:
@@ -196,7 +198,7 @@ def read_state(
 
 def _check_settings(state: SplatsState) -> None:
     light, nested = state.light, state.nested
-    if light != "none" and nested is not None and not passes_splats(nested):
+    if light != "none" and nested is not None and not isinstance(nested, TransportIntegrator):
         raise PluginError(
             f"splats: with light '{light}', the nested integrator must be splatpath, got "
             f"{nested.class_name()}; it takes max_depth, rr_depth and hide_emitters as path does"
@@ -225,13 +227,15 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
             raise PluginError(
                 f"splats: give either 'filename' or tensors, got both ({', '.join(given)})"
             )
-        path = mi.file_resolver().resolve(str(props["filename"]))
+        resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  has no type in the stub
+        path = resolver.resolve(str(props["filename"]))
         gaussians = replace(_loaded(str(path)).to(mi.TensorXf), features=features)
     elif given or features or "to_world" in props:
         gaussians = replace(_gaussians_of_tensors(props, given), features=features)
     else:
         shapes = [(0, 3), (0, 4), (0, 3), (0,), (0, 1, 3), (0, 0, 3)]
-        return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes)).to(mi.TensorXf)
+        means, quats, log_scales, logits, sh0, shN = (np.zeros(s, np.float32) for s in shapes)
+        return Gaussians(means, quats, log_scales, logits, sh0, shN).to(mi.TensorXf)
     check_shapes(gaussians)
     return gaussians
 
@@ -243,7 +247,7 @@ def _gaussians_of_tensors(props: mi.Properties, given: Sequence[str]) -> Gaussia
             "splats: give 'filename', or the Gaussians as tensors "
             f"{', '.join(PARAMETER_NAMES)}; missing: {', '.join(missing)}"
         )
-    values = {name: _tensor(props, name) for name in given}
+    values: dict[str, Any] = {name: _tensor(props, name) for name in given}
     if "shN" not in given:
         values["shN"] = dr.zeros(mi.TensorXf, (next(iter(values["means"].shape), 0), 0, 3))
     for name in {"logit_opacities", "smoothing"} & set(given):
@@ -268,7 +272,7 @@ def _loaded(path: str) -> Gaussians:
 
 def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     """Copy a tensor: parameters are assigned in place, the caller's are not."""
-    value = props[name]
+    value: Any = props[name]
     if not dr.is_array_v(value):
         raise PluginTypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
     if not dr.is_jit_v(value):  # of the host, as is what a property set makes of three numbers
@@ -349,7 +353,7 @@ def _agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> d
 # ----------------------------------------------------------------------------------------------
 
 
-def nested_integrators(props: mi.Properties) -> dict[str, mi.Integrator]:
+def nested_integrators(props: mi.Properties) -> dict[str, mi.SamplingIntegrator]:
     """Return nested integrators by name: their key, or in XML the id where no name is given."""
     # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
     is_object = mi.Properties.Type.Object
@@ -359,6 +363,7 @@ def nested_integrators(props: mi.Properties) -> dict[str, mi.Integrator]:
         value = props[name]
         if name == "background":
             continue
+        assert isinstance(value, mi.Object), "as the type of the property tells"
         if not isinstance(value, mi.Integrator):
             raise PluginError(
                 f"splats: {name} must be an integrator, the only object besides the texture "

@@ -11,10 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import Protocol, TypeVar, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
+
+from drgs.core.types import Bool, Float
+
+Ray = TypeVar("Ray", bound="mi.Ray3f")
 
 INVISIBLE = 1e-6
 """Opacity, of which rounding leaves up to 2e-7 where there is none."""
@@ -104,7 +108,7 @@ class RaysBehind:
     rays: StraightRays
     count: int
 
-    def moved(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.Float]:
+    def advance(self, ray: Ray, active: mi.Bool) -> tuple[Ray, mi.Float]:
         """Return the rays, which may have differentials, and their weights. Not differentiated."""
         with dr.suspend_grad():
             rest, active = mi.Ray3f(ray), dr.full(mi.Bool, True, dr.width(ray)) & active
@@ -131,7 +135,7 @@ def _sensor_type(variant: str) -> type:
     del variant
 
     class SensorBehind(mi.Sensor):
-        """Another sensor's rays, without their beginning."""
+        """Rays of another sensor, without their beginning."""
 
         def __init__(
             self, sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind
@@ -146,13 +150,23 @@ def _sensor_type(variant: str) -> type:
             self.m_needs_sample_3 = sensor.needs_sample_3()
 
         def sample_ray(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+            self,
+            time: Float,
+            sample1: Float,
+            sample2: mi.Point2f,
+            sample3: mi.Point2f,
+            active: Bool | bool = True,
         ) -> tuple[mi.Ray3f, mi.Spectrum]:
             ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
             return mi.Ray3f(ray), weight
 
         def sample_ray_differential(
-            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+            self,
+            time: Float,
+            sample1: Float,
+            sample2: mi.Point2f,
+            sample3: mi.Point2f,
+            active: Bool | bool = True,
         ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
             # Not by the batch, whose calls reach all sensors that there are, this one included.
             place, found = sample2.x * len(self.sensors), None
@@ -160,7 +174,8 @@ def _sensor_type(variant: str) -> type:
                 point = mi.Point2f(place - k, sample2.y)
                 own = sensor.sample_ray_differential(time, sample1, point, sample3, active)
                 found = own if found is None else dr.select(place >= k, own, found)
-            ray, passes = self.behind.moved(found[0], mi.Bool(active))
+            assert found is not None, "a batch has sensors"
+            ray, passes = self.behind.advance(found[0], mi.Bool(active))
             return ray, found[1] * passes
 
         def to_string(self) -> str:
@@ -194,6 +209,9 @@ class SplatTransport(Protocol):
         ...
 
 
-def passes_splats(integrator: mi.Integrator) -> bool:
-    """Return whether an integrator's paths can pass splats, as those of ``splatpath`` do."""
-    return hasattr(integrator, "use_transport")
+@runtime_checkable
+class TransportIntegrator(Protocol):
+    """An integrator whose paths can pass splats, as those of ``splatpath`` do."""
+
+    def use_transport(self, transport: SplatTransport | None) -> None:
+        """Pass splats by this transport from now on."""

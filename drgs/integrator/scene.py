@@ -37,7 +37,7 @@ def make_scene(
         tensors["smoothing"] = uploaded.smoothing
     integrator = {
         "type": "splats",
-        "background": _picture(background) if isinstance(background, Path) else list(background),
+        "background": _bitmap(background) if isinstance(background, Path) else list(background),
         "near": model.near_plane,
         **model.approximations.others_than_default,
         "srgb_primitives": False,
@@ -47,32 +47,33 @@ def make_scene(
     return mi.load_dict({"type": "scene", "integrator": integrator})
 
 
-def _picture(path: Path) -> dict[str, object]:
+def _bitmap(path: Path) -> dict[str, object]:
     return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
 
 
 def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, remedy: str) -> None:
     """Raise UserError for a lens that the projection cannot render; where, remedy: words."""
-    bent = next((view for view in views if view.lens is not None), None)
+    bent = next(((view.name, view.lens) for view in views if view.lens is not None), None)
     if model.projection == "exact" and bent is not None:
-        names = ", ".join(bent.lens.coefficients())
+        name, lens = bent
+        names = ", ".join(lens.coefficients())
         raise UserError(
             f"{where}model.projection must be ewa or unscented for lenses that are no pinholes, "
-            f"such as that of view {bent.name} ({bent.lens.kind}: {names}), got exact; or {remedy}"
+            f"such as that of view {name} ({lens.kind}: {names}), got exact; or {remedy}"
         )
 
 
 def check_sizes(views: Iterable[Viewpoint], remedy: str) -> None:
     """Raise :class:`UserError` for an image that cannot be held; remedy: end of the message."""
     for view in views:
-        is_blurred = view.motion is not None and view.motion.shutter == "global"
-        samples = view.motion.samples if is_blurred else 1
+        motion = view.motion
+        samples = 1 if motion is None or motion.shutter != "global" else motion.samples
         if reason := why_too_large(view.width, view.height, samples=samples):
             raise UserError(f"view {view.name}: {reason}; {remedy}")
 
 
 def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[mi.Sensor]:
-    """One sensor per view: box filter, one sample, RGB.
+    """Return one sensor per view: box filter, one sample, RGB.
 
     ``perspective`` where Mitsuba's own sensor can be the view's camera, else (or if all are to be)
     ``calibrated``. Views of one size share a film.
@@ -82,13 +83,13 @@ def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[m
     for view in views:
         size = (view.width, view.height)
         if size not in films:
-            films[size] = mi.load_dict(film_of(*size))
+            films[size] = mi.load_dict(film_description(*size))
         sensors.append(mi.load_dict({**_sensor(view, calibrated), "film": films[size]}))
     return sensors
 
 
-def film_of(width: int, height: int) -> dict[str, object]:
-    """The film of one picture (px), for ``mi.load_dict``: RGB, with a box filter."""
+def film_description(width: int, height: int) -> dict[str, object]:
+    """Describe the film of one image (px) for ``mi.load_dict``: RGB, with a box filter."""
     return {
         "type": "hdrfilm",
         "width": width,
@@ -134,7 +135,7 @@ def _perspective(view: Viewpoint) -> dict[str, object]:
 
 
 def _has_square_pixels(view: Viewpoint) -> bool:
-    """To within :data:`SQUARE_PIXEL_TOLERANCE`."""
+    """Compare the focal lengths, to within :data:`SQUARE_PIXEL_TOLERANCE`."""
     focal = math.sqrt(view.fx * view.fy)
     shift = max(
         abs(view.fx / focal - 1) * max(view.cx, view.width - view.cx),
@@ -144,7 +145,7 @@ def _has_square_pixels(view: Viewpoint) -> bool:
 
 
 def render_views(scene: mi.Scene, views: Iterable[Viewpoint]) -> Iterator[np.ndarray]:
-    """Pictures (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
+    """Yield images (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
     for sensor in make_sensors(views):
         with dr.suspend_grad():  # ends before the picture is out: nobody may ask for the next one
             image = np.array(mi.render(scene, sensor=sensor, spp=1))

@@ -12,30 +12,31 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, repeat
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import Channels, offsets_of, pixel_corners, samples_in
-from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
+from drgs.integrator.film import Channels, num_samples, pixel_corners, sample_offsets
+from drgs.integrator.sensors import SensorState, camera_from_sensor, depth_range, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
 from drgs.splatting.footprint import Positions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.surfaces import Hybrid
-    from drgs.integrator.visible_surfaces import Layers
+    from drgs.integrator.visible_surfaces import SurfaceLayers
 
 
 Passes = list[Channels]
 """Channels by pass: of one sample per pixel or, on a small film, of several."""
 
-Planes = list[list[list[Any]]]
-"""Planes of frames, each Float (samples * H * W,), by time and by pass."""
+Planes = list[list[list[Float]]]
+"""Planes of frames, each (samples * H * W,), by time and by pass."""
 
 
 PASSES_PER_KERNEL = 16
@@ -112,7 +113,7 @@ class SensorRender:
         behind = self._behind(constant)
         seen = repeat(repeat(None))
         if self.hybrid is not None:
-            seen = self._traced_surfaces(self._state().detached()).value
+            seen = self._traced_surfaces(self.hybrid, self._state().detached()).value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -123,12 +124,12 @@ class SensorRender:
     def _channels_of(
         self,
         behind: _Behind,
-        planes: list[Any],
-        layers: Layers | None,
+        planes: list[Float],
+        layers: SurfaceLayers | None,
         color: mi.Color3f,
         radiance: mi.Color3f | None,
     ) -> Channels:
-        """Channels of one sample; layers: surfaces that it sees, None where there are none."""
+        """Return channels of a sample; layers: surfaces that it sees, None if there are none."""
         if layers is None:
             return self._composited(planes, mi.Float(1), behind, color)
         from drgs.integrator.visible_surfaces import rest_behind
@@ -141,21 +142,23 @@ class SensorRender:
 
         def of_surfaces(kind: str) -> Channels | None:
             values = [surface.aov_values(kind, front) for surface, front in pairs]
-            return None if values[0] is None else list(map(sum, zip(*values, strict=True)))
+            found = [of_surface for of_surface in values if of_surface is not None]
+            return [_sum(terms) for terms in zip(*found, strict=True)] if found else None
 
         past = [rest_behind(layers) * planes[0], *planes[1:]]
         own = self._composited(past, whole, behind, color, of_surfaces)
+        assert self.hybrid is not None, "its surfaces are the layers"
         return own + self.hybrid.insertion.values(layers, fronts, radiance)
 
     def _composited(
         self,
-        planes: list[Any],
+        planes: list[Float],
         whole: mi.Float,
         behind: _Behind,
         color_behind: mi.Color3f,
         of_surfaces: Callable[[str], Channels | None] = lambda kind: None,
     ) -> Channels:
-        """Planes of pixels: red, green, blue, perhaps alpha, AOVs.
+        """Turn planes of pixels into channels: red, green, blue, perhaps alpha, AOVs.
 
         whole: sum of the weights of splats and background, 1 less the shares of surfaces;
         of_surfaces: what surfaces contribute to the channels of an AOV of this kind.
@@ -189,6 +192,7 @@ class SensorRender:
             nothing = repeat(repeat(None))
             return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
         behind = splats.background if environment is None else environment
+        assert isinstance(behind, (mi.Emitter, mi.Texture)), "a colour would be constant"
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
@@ -203,7 +207,7 @@ class SensorRender:
         """Return frames by time and by pass, those of the last image where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
         state = self._state().detached()
-        traced = None if self.hybrid is None else self._traced_surfaces(state)
+        traced = None if self.hybrid is None else self._traced_surfaces(self.hybrid, state)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
 
         def render() -> list[list[rendering.Frame]]:
@@ -215,31 +219,34 @@ class SensorRender:
 
         return self.splats.cache.find(f"frames {self.index}", *key, render).value
 
-    def _traced_surfaces(self, state: SensorState) -> Cached:
+    def _traced_surfaces(
+        self, hybrid: Hybrid, state: SensorState
+    ) -> Cached[list[list[SurfaceLayers]]]:
         from drgs.integrator.visible_surfaces import trace_surfaces
 
-        sensor, hides = self.sensor, self.splats.hide_emitters
-        settings = self.hybrid.surfaces, self.key, hides, sensor.far_clip(), *state.settings
+        hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
+        settings = hybrid.surfaces, self.key, hides, far, *state.settings
         return self.splats.cache.find(
             f"surfaces {self.index}",
             settings,
             state.device,
             lambda: trace_surfaces(
-                self.hybrid.rays,
-                sensor,
+                hybrid.rays,
+                far,
+                self.sensor.film(),
                 self._cameras(state),
                 self._offsets,
                 with_normals="normal" in self.splats.aovs.values(),
             ),
         )
 
-    def num_surfaces(self) -> int:
-        """Number of surfaces that are seen one through the other."""
-        return len(self._traced_surfaces(self._state().detached()).value[0][0])
+    def num_surfaces(self, hybrid: Hybrid) -> int:
+        """Return the number of surfaces that are seen one through the other."""
+        return len(self._traced_surfaces(hybrid, self._state().detached()).value[0][0])
 
     @property
-    def _offsets(self) -> list[tuple[Any, Any]]:
-        return [offsets_of(positions) for positions in self.positions]
+    def _offsets(self) -> list[tuple[Float | float, Float | float]]:
+        return [sample_offsets(positions) for positions in self.positions]
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)
@@ -247,7 +254,7 @@ class SensorRender:
     def _cameras(self, state: SensorState) -> list[Camera]:
         return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
-    def _camera_tangents(self, count: int) -> list[list[mi.Float] | None]:
+    def _camera_tangents(self, count: int) -> Sequence[list[mi.Float] | None]:
         """Return the derivatives of each time's camera numbers along those set on the sensor."""
         state = self._state()
         if not state.is_attached:
@@ -257,6 +264,10 @@ class SensorRender:
         return dr.grad(numbers)
 
 
+def _sum(values: Sequence[Float]) -> Float:
+    return sum(values[1:], values[0])
+
+
 def _mean(passes: Sequence[Passes]) -> Passes:
     total: list[Passes] = []
     for first in range(0, len(passes), PASSES_PER_KERNEL):
@@ -264,7 +275,7 @@ def _mean(passes: Sequence[Passes]) -> Passes:
         terms = [*total, *passes[first : first + PASSES_PER_KERNEL]]
         total = [
             [
-                [sum(values[1:], values[0]) for values in zip(*of_sample, strict=True)]
+                [_sum(values) for values in zip(*of_sample, strict=True)]
                 for of_sample in zip(*terms, strict=True)
             ]
         ]
@@ -295,7 +306,7 @@ def _render(
     camera: Camera,
     pipeline: rendering.Pipeline,
     positions: Sequence[Positions],
-    surfaces: Sequence[Layers] | None,
+    surfaces: Sequence[SurfaceLayers] | None,
 ) -> list[rendering.Frame]:
     """Render a frame for each pass; surfaces: the visible ones of each."""
     pipeline = with_effects(pipeline, gaussians, camera)
@@ -323,7 +334,7 @@ def constant_background(splats: SplatsState) -> mi.Color3f | None:
 
 
 def accumulate_in_sensor(
-    ignored: Collection[str], state: SensorState, gradients: list[list[Any]]
+    ignored: Collection[str], state: SensorState, gradients: list[list[Float]]
 ) -> None:
     """Accumulate derivatives by ``Camera.numbers()``, by time, into a sensor."""
     numbers = [camera.numbers() for camera in _attached_cameras(ignored, state)]
@@ -335,7 +346,7 @@ def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Came
     return cameras_in_time(without_effects(state.make(state), ignored))
 
 
-def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]) -> None:
+def _accumulate_through(values: list[list[Float]], gradients: list[list[mi.Float]]) -> None:
     pairs = zip(chain(*values), chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
     for value, gradient in attached:
@@ -345,9 +356,9 @@ def _accumulate_through(values: list[list[Any]], gradients: list[list[mi.Float]]
 
 
 LENS_POINTS = 16
-"""At which an aperture is sampled, for each place on the film: always the same, so that nothing is
-random. What is much brighter than its surroundings and smaller than the gaps between them is seen
-as so many pictures of itself."""
+"""Points at which an aperture is sampled, for each place on the film: always the same, so that
+nothing is random. What is much brighter than its surroundings and smaller than the gaps between
+the points is seen as so many images of itself."""
 
 
 def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f) -> mi.Color3f:
@@ -381,7 +392,7 @@ def background_radiance(
 
     cameras: of each time; offsets: of each pass, x and y from the pixel's upper left corner, px.
     """
-    places = [pixel_corners(film, samples_in(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
+    places = [pixel_corners(film, num_samples(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
     if isinstance(background, mi.Texture):
         found = [stretched_radiance(background, film, place) for place in places]
         return [found] * len(cameras)

@@ -12,18 +12,22 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
 from drgs.core.errors import PluginError, PluginTypeError
-from drgs.integrator.film import Channels
-from drgs.splatting.footprint import PixelCenters, Positions
+from drgs.core.types import Array3f, Float, Matrix3f, Matrix4f
+from drgs.integrator.film import Channels, SamplePoints
+from drgs.splatting.footprint import Positions
+
+Pair = tuple[Float, Float]
+"""Numbers along the two sides of the film."""
 
 
 @dataclass(frozen=True)
 class SensorState:
-    """All that the camera of a Mitsuba sensor depends on, film and crop included.
+    """State that the camera of a Mitsuba sensor depends on, film and crop included.
 
     Holding it keeps the variables of ``device`` alive, so that equal indices mean equal values.
     """
 
-    device: dict[str, Any]  # numbers on the device, by the names that Mitsuba gives them
+    device: dict[str, Any]  # arrays on the device, by the names that Mitsuba gives them
     host: tuple[float, ...]  # film width and height, crop offset x and y, crop size, near
     make: Callable[[SensorState], Camera]
 
@@ -38,7 +42,7 @@ class SensorState:
 
     @property
     def settings(self) -> tuple[object, ...]:
-        """All besides the device's numbers, compared by ==."""
+        """State besides the device's numbers, compared by ==."""
         return self.make, self.host
 
 
@@ -47,17 +51,28 @@ class CameraSensor(Protocol):
     """A sensor that makes its camera itself, as ``calibrated`` does."""
 
     def camera_parameters(self) -> list[str]:
-        """Names of the parameters that the camera depends on, as ``mi.traverse`` has them."""
+        """Return the parameters that the camera depends on, named as by ``mi.traverse``."""
+        ...
 
     def camera_from_state(self, state: SensorState) -> Camera:
-        """The camera with these values of its parameters; OpenCV axes, px."""
+        """Return the camera with these values of its parameters; OpenCV axes, px."""
+        ...
 
     def num_poses(self) -> int:
-        """Poses whose pictures are averaged: 1 unless motion blurs them."""
+        """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
+        ...
+
+    def near_clip(self) -> float:
+        """Return the depth of the near plane, scene units."""
+        ...
+
+    def far_clip(self) -> float:
+        """Return the depth of the far plane, scene units."""
+        ...
 
 
 def num_poses(sensor: mi.Sensor) -> int:
-    """Poses of a sensor whose pictures are averaged: 1 unless motion blurs them."""
+    """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
     return sensor.num_poses() if isinstance(sensor, CameraSensor) else 1
 
 
@@ -73,33 +88,42 @@ def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
     return SideBySide.of(sensor).sensors
 
 
+def depth_range(sensor: mi.Sensor) -> tuple[float, float]:
+    """Return the depths of a sensor's near and far plane, scene units.
+
+    Raises PluginTypeError for a sensor that is none of ``perspective``, ``thinlens``,
+    ``orthographic`` and ``calibrated``.
+    """
+    if isinstance(sensor, (CameraSensor, mi.ProjectiveCamera)):
+        return sensor.near_clip(), sensor.far_clip()
+    raise PluginTypeError(
+        "splats: the sensor must be of type perspective, thinlens, orthographic or "
+        f"calibrated, got {sensor.class_name()} '{sensor.id()}'"
+    )
+
+
 def read_sensor(sensor: mi.Sensor, near: float) -> SensorState:
     """Collect a sensor's state without reading anything back from the device.
 
     near: near plane, scene units; the sensor's ``near_clip`` applies as well, the larger wins.
 
-    Raises PluginTypeError for a sensor that is none of ``perspective``, ``thinlens``,
-    ``orthographic`` and ``calibrated``.
+    Raises PluginTypeError as :func:`depth_range` does.
     """
+    near_clip, _ = depth_range(sensor)
     if isinstance(sensor, CameraSensor):
         names, make = sensor.camera_parameters(), sensor.camera_from_state
-    elif isinstance(sensor, mi.ProjectiveCamera):
-        names, make = _PROJECTIVE[sensor.class_name()]
     else:
-        raise PluginTypeError(
-            "splats: the sensor must be of type perspective, thinlens, orthographic or "
-            f"calibrated, got {sensor.class_name()} '{sensor.id()}'"
-        )
+        names, make = _PROJECTIVE[sensor.class_name()]
     params = mi.traverse(sensor)
-    device = {name: params[name] for name in names}
+    device: dict[str, Any] = {name: params[name] for name in names}
     device = {k: v.matrix if k.startswith("to_world") else v for k, v in device.items()}
     film = sensor.film()
-    host = (*film.size(), *film.crop_offset(), *film.crop_size(), max(near, sensor.near_clip()))
+    host = (*film.size(), *film.crop_offset(), *film.crop_size(), max(near, near_clip))
     return SensorState(device=device, host=host, make=make)
 
 
 def camera_from_sensor(state: SensorState) -> Camera:
-    """The camera of a Mitsuba sensor's crop window, detached.
+    """Create the camera of a Mitsuba sensor's crop window, detached.
 
     ``state.make(state)`` is the one that Dr.Jit differentiates in the sensor's parameters.
     """
@@ -150,12 +174,12 @@ _PROJECTIVE = {
     "ThinLensCamera": (("to_world", "x_fov", "aperture_radius", "focus_distance"), _thin_lens),
     "OrthographicCamera": (("to_world",), _orthographic),
 }
-"""By the name of Mitsuba's class, which has no type in Python: the parameters that the camera
-depends on, and what makes it."""
+"""Parameters that a camera depends on, and the function that makes it, by the name of Mitsuba's
+class, which has no type in Python."""
 
 
-def opaque_host(state: SensorState) -> list[Any]:
-    """The numbers of the host on the device.
+def opaque_host(state: SensorState) -> list[Float]:
+    """Move the numbers of the host to the device.
 
     None may be compiled into a kernel: each film, crop or view would compile its own.
     """
@@ -164,9 +188,9 @@ def opaque_host(state: SensorState) -> list[Any]:
 
 
 def on_crop_window(
-    state: SensorState, host: list[Any], to_world: Any, focal: Any, principal: Any
+    state: SensorState, host: list[Float], to_world: Matrix4f, focal: Pair, principal: Pair
 ) -> Camera:
-    """A camera of the crop window of a film.
+    """Create the camera of the crop window of a film.
 
     to_world: 4 x 4, from Mitsuba's camera axes; focal and principal: pairs, px, of the whole film.
     """
@@ -187,8 +211,8 @@ def on_crop_window(
     )
 
 
-def pose_from_to_world(to_world: Any) -> tuple[Any, Any]:
-    """Rotation (world to camera, OpenCV axes) and centre of Mitsuba's 4 x 4 ``to_world``.
+def pose_from_to_world(to_world: Matrix4f) -> tuple[Matrix3f, Array3f]:
+    """Return rotation (world to camera, OpenCV axes) and centre of Mitsuba's ``to_world``.
 
     Mitsuba's camera has x to the left and y up, OpenCV's x to the right and y down. A camera has
     no unit of length: if ``to_world`` scales, its axes are normalised.
@@ -199,12 +223,12 @@ def pose_from_to_world(to_world: Any) -> tuple[Any, Any]:
     return t.Matrix3f(axes), center
 
 
-def axis_lengths(to_world: Any) -> list[Any]:
-    """World units in a unit of the camera, by axis."""
+def axis_lengths(to_world: Matrix4f) -> list[Float]:
+    """Return the world units in a unit of the camera, by axis."""
     return [dr.norm(column) for column in _columns(to_world)[:3]]
 
 
-def _columns(matrix: Any) -> list[Any]:
+def _columns(matrix: Matrix4f) -> list[Array3f]:
     t = types_of(type(matrix[0, 0]))
     return [t.Array3f([matrix[row, column] for row in range(3)]) for column in range(4)]
 
@@ -219,7 +243,7 @@ class SideBySide:
 
     @staticmethod
     def of(batch: mi.Sensor) -> SideBySide:
-        """Raises PluginError if the batch's film has a crop window."""
+        """Read a batch; PluginError if its film has a crop window."""
         sensors, film = _children(batch), batch.film()
         if list(film.crop_size()) != list(film.size()):
             raise PluginError("splats: the film of a batch sensor must not have a crop window")
@@ -228,21 +252,21 @@ class SideBySide:
     def positions(self, positions: Sequence[Positions], index: int) -> tuple[Positions, ...]:
         """Return the points at which the pixels of one image are evaluated, by pass."""
         return tuple(
-            p
-            if isinstance(p, PixelCenters)
-            else replace(p, x=self._cut(p.x, index), y=self._cut(p.y, index))
+            replace(p, x=self._cut(p.x, index), y=self._cut(p.y, index))
+            if isinstance(p, SamplePoints)
+            else p
             for p in positions
         )
 
     def cut(self, passes: Sequence[Channels], index: int) -> list[Channels]:
-        """The part of one picture of what the film gets, by pass."""
+        """Cut the part of one image out of the channels for the film, by pass."""
         return [[self._cut(plane, index) for plane in channels] for channels in passes]
 
-    def put_together(self, pictures: Sequence[Sequence[Channels]]) -> list[Channels]:
-        """Return the channels for the film, by pass; pictures: by sensor, each by pass."""
+    def concatenate(self, images: Sequence[Sequence[Channels]]) -> list[Channels]:
+        """Return the channels for the film, by pass; images: by sensor, each by pass."""
         return [
             [self._joined(planes) for planes in zip(*of_pass, strict=True)]
-            for of_pass in zip(*pictures, strict=True)
+            for of_pass in zip(*images, strict=True)
         ]
 
     def _cut(self, plane: mi.Float, index: int) -> mi.Float:
@@ -267,10 +291,10 @@ class SideBySide:
 
 
 def _children(batch: mi.Sensor) -> list[mi.Sensor]:
-    """The sensors of a batch in their order; ``mi.traverse`` names each once."""
+    """Return the sensors of a batch in their order; ``mi.traverse`` names each once."""
 
     class Children(mi.TraversalCallback):  # of the variant that is set
-        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+        def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
             del name, flags, cpptype
             if isinstance(value, mi.Sensor):
                 sensors.append(value)

@@ -34,13 +34,13 @@ from drgs.splatting.projection import load_rows
 GAMMA = 2.2
 
 HIDDEN = 1 / 64
-"""Of light that splats do not let through."""
+"""Least part of the light that splats let through."""
 
 SAMPLES = 64
-"""Of the scene's emitters, for each splat; a pixel shows the mean of many."""
+"""Samples of the scene's emitters for each splat; a pixel shows the mean of many."""
 
 LEAST = 1 / 64
-"""Of the light without other splats, what objects hold off at least for a splat to be shaded."""
+"""Least part of the light without other splats that objects hold off a splat to be shaded."""
 
 AHEAD = 3.0
 """Standard deviations of a splat, along its shortest axis, from its mean to where light is asked
@@ -59,7 +59,7 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
         rays = _rays_through(surfaces.objects)
         without = _rays_through(_without(surfaces.objects, splats.shadows))
         blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
-        return _darkened(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
+        return _darken(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
 
     cache.shaded = None
     cache.shaded = cache.find("shaded", (surfaces,), gaussians, estimate).value
@@ -85,7 +85,7 @@ class _Estimate:
     splats: RaySplats
 
     def ratios(self, gaussians: Gaussians) -> mi.Color3f:
-        """E / E' of each Gaussian, at most 1."""
+        """Return E / E' of each Gaussian, at most 1."""
         rows = load_rows(gaussians, sh_degree=0)
         means, normals = mi.Point3f(rows.means), _shortest_axes(rows.quats, rows.log_scales)
         dr.eval(means, normals)
@@ -93,10 +93,11 @@ class _Estimate:
         if not self.scene.scene.emitters():
             return ratio
         lit, dark = self._irradiance(means, normals, lambda ray, sample: mi.Float(1))
-        shaded = dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark))
+        shaded = mi.UInt32(dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark)))
         if dr.width(shaded) > 0:
-            place = [dr.gather(type(v), v, shaded) for v in (means, normals)]
-            lit, dark = self._irradiance(*place, self._let_through)
+            points = dr.gather(mi.Point3f, means, shaded)
+            directions = dr.gather(mi.Vector3f, normals, shaded)
+            lit, dark = self._irradiance(points, directions, self._let_through)
             found = dr.select(lit + dark > 0, lit / (lit + dark), 1)
             dr.scatter(ratio, found, shaded)
         dr.eval(ratio)
@@ -119,7 +120,7 @@ class _Estimate:
             )
             cosine = dr.dot(normals, ds.d)  # the normal is as long as the splat is thick
             start = points + AHEAD * dr.sign(cosine) * normals
-            ray = mi.Ray3f(start, ds.d, ds.dist * (1 - mi.math.ShadowEpsilon), 0, [])
+            ray = mi.Ray3f(mi.Ray3f(start, ds.d), ds.dist * (1 - mi.math.ShadowEpsilon))
             weight *= dr.abs(cosine) * dr.rcp(dr.norm(normals))
             weight *= let_through(ray, sampler.next_1d())
             passes = self.scene.transmittance(ray, mi.Bool(True))
@@ -138,14 +139,14 @@ class _Estimate:
         return lit, dark
 
     def _let_through(self, ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
-        """HIDDEN and 1: nothing in between, but so on average."""
+        """Return HIDDEN or 1, so that the mean is about the transmittance."""
         segment = Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.maxt, dr.full(mi.Bool, True))
         T = self.splats.transmittance(segment, sample)
         return dr.select(sample > T, HIDDEN, mi.Float(1))
 
 
 def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:
-    """Directions in which splats are thinnest, as long as they are thick."""
+    """Return the directions in which splats are thinnest, as long as they are thick."""
     rotation = quat_to_rotation(quats)
     axes = [mi.Vector3f([rotation[row, k] for row in range(3)]) for k in range(3)]
     shortest, thickness = axes[0], log_scales[0]
@@ -156,8 +157,8 @@ def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:
     return shortest * dr.exp(thickness)
 
 
-def _darkened(gaussians: Gaussians, ratio: mi.Color3f) -> Gaussians:
-    """Colours times ratio^(1 / GAMMA): of 0.5 + basis x coefficients."""
+def _darken(gaussians: Gaussians, ratio: mi.Color3f) -> Gaussians:
+    """Multiply colours by ratio^(1 / GAMMA): of 0.5 + basis x coefficients."""
     factor = [dr.power(channel, 1 / GAMMA) for channel in ratio]
 
     def scaled(tensor: mi.TensorXf, of_half: float) -> mi.TensorXf:

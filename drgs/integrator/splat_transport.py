@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -40,10 +40,11 @@ import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
+from drgs.core.arrays import reinterpret
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import PathSegment, SplatTransport
+from drgs.integrator.rays import PathSegment, SplatTransport, TransportIntegrator
 from drgs.integrator.sensor_render import decode
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
@@ -52,12 +53,18 @@ from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 from drgs.splatting.rendering import color_features, depth_feature
 
+if TYPE_CHECKING:
+    from drgs.integrator.mirrors import FlatMirror, Mirrors
+else:  # Dr.Jit evaluates annotations
+    Mirrors = object
+
+
 DECODING = (0.012522878, 0.682171111, 0.305306011)
-"""Of the first three powers of a display-encoded colour, whose sum is nearly linear radiance
+"""Factors of the first three powers of an encoded colour, whose sum is nearly linear radiance
 (Chapman, "sRGB approximations for HLSL", 2012)."""
 
 DECODED_WITHIN = 2e-3
-"""Of a colour in 0..1, decoded by :data:`DECODING`."""
+"""Largest error of a colour in 0..1, decoded by :data:`DECODING`."""
 
 LEAST_SAMPLES = 3
 """Splats that a ray draws, at least: for the third power."""
@@ -103,13 +110,13 @@ class RayTransport:
     def _sampled(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
-        seed, n = dr.reinterpret_array(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
-        drawn, exist, T = self.splats.sampled(segment, seed, n)
+        seed, n = reinterpret(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
+        drawn, exist, T = self.splats.sample_splats(segment, seed, n)
         colors = [
             dr.select(is_open & ~exists, 0, mi.Color3f(color))
             for color, exists in zip(drawn, exist, strict=True)
         ]
-        s1, s2, s3 = (sum(color**k for color in colors) for k in (1, 2, 3))
+        s1, s2, s3 = (sum((color**k for color in colors), mi.Color3f(0)) for k in (1, 2, 3))
         mean = s1 / n
         square = (s1 * s1 - s2) / (n * (n - 1))
         cube = (s1 * s1 * s1 - 3 * s1 * s2 + 2 * s3) / (n * (n - 1) * (n - 2))
@@ -119,7 +126,7 @@ class RayTransport:
         return whole * (a * mean + b * square + c * cube), coverage
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
-        """An estimate of that of the splats along segments.
+        """Estimate the transmittance of the splats along segments.
 
         Below :data:`ROULETTE`, Russian roulette: a ray that lets through less than ``sample`` (in
         0..1) times that is dark, and all others let through as much as that.
@@ -131,7 +138,7 @@ class RayTransport:
 
 
 def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: int) -> RaySplats:
-    """Gaussians as rays meet them, their smoothing filter included."""
+    """Prepare Gaussians for rays, their smoothing filter included."""
     rows = load_rows(gaussians, degree)
     if rows.smoothing is not None:
         from drgs.effects.smoothing import smoothed
@@ -142,12 +149,13 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
 
 def nested_with_transport(
     splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
-) -> mi.Integrator:
+) -> mi.SamplingIntegrator:
     """Return the nested integrator, given the splats; num_paths: of a pixel; sensors: rendered."""
-    nested = splats.nested
+    nested: mi.SamplingIntegrator | None = splats.nested
     if nested is None:
         settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
         nested = mi.load_dict(settings)
+    assert isinstance(nested, TransportIntegrator), "checked with the settings"
     if splats.light == "rays":
         nested.use_transport(RayTransport.of(splats))
     else:
@@ -171,7 +179,7 @@ TOO_CLOSE = (
 )
 
 NOBODY = 0xFFFFFFFF
-"""In place of a probe's number."""
+"""Number in place of a probe's, where there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +187,7 @@ class ProbeTransport:
     """Transport along rays that are looked up in probes."""
 
     probes: Probes
-    mirrors: Any  # drgs.integrator.mirrors.Mirrors of the shapes that are some; None: none is
+    mirrors: Mirrors | None  # the shapes that are some; None: none is
     exposure: mi.Float  # (1,): factor of the splats' radiance
     shapes: dict[int, mi.ShapePtr]  # that have a probe, by its number
     emitters: dict[int, mi.EmitterPtr]  # likewise
@@ -276,7 +284,10 @@ class ProbeTransport:
 
 
 def _probes(
-    splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
+    splats: SplatsState,
+    objects: Sequence[mi.Emitter | mi.Shape],
+    flat: dict[int, FlatMirror],
+    sensor: SensorState,
 ) -> Probes:
     """Render the probes of objects; flat: mirrors by the probe's number; sensor: that sees them."""
     gaussians, (centers, planes) = dr.detach(splats.gaussians), _places(objects, flat, sensor)
@@ -288,7 +299,7 @@ def _probes(
             from drgs.effects.smoothing import smoothed
 
             pipeline = replace(pipeline, rows=smoothed)
-        probes = Probes.of(gaussians, pipeline, centers, splats.near, _decoded, planes)
+        probes = Probes.of(gaussians, pipeline, centers, splats.near, _decode, planes)
         _warn_of_close(splats, objects, flat, probes)
         return probes
 
@@ -298,7 +309,10 @@ def _probes(
 
 
 def _warn_of_close(
-    splats: SplatsState, objects: Sequence[mi.Object], flat: dict[int, Any], probes: Probes
+    splats: SplatsState,
+    objects: Sequence[mi.Emitter | mi.Shape],
+    flat: dict[int, FlatMirror],
+    probes: Probes,
 ) -> None:
     """Log a warning for each shape that is too close to splats, the first time that it is."""
     close = {
@@ -309,15 +323,16 @@ def _warn_of_close(
         and probes.nearest[k] < CLOSE * float(dr.max(node.bbox().extents())) / 2
     }
     for name in sorted(close - splats.cache.too_close):
-        mi.Log(mi.LogLevel.Warn, TOO_CLOSE.format(name))
+        message = TOO_CLOSE.format(name)
+        mi.Log(mi.LogLevel.Warn, message)  # pyright: ignore[reportCallIssue]  no type in the stub
     splats.cache.too_close |= close
 
 
-def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, Any]:
+def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, FlatMirror]:
     """Return the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
     from drgs.integrator.mirrors import FlatMirror
 
-    def recognise() -> dict[int, Any]:
+    def recognise() -> dict[int, FlatMirror]:
         every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
         return {k: mirror for k, mirror in every.items() if mirror is not None}
 
@@ -325,13 +340,13 @@ def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int,
 
 
 def _mirror_images(
-    splats: SplatsState, scene: mi.Scene, mirrors: list[Any], states: list[SensorState]
-) -> Any:
+    splats: SplatsState, scene: mi.Scene, mirrors: list[FlatMirror], states: list[SensorState]
+) -> Mirrors | None:
     from drgs.integrator.mirrors import Mirrors
 
-    if not mirrors:
-        return None
     gaussians, surfaces = dr.detach(splats.gaussians), splats.cache.surfaces
+    if not mirrors or surfaces is None:
+        return None
     how = splats.approximations, splats.sh_degree
     settings = (surfaces, *how, *(state.settings for state in states))
     arrays = gaussians, [state.device for state in states]
@@ -344,7 +359,7 @@ def _mirror_images(
 
 
 def _places(
-    objects: Sequence[mi.Object], flat: dict[int, Any], sensor: SensorState
+    objects: Sequence[mi.Emitter | mi.Shape], flat: dict[int, FlatMirror], sensor: SensorState
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
 
@@ -360,14 +375,14 @@ def _places(
     return centers, planes
 
 
-def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Object]:
-    nodes = [*scene.emitters(), *scene.shapes()]
+def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Emitter | mi.Shape]:
+    nodes: list[mi.Emitter | mi.Shape] = [*scene.emitters(), *scene.shapes()]
     check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
     known = {node.id(): node for node in nodes}
     return [known[name] for name in names]
 
 
-def _center(node: mi.Object) -> list[float]:
+def _center(node: mi.Emitter | mi.Shape) -> list[float]:
     box = node.bbox()
     if not box.valid():
         raise PluginError(
@@ -378,10 +393,10 @@ def _center(node: mi.Object) -> list[float]:
 
 
 def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
-    """D(C), of A D(C / A) and A: with black as the last splat."""
+    """Decode with black as the last splat: return D(C), given A D(C / A) and A."""
     display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
     return mi.math.srgb_to_linear(coverage * display)
 
 
-def _decoded(color: list[mi.Float]) -> list[mi.Float]:
+def _decode(color: list[mi.Float]) -> list[mi.Float]:
     return [mi.math.srgb_to_linear(channel) for channel in color]

@@ -1,14 +1,14 @@
 """The state of the integrator ``splats``: what it was given, and what it keeps between renderings.
 
-``mi.render`` has Dr.Jit traverse it, which resolves annotations in whatever variant is active:
-types that are imported on demand, or belong to one variant, are ``Any`` here and named beside it.
+``mi.render`` has Dr.Jit traverse it, which evaluates the annotations of fields in whatever variant
+is active: types that are imported on demand are ``Any`` then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +19,7 @@ from drgs.config.approximations import Approximations, Value
 from drgs.core.arrays import tangent_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
+from drgs.core.types import Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.checks import (
     check_columns,
@@ -29,8 +30,13 @@ from drgs.integrator.checks import (
 )
 from drgs.splatting import rendering
 
-if TYPE_CHECKING:  # imported where a scene has other Gaussians than the integrator's, unmoved
-    from drgs.integrator.gathering import Gathered, Part
+if TYPE_CHECKING:
+    from drgs.integrator.gathering import Gathered, Part, Placement, Turn
+    from drgs.integrator.surfaces import Surfaces
+else:
+    Gathered = Turn = Surfaces = Any
+
+T = TypeVar("T")
 
 AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 """Outputs besides colour, and the names of their channels as in Mitsuba's ``aov``."""
@@ -40,12 +46,12 @@ AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
 class BackwardResult:
     """Results of a backward pass that ``mi.render`` cannot return; N Gaussians."""
 
-    means2d_grad: Any  # TensorXf (N, 2): derivative of the loss, per px on the film
-    visible: Any  # Bool (N,): the Gaussian's extent touches the film
-    first_nonfinite: Any  # UInt32 (1,): of all derivatives, for rendering.decode_fault
+    means2d_grad: TensorXf  # (N, 2): derivative of the loss, per px on the film
+    visible: Bool  # (N,): the Gaussian's extent touches the film
+    first_nonfinite: UInt32  # (1,): of all derivatives, for rendering.decode_fault
     frames: list[rendering.Frame]  # of the last view; none once a parameter has changed
 
-    def weighted_sums(self, plane: Any) -> Any:
+    def weighted_sums(self, plane: Float) -> Float:
         """Return the sum over pixels of each Gaussian's weight times ``plane``: Float (N,).
 
         plane: Float (H * W,). The weight is alpha times transmittance, as composited; its mean over
@@ -56,35 +62,34 @@ class BackwardResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Cached:
+class Cached(Generic[T]):
     """A value with all that it depends on, held so that indices of variables are not reused."""
 
-    value: Any
+    value: T
     settings: tuple[object, ...]  # compared by ==
-    arrays: Any  # a PyTree, detached: compared by variables
+    arrays: object  # a PyTree, detached: compared by variables
 
 
 @dataclass
 class RenderCache:
     """Intermediate results of the last renderings."""
 
-    kept: dict[str, Cached] = field(default_factory=dict)  # by what they are
+    kept: dict[str, Cached[Any]] = field(default_factory=dict)  # by what they are
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
-    gathered: Any = None  # drgs.integrator.gathering.Gathered; None: the own Gaussians, unmoved
+    gathered: Gathered | None = None  # None: the own Gaussians, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
-    instances: list[Any] = field(default_factory=list)  # mi.Shape: of the last scene, checked
-    sensor: Any = None  # mi.Sensor that was rendered last
-    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
+    instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
+    sensor: mi.Sensor | None = None  # the last that was rendered
+    surfaces: Surfaces | None = None  # of the last scene that had some
     too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
-    shaded: Any = None  # Gaussians in the shadow of surfaces; None: there are no such shadows
+    shaded: Gaussians | None = None  # in the shadow of surfaces; None: there are no such shadows
 
     def find(
-        self, name: str, settings: tuple[object, ...], arrays: Any, make: Callable[[], Any]
-    ) -> Cached:
+        self, name: str, settings: tuple[object, ...], arrays: object, make: Callable[[], T]
+    ) -> Cached[T]:
         """Return what was kept under a name, made anew unless settings and arrays are the same."""
         last = self.kept.get(name)
-        is_same = last is not None and last.settings == settings
-        if not is_same or not same_variables(last.arrays, arrays):
+        if last is None or last.settings != settings or not same_variables(last.arrays, arrays):
             last = self.kept[name] = Cached(make(), settings, arrays)
         return last
 
@@ -98,7 +103,7 @@ class SplatObject:
     """Gaussians that one ``to_world`` places: the integrator's own, or those of a nested one."""
 
     gaussians: Gaussians  # in the space of the object; Mitsuba assigns to its arrays in place
-    to_world: Any  # AffineTransform4f
+    to_world: mi.AffineTransform4f
     is_moved: bool  # whether it moves them
     file: str = ""
     header: dict[str, Value] = field(default_factory=dict)  # approximations of the file's header
@@ -121,9 +126,9 @@ class SplatsState:
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
-    turns: dict[str, Any]  # drgs.integrator.gathering.Turn by shapes' ids; "": of all others
-    background: Any  # Color3f, display space; or mi.Texture, linear
-    nested: Any  # mi.Integrator of surfaces, or None
+    turns: dict[str, Turn]  # of harmonics, by shapes' ids; "": of all others
+    background: mi.Color3f | mi.Texture  # in display space; or linear
+    nested: mi.SamplingIntegrator | None  # of surfaces
     default_degree: int  # of spherical harmonics, where the scene has no other Gaussians
     given_degree: int | None  # None: the highest that the Gaussians have
     approximations: Approximations
@@ -145,7 +150,7 @@ class SplatsState:
 
     @property
     def objects(self) -> dict[str, SplatObject]:
-        """All objects that have Gaussians, by the prefix of their parameters' names."""
+        """Objects that have Gaussians, by the prefix of their parameters' names."""
         own = {"": self.own} if self.own.has_gaussians else {}
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
@@ -211,9 +216,9 @@ class SplatsState:
         """Raise PluginError for AOVs of too many channels."""
         check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
 
-    def parameters_changed(self, keys: list[str], is_object: bool) -> None:
+    def parameters_changed(self, keys: Sequence[str], is_object: bool) -> None:
         """Check that own parameters fit together; keys: none for all."""
-        if keys != ["background"]:
+        if list(keys) != ["background"]:
             self.cache.forget("frames")
             self.cache.gathered = None
         if not self.own.has_gaussians:
@@ -241,13 +246,13 @@ class SplatsState:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All rendered Gaussians, world space; attached where they are the parameters."""
+        """Rendered Gaussians, world space; attached where they are the parameters."""
         shaded = self.cache.shaded
         return self.unshaded_gaussians if shaded is None else shaded
 
     @property
     def unshaded_gaussians(self) -> Gaussians:
-        """All rendered Gaussians, without the shadows of surfaces."""
+        """Rendered Gaussians, without the shadows of surfaces."""
         if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
             self.cache.gathered = _gather_parts(self._placements(), None)
         gathered = self.cache.gathered
@@ -277,14 +282,14 @@ class SplatsState:
 
     def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
         """Return Gaussians of objects and shapes, attached, in the order of rendering."""
-        parts = self._placements()
+        parts: list[Part] = [*self._placements()]
         if shapes or self.turns:
             from drgs.integrator.gathering import conversions_of
 
             parts += conversions_of(shapes, self.turns)
         return parts
 
-    def _placements(self) -> list[Part]:
+    def _placements(self) -> list[Placement]:
         from drgs.integrator.gathering import Placement
 
         return [
@@ -298,8 +303,9 @@ class SplatsState:
             self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
             return
         own = self.own.gaussians
+        features = own.features or {}
         pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
-        pairs += [(own.features[name], d) for name, d in (gradients.features or {}).items()]
+        pairs += [(features[name], d) for name, d in (gradients.features or {}).items()]
         for parameter, gradient in pairs:
             if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
                 dr.accum_grad(parameter, gradient)

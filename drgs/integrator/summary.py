@@ -25,7 +25,7 @@ AS_THE_FILE_SAYS = "as the file says"
 
 @dataclass(frozen=True)
 class SimulatedEffect:
-    """One effect of a summary: simulated, or not."""
+    """An effect of a summary: simulated, or not."""
 
     name: str
     what: str | None  # that is simulated; None: nothing is
@@ -33,14 +33,14 @@ class SimulatedEffect:
     ignored: bool = False  # whether it is asked for where it is not to be simulated
 
     def unless(self, is_ignored: bool) -> SimulatedEffect:
-        """The effect, not simulated if it ``is_ignored``."""
+        """Return the effect, not simulated if it ``is_ignored``."""
         if is_ignored and self.what is not None:
             return replace(self, what=None, ignored=True)
         return self
 
 
 def described(effects: Sequence[SimulatedEffect]) -> str:
-    """The summary as text: a line for each effect that is simulated, one for all the others."""
+    """Format the summary: a line for each effect that is simulated, one for all the others."""
     lines = [f"  {e.name}: {e.what} ({e.why})" for e in effects if e.what is not None]
     absent = [
         f"{e.name} (ignored)" if e.ignored else e.name
@@ -74,7 +74,7 @@ def summary_of_sensors(
     left = [without_effects(camera, splats.ignore) for camera in cameras]
 
     def effect(name: str, words: Callable[[Camera], str | None]) -> SimulatedEffect:
-        """words: what a camera has of it, or None."""
+        """Summarise one effect; words: describes what a camera has of it, or None."""
         shown = [what for what in map(words, left) if what is not None]
         why = "the sensor" if len(left) == 1 else f"{len(shown)} of {len(left)} sensors"
         ignored = sum(words(camera) is not None for camera in cameras) > len(shown)
@@ -83,7 +83,7 @@ def summary_of_sensors(
     of_cameras = [
         effect("lens", lambda camera: _lens_words(camera.lens)),
         effect("depth of field", lambda camera: None if camera.aperture is None else "a thin lens"),
-        effect("motion", lambda camera: camera.shutter and camera.shutter.label),
+        effect("motion", lambda camera: None if camera.shutter is None else camera.shutter.label),
     ]
     surfaces = SimulatedEffect(
         "surfaces",
@@ -160,20 +160,20 @@ def antialiasing_effect(opacities: str | None, smoothing: str | None) -> Simulat
 
 
 def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
-    """Colours that depend on the direction, up to a degree of the spherical harmonics."""
+    """Summarise colours that depend on the direction, up to a degree of the spherical harmonics."""
     what = None if degree == 0 else f"spherical harmonics up to degree {degree}"
     return SimulatedEffect("view dependence", what, why)
 
 
 def lens_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
-    """Lenses that are no pinholes; of: whose."""
+    """Summarise lenses that are no pinholes; of: whose."""
     bent = [view.lens for view in views if view.lens is not None]
     kinds = sorted({f"{lens.kind} ({', '.join(lens.coefficients())})" for lens in bent})
     return SimulatedEffect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
 
 
 def motion_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
-    """Cameras that move while a photograph is taken; of: whose."""
+    """Summarise cameras that move while a photograph is taken; of: whose."""
     moving = [view.motion.shutter for view in views if view.motion is not None]
     shutters = " and ".join(f"{kind} shutter" for kind in sorted(set(moving)))
     return SimulatedEffect("motion", shutters or None, f"{len(moving)} of {of}")

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Protocol, TypeVar, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -36,12 +36,14 @@ from drgs.integrator.film import pixels_adjoint as film_adjoint
 from drgs.integrator.rays import (
     RaysBehind,
     StraightRays,
+    TransportIntegrator,
     has_transparent_parts,
-    passes_splats,
     sensor_behind,
 )
 from drgs.integrator.sensors import sensors_of
-from drgs.integrator.visible_surfaces import Layers, rest_behind
+from drgs.integrator.visible_surfaces import SurfaceLayers, rest_behind
+
+T = TypeVar("T")
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")
 """Words of errors of Dr.Jit and ``splatpath`` about a picture that no parameter changes."""
@@ -62,7 +64,7 @@ class Surfaces:
     """
 
     objects: list[mi.Object]  # of the scene, without its Gaussians and integrator
-    parameters: list[Any]  # of these, detached: held, so that equal indices mean equal values
+    parameters: list[object]  # of these, detached: held, so that equal indices mean equal values
     apart: mi.Scene | None  # made of the objects, where the scene has Gaussians besides
     is_transparent: bool  # in parts: whether anything lets light pass straight on
 
@@ -86,8 +88,8 @@ class Surfaces:
         return scene if self.apart is None else self.apart
 
 
-def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
-    """A scene's own objects but Gaussians and integrators, and parameters of all but sensors.
+def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[object]]:
+    """Return a scene's objects but Gaussians and integrators, and parameters of all but sensors.
 
     Shape groups are found among them alone: instances do not show what they repeat.
     """
@@ -105,7 +107,7 @@ def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[Any]]:
     return objects, [parameter_value(params, name) for name in names]
 
 
-def _same(parameters: list[Any], others: list[Any]) -> bool:
+def _same(parameters: list[object], others: list[object]) -> bool:
     """Return whether arrays are the same variables, and everything else has the same value."""
     on_host = [[v for v in of if not dr.is_array_v(v)] for of in (parameters, others)]
     return on_host[0] == on_host[1] and same_variables(parameters, dr.detach(others))
@@ -127,7 +129,7 @@ def scene_of(objects: list[mi.Object]) -> mi.Scene:
 
 @dataclass(frozen=True)
 class Insertion:
-    """Puts nested pictures into that of the splats; all are developed already.
+    """Puts nested images into that of the splats; all are developed already.
 
     That of the splats has channels of its own at its end: for each surface its share p_k T_k and
     its coverage p_k, and where the nested picture shows a background, (1 - sum p_k) B in linear
@@ -148,7 +150,7 @@ class Insertion:
         return [f"surface.{k}.{name}" for k, name in enumerate(names)]
 
     def values(
-        self, layers: Layers, fronts: Sequence[mi.Float], radiance: mi.Color3f | None
+        self, layers: SurfaceLayers, fronts: Sequence[mi.Float], radiance: mi.Color3f | None
     ) -> Channels:
         """Return those channels of a pass; fronts: sums of weights; radiance: B, linear."""
         values = []
@@ -157,18 +159,19 @@ class Insertion:
         nothing = dr.zeros(mi.Float, dr.width(layers[0].coverage))
         values += [nothing] * (2 * (self.num_surfaces - len(layers)))
         if self.shows_background:
+            assert radiance is not None, "of the background"
             values += list(rest_behind(layers) * radiance)
         return values
 
     def develop(self, image: mi.TensorXf, nested: list[mi.TensorXf]) -> mi.TensorXf:
-        """The picture of all, which the film then holds."""
+        """Develop the image of all, which the film then holds."""
         channels = self._inserted(planes_of(image), [planes_of(each) for each in nested])
         return develop_pixels(self.film, channels, self.aovs)
 
     def adjoint(
         self, image: mi.TensorXf, nested: list[mi.TensorXf], grad_in: mi.TensorXf
     ) -> tuple[mi.TensorXf, list[mi.TensorXf]]:
-        """Derivatives of the loss with respect to all, given those of :meth:`develop`."""
+        """Return derivatives of the loss with respect to all, given those of :meth:`develop`."""
         planes = planes_of(image), [planes_of(each) for each in nested]
         with dr.resume_grad():
             dr.enable_grad(planes)
@@ -189,7 +192,7 @@ class Insertion:
         d_image: mi.TensorXf,
         d_nested: list[mi.TensorXf],
     ) -> mi.TensorXf:
-        """Directional derivative of :meth:`develop` along those of all."""
+        """Return the directional derivative of :meth:`develop` along those of all."""
         planes = planes_of(image), [planes_of(each) for each in nested]
         d_planes = planes_of(d_image), [planes_of(each) for each in d_nested]
         with dr.resume_grad():
@@ -205,30 +208,30 @@ class Insertion:
         to_developed, to_rgb = self._color_maps()
         count = len(to_developed)
         rest, own = planes[count : -len(self.channels)], planes[-len(self.channels) :]
-        behind = _mapped(to_developed, own[2 * self.num_surfaces :]) or [mi.Float(0)] * count
+        behind = _apply_map(to_developed, own[2 * self.num_surfaces :]) or [mi.Float(0)] * count
         shown = self.shown(own, [*(each[:count] for each in nested), behind])
         colors = [s + c for s, c in zip(shown, planes[:count], strict=True)]
-        return [*_mapped(to_rgb, colors), *rest]
+        return [*_apply_map(to_rgb, colors), *rest]
 
-    def shown(self, own: list[mi.Float], pictures: list[list[mi.Float]]) -> list[mi.Float]:
+    def shown(self, own: list[mi.Float], images: list[list[mi.Float]]) -> list[mi.Float]:
         """Return the sum of what surfaces show past the splats.
 
-        own: channels of :meth:`values`; pictures: colours of N_0, N_1, ..., the last of which is
+        own: channels of :meth:`values`; images: colours of N_0, N_1, ..., the last of which is
         the background alone.
         """
-        total, weight = [mi.Float(0)] * len(pictures[0]), mi.Float(0)
+        total, weight = [mi.Float(0)] * len(images[0]), mi.Float(0)
         for k in range(self.num_surfaces):
             share, coverage = own[2 * k : 2 * k + 2]
             part = dr.select(coverage > 0, share / dr.select(coverage > 0, coverage, 1), 0)
-            lights = [here - behind for here, behind in zip(*pictures[k : k + 2], strict=True)]
+            lights = [here - behind for here, behind in zip(*images[k : k + 2], strict=True)]
             total = [dr.fma(part, light, t) for light, t in zip(lights, total, strict=True)]
             weight = weight + share
-        if self.num_surfaces > 1:  # differences of noisy pictures may be negative
+        if self.num_surfaces > 1:  # differences of noisy images may be negative
             total = [dr.maximum(t, 0) for t in total]
-        return self._encoded(total, weight) if self.display_space else total
+        return self._encode(total, weight) if self.display_space else total
 
     @staticmethod
-    def _encoded(total: list[mi.Float], weight: mi.Float) -> list[mi.Float]:
+    def _encode(total: list[mi.Float], weight: mi.Float) -> list[mi.Float]:
         """Return the sum of weighted colours in display space: that of their mean."""
         part = dr.select(weight > 0, weight, 1)
         mean = mi.Color3f([dr.maximum(t / part, 0) for t in total])
@@ -249,19 +252,21 @@ class Insertion:
         return to_developed, np.linalg.pinv(to_developed)
 
 
-def _mapped(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
+def _apply_map(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
     if not planes or np.array_equal(matrix, np.eye(3)):
         return planes
-    return [sum(float(m) * p for m, p in zip(row, planes, strict=True)) for row in matrix]
+    return [
+        sum((float(m) * p for m, p in zip(row, planes, strict=True)), mi.Float(0)) for row in matrix
+    ]
 
 
 @dataclass(frozen=True)
 class Hybrid:
-    """One rendering of splats and surfaces: the part of the surfaces."""
+    """The part of the surfaces in a rendering of splats and surfaces."""
 
     surfaces: Surfaces
-    integrator: mi.Integrator  # of the picture
-    adjoint_integrator: mi.Integrator  # of its derivatives
+    integrator: mi.SamplingIntegrator  # of the picture
+    adjoint_integrator: mi.SamplingIntegrator  # of its derivatives
     sensor: mi.Sensor
     seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
@@ -272,7 +277,7 @@ class Hybrid:
         """Return the same for so many surfaces that are seen one through the other."""
         return replace(self, insertion=replace(self.insertion, num_surfaces=count))
 
-    def pictures(self) -> list[mi.TensorXf]:
+    def images(self) -> list[mi.TensorXf]:
         """Return N_0, N_1, ..., developed. Leaves the film with the last."""
         return [
             self.integrator.render(self.rays.scene, sensor=sensor, seed=self.seed, spp=self.spp)
@@ -287,9 +292,9 @@ class Hybrid:
         for count in range(self.insertion.num_surfaces):
             behind, weight = mi.RayDifferential3f(ray), mi.Float(1)
             if self.surfaces.is_transparent:
-                behind, weight = RaysBehind(self.rays, count).moved(behind, active)
+                behind, weight = RaysBehind(self.rays, count).advance(behind, active)
             with _depth_reduced(self.integrator, count):
-                # Of the base class, as integrators written in Python have another signature.
+                # The base class's, as integrators written in Python have another signature.
                 radiance, *_ = mi.SamplingIntegrator.sample(
                     self.integrator, self.rays.scene, sampler, behind, None, active
                 )
@@ -309,15 +314,15 @@ class Hybrid:
             if parameters:
                 self._where_they_matter(add)
 
-    def tangents(self, params: object, pictures: list[mi.TensorXf]) -> list[mi.TensorXf]:
-        """Directional derivatives of the nested pictures, along those set on the parameters."""
+    def tangents(self, params: object, images: list[mi.TensorXf]) -> list[mi.TensorXf]:
+        """Return derivatives of the nested images along those set on the parameters."""
 
         def along(sensor: mi.Sensor) -> mi.TensorXf:
             return self.adjoint_integrator.render_forward(
                 self.rays.scene, params, sensor, self.seed, self.spp
             )
 
-        found = [None] * len(pictures)
+        found: list[mi.TensorXf | None] = [None] * len(images)
         with self._differentiating() as parameters:
             if parameters:
                 # A loop sees tangents of what is inside of it alone, so that those of all that
@@ -325,12 +330,13 @@ class Hybrid:
                 dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
                 dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
                 found = self._where_they_matter(along)
-        pairs = zip(found, pictures, strict=True)
+        pairs = zip(found, images, strict=True)
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 
-    def _where_they_matter(self, differentiate: Callable[[mi.Sensor], Any]) -> list[Any]:
+    def _where_they_matter(self, differentiate: Callable[[mi.Sensor], T]) -> list[T | None]:
         """Differentiate nested images; None for those that do not depend on parameters."""
-        found, errors = [], []
+        found: list[T | None] = []
+        errors: list[Exception] = []
         for sensor in self._sensors():
             try:
                 found.append(differentiate(sensor))
@@ -344,7 +350,7 @@ class Hybrid:
         return found
 
     def _sensors(self) -> Iterator[mi.Sensor]:
-        """Yield sensors that see what is behind 0, 1, ... surfaces, while nested pictures are made.
+        """Yield sensors that see what is behind 0, 1, ... surfaces, while nested images are made.
 
         A path that starts behind windows has fewer bounces left than one from the camera, where
         the nested integrator says so in Python.
@@ -378,26 +384,34 @@ class Hybrid:
                 ) from None
 
 
+@runtime_checkable
+class _HasMaxDepth(Protocol):
+    """An integrator with a limit of its paths that Python can set."""
+
+    max_depth: object
+
+
 @contextmanager
 def _depth_reduced(integrator: mi.Integrator, count: int) -> Iterator[None]:
     """Shorten paths by ``count`` bounces, where they are bounded by an attribute of Python."""
-    depth = getattr(integrator, "max_depth", None)
-    counts_windows = not passes_splats(integrator)
-    is_bounded = counts_windows and isinstance(depth, int) and depth < UNBOUNDED
-    if is_bounded:
+    counts_windows = not isinstance(integrator, TransportIntegrator)
+    if not counts_windows or not isinstance(integrator, _HasMaxDepth):
+        yield
+        return
+    depth = integrator.max_depth
+    if isinstance(depth, int) and depth < UNBOUNDED:
         integrator.max_depth = max(depth - count, 0)
     try:
         yield
     finally:
-        if is_bounded:
-            integrator.max_depth = depth
+        integrator.max_depth = depth
 
 
 @contextmanager
 def _sample_count_kept(sensor: mi.Sensor) -> Iterator[None]:
-    """Mitsuba's integrators leave theirs with the sampler: the splats' next picture would have it.
+    """Restore the sampler's sample count, which Mitsuba's integrators set to their own.
 
-    With ``nested_spp``, that would have other samples than the one before, and its gradients.
+    With ``nested_spp``, the splats' next image would have other samples than the one before.
     """
     sampler = sensor.sampler()
     count = sampler.sample_count()

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera
+from drgs.core.types import Float
 from drgs.effects.occlusion import Surface
-from drgs.integrator.film import pixel_corners, samples_in
+from drgs.integrator.film import num_samples, pixel_corners
 from drgs.integrator.rays import INVISIBLE, StraightRays
 
 EDGE_GRID = 4
@@ -34,14 +34,16 @@ FAR_AWAY = 1e30
 
 @dataclass(frozen=True, eq=False)
 class VisibleSurface(Surface):
-    """One visible surface at each pixel."""
+    """A visible surface at each pixel."""
 
-    normal: Any  # Normal3f, world, times the coverage; None where no AOV needs it
+    normal: mi.Normal3f | None  # world, times the coverage; None where no AOV needs it
 
     def at(self, pixel: mi.UInt32) -> VisibleSurface:
-        planes = (dr.gather(mi.Float, plane, pixel) for plane in (self.depth, self.coverage))
-        normal = None if self.normal is None else dr.gather(mi.Normal3f, self.normal, pixel)
-        return VisibleSurface(*planes, normal)
+        return VisibleSurface(
+            dr.gather(mi.Float, self.depth, pixel),
+            dr.gather(mi.Float, self.coverage, pixel),
+            None if self.normal is None else dr.gather(mi.Normal3f, self.normal, pixel),
+        )
 
     def share(self, front: mi.Float) -> mi.Float:
         """Return the weight of the surface; front: sum of the weights of splats in front of it."""
@@ -51,11 +53,12 @@ class VisibleSurface(Surface):
         if kind == "depth":
             return [self.share(front) * self.depth]
         if kind == "normal":
+            assert self.normal is not None, "traced where there is this AOV"
             return [(1 - front) * component for component in self.normal]
         return None
 
 
-Layers = list[VisibleSurface]
+SurfaceLayers = list[VisibleSurface]
 """The surfaces of each pixel, nearest first."""
 
 
@@ -69,30 +72,31 @@ def rest_behind(surfaces: Sequence[Surface]) -> mi.Float:
 
 def trace_surfaces(
     rays: StraightRays,
-    sensor: mi.Sensor,
+    far: float,
+    film: mi.Film,
     cameras: Sequence[Camera],
-    within: Sequence[tuple[Any, Any]],
+    within: Sequence[tuple[Float | float, Float | float]],
     with_normals: bool,
-) -> list[list[Layers]]:
+) -> list[list[SurfaceLayers]]:
     """Return what is seen of the surfaces, by time and by pass, evaluated.
 
-    cameras: of each time; within: of each pass, x and y from the pixel's upper left corner, px.
+    far: depth of the farthest surfaces; cameras: of each time; within: of each pass, x and y from
+    the pixel's upper left corner, px.
     All have the same number of surfaces. The host reads whether more are seen through others.
     """
-    tracer = _Tracer(rays, dr.opaque(mi.Float, sensor.far_clip()), with_normals)
-    film = sensor.film()
+    tracer = _Tracer(rays, dr.opaque(mi.Float, far), with_normals)
     if len(within) == 1 and dr.width(within[0]) == 1:  # the same place in all pixels
         seen = [[tracer.trace_with_edges(camera, film, *within[0])] for camera in cameras]
     else:
-        places = [(pixel_corners(film, samples_in(film, x)), x, y) for x, y in within]
+        places = [(pixel_corners(film, num_samples(film, x)), x, y) for x, y in within]
         seen = [[tracer.trace(camera, *place) for place in places] for camera in cameras]
     most = max(len(layers) for of_time in seen for layers in of_time)
-    seen = [[_padded(layers, most) for layers in of_time] for of_time in seen]
+    seen = [[_pad(layers, most) for layers in of_time] for of_time in seen]
     dr.eval(seen)
     return seen
 
 
-def _padded(layers: Layers, count: int) -> Layers:
+def _pad(layers: SurfaceLayers, count: int) -> SurfaceLayers:
     first = layers[0]
     zero = dr.zeros(mi.Float, dr.width(first.coverage))
     far = zero + FAR_AWAY
@@ -108,7 +112,9 @@ class _Tracer:
     far: mi.Float  # depth, scene units: farther surfaces are not seen
     with_normals: bool
 
-    def trace(self, camera: Camera, corner: mi.Point2f, x: Any, y: Any) -> Layers:
+    def trace(
+        self, camera: Camera, corner: mi.Point2f, x: Float | float, y: Float | float
+    ) -> SurfaceLayers:
         """Return what rays meet at x, y from the corners of pixels, px."""
         place = corner + mi.Point2f(x, y)
         camera = camera.at_row(place.y)
@@ -155,7 +161,9 @@ class _Tracer:
             normal = dr.select(valid, coverage * mi.Normal3f(frame.n), 0)
         return VisibleSurface(dr.select(valid, depth, FAR_AWAY), coverage, normal)
 
-    def trace_with_edges(self, camera: Camera, film: mi.Film, x: Any, y: Any) -> Layers:
+    def trace_with_edges(
+        self, camera: Camera, film: mi.Film, x: Float | float, y: Float | float
+    ) -> SurfaceLayers:
         """Trace at one place of each pixel, or at several where coverage changes next to it.
 
         Around the crop window is a row of pixels more, so that its edges are those of the film.
@@ -175,7 +183,7 @@ class _Tracer:
         for down in (number - width, number, number + width):
             for neighbour in (down - 1, down, down + 1):
                 differs |= dr.gather(mi.Float, rest, neighbour) != own
-        edge = dr.compress(differs)
+        edge = mi.UInt32(dr.compress(differs))
         layers = [surface.at(number) for surface in around]
         if dr.width(edge) == 0:
             return layers
@@ -183,7 +191,7 @@ class _Tracer:
         places = [(k + 0.5) / EDGE_GRID for k in range(EDGE_GRID)]
         hits = [self.trace(camera, corner, x, y) for y in places for x in places]
         most = max(map(len, [layers, *hits]))
-        layers, hits = _padded(layers, most), [_padded(found, most) for found in hits]
+        layers, hits = _pad(layers, most), [_pad(found, most) for found in hits]
         return [
             _with_means(surface, [found[k] for found in hits], edge)
             for k, surface in enumerate(layers)
@@ -199,7 +207,8 @@ def _with_means(
     depth = dr.select(covered > 0, depth / dr.select(covered > 0, covered, 1), FAR_AWAY)
     means, planes = [depth, covered / len(hits)], [surface.depth, surface.coverage]
     if surface.normal is not None:
-        means += list(sum((h.normal for h in hits), mi.Normal3f(0)) / len(hits))
+        normals = (h.normal for h in hits if h.normal is not None)
+        means += list(sum(normals, mi.Normal3f(0)) / len(hits))
         planes += list(surface.normal)
     planes = [mi.Float(plane) for plane in planes]
     for plane, mean in zip(planes, means, strict=True):

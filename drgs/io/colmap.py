@@ -129,7 +129,7 @@ class ColmapModel:
 
     @property
     def has_points(self) -> bool:
-        """Whether there is at least one point."""
+        """True if there is at least one point."""
         file = self.points_file
         return file is not None and next(iter(_records(file)), None) is not None
 
@@ -241,7 +241,7 @@ def _points(records: Iterable[tuple]) -> ColmapPoints:
             yield tuple(position), tuple(color), error, track_length
 
     table = np.fromiter(rows(), _POINT)
-    return ColmapPoints(*(np.ascontiguousarray(table[name]) for name in _POINT.names))
+    return ColmapPoints(*(np.ascontiguousarray(table[name]) for name in _POINT.names or ()))
 
 
 def _check_numbers(place: Place, names: Sequence[str], values: Sequence[float]) -> None:

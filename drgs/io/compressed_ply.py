@@ -105,8 +105,8 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
 def _bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the smallest and largest values (C, 3) of each group of values (N, 3); float32."""
     starts = np.arange(0, len(values), CHUNK)
-    sides = (limit.reduceat(values, starts, axis=0) for limit in (np.minimum, np.maximum))
-    return tuple(side.astype("<f4") for side in sides)
+    low, high = (limit.reduceat(values, starts, axis=0) for limit in (np.minimum, np.maximum))
+    return low.astype("<f4"), high.astype("<f4")
 
 
 def _parts(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -139,7 +139,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     """
     rows, statements = read_elements(path, ["chunk", "vertex", "sh"])
     vertex, chunk, sh = rows["vertex"], rows["chunk"], rows.get("sh")
-    harmonics = 1 if sh is None else 1 + len(sh.dtype.names) // 3
+    harmonics = 1 if sh is None else 1 + len(sh.dtype.names or ()) // 3
     require_scene_memory(path, len(vertex), harmonics)
     _require(path, "vertex", vertex, BITS, "u4")
     if len(chunk) != (expected := -(-len(vertex) // CHUNK)):
@@ -164,7 +164,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
 def _require(
     path: str | Path, element: str, rows: np.ndarray, names: Mapping | list[str], kind: str
 ) -> None:
-    types = {name: rows.dtype[name].newbyteorder("<").str[1:] for name in rows.dtype.names}
+    types = {name: rows.dtype[name].newbyteorder("<").str[1:] for name in rows.dtype.names or ()}
     if wrong := [name for name in names if types.get(name) != kind]:
         raise UserError(
             f"{path}: element {element}: properties {', '.join(wrong)} must be there, in the type "
@@ -176,7 +176,7 @@ def _between(path: str | Path, rows: Mapping[str, np.ndarray], word: str) -> np.
     """Return the values (N, 3) of a word, which lie between the bounds of their groups."""
     names, chunk = BOUNDED[word], rows["chunk"]
     parts = _unpacked(rows["vertex"], word)[:, :3]
-    if word == "packed_color" and "min_r" not in chunk.dtype.names:
+    if word == "packed_color" and "min_r" not in (chunk.dtype.names or ()):
         return parts
     _require(path, "chunk", chunk, [f"{s}_{n}" for s in ("min", "max") for n in names], "f4")
     low, high = (
@@ -210,7 +210,7 @@ def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
     """Return coefficients (N, K - 1, 3); sh: the rows of the element, None: there is none."""
     if sh is None:
         return np.zeros((num, 0, 3))
-    names = [f"f_rest_{i}" for i in range(len(sh.dtype.names))]
+    names = [f"f_rest_{i}" for i in range(len(sh.dtype.names or ()))]
     if len(names) not in NUM_REST or len(sh) != num:
         raise UserError(
             f"{path}: element sh must have a row of {sorted(NUM_REST)[1:]} harmonics for each of "
@@ -231,8 +231,12 @@ class CompressedPly(FileFormat):
     suffix = ".compressed.ply"
     description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
     metadata = None
-    read = staticmethod(read_gaussians)
-    encode = staticmethod(encode)
+
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        return read_gaussians(path)
+
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        return encode(gaussians, rendered_with)
 
     def recognizes(self, path: Path) -> bool:
         """Return whether the vertices are packed."""

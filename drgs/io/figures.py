@@ -7,18 +7,19 @@ early should not.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from drgs.core.files import atomic_path
 
 if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
 
 def new_figure(width: float, height: float, paper: str = "white", dpi: float = 110) -> Figure:
-    """An empty figure; width, height: inches; paper: its colour; dpi: pixels per inch."""
+    """Return an empty figure; width, height: inches; paper: its colour; dpi: pixels per inch."""
     # Without pyplot no window system is looked for.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -35,6 +36,7 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def pixels_of(figure: Figure) -> np.ndarray:
-    """(H, W, 3) uint8: the figure as it is written."""
-    figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba())[:, :, :3]
+    """Return the pixels of a figure as it is written: (H, W, 3) uint8."""
+    canvas = cast("FigureCanvasAgg", figure.canvas)  # see new_figure()
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3]

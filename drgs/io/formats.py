@@ -228,11 +228,12 @@ def pop_origin(path: str | Path, rendered_with: dict[str, Scalar]) -> Origin:
     values = [rendered_with.pop(name, None) for name in ORIGIN]
     if values == [None, None, None]:
         return WORLD
-    if not all(type(value) in (int, float) and abs(value) <= MAX_ORIGIN for value in values):
+    numbers = [v for v in values if type(v) is int or type(v) is float]
+    if len(numbers) < 3 or not all(abs(number) <= MAX_ORIGIN for number in numbers):
         got = ", ".join("nothing" if value is None else str(value) for value in values)
         raise UserError(
             f"{path}: {', '.join(ORIGIN)} must be three numbers of at most {MAX_ORIGIN:g} in size, "
             f"got {one_line(got, 80)}; correct the header, or remove them"
         )
-    x, y, z = map(float, values)
+    x, y, z = map(float, numbers)
     return x, y, z

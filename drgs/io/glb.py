@@ -21,7 +21,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import AliasPath, BaseModel, ConfigDict, Field, ValidationError
@@ -29,7 +29,7 @@ from pydantic.alias_generators import to_camel
 
 from drgs.core.errors import Place, UserError, one_line
 from drgs.core.files import read_bytes
-from drgs.core.origin import WORLD, near_means
+from drgs.core.origin import WORLD, Origin, near_means
 from drgs.io.formats import FORMATS, MAX_ORIGIN, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
 from drgs.io.ply import STATEMENT
 from drgs.io.quantization import (
@@ -78,9 +78,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     """Return a file of Gaussians; the origin becomes the translation of the node."""
     attributes, said = _attributes(gaussians), dict(rendered_with)
     origin = pop_origin("rendered_with", said)
-    document = _document(attributes, {OURS: said} if said else None)
-    if origin != WORLD:
-        document["nodes"][0]["translation"] = list(origin)
+    document = _document(attributes, {OURS: said} if said else None, origin)
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary = b"".join(values.tobytes() for values in attributes.values())
@@ -129,8 +127,11 @@ def _harmonics(count: int) -> list[str]:
 
 
 def _document(
-    attributes: Mapping[str, np.ndarray], extras: Mapping[str, object] | None
+    attributes: Mapping[str, np.ndarray], extras: Mapping[str, object] | None, origin: Origin
 ) -> dict[str, object]:
+    node: dict[str, object] = {"mesh": 0}
+    if origin != WORLD:
+        node["translation"] = list(origin)
     views, accessors, start = [], [], 0
     for name, values in attributes.items():
         views.append(
@@ -160,7 +161,7 @@ def _document(
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -210,30 +211,34 @@ def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]
 
 def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:
     """Return the JSON part, the binary part, and the byte at which that begins."""
+    refused = UserError(
+        f"{Place(path, 'byte', 0)}: must be a binary glTF 2.0 file of a JSON part, of at most "
+        f"{MAX_JSON_BYTES:,} bytes, and a binary part; it is damaged, cut off or another file"
+    )
     try:
         magic, version, length = HEADER.unpack_from(content)
         json_size, json_kind = CHUNK.unpack_from(content, HEADER.size)
         text = HEADER.size + CHUNK.size
         size, kind = CHUNK.unpack_from(content, text + min(json_size, MAX_JSON_BYTES))
     except struct.error:
-        magic = b""
-    start = text + json_size + CHUNK.size if magic else 0
-    found = magic and (magic, version, length, json_kind, kind)
+        raise refused from None
+    start = text + json_size + CHUNK.size
+    found = magic, version, length, json_kind, kind
     if found != (MAGIC, VERSION, len(content), JSON, BINARY) or start + size > length:
-        raise UserError(
-            f"{Place(path, 'byte', 0)}: must be a binary glTF 2.0 file of a JSON part, of at most "
-            f"{MAX_JSON_BYTES:,} bytes, and a binary part; it is damaged, cut off or another file"
-        )
+        raise refused
     return content[text : text + json_size], content[start : start + size], start
 
 
 Index = Annotated[int, Field(ge=0, lt=2**32)]
 Coordinate = Annotated[float, Field(ge=-MAX_ORIGIN, le=MAX_ORIGIN)]
-IDENTITY = {
+IDENTITY: dict[str, list[float]] = {
     "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
     "rotation": [0, 0, 0, 1],
     "scale": [1, 1, 1],
 }
+
+
+Part = TypeVar("Part", bound=BaseModel)
 
 
 class _Part(BaseModel):
@@ -259,7 +264,7 @@ class _View(_Part):
     byte_stride: Annotated[int, Field(ge=4, le=252)] | None = None
 
 
-def _of_extension(key: str, **settings: object) -> object:
+def _of_extension(key: str, **settings: Any) -> Any:
     """Return the field of a primitive for a value of its extension."""
     return Field(validation_alias=AliasPath("extensions", EXTENSION, key), **settings)
 
@@ -362,7 +367,7 @@ class _Document:
             )
         return values
 
-    def _item(self, key: str, items: list[object], index: int, kind: type[BaseModel]) -> BaseModel:
+    def _item(self, key: str, items: list[object], index: int, kind: type[Part]) -> Part:
         if index >= len(items):
             raise UserError(f"{self.path}: {key}[{index}] must be there, got {len(items)} of them")
         return _validated(self.path, f"{key}[{index}].", kind, items[index])
@@ -378,7 +383,7 @@ def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Docum
         (mesh, index)
         for mesh, each in enumerate(file.meshes)
         for index, primitive in enumerate(each.primitives)
-        if isinstance(primitive.get("extensions"), dict) and EXTENSION in primitive["extensions"]
+        if isinstance(known := primitive.get("extensions"), dict) and EXTENSION in known
     ]
     if len(found) != 1:
         raise UserError(
@@ -394,7 +399,7 @@ def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Docum
     return _Document(path, place, primitive, file, translation, binary, start)
 
 
-def _validated(path: Path, place: str, kind: type[BaseModel], content: object) -> BaseModel:
+def _validated(path: Path, place: str, kind: type[Part], content: object) -> Part:
     try:
         return kind.model_validate(content)
     except ValidationError as failed:
@@ -439,5 +444,9 @@ class Glb(FileFormat):
     description = "binary glTF with KHR_gaussian_splatting, in full precision"
     up = "y"
     metadata = None
-    read = staticmethod(read_gaussians)
-    encode = staticmethod(encode)
+
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        return read_gaussians(path)
+
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        return encode(gaussians, rendered_with)

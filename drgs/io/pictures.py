@@ -13,11 +13,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import imageio.v3 as iio
 import numpy as np
-from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, ImageFile, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, open_regular
@@ -25,6 +25,7 @@ from drgs.core.memory import require_memory
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    from PIL.TiffImagePlugin import TiffImageFile
 
 MAX_PIXELS, PIXEL_BYTES = 1 << 26, 16
 """Pixels of an image, as 8192 x 8192: 0.8 GB once decoded to float32; and memory for a pixel while
@@ -108,7 +109,7 @@ def read_header(path: Path) -> ImageHeader:
     """Return the header of an image; raises :class:`UserError` for a file that is none."""
     with _opened(path) as image:
         alpha, orientation = _has_alpha(image), _orientation(image)
-        return ImageHeader(_stored_size(image), image.format, image.mode, alpha, orientation)
+        return ImageHeader(_stored_size(image), image.format or "", image.mode, alpha, orientation)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -120,7 +121,8 @@ def image_size(path: Path) -> tuple[int, int]:
 def _stored_size(image: Image.Image) -> tuple[int, int]:
     if image.format == "TIFF":  # Pillow's is that of the upright image
         tags = ExifTags.Base
-        return image.tag_v2[tags.ImageWidth], image.tag_v2[tags.ImageLength]
+        sizes = cast("TiffImageFile", image).tag_v2
+        return sizes[tags.ImageWidth], sizes[tags.ImageLength]
     return image.size
 
 
@@ -160,10 +162,10 @@ def unused_content(path: Path) -> list[str]:
         return found
 
 
-def _bits(image: Image.Image) -> int:
+def _bits(image: ImageFile.ImageFile) -> int:
     """Return bits of a channel in the file; Pillow decodes colours to 8."""
     if image.format == "TIFF":
-        return max(image.tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
+        return max(cast("TiffImageFile", image).tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
     if image.format == "JPEG2000" or not image.tile:
         return 8
     args = image.tile[0].args
@@ -247,7 +249,7 @@ def _check(path: Path, image: Image.Image) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
+def _opened(path: Path) -> Iterator[ImageFile.ImageFile]:
     """Open an image without decoding it; errors within the block become the user's."""
     try:
         with open_regular(path, "image", MAX_BYTES) as file, Image.open(file) as image:
@@ -289,7 +291,7 @@ def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
     _write(path, stream.raw_buffer())
 
 
-def encode(image: np.ndarray, suffix: str, **options: float) -> bytes:
+def encode(image: np.ndarray, suffix: str, **options: Any) -> bytes:
     """Return a file with ``suffix``, png or webp, of an image or the frames of an animation.
 
     options: of Pillow's writer.
@@ -326,6 +328,7 @@ def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
             data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
             if len(data) <= WEBP_BYTES:
                 break
+    assert data is not None, "there is at least one quality"
     _write(path, data)
     _write_gif(path.with_suffix(".gif"), [_shrink(Image.fromarray(frame)) for frame in large])
 

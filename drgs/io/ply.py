@@ -73,7 +73,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     """
     rows, statements = read_elements(path, ["vertex"])
     vertex = rows["vertex"]
-    num_rest = sum(name.startswith("f_rest_") for name in vertex.dtype.names)
+    num_rest = sum(name.startswith("f_rest_") for name in vertex.dtype.names or ())
     if num_rest not in NUM_REST:
         raise UserError(
             f"{path}: the number of f_rest properties must be one of {sorted(NUM_REST)} "
@@ -96,7 +96,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
         "sh0": _columns(vertex, SH0)[:, None, :],
         "shN": np.ascontiguousarray(sh_rest.transpose(0, 2, 1)),
     }
-    if set(SMOOTHING) <= set(vertex.dtype.names):
+    if set(SMOOTHING) <= set(vertex.dtype.names or ()):
         gaussians["smoothing"] = _columns(vertex, SMOOTHING)[:, 0]
     return gaussians, statements
 
@@ -158,7 +158,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     positions = _columns(vertex, POSITION, np.float64)
     _check_rows(path, vertex, POSITION, np.abs(positions) <= np.finfo(np.float32).max, "finite")
     positions += pop_origin(path, statements)
-    if not set(COLOR) <= set(vertex.dtype.names):
+    if not set(COLOR) <= set(vertex.dtype.names or ()):
         return positions, None
     colors = _columns(vertex, COLOR)
     kind = vertex.dtype["red"]
@@ -356,8 +356,8 @@ def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
             f"bits leave them for 1 and 0; read as {LARGEST_LOGIT:.2f} and {SMALLEST_LOGIT:.2f}"
         )
         warnings.warn(UserNote(note), stacklevel=2)
-    ends = {"posinf": np.float32(LARGEST_LOGIT), "neginf": np.float32(SMALLEST_LOGIT)}
-    return np.nan_to_num(logits, nan=np.nan, **ends)
+    largest, smallest = float(np.float32(LARGEST_LOGIT)), float(np.float32(SMALLEST_LOGIT))
+    return np.nan_to_num(logits, nan=np.nan, posinf=largest, neginf=smallest)
 
 
 def _check_rows(
@@ -377,7 +377,7 @@ def _rest(num_rest: int) -> tuple[str, ...]:
 
 
 def _require(path: str | Path, vertex: np.ndarray, names: tuple[str, ...], what: str) -> None:
-    if missing := [name for name in names if name not in vertex.dtype.names]:
+    if missing := [name for name in names if name not in (vertex.dtype.names or ())]:
         raise UserError(f"{path}: not a PLY of {what}: properties {', '.join(missing)} are missing")
 
 
@@ -399,8 +399,12 @@ class Ply(FileFormat):
     has_smoothing = True
     allows_nonfinite = True
     metadata = None
-    read = staticmethod(read_gaussians)
-    encode = staticmethod(encode)
+
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        return read_gaussians(path)
+
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        return encode(gaussians, rendered_with)
 
     def recognizes(self, path: Path) -> bool:
         """Return whether the vertices are not packed."""

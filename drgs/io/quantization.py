@@ -26,7 +26,9 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the other three components, by the index of one of four."""
 
 
-def require_scene_memory(path: Path, count: int, harmonics: int, turned: bool = False) -> None:
+def require_scene_memory(
+    path: str | Path, count: int, harmonics: int, turned: bool = False
+) -> None:
     """Raise :class:`UserError` unless there is the memory to decode so many Gaussians.
 
     harmonics: coefficients of each; turned: whether a format's axes are turned to ours afterwards.

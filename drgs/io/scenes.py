@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +19,7 @@ from drgs.core.files import open_regular
 
 @contextmanager
 def openexr_threads() -> Iterator[None]:
-    """Two threads at least while OpenEXR files are read or written within the block.
+    """Use two threads at least while OpenEXR files are read or written within the block.
 
     Mitsuba 3.9 has OpenEXR work in Dr.Jit's pool and sleeps until it is done: with a single thread,
     nobody is left to do it.
@@ -50,10 +51,10 @@ def load_scene_file(path: Path, **definitions: str) -> mi.Object:
     open_regular(path, "scene").close()
     try:
         if not {"config", "filename"} & set(definitions):  # names that the parser does not take
-            config = mi.parser.ParserConfig(mi.variant())
-            _check(mi.parser.parse_file(config, str(path), **definitions).nodes, path)
+            _check(mi.parser.parse_file(_parser_config(), str(path), **definitions).nodes, path)
         with openexr_threads():
-            return mi.load_file(str(path), **definitions)
+            parameters: dict[str, Any] = dict(definitions)
+            return mi.load_file(str(path), **parameters)
     except (UnicodeDecodeError, RuntimeError) as error:
         # Mitsuba's own error quotes the file; on its way to Python, the quotation fails or is lost.
         if not isinstance(error, UnicodeDecodeError) and str(error):
@@ -63,14 +64,20 @@ def load_scene_file(path: Path, **definitions: str) -> mi.Object:
 
 def load_scene_dictionary(description: dict[str, object], path: Path) -> mi.Object:
     """Load what a dictionary describes, which the file ``path`` gave; raises as the above."""
-    config = mi.parser.ParserConfig(mi.variant())
+    config = _parser_config()
     with openexr_threads():
         _check(mi.parser.parse_dict(config, description).nodes, path)
         return mi.load_dict(description)
 
 
+def _parser_config() -> mi.parser.ParserConfig:
+    variant = mi.variant()
+    assert variant is not None, "commands set a variant first"
+    return mi.parser.ParserConfig(variant)
+
+
 def _check(nodes: Iterable[mi.parser.SceneNode], path: Path) -> None:
-    """Some samplers divide by their count when they are made."""
+    """Refuse samplers without samples: some divide by the count when they are made."""
     for node in nodes:
         if node.type != mi.ObjectType.Sampler:
             continue

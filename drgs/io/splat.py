@@ -75,12 +75,12 @@ def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]
         )
     rows = np.frombuffer(content, ROW)
     require_scene_memory(path, len(rows), 1)
-    for name, least in (("mean", -MAX_NUMBER), ("scale", 0)):
+    for name, start, least in (("mean", 0, -MAX_NUMBER), ("scale", 12, 0)):
         values = rows[name]
         bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
         if len(bad):
             row, axis = bad[0]
-            at = row * ROW.itemsize + ROW.fields[name][1] + 4 * axis
+            at = row * ROW.itemsize + start + 4 * axis
             raise UserError(
                 f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, "
                 f"got {values[row, axis]}; is it a .splat file?"
@@ -103,5 +103,9 @@ class Splat(FileFormat):
     suffix = ".splat"
     description = "antimatter15's .splat, for old viewers: no harmonics"
     has_harmonics = False
-    read = staticmethod(read_gaussians)
-    encode = staticmethod(encode)
+
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        return read_gaussians(path)
+
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        return encode(gaussians, rendered_with)

@@ -322,5 +322,9 @@ class Spz(FileFormat):
     description = "Niantic's SPZ, the smallest"
     up = "y"
     metadata = frozenset({"antialiased"})
-    read = staticmethod(read_gaussians)
-    encode = staticmethod(encode)
+
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        return read_gaussians(path)
+
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        return encode(gaussians, rendered_with)

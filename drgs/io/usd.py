@@ -9,10 +9,12 @@ space.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.core.environment import required
 from drgs.core.errors import UserError
@@ -35,8 +37,10 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     Raises :class:`UserError` where OpenUSD is not installed or too old.
     """
     required("pxr", "usd", "USD")
-    from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
-
+    # OpenUSD has no stubs.
+    Sdf, Usd, UsdGeom, UsdVol, Vt = (
+        import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt")
+    )
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise UserError("USD needs OpenUSD 26.03 or newer: pip install 'drgs[usd]'")
     g = gaussians
@@ -70,7 +74,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         return path.read_bytes()
 
 
-def _float32(values: object) -> np.ndarray:
+def _float32(values: ArrayLike) -> np.ndarray:
     return np.ascontiguousarray(values, np.float32)
 
 
@@ -82,4 +86,6 @@ class Usd(FileFormat):
     description = "OpenUSD's ParticleField3DGaussianSplat (extra usd), written only"
     up = "z"
     metadata = frozenset(ORIGIN)
-    encode = staticmethod(encode)
+
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        return encode(gaussians, rendered_with)

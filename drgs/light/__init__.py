@@ -1,4 +1,4 @@
-"""Light between splats and surfaces: what rays pass, imported where a scene asks for it.
+"""Light between splats and surfaces along rays, imported where a scene uses it.
 
 May import ``splatting``, ``config``, ``gaussians``, ``cameras`` and ``core``.
 """

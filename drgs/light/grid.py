@@ -10,16 +10,17 @@ that this point is in, once, and those in cells that come later are behind it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import numpy as np
 
-from drgs.core.arrays import from_host, types_of
+from drgs.core.arrays import from_host, reinterpret, types_of
+from drgs.core.types import Array3f, Array3u, Bool, Float, UInt32
 from drgs.splatting.tiles import lower_bounds
 
 CELLS_PER_GAUSSIAN = 2.0
-"""Of the innermost cube. With more, lists are shorter, and a ray passes more cells."""
+"""Cells of the innermost cube for each Gaussian. More shorten the lists and lengthen the walk."""
 
 RESOLUTIONS = (8, 128)
 """Least and most cells along an edge. All are multiples of 4: the middle half is a finer cube."""
@@ -31,7 +32,7 @@ MOST_LEVELS = 24
 """Cubes; what is farther out than 2^23 times the innermost one's size is in no list."""
 
 MOST_ENTRIES = 32
-"""For each Gaussian, and :data:`FREE_ENTRIES` more: cells become larger until there are no more."""
+"""Entries for each Gaussian, besides :data:`FREE_ENTRIES`: cells grow until there are no more."""
 
 FREE_ENTRIES = 1 << 20
 
@@ -47,12 +48,12 @@ STEP = 1 / 1024
 class Ellipsoids:
     """The ellipsoids in which N Gaussians show."""
 
-    centers: Any  # Array3f, world
-    axes: list[Any]  # three Array3f, world: principal half axes, as far as the Gaussian shows
-    exist: Any  # Bool
+    centers: Array3f  # world
+    axes: list[Array3f]  # three, world: principal half axes, as far as the Gaussian shows
+    exist: Bool
 
-    def half_sizes(self) -> Any:
-        """Array3f: of the boxes around them."""
+    def half_sizes(self) -> Array3f:
+        """Return half the sizes of the boxes around them."""
         return dr.sqrt(sum((dr.square(axis) for axis in self.axes[1:]), dr.square(self.axes[0])))
 
 
@@ -60,22 +61,23 @@ class Ellipsoids:
 class SplatGrid:
     """Lists of Gaussians by cell."""
 
-    center: Any  # Array3f (1,), world
-    size: Any  # Float (1,): half the innermost cube's edge, world units
-    num_levels: Any  # UInt32 (1,)
-    resolution: Any  # UInt32 (1,): R
-    cells: Any  # UInt32 (2 cells,): number of entries, the first of them; or 0, cells to pass over
-    rows: Any  # UInt32 (entries,): Gaussians
+    center: Array3f  # (1,), world
+    size: Float  # (1,): half the innermost cube's edge, world units
+    num_levels: UInt32  # (1,)
+    resolution: UInt32  # (1,): R
+    cells: UInt32  # (2 cells,): number of entries, the first of them; or 0, cells to pass over
+    rows: UInt32  # (entries,): Gaussians
 
     @property
-    def reach(self) -> Any:
-        """Float (1,): half the outermost cube's edge, world units."""
+    def reach(self) -> Float:
+        """Half the outermost cube's edge, world units: (1,)."""
         Float = type(self.size)
         return self.size * dr.exp2(Float(self.num_levels) - 1)
 
-    def span(self, origin: Any, direction: Any) -> tuple[Any, Any]:
+    def span(self, origin: Array3f, direction: Array3f) -> tuple[Float, Float]:
         """Return where rays enter and leave the outermost cube; the first is larger for misses."""
-        first, last = -dr.inf, dr.inf
+        Float = type(self.size)
+        first, last = Float(-dr.inf), Float(dr.inf)
         for o, d, c in zip(origin, direction, self.center, strict=True):
             inverse = 1 / d
             a, b = (c - self.reach - o) * inverse, (c + self.reach - o) * inverse
@@ -85,7 +87,7 @@ class SplatGrid:
             last = dr.select(high < last, high, last)
         return first, last
 
-    def cell(self, origin: Any, direction: Any, t: Any) -> tuple[Any, Any, Any]:
+    def cell(self, origin: Array3f, direction: Array3f, t: Float) -> tuple[UInt32, UInt32, Float]:
         """Return the first entry and the end of the list of the cell that rays enter at t.
 
         Then where they leave it, or empty ones around it; at least a step ahead.
@@ -117,22 +119,23 @@ class SplatGrid:
             leaves = dr.select(until < leaves, until, leaves)
         return first, first + number, dr.select(leaves > ahead, leaves, ahead)
 
-    def _cube(self, distance: Any) -> tuple[Any, Any]:
-        """The smallest cube that a point is in: its number, and its size in innermost ones."""
-        Single = dr.float32_array_t(type(distance))
+    def _cube(self, distance: Float) -> tuple[UInt32, Float]:
+        """Find the smallest cube that a point is in: its number, and its size in innermost ones."""
+        Single = cast(type[Float], dr.float32_array_t(type(distance)))
+        UInt32 = types_of(Single).UInt32
         # A number from 2^k to 2^(k + 1) has k + 127 above its 23 bits of mantissa.
-        exponent = dr.reinterpret_array(dr.uint32_array_t(Single), Single(distance)) >> 23
+        exponent = reinterpret(UInt32, Single(distance)) >> 23
         level = dr.select(exponent > 126, exponent - 126, 0)
         level = dr.select(level < self.num_levels, level, self.num_levels - 1)
-        return level, type(distance)(dr.reinterpret_array(Single, (level + 127) << 23))
+        return level, type(distance)(reinterpret(Single, (level + 127) << 23))
 
-    def _distance(self, point: Any) -> Any:
-        """From the centre, as cubes go, in half edges of the innermost one."""
+    def _distance(self, point: Array3f) -> Float:
+        """Return the distance from the centre, as cubes go, in half edges of the innermost one."""
         return dr.max(dr.abs(point - self.center)) / self.size
 
 
 def build_grid(ellipsoids: Ellipsoids) -> SplatGrid:
-    """The lists of all cells. The host waits for the device."""
+    """Build the lists of all cells. The host waits for the device."""
     shown = np.array(ellipsoids.exist)
     centers = np.array(ellipsoids.centers, np.float64)[:, shown]
     sizes = np.array(ellipsoids.half_sizes(), np.float64)[:, shown]
@@ -167,11 +170,11 @@ class _Boxes:
     size: float
 
     def count(self, level: int, resolution: int) -> int:
-        """Cells of a level that are in boxes around the ellipsoids."""
+        """Count the cells of a level that are in boxes around the ellipsoids."""
         return int(np.array(dr.prod(self._ranges(level, resolution)[1])).sum(dtype=np.int64))
 
     def grid(self, levels: int, resolution: int) -> SplatGrid:
-        """Sorted by cell, and in a cell by Gaussian."""
+        """Sort the entries by cell, and in a cell by Gaussian."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
         # Dr.Jit does not compute with empty arrays, and a level may have no entries.
@@ -196,8 +199,8 @@ class _Boxes:
         dr.eval(grid)
         return grid
 
-    def _ranges(self, level: int, resolution: int) -> tuple[Any, Any]:
-        """First cell and number of cells along each axis, of the boxes around the ellipsoids."""
+    def _ranges(self, level: int, resolution: int) -> tuple[Array3u, Array3u]:
+        """Return first cell and number of cells along each axis, of boxes around the ellipsoids."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
         half = dr.opaque(Float, float(self.size * 2.0**level))
@@ -215,22 +218,23 @@ class _Boxes:
             high = dr.select(high < count - 1, high, count - 1)
             first.append(t.UInt32(dr.select(misses, 0, low)))
             number.append(t.UInt32(dr.select(misses, 0, high - low + 1)))
-        Array3u = dr.uint32_array_t(t.Array3f)
-        return Array3u(first), Array3u(number)
+        triple = cast(type[Array3u], dr.uint32_array_t(t.Array3f))
+        return triple(first), triple(number)
 
-    def _entries(self, level: int, resolution: int) -> tuple[Any, Any]:
-        """Rows and cells of a level, in the order of the rows, of what is in both."""
+    def _entries(self, level: int, resolution: int) -> tuple[UInt32, UInt32]:
+        """Make rows and cells of a level, in the order of the rows, of what is in both."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
         first, number = self._ranges(level, resolution)
         counts = dr.prod(number)
-        row, local = _expanded(counts)
+        row, local = _expand(counts)
         if dr.width(row) == 0:
             return t.UInt32(), t.UInt32()
         nx, ny = (dr.gather(t.UInt32, number[k], row) for k in (0, 1))
         # Exact in double precision; an integer division has no vector instruction.
-        line = t.UInt32((dr.float64_array_t(t.UInt32)(local) + 0.5) / nx)
-        layer = t.UInt32((dr.float64_array_t(t.UInt32)(line) + 0.5) / ny)
+        double = cast(type[Float], dr.float64_array_t(t.UInt32))
+        line = t.UInt32((double(local) + 0.5) / nx)
+        layer = t.UInt32((double(line) + 0.5) / ny)
         place = (local - line * nx, line - layer * ny, layer)
         place = [dr.gather(t.UInt32, first[k], row) + p for k, p in enumerate(place)]
         keep = self._touches(place, row, level, resolution)
@@ -240,10 +244,10 @@ class _Boxes:
         cell = t.UInt32(level)
         for p in reversed(place):
             cell = cell * resolution + p
-        kept = dr.compress(keep)
+        kept = t.UInt32(dr.compress(keep))
         return dr.gather(t.UInt32, row, kept), dr.gather(t.UInt32, cell, kept)
 
-    def _touches(self, place: list[Any], row: Any, level: int, resolution: int) -> Any:
+    def _touches(self, place: list[UInt32], row: UInt32, level: int, resolution: int) -> Bool:
         """Return whether no principal axis of an ellipsoid tells it from a cell."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
@@ -251,7 +255,7 @@ class _Boxes:
         middle = t.Array3f([t.Float(p) + 0.5 - resolution / 2 for p in place]) * cell
         middle += t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center))
         offset = middle - dr.gather(t.Array3f, self.ellipsoids.centers, row)
-        touches = True
+        touches = t.Bool(True)
         for axis in self.ellipsoids.axes:
             direction = dr.gather(t.Array3f, axis, row)
             # Along the axis, times its length: how far the cell reaches, and the ellipsoid.
@@ -261,8 +265,8 @@ class _Boxes:
         return touches
 
 
-def _expanded(counts: Any) -> tuple[Any, Any]:
-    """For each of ``counts[row]`` items of each row: the row, and the item's number in it."""
+def _expand(counts: UInt32) -> tuple[UInt32, UInt32]:
+    """List for each of ``counts[row]`` items of each row: the row, and the item's number in it."""
     UInt32 = type(counts)
     size = dr.width(counts)
     row = dr.arange(UInt32, size)
@@ -278,7 +282,7 @@ def _expanded(counts: Any) -> tuple[Any, Any]:
 
 
 def _cells(starts: np.ndarray, levels: int, resolution: int) -> np.ndarray:
-    """What :attr:`SplatGrid.cells` has; starts: (cells + 1,) first entry of each."""
+    """Make :attr:`SplatGrid.cells`; starts: (cells + 1,) first entry of each."""
     from scipy.ndimage import distance_transform_cdt
 
     shape = (levels, *(resolution,) * 3)
@@ -288,7 +292,7 @@ def _cells(starts: np.ndarray, levels: int, resolution: int) -> np.ndarray:
         occupied = number[level] > 0
         if level > 0:
             occupied[middle, middle, middle] = True  # by finer cells
-        distance = distance_transform_cdt(~occupied, metric="chessboard")
+        distance = np.asarray(distance_transform_cdt(~occupied, metric="chessboard"))
         distance[distance < 0] = resolution  # there is nothing at all
         empty = number[level] == 0
         first[level][empty] = np.maximum(distance[empty], 1)

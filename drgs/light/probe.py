@@ -17,13 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import types_of
+from drgs.core.arrays import ArrayTypes, types_of
+from drgs.core.types import Array3f, Bool, Float, UInt32
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting import rendering
 from drgs.splatting.projection import GaussianRows
@@ -53,30 +53,30 @@ BORDER = 1
 """Texels around each picture that show what the neighbours do, for interpolation."""
 
 LEAST_REACH = 0.1
-"""Of the distance to the nearest splats: the first steps of a ray that starts at the centre."""
+"""Part of the distance to the nearest splats: the first steps of a ray from the centre."""
 
 MARGIN = 0.98
-"""Of the distance before a step, from which on what is seen behind it is met."""
+"""Part of the distance before a step, from which on what is seen behind it is met."""
 
 
 @dataclass(frozen=True)
 class Seen:
     """Results of looking along rays."""
 
-    color: Any  # Array3f: times the coverage
-    coverage: Any  # Float
-    is_known: Any  # Bool: whether the probe can tell
+    color: Array3f  # times the coverage
+    coverage: Float
+    is_known: Bool  # whether the probe can tell
 
 
 @dataclass(frozen=True)
 class Probes:
-    """Several ones, whose texels follow each other: by probe, level, face, row and column."""
+    """Probes, whose texels follow each other: by probe, level, face, row and column."""
 
-    centers: Any  # Array3f: world, by probe
-    normals: Any  # Array3f: of the planes beyond which they see, by probe; 0: there is none
-    nearest: Any  # Float: world units, by probe: to the nearest splats
-    colors: Any  # Float: 4 a texel: colour times coverage; the last one is 0
-    places: Any  # Float: 2 a texel: coverage, and coverage by distance
+    centers: Array3f  # world, by probe
+    normals: Array3f  # of the planes beyond which they see, by probe; 0: there is none
+    nearest: Float  # world units, by probe: to the nearest splats
+    colors: Float  # 4 a texel: colour times coverage; the last one is 0
+    places: Float  # 2 a texel: coverage, and coverage by distance
 
     @staticmethod
     def of(
@@ -84,7 +84,7 @@ class Probes:
         pipeline: rendering.Pipeline,
         centers: np.ndarray,
         near: float,
-        decode: Callable[[list[Any]], list[Any]],
+        decode: Callable[[list[Float]], list[Float]],
         planes: np.ndarray | None = None,
     ) -> Probes:
         """Render them.
@@ -99,20 +99,20 @@ class Probes:
         for center, plane in zip(centers, planes, strict=True):
             beyond = _beyond(t, plane, pipeline)
             faces = [_face(center, k, gaussians, beyond, near, decode) for k in range(6)]
-            levels = [_joined(faces)]
+            levels = [_concatenate(faces)]
             for level in range(1, LEVELS):
-                levels.append(_halved(levels[-1], SIZE >> level))
-            texels.append(_joined(levels))
+                levels.append(_halve(levels[-1], SIZE >> level))
+            texels.append(_concatenate(levels))
             coverage, nearness = levels[0][3:]
             distance = dr.select(coverage > SOLID, coverage / nearness, dr.inf)
             nearest.append(dr.select(dr.min(distance) < dr.inf, dr.min(distance), 1))
-        columns = _joined(texels)
+        columns = _concatenate(texels)
         index = dr.arange(t.UInt32, dr.width(columns[0]))
         colors, places = (dr.empty(t.Float, n * dr.width(columns[0])) for n in (4, 2))
         dr.scatter(colors, t.Array4f(*columns[:3], 0), index)
         dr.scatter(places, t.Array2f(columns[3:]), index)
         place, normals = (
-            t.Array3f(*(t.Float(list(values)) for values in np.float64(vectors).T))
+            t.Array3f(*(t.Float(list(values)) for values in np.asarray(vectors, np.float64).T))
             for vectors in (centers, planes[:, :3])
         )
         found = Probes(place, normals, dr.concat(nearest), colors, places)
@@ -120,9 +120,15 @@ class Probes:
         return found
 
     def look(
-        self, probe: Any, origin: Any, direction: Any, far: Any, level: Any, active: Any
+        self,
+        probe: UInt32,
+        origin: Array3f,
+        direction: Array3f,
+        far: Float,
+        level: UInt32,
+        active: Bool,
     ) -> Seen:
-        """Look along unit directions up to ``far``; probe, level: UInt32, of each ray."""
+        """Look along unit directions up to ``far``; probe, level: of each ray."""
         t = types_of(type(far))
         start = origin - dr.gather(t.Array3f, self.centers, probe, active)
         reach = LEAST_REACH * dr.gather(t.Float, self.nearest, probe, active)
@@ -130,8 +136,8 @@ class Probes:
         end = dr.select(far < dr.inf, far / (far + reach), 1)
         towards = direction * reach
 
-        def place(u: Any) -> Any:
-            """From the centre, times 1 - u; u: 0 where the ray starts, 1 infinitely far."""
+        def place(u: Float) -> Array3f:
+            """Return the offset from the centre times 1 - u; u: 0 at the start, 1 at infinity."""
             return start * (1 - u) + towards * u
 
         active &= dr.dot(dr.gather(t.Array3f, self.normals, probe, active), direction) >= 0
@@ -150,20 +156,20 @@ class Probes:
         return Seen(color, dr.select(shows, coverage, 0), is_known)
 
     def _search(
-        self, place: Callable[[Any], Any], end: Any, cube: _Cube, active: Any
-    ) -> tuple[Any, Any, Any]:
+        self, place: Callable[[Float], Array3f], end: Float, cube: _Cube, active: Bool
+    ) -> tuple[Float, Bool, Bool]:
         """Find where lines meet the splats, or end; whether they meet any; is that known."""
         t = types_of(type(end))
 
-        def look(u: Any, active: Any) -> tuple[Any, Any, Any]:
-            """How far a place is from the centre, how far splats are there, and which is nearer."""
+        def look(u: Float, active: Bool) -> tuple[Float, Float, Bool]:
+            """Return the distances of a place and of splats there, and which is nearer."""
             v = place(u)
             coverage, nearness = dr.gather(t.Array2f, self.places, cube.nearest(v), active)
             is_solid, r = coverage > SOLID, dr.norm(v)
             is_behind = is_solid & (r * nearness > (1 - u) * coverage)
             return r / (1 - u), dr.select(is_solid, coverage / nearness, dr.inf), is_behind
 
-        def step(k: Any, before: Any, meets: Any, is_known: Any) -> tuple:
+        def step(k: UInt32, before: Float, meets: Bool, is_known: Bool) -> tuple:
             r, distance, is_behind = look(end * (t.Float(k) / STEPS), active)
             meets = is_behind & (distance > MARGIN * before)
             return k + 1, r, meets, meets | ~is_behind
@@ -184,8 +190,8 @@ class Probes:
         return dr.select(meets, high, end), meets, is_known
 
 
-def _beyond(t: Any, plane: np.ndarray, pipeline: rendering.Pipeline) -> rendering.Pipeline:
-    """A pipeline that leaves out Gaussians whose means are on the other side of a plane."""
+def _beyond(t: ArrayTypes, plane: np.ndarray, pipeline: rendering.Pipeline) -> rendering.Pipeline:
+    """Return a pipeline that leaves out Gaussians whose means are on the other side of a plane."""
     *normal, offset = (dr.opaque(t.Float, float(value)) for value in plane)
 
     def rows(rows: GaussianRows) -> GaussianRows:
@@ -207,11 +213,11 @@ NUM_TEXELS = sum(map(_num_texels, range(LEVELS)))
 class _Cube:
     """The texels of one level of probes."""
 
-    first: Any  # UInt32
-    size: Any  # UInt32: texels of an edge, without border
+    first: UInt32
+    size: UInt32  # texels of an edge, without border
 
     @staticmethod
-    def of(probe: Any, level: Any) -> _Cube:
+    def of(probe: UInt32, level: UInt32) -> _Cube:
         UInt32 = type(level)
         before, first = 0, UInt32(0)
         for k in range(LEVELS):
@@ -219,16 +225,16 @@ class _Cube:
             before += _num_texels(k)
         return _Cube(probe * UInt32(NUM_TEXELS) + first, UInt32(SIZE) >> level)
 
-    def nearest(self, v: Any) -> Any:
-        """UInt32: the texel in the direction of a vector."""
+    def nearest(self, v: Array3f) -> UInt32:
+        """Return the texel in the direction of a vector."""
         face, x, y = _place_on_cube(v)
         UInt32, size = type(self.size), type(x)(self.size)
         last = self.size - 1
         column, row = (dr.minimum(UInt32(place * size), last) + BORDER for place in (x, y))
         return self._texel(face, column, row)
 
-    def around(self, v: Any) -> list[tuple[Any, Any]]:
-        """Four texels around the direction of a vector, and their weights."""
+    def around(self, v: Array3f) -> list[tuple[UInt32, Float]]:
+        """Return four texels around the direction of a vector, and their weights."""
         face, x, y = _place_on_cube(v)
         UInt32, Float = type(self.size), type(x)
         x, y = (place * Float(self.size) + (BORDER - 0.5) for place in (x, y))
@@ -242,13 +248,13 @@ class _Cube:
             (texel + edge + 1, right * down),
         ]
 
-    def _texel(self, face: Any, column: Any, row: Any) -> Any:
+    def _texel(self, face: UInt32, column: UInt32, row: UInt32) -> UInt32:
         edge = self.size + 2 * BORDER
         return self.first + (face * edge + row) * edge + column
 
 
-def _place_on_cube(v: Any) -> tuple[Any, Any, Any]:
-    """The face that a vector points to (+x, -x, +y, ...), and where, 0..1 from its corner.
+def _place_on_cube(v: Array3f) -> tuple[UInt32, Float, Float]:
+    """Find the face that a vector points to (+x, -x, +y, ...), and where, 0..1 from its corner.
 
     On the face of an axis, the next axis points to the right and the one after it down; on that of
     the opposite direction, the other way around, so that neither is mirrored.
@@ -274,8 +280,8 @@ def _face(
     gaussians: Gaussians,
     pipeline: rendering.Pipeline,
     near: float,
-    decode: Callable[[list[Any]], list[Any]],
-) -> list[Any]:
+    decode: Callable[[list[Float]], list[Float]],
+) -> list[Float]:
     """Render a side of a cube (+x, -x, +y, ...), borders included.
 
     Red, green, blue, coverage, nearness of its texels.
@@ -302,14 +308,14 @@ def _face(
     return columns
 
 
-def _joined(parts: list[list[Any]]) -> list[Any]:
+def _concatenate(parts: list[list[Float]]) -> list[Float]:
     columns = [dr.concat(columns) for columns in zip(*parts, strict=True)]
     dr.eval(columns)
     return columns
 
 
-def _halved(columns: list[Any], size: int) -> list[Any]:
-    """A cube of ``size`` texels an edge from one with twice as many: means of four places each."""
+def _halve(columns: list[Float], size: int) -> list[Float]:
+    """Make a cube of ``size`` texels an edge from twice as many: means of four places each."""
     t = types_of(type(columns[0]))
     edge, larger = size + 2 * BORDER, _Cube(t.UInt32(0), t.UInt32(2 * size))
     index = dr.arange(t.UInt32, 6 * edge * edge)
@@ -326,8 +332,8 @@ def _halved(columns: list[Any], size: int) -> list[Any]:
     return means
 
 
-def _vector_to(face: Any, right: Any, down: Any) -> Any:
-    """Array3f: to a place of a face, -1..1; beyond it, to a neighbour."""
+def _vector_to(face: UInt32, right: Float, down: Float) -> Array3f:
+    """Return the vector to a place of a face, -1..1; beyond it, to a neighbour."""
     t = types_of(type(right))
     axis, is_negative = face >> 1, (face & 1) == 1
     right, down = dr.select(is_negative, down, right), dr.select(is_negative, right, down)

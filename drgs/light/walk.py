@@ -20,12 +20,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import Rows, types_of
+from drgs.core.arrays import ArrayTypes, Rows, types_of
 from drgs.core.constants import COLOR_MIN
+from drgs.core.types import Array3f, Bool, Float, Scalar, UInt32
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.gaussians.sh import num_coefficients, sh_basis
 from drgs.light.grid import Ellipsoids, SplatGrid, build_grid
@@ -53,10 +53,10 @@ _SHAPE = 13
 class Segment:
     """Rays from where they start to where they end."""
 
-    origin: Any  # Array3f, world
-    direction: Any  # Array3f, unit
-    far: Any  # Float, world units
-    active: Any  # Bool
+    origin: Array3f  # world
+    direction: Array3f  # unit
+    far: Float  # world units
+    active: Bool
 
 
 @dataclass(frozen=True)
@@ -99,16 +99,16 @@ class RaySplats:
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
 
-    def composite_segment(self, segment: Segment) -> tuple[Any, Any]:
+    def composite_segment(self, segment: Segment) -> tuple[Array3f, Float]:
         """Composite the splats along segments, in the order of their peaks.
 
-        Return the sum of w_i c_i, Array3f, display space, and the transmittance, Float.
+        Return the sum of w_i c_i, display space, and the transmittance.
         """
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
         basis = sh_basis(walk.direction, self.sh_degree)
 
-        def body(at: _Place, last: list, T: Any, color: list) -> tuple:
+        def body(at: _Place, last: list, T: Float, color: list) -> tuple:
             at, window, overflows = walk.nearest(at, last, T)
             T, color, last = walk.composite(window, basis, T, color)
             # What did not fit comes behind what was composited, and is in the same list.
@@ -128,7 +128,9 @@ class RaySplats:
         )
         return t.Array3f(color), dr.abs(T)
 
-    def sampled(self, segment: Segment, seed: Any, count: int) -> tuple[list[Any], list[Any], Any]:
+    def sample_splats(
+        self, segment: Segment, seed: UInt32, count: int
+    ) -> tuple[list[Array3f], list[Bool], Float]:
         """Draw ``count`` splats that segments show, with their weights.
 
         A splat lets light pass with the probability 1 - alpha; the first that does not is drawn
@@ -137,20 +139,22 @@ class RaySplats:
         order: a later splat of the list that does not, either, replaces the last one if it is
         nearer. See :class:`_Draw` for when none does.
 
-        seed: UInt32, of each ray; count: at least 1. Return colours of independent draws, Array3f,
-        display space; of each whether it exists, Bool, independent of them, with the probability
-        1 - T; and an estimate of T, which is independent of the colours.
+        seed: of each ray; count: at least 1. Return colours of independent draws, display space; of
+        each whether it exists, independent of them, with the probability 1 - T; and an estimate of
+        T, which is independent of the colours.
         """
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
 
-        def offer(coverage: Any, draws: list, row: Any, peak: Any, log2_alpha: Any) -> tuple:
+        def offer(
+            coverage: Float, draws: list, row: UInt32, peak: Float, log2_alpha: Float
+        ) -> tuple:
             chances = _Chances.of(walk.alpha(log2_alpha), coverage)
             words = _hashes(row, seed, count)
             drawn = [one.offer(row, peak, chances, u) for one, u in zip(draws, words, strict=True)]
             return chances.coverage, drawn
 
-        def choose(at: _Place, coverage: Any, draws: list) -> tuple:
+        def choose(at: _Place, coverage: Float, draws: list) -> tuple:
             at, row, peak, log2_alpha = walk.next(at)
             return at, *dr.if_stmt(
                 args=(coverage, draws, row, peak, log2_alpha),
@@ -159,14 +163,14 @@ class RaySplats:
                 false_fn=lambda coverage, draws, *_: (coverage, draws),
             )
 
-        def body(at: _Place, coverage: Any, draws: list) -> tuple:
+        def body(at: _Place, coverage: Float, draws: list) -> tuple:
             return dr.while_loop(
                 state=(walk.find(at), coverage, draws),
                 cond=lambda at, coverage, draws: at.has_entry(),
                 body=choose,
             )
 
-        def goes_on(at: _Place, coverage: Any, draws: list) -> Any:
+        def goes_on(at: _Place, coverage: Float, draws: list) -> Bool:
             # Cells that come later are behind what was drawn in this one.
             more = (at.entry < at.last) | ((_farthest(draws) == dr.inf) & (at.end < walk.stop))
             return segment.active & more
@@ -192,7 +196,7 @@ class RaySplats:
         exist = [one.is_stopped for one in draws]
         return [t.Array3f(color) for color in found], exist, T
 
-    def _color(self, row: Any, basis: list[Any], active: Any) -> list[Any]:
+    def _color(self, row: UInt32, basis: list[Scalar], active: Bool) -> list[Float]:
         t = types_of(self.shapes.Float)
         numbers = self.colors.load(row, active)[: 3 * num_coefficients(self.sh_degree)]
         color = []
@@ -203,16 +207,16 @@ class RaySplats:
             color.append(dr.select(value > COLOR_MIN, value, COLOR_MIN))
         return color
 
-    def transmittance(self, segment: Segment, least: Any) -> Any:
+    def transmittance(self, segment: Segment, least: Float) -> Float:
         """Return what segments let through; where that is less than ``least``, anything less."""
         walk = _Walk.along(self, segment)
         t = types_of(self.shapes.Float)
 
-        def weaken(at: _Place, T: Any) -> tuple:
+        def weaken(at: _Place, T: Float) -> tuple:
             at, _, _, log2_alpha = walk.next(at)
             return at, dr.fma(-walk.alpha(log2_alpha), T, T)
 
-        def body(at: _Place, T: Any) -> tuple:
+        def body(at: _Place, T: Float) -> tuple:
             return dr.while_loop(
                 state=(walk.find(at), T),
                 cond=lambda at, T: (least <= T) & at.has_entry(),
@@ -235,25 +239,25 @@ class RaySplats:
 class _Place:
     """The place of rays: a cell, and an entry of its list. Not frozen: Dr.Jit assigns to it."""
 
-    start: Any  # Float: where the ray enters the cell
-    end: Any  # Float: where it leaves it
-    entry: Any  # UInt32: the next one of the list
-    first: Any  # UInt32: of the list
-    last: Any  # UInt32: one behind the list; where that is the next entry, there is another cell
-    turn: Any  # UInt32: entries since rays of a vector waited for each other
+    start: Float  # where the ray enters the cell
+    end: Float  # where it leaves it
+    entry: UInt32  # the next one of the list
+    first: UInt32  # of the list
+    last: UInt32  # one behind the list; where that is the next entry, there is another cell
+    turn: UInt32  # entries since rays of a vector waited for each other
 
     @staticmethod
-    def first_of(start: Any) -> _Place:
-        """Before the first cell."""
+    def first_of(start: Float) -> _Place:
+        """Return the place before the first cell."""
         UInt32, size = types_of(type(start)).UInt32, dr.width(start)
         return _Place(start, type(start)(start), *(dr.zeros(UInt32, size) for _ in range(4)))
 
-    def has_entry(self) -> Any:
+    def has_entry(self) -> Bool:
         """Return whether the list goes on, and other rays need not find another cell first."""
         return (self.entry < self.last) & (self.turn < TURNS)
 
-    def back(self, goes_back: Any) -> _Place:
-        """At the beginning of the list that was read last, on some rays."""
+    def back(self, goes_back: Bool) -> _Place:
+        """Return to the beginning of the list that was read last, on some rays."""
         return replace(self, entry=dr.select(goes_back, self.first, self.entry))
 
 
@@ -262,9 +266,9 @@ class _Walk:
     """Rays on their way through the grid, from where they enter it."""
 
     splats: RaySplats
-    origin: Any  # Array3f: where a ray enters, or starts
-    direction: Any
-    stop: Any  # Float: where it ends, or leaves the grid
+    origin: Array3f  # where a ray enters, or starts
+    direction: Array3f
+    stop: Float  # where it ends, or leaves the grid
 
     @staticmethod
     def along(splats: RaySplats, segment: Segment) -> _Walk:
@@ -274,7 +278,7 @@ class _Walk:
         origin = segment.origin + segment.direction * dr.select(start < end, start, 0)
         return _Walk(splats, origin, segment.direction, end - start)
 
-    def goes_on(self, at: _Place) -> Any:
+    def goes_on(self, at: _Place) -> Bool:
         """Return whether there is another entry, or another cell."""
         return (at.entry < at.last) | (at.end < self.stop)
 
@@ -291,8 +295,8 @@ class _Walk:
         )
         return replace(at, turn=type(at.turn)(0))
 
-    def next(self, at: _Place) -> tuple[_Place, Any, Any, Any]:
-        """The next entry: the place behind it, the Gaussian, where it is met, log2 of its alpha."""
+    def next(self, at: _Place) -> tuple[_Place, UInt32, Float, Float]:
+        """Read the next entry: place behind it, Gaussian, where it is met, log2 of its alpha."""
         UInt32 = type(at.entry)
         row = dr.gather(UInt32, self.splats.grid.rows, at.entry)
         peak, log2_alpha = self.meet(row, True)
@@ -301,7 +305,7 @@ class _Walk:
         behind = replace(at, entry=at.entry + 1, turn=at.turn + 1)
         return behind, row, peak, log2_alpha
 
-    def meet(self, row: Any, active: Any) -> tuple[Any, Any]:
+    def meet(self, row: UInt32, active: Bool | bool) -> tuple[Float, Float]:
         """Return where a ray meets a Gaussian, and the base-2 logarithm of alpha, -inf outside."""
         Array3f = types_of(self.splats.shapes.Float).Array3f
         numbers = self.splats.shapes.load(row, active)
@@ -317,12 +321,12 @@ class _Walk:
         shows = log2_alpha >= self.splats.cutoffs.log2_floor(log2_opacity)
         return peak, dr.select(shows, log2_alpha, -dr.inf)
 
-    def alpha(self, log2_alpha: Any) -> Any:
+    def alpha(self, log2_alpha: Float) -> Float:
         alpha, most = dr.exp2(log2_alpha), self.splats.cutoffs.alpha_max
         return dr.select(alpha < most, alpha, most)
 
-    def nearest(self, at: _Place, last: list[Any], T: Any) -> tuple[_Place, list[list[Any]], Any]:
-        """The next peaks, and whether the list that was read last has more.
+    def nearest(self, at: _Place, last: list, T: Float) -> tuple[_Place, list[list], Bool]:
+        """Find the next peaks, and whether the list that was read last has more.
 
         Rays read one list after the other while half of the window is free, at least, and what
         they have read lets something through. Of each peak: where it is, the Gaussian, the base-2
@@ -331,7 +335,7 @@ class _Walk:
         """
         t = types_of(self.splats.shapes.Float)
 
-        def insert(at: _Place, window: list, overflows: Any) -> tuple:
+        def insert(at: _Place, window: list, overflows: Bool) -> tuple:
             at, row, peak, log2_alpha = self.next(at)
             behind = (peak > last[0]) | ((peak == last[0]) & (row > last[1]))
             peak = dr.select(behind & (log2_alpha > -dr.inf), peak, dr.inf)
@@ -344,14 +348,14 @@ class _Walk:
                 item = [dr.select(before, old, new) for old, new in pairs]
             return at, kept, overflows | (item[0] < dr.inf)
 
-        def body(at: _Place, window: list, overflows: Any) -> tuple:
+        def body(at: _Place, window: list, overflows: Bool) -> tuple:
             return dr.while_loop(
                 state=(self.find(at), window, overflows),
                 cond=lambda at, window, overflows: at.has_entry(),
                 body=insert,
             )
 
-        def goes_on(at: _Place, window: list, overflows: Any) -> Any:
+        def goes_on(at: _Place, window: list, overflows: Bool) -> Bool:
             through = T
             for peak, _, log2_alpha in window:
                 alpha = dr.select(peak < dr.inf, self.alpha(log2_alpha), 0)
@@ -372,12 +376,12 @@ class _Walk:
         )
 
     def composite(
-        self, window: list[list[Any]], basis: list[Any], T: Any, color: list[Any]
-    ) -> tuple[Any, list[Any], list[Any]]:
+        self, window: list[list], basis: list[Scalar], T: Float, color: list[Float]
+    ) -> tuple[Float, list[Float], list]:
         """Composite what was kept; returns T, negative where the ray is finished, colour, last."""
         t = types_of(self.splats.shapes.Float)
 
-        def body(window: list, T: Any, color: list, last: list) -> tuple:
+        def body(window: list, T: Float, color: list, last: list) -> tuple:
             (peak, row, log2_alpha), *others = window
             active = peak < dr.inf
             weight, T, _ = composite_step(
@@ -407,18 +411,18 @@ class _Draw:
     and whether they are stopped does not depend on which splats these are.
     """
 
-    row: Any  # UInt32
-    peak: Any  # Float, inf: it has none
-    is_stopped: Any  # Bool
+    row: UInt32
+    peak: Float  # inf: it has none
+    is_stopped: Bool
 
     @staticmethod
-    def without_splat(t: Any, size: int) -> _Draw:
-        """Before the first entry of a list; t: types."""
+    def without_splat(t: ArrayTypes, size: int) -> _Draw:
+        """Return the draw before the first entry of a list."""
         none = dr.full(t.Float, dr.inf, size)
         return _Draw(dr.zeros(t.UInt32, size), none, dr.full(t.Bool, False, size))
 
-    def offer(self, row: Any, peak: Any, chances: _Chances, u: Any) -> _Draw:
-        """The draw after another splat; u: UInt32, a random number."""
+    def offer(self, row: UInt32, peak: Float, chances: _Chances, u: UInt32) -> _Draw:
+        """Return the draw after another splat; u: a random number."""
         replaces = u < dr.select(self.is_stopped, 0, chances.replaces)
         competes = u < dr.select(self.is_stopped, chances.stops, chances.competes)
         takes = replaces | (competes & (peak < self.peak))
@@ -431,39 +435,42 @@ class _Draw:
 
 @dataclass(frozen=True)
 class _Chances:
-    """Probabilities of a splat in draws, as bounds of random numbers: UInt32, of 2^32.
+    """Probabilities of a splat in draws, as bounds of random numbers of 2^32.
 
     With A the coverage by the splats before it in the list and A' that after it, it is the first
     to stop light with the probability v = (1 - A) alpha; given that any does, with v / A'. A draw
     that is not stopped is decided anew by that, as in reservoir sampling.
     """
 
-    stops: Any  # alpha
-    replaces: Any  # the last splat of a draw that was not stopped: it stops it, or is the first
-    competes: Any  # that, or it stops light too: of those, the nearest is drawn
-    coverage: Any  # Float: A'
+    stops: UInt32  # alpha
+    replaces: UInt32  # the last splat of a draw that was not stopped: it stops it, or is the first
+    competes: UInt32  # that, or it stops light too: of those, the nearest is drawn
+    coverage: Float  # A'
 
     @staticmethod
-    def of(alpha: Any, coverage: Any) -> _Chances:
-        """coverage: before the splat."""
-        Float, UInt32 = type(alpha), types_of(type(alpha)).UInt32
+    def of(alpha: Float, coverage: Float) -> _Chances:
+        """Compute them for a splat; coverage: before it."""
+        t = types_of(type(alpha))
+
+        def bound(probability: Float) -> UInt32:
+            return t.UInt32(t.Float(probability) * MOST_RANDOM)
+
         stopped = (1 - coverage) * alpha
         after = coverage + stopped
         is_first = stopped * dr.rcp(dr.select(after > 0, after, 1))
         replaces = dr.fma(1 - alpha, is_first, alpha)
         competes = dr.fma(1 - replaces, alpha, replaces)
-        below = [UInt32(Float(p) * MOST_RANDOM) for p in (alpha, replaces, competes)]
-        return _Chances(*below, after)
+        return _Chances(bound(alpha), bound(replaces), bound(competes), after)
 
 
-def _farthest(draws: list[_Draw]) -> Any:
-    """Peak of the farthest splat; inf if another one may be farther: not all are stopped."""
+def _farthest(draws: list[_Draw]) -> Float:
+    """Return the peak of the farthest splat; inf while not all draws are stopped."""
     peaks = [dr.select(one.is_stopped, one.peak, dr.inf) for one in draws]
     return reduce(lambda a, b: dr.select(a > b, a, b), peaks)
 
 
-def _hashes(row: Any, seed: Any, count: int) -> list[Any]:
-    """Random numbers of a Gaussian and a ray, UInt32.
+def _hashes(row: UInt32, seed: UInt32, count: int) -> list[UInt32]:
+    """Return random numbers of a Gaussian and a ray.
 
     By PCG's output function (O'Neill 2014). Two numbers a hash: its first 16 bits are those of the
     one, its last 16 bits of the other; what follows in one are the first bits of the other.

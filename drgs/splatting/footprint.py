@@ -88,7 +88,7 @@ class Positions:
     """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4."""
 
     margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
-    samples: ClassVar[int] = 1  # times that each pixel is evaluated
+    samples: int = 1  # times that each pixel is evaluated
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> Positions:
         """Load what the lanes of one kernel need; the other methods are called of the result."""
@@ -123,8 +123,6 @@ class Positions:
 @dataclass(frozen=True)
 class PixelCenters(Positions):
     """The pixels' centres: rows and columns share their offsets."""
-
-    samples: ClassVar[int] = 1
 
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
         """x and y (px) of the 16 pixels."""
@@ -216,8 +214,15 @@ class GaussianFalloff:
     d loss / d ln(alpha), that give the derivatives of what :meth:`differentiable` lists.
     """
 
-    num_geometry: ClassVar[int] = 6  # numbers of a splat
-    num_moments: ClassVar[int] = 6  # sums over pixels, by splat
+    @property
+    def num_geometry(self) -> int:
+        """Numbers of a splat."""
+        return 6
+
+    @property
+    def num_moments(self) -> int:
+        """Sums over pixels, by splat."""
+        return 6
 
     def for_camera(self, camera: Camera) -> GaussianFalloff:
         """Return this falloff for one camera; here, nothing depends on it."""
@@ -262,7 +267,9 @@ class GaussianFalloff:
         dx, dy = x - mean_x, y - mean_y
         return dr.fma(p, dx, r * dy), s * dy
 
-    def footprint(self, geometry: list[Float], offsets_from: Offsets, active: Bool) -> Footprint:
+    def footprint(
+        self, geometry: list[Float], offsets_from: Offsets, active: Bool | bool
+    ) -> Footprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
         x, y, p, r, s, log2_opacity = geometry
         log2_opacity = dr.select(active, log2_opacity, -dr.inf)
@@ -463,7 +470,7 @@ class FootprintModel:
             cutoffs=self.cutoffs,
         )
 
-    def footprint(self, geometry: list[Float], lanes: Lanes, active: Bool) -> Footprint:
+    def footprint(self, geometry: list[Float], lanes: Lanes, active: Bool | bool) -> Footprint:
         """A splat at the pixels of each lane."""
         return self.falloff.footprint(geometry, partial(self.positions.offsets, lanes), active)
 

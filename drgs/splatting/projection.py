@@ -94,7 +94,7 @@ class FilmShape:
         return dr.abs(p * s)
 
 
-Projection = Callable[["GaussianRows", Camera, Array3f, float], FilmShape]
+Projection = Callable[["GaussianRows", Camera, Array3f, Float | float], FilmShape]
 """From rows, camera, means (Array3f, camera axes) and low-pass (px^2) to shapes on the film."""
 
 
@@ -104,11 +104,13 @@ class ProjectionModel:
     A subclass has a :data:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
     """
 
-    falloff: ClassVar[type | None] = None  # one of its own; None: as is configured
+    falloff: ClassVar[type | None] = None  # its own falloff; None: as is configured
     shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
 
     @staticmethod
-    def shape(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float) -> FilmShape:
+    def shape(
+        rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+    ) -> FilmShape:
         """Project; see :data:`Projection`."""
         raise NotImplementedError
 
@@ -210,7 +212,9 @@ def project(
     )
 
 
-def ewa(rows: GaussianRows, camera: Camera, position: Array3f, low_pass: float) -> FilmShape:
+def ewa(
+    rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+) -> FilmShape:
     """The affine approximation of the projection at the mean (Zwicker et al. 2002, section 4).
 
     position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
@@ -229,7 +233,7 @@ class Ewa(ProjectionModel):
 
 
 def whiten(
-    means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: float
+    means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: Float | float
 ) -> FilmShape:
     """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
 

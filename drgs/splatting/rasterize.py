@@ -139,12 +139,12 @@ class Records:
         dr.eval(rows)
         return Records(rows, bins.model.falloff.num_geometry, bins.num_features)
 
-    def load(self, entry: UInt32, active: Bool) -> tuple[list[Float], list[Float]]:
+    def load(self, entry: UInt32, active: Bool | bool) -> tuple[list[Float], list[Float]]:
         """Geometry and features of a sorted entry."""
         numbers = self.rows.load(entry, active)
         return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
 
-    def load_keys(self, entry: UInt32, active: Bool) -> list[Float]:
+    def load_keys(self, entry: UInt32, active: Bool | bool) -> list[Float]:
         """Keys of a sorted entry."""
         return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
 

@@ -14,7 +14,7 @@ from support.views import VIEWS, Scene, View, gradients_of, image_of, tensors, t
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.cameras.camera import Camera
-from drgs.cameras.motion import CameraMotion, RollingShutter
+from drgs.cameras.motion import Motion, RollingShutter
 from drgs.core.arrays import from_host
 from drgs.reference import effects
 from drgs.reference import splatting as reference
@@ -156,7 +156,7 @@ def rolling_picture(scene, values):
     opened, closed = (with_intrinsics(c(VIEWS[1], values), values) for c in (camera_of, closing))
     camera: Camera = device_camera(opened, FLOAT64)
     other = device_camera(closed, FLOAT64)
-    motion = CameraMotion.between(camera, other.rotation, other.center)
+    motion = Motion.between(camera, other.rotation, other.center)
     camera = replace(camera, shutter=RollingShutter(*motion))
     gaussians = device_gaussians(scene.gaussians, FLOAT64)
     frame = rendering.render(gaussians, camera, rendering.Pipeline(scene.degree))

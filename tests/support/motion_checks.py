@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.cameras.motion import (
-    CameraMotion,
+    Motion,
     MotionBlur,
     RollingShutter,
 )
@@ -76,7 +76,7 @@ class MovingCase(LensCase):
     def device_camera(self, precision) -> Camera:
         camera = super().device_camera(precision)
         close = lens_camera(self.close_camera, self.lens, precision)
-        motion = CameraMotion.between(camera, close.rotation, close.center)
+        motion = Motion.between(camera, close.rotation, close.center)
         if self.samples:
             camera = replace(camera, shutter=MotionBlur(*motion, self.samples))
         else:
