@@ -17,12 +17,12 @@ from drgs.cameras import (
     thin_prism_fisheye,
 )
 from drgs.effects import defocus, occlusion
-from drgs.integrator.film import SamplePoints
+from drgs.integrator.film import LanePoints
 from drgs.splatting import footprint, rendering
 
 CLASSES = {
     footprint.GaussianFalloff: (exact.RayFalloff, defocus.DimmedFalloff),
-    footprint.Positions: (footprint.PixelCenters, SamplePoints),
+    footprint.Positions: (footprint.PixelCenters, LanePoints),
     footprint.SplatFeatures: (
         occlusion.OccludedFeatures,
         ray_colors.RayColors,
