@@ -4,11 +4,11 @@
 >>> dataset = drgs.load_dataset("data/lego", image_size=400)
 >>> fitted = drgs.train("scenes/lego.yml", dataset)
 >>> fitted.gaussians.save("lego.ply")
->>> picture, alpha, _ = drgs.rasterization(means, quats, scales, opacities, colors, ...)
+>>> image, alpha, _ = drgs.rasterization(means, quats, scales, opacities, colors, ...)
 
 :class:`Gaussians`: a scene, from and to files and numpy arrays; :func:`load_dataset`:
 photographs with their cameras; :func:`train`: fits Gaussians to them; :func:`rasterization`:
-differentiable pictures, with gsplat's names and conventions.
+differentiable images, with gsplat's names and conventions.
 
 Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
 and for every later one; these names are imported when they are first used.
@@ -17,9 +17,16 @@ and for every later one; these names are imported when they are first used.
 from __future__ import annotations
 
 import importlib
+from typing import TYPE_CHECKING
 
 from drgs import _registration
 from drgs.core import errors, llvm
+
+if TYPE_CHECKING:
+    from drgs.datasets import load_dataset
+    from drgs.gaussians.parameters import Gaussians
+    from drgs.gsplat_api import rasterization
+    from drgs.training.session import train
 
 __version__ = "0.1.0"
 
@@ -40,14 +47,16 @@ _MODULES = {
 }
 
 
-def __getattr__(name: str) -> object:
-    """The public names, imported when they are first used."""
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(_MODULES[name]), name)
-    return value
+if not TYPE_CHECKING:  # else a type checker would accept every name
+
+    def __getattr__(name: str) -> object:
+        """Import a public name when it is first used."""
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = globals()[name] = getattr(importlib.import_module(_MODULES[name]), name)
+        return value
 
 
 def __dir__() -> list[str]:
-    """List the names that are there, and those that are imported when they are used."""
+    """Return the names that exist, and those that are imported when they are used."""
     return sorted({*globals(), *__all__})

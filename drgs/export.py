@@ -32,7 +32,7 @@ from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
 from drgs.results.refined_cameras import training_cameras
-from drgs.results.viewer import HONOURED, Shown, Standpoint, viewer_page
+from drgs.results.viewer import HONOURED, InitialView, Shown, viewer_page
 
 COMMAND = "export"
 
@@ -110,11 +110,11 @@ def _page(source: ExportSource) -> bytes:
         background = load_run_config(folder).data.background_rgb
         cameras = None if source.is_turned else training_cameras(folder, gaussians.origin)
     if cameras is not None:
-        standpoint = Standpoint.of_views(cameras, gaussians)
+        initial_view = InitialView.from_views(cameras, gaussians)
     else:
-        standpoint = Standpoint.of_gaussians(gaussians, Z_UP)
+        initial_view = InitialView.from_gaussians(gaussians, Z_UP)
     shown = Shown(gaussians, Approximations.of(gaussians.rendered_with or {}))
-    return viewer_page(title, shown, standpoint, background)
+    return viewer_page(title, shown, initial_view, background)
 
 
 PAGE = ExportTarget(

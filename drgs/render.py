@@ -36,7 +36,7 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.execution import add_execution_arguments, executing, select_variant
-from drgs.config.schema import NAMED_COLORS
+from drgs.config.schema import NAMED_COLORS, FitConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
@@ -48,7 +48,7 @@ from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import FIELD_OF_VIEW, field_of_view, look_at, pinhole, read_viewpoints
 from drgs.effects.compose import IGNORABLE
 from drgs.integrator.scene import render_views
-from drgs.integrator.state import is_splats
+from drgs.integrator.types import is_splats
 from drgs.io.formats import format_for, readable_formats
 from drgs.io.pictures import (
     MITSUBA_FORMATS,
@@ -232,7 +232,7 @@ def render_model(args: argparse.Namespace, model: Model, folder: ImageFolder) ->
 
 
 def _load_model(args: argparse.Namespace, render: Render) -> Model:
-    overrides = list(args.set or ())
+    overrides: list[str] = list(args.set or ())
     if args.data is not None:
         overrides.append(f"data.path={args.data}")
     background = parse_background(args.background)
@@ -276,23 +276,25 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
 def render_orbit(model: Model, args: argparse.Namespace, folder: ImageFolder) -> None:
     """Render frames around the scene, and animations of them."""
     if model.config is None:
-        fov, size = args.fov or FIELD_OF_VIEW, args.size or DEFAULT_SIZE
+        fov, (width, height) = args.fov or FIELD_OF_VIEW, args.size or DEFAULT_SIZE
         orbit = orbit_of_gaussians(model.gaussians, np.array(args.up or UP), fov)
     else:
-        views = _orbited_views(model, args)
-        fov, size = args.fov or field_of_view(views), args.size or orbit_size(views)
+        views = _orbited_views(model, model.config, args)
+        fov, (width, height) = args.fov or field_of_view(views), args.size or orbit_size(views)
         orbit = orbit_of_views(views, model.gaussians)
-    check_animation(args.orbit, *size)
-    viewpoints = orbit.viewpoints(args.orbit, *size, fov)
+    check_animation(args.orbit, width, height)
+    viewpoints = orbit.viewpoints(args.orbit, width, height, fov)
     images = render_cameras(model, viewpoints, folder, [ORBIT, ORBIT_GIF])
     write_animation(folder.path / ORBIT, images)
 
 
-def _orbited_views(model: Model, args: argparse.Namespace) -> Sequence[Viewpoint]:
+def _orbited_views(
+    model: Model, config: FitConfig, args: argparse.Namespace
+) -> Sequence[Viewpoint]:
     """Return the training cameras: those in a fit's folder, unless photographs are named."""
     if args.what.is_dir() and (args.scene, args.data, args.set) == (None, None, None):
         refined = args.what / CAMERAS
-        if model.config.cameras.optimise and refined.is_file():
+        if config.cameras.optimise and refined.is_file():
             print(f"cameras: as refined, from {refined}")
         if (views := training_cameras(args.what, model.gaussians.origin)) is not None:
             return views
@@ -312,7 +314,8 @@ def render_cameras(
 
 def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     """Return the cameras of ``--camera`` or of ``--origin``, relative to the model's origin."""
-    size, origin = tuple(args.size) if args.size else None, model.gaussians.origin
+    size: tuple[int, int] | None = tuple(args.size) if args.size else None
+    origin = model.gaussians.origin
     if args.camera is not None:
         samples = model.config.data.shutter_samples if model.config else SHUTTER_SAMPLES
         views = read_viewpoints(args.camera, size, samples)
@@ -334,7 +337,7 @@ def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str,
         scene = load_scene_file(path, **definitions)
     except RuntimeError as error:
         raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
-    if scene.integrator() is None or not scene.sensors():
+    if not isinstance(scene, mi.Scene) or scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     is_linear, stem, count = (
         _is_linear(scene.integrator()),

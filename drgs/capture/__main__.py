@@ -15,7 +15,7 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 
 from drgs.capture.camera_placement import ENOUGH_SENSORS, KINDS, settings_for, views_of
 from drgs.capture.dataset import POINTS, CaptureFolder
@@ -139,7 +139,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _capture(args: argparse.Namespace) -> None:
     given = _given_settings(args)
-    settings = CaptureSettings(**given)
+    settings = replace(CaptureSettings(), **given)
     if reason := why_too_large(*settings.size):
         raise UserError(f"--size: {reason}")
     if not args.scene.is_file():
@@ -161,8 +161,9 @@ def _capture(args: argparse.Namespace) -> None:
 def _given_settings(args: argparse.Namespace) -> dict[str, object]:
     options = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
     given = {name: value for name, value in options.items() if value is not None}
-    given = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
-    return given | ({"fov": math.radians(given["fov"])} if "fov" in given else {})
+    if args.fov is not None:
+        given["fov"] = math.radians(args.fov)
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
 
 
 def _describe_cameras(settings: CaptureSettings, count: int) -> str:
@@ -170,6 +171,7 @@ def _describe_cameras(settings: CaptureSettings, count: int) -> str:
         return f"cameras: the scene's own sensors, {count}"
     place = "around the scene"
     if settings.cameras == "inside":
+        assert settings.target is not None, "settings_for sets it"
         target = ", ".join(f"{value:.4g}" for value in settings.target)
         place = f"inside the scene, around ({target})"
     return f"cameras: {count} {place}, field of view {math.degrees(settings.fov):.4g} degrees"

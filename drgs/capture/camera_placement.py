@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Set
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
 from drgs.capture.path_tracing import (
@@ -28,6 +29,7 @@ from drgs.capture.path_tracing import (
     lit_part,
 )
 from drgs.core.errors import UserError
+from drgs.core.types import Float
 from drgs.datasets.viewpoints import look_at
 
 KINDS = ("around", "inside", "sensors")
@@ -40,7 +42,7 @@ INSIDE_PART = 0.6  # place of a camera on the way from the target to the wall be
 ENOUGH_SENSORS = 10  # number of sensors from which a scene is photographed from where they are
 
 TEST_EVERY = 8
-"""Every eighth of the scene's own sensors is for testing, as in the nerfstudio layout."""
+"""Interval of the scene's own sensors that are for testing, as in the nerfstudio layout."""
 
 COUNTS = {"views", "val_views", "test_views"}
 
@@ -87,7 +89,7 @@ def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
         pose = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
         pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
         width, height = sensor.film().size()
-        fov = math.radians(parameters["x_fov"][0])
+        fov = math.radians(cast("Float", parameters["x_fov"])[0])
         if height < width:
             fov = 2 * math.atan(height / width * math.tan(fov / 2))
         found.append(OwnCamera(pose @ OPENGL_TO_MITSUBA, fov))
@@ -218,7 +220,7 @@ def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]
     return spots[best], bool(is_closed.any())
 
 
-def _look_around(scene: mi.Scene, spots: object) -> tuple[np.ndarray, np.ndarray]:
+def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the part of all directions with a surface, and the room, (N,), at places (N, 3).
 
     A surface that is seen from behind does not count: the place is inside an object.
@@ -256,7 +258,7 @@ def _free_way(
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
     """Return the target of cameras around a scene, (3,) world, and their distance from it.
 
-    Without ``distance``, the bounding box's sphere just fits between the edges of the picture:
+    Without ``distance``, the bounding box's sphere just fits between the edges of the image:
     radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
     has empty corners.
     """

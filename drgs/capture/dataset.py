@@ -253,7 +253,8 @@ def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
     """Write a PLY of points: positions (N, 3) world, colours (N, 3) uint8 display space."""
     columns = dict(zip("xyz", positions.T, strict=True))
     columns |= dict(zip(("red", "green", "blue"), colors.T, strict=True))
-    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    dtype = [(name, column.dtype) for name, column in columns.items()]
+    rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
     # Not to the file itself: numpy's errors of a full disk name neither the file nor the reason.
     stream = io.BytesIO()
     PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)

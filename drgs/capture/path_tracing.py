@@ -28,7 +28,8 @@ import numpy as np
 
 from drgs.cameras.axes import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
-from drgs.integrator.state import is_splats
+from drgs.core.types import Bool
+from drgs.integrator.types import is_splats
 from drgs.io.pictures import to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
 
@@ -64,7 +65,7 @@ class CaptureSettings:
     spp: int = 256  # paths per pixel
     max_depth: int = 8  # segments of a path
     fov: float = NERF_SYNTHETIC_FOV  # radians, horizontal
-    distance: float | None = None  # of the cameras from the target; None: all is in the picture
+    distance: float | None = None  # of the cameras from the target; None: all is in the image
     target: tuple[float, float, float] | None = None  # None: centre of the bounding box
     up: str = "z"
     points: int = 100_000
@@ -99,7 +100,7 @@ class CaptureSettings:
 
     @property
     def hides_lights(self) -> bool:
-        """Whether shining surfaces are left out: an object's studio is, a room's lamps are not."""
+        """True if shining surfaces are left out: an object's studio is, a room's lamps are not."""
         return self.cameras != "inside"
 
     def count(self, split: str) -> int:
@@ -109,7 +110,7 @@ class CaptureSettings:
 
 @dataclass(frozen=True, eq=False)
 class CaptureView:
-    """One image to take."""
+    """Image to take."""
 
     split: str
     index: int
@@ -118,7 +119,7 @@ class CaptureView:
 
     @property
     def file_path(self) -> str:
-        """Its name in the transforms file, without the suffix."""
+        """The image's name in the transforms file, without the suffix."""
         return f"./{self.split}/r_{self.index}"
 
 
@@ -146,6 +147,7 @@ def load_scene(path: Path) -> mi.Scene:
 def _scene_dictionary(path: Path) -> dict[str, object]:
     """Return what ``scene()`` of a Python file returns; files in its folder are found by name."""
     variant = mi.variant()
+    assert variant is not None, "the command selects one"
     try:
         description = _import(path).scene()
     except (Exception, SystemExit) as error:
@@ -168,13 +170,15 @@ def _scene_dictionary(path: Path) -> dict[str, object]:
         )
     if not isinstance(description, dict) or description.get("type") != "scene":
         raise UserError(f'{path}: scene() must return a dictionary with "type": "scene"')
-    mi.file_resolver().append(str(path.parent.resolve()))
+    resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  # not in the stub
+    resolver.append(str(path.parent.resolve()))
     return description
 
 
 def _import(path: Path) -> ModuleType:
     name = f"drgs_capture_scene_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None, "the file's name ends in .py"
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
     # As for a script: its neighbours can be imported.
@@ -270,15 +274,16 @@ class CaptureCamera:
         seeds = np.random.SeedSequence(entropy).generate_state(len(counts))
         total = np.zeros((height, width, 4))
         settings = {"sensor": self._sensor, "integrator": self._integrator}
-        level = mi.logger().log_level()
+        logger: mi.Logger = mi.logger()  # pyright: ignore[reportCallIssue]  # not in the stub
+        level = logger.log_level()
         # Mitsuba would warn in each pass that its sampler rounds the number of paths up.
-        mi.logger().set_log_level(mi.LogLevel.Error)
+        logger.set_log_level(mi.LogLevel.Error)
         try:
             for count, seed in zip(counts, seeds, strict=True):
-                image = mi.render(self._scene, seed=int(seed), spp=count, **settings)
+                image = mi.render(self._scene, seed=int(seed), spp=count, **settings)  # pyright: ignore[reportArgumentType]  # also an int
                 total += count * np.array(image, np.float64)
         finally:
-            mi.logger().set_log_level(level)
+            logger.set_log_level(level)
         return total / spp
 
 
@@ -333,10 +338,15 @@ def first_hits(
     past_lamps: whether surfaces that shine do not count.
     """
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
-    for _ in range(MAX_LAMPS_IN_A_ROW):
+
+    def intersect(ray: mi.Ray3f) -> tuple[mi.SurfaceInteraction3f, Bool]:
         hit = scene.ray_intersect(ray)
-        lamp = hit.is_valid() & hit.shape.is_emitter() & past_lamps
+        return hit, hit.is_valid() & hit.shape.is_emitter() & past_lamps
+
+    hit, lamp = intersect(ray)
+    for _ in range(MAX_LAMPS_IN_A_ROW - 1):
         if not dr.any(lamp):
             break
         ray = dr.select(lamp, hit.spawn_ray(ray.d), ray)
+        hit, lamp = intersect(ray)
     return np.array(hit.p).T, np.array(hit.is_valid() & ~lamp)

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
@@ -24,7 +24,7 @@ __all__ = ["Dataset", "View", "Viewpoint", "load_dataset"]
 def load_dataset(
     source: str | Path | DataConfig,
     keeps: Keeps = all_of_them,
-    sections: Mapping[str, Any] = MappingProxyType({}),
+    sections: Mapping[str, BaseModel | None] = MappingProxyType({}),
     **settings: object,
 ) -> Dataset:
     """Return all views of a dataset: photographs with their cameras, to train and to measure on.

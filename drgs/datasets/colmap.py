@@ -23,7 +23,7 @@ from drgs.datasets.files import FileKind, find_files, images_in, key_of, masks_o
 from drgs.datasets.images import is_scaled
 from drgs.datasets.reader import MAX_WIDTH, DatasetReader, Photographs
 from drgs.datasets.splits import unlisted_splits
-from drgs.datasets.transforms import LENS_OF_MODEL, Frame, FrameValues
+from drgs.datasets.transforms import LENS_OF_MODEL, FrameValues, TransformsFrame
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
 from drgs.io.pictures import MAX_SIDE, read_header
 
@@ -47,12 +47,10 @@ class ColmapReader(DatasetReader):
     """Reads a model of COLMAP and its photographs."""
 
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        """See :class:`DatasetReader`."""
         del names
         return find_model(folder) is not None
 
     def photographs(self, config: DataConfig) -> Photographs:
-        """See :class:`DatasetReader`."""
         notes: list[str] = []
         root, folder = _root_and_model(config.path)
         model = read_model(folder)
@@ -67,7 +65,7 @@ class ColmapReader(DatasetReader):
             if mask is not None and not config.ignore_masks:
                 found["mask"] = mask
             place = f"image {one_line(image.name, 100)}: "
-            frames.append(Frame(values, folder, place, is_as_stored=True, files=found))
+            frames.append(TransformsFrame(values, folder, place, is_as_stored=True, files=found))
         lists = unlisted_splits((folder, root), [image.name for image in model.images], notes)
         cloud, note = model.points_file if model.has_points else None, f"; pictures of {below.name}"
         if cloud is not None and config.ignore_points:
@@ -184,6 +182,7 @@ def _values(
     scale_x, scale_y = width / camera.width, height / camera.height
     focal = named.pop("f", None)
     return FrameValues.model_construct(
+        None,
         file_path=image.name,
         transform_matrix=image.camera_to_world,
         mask_path=None if mask is None else str(mask),

@@ -202,8 +202,9 @@ def masks_of(
         exact.setdefault(stem, file)
         marked.setdefault(_photograph_key(stem), file)
         loose.setdefault(stem_of(_photograph_key(stem) or stem), file)
-    for file in () if images is None else _marked_beside(images, names):
-        marked.setdefault(_photograph_key(_mask_key(file.relative_to(images).as_posix())), file)
+    if images is not None:
+        for file in _marked_beside(images, names):
+            marked.setdefault(_photograph_key(_mask_key(file.relative_to(images).as_posix())), file)
     chosen = []
     for name in names:
         keys = key_of(name), _mask_key(name)

@@ -8,7 +8,8 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+
+from pydantic import BaseModel
 
 from drgs.config.extensions import READERS, section_of
 from drgs.config.load import config_from
@@ -39,12 +40,12 @@ MARKERS = ("transforms_train.json", "transforms.json")
 GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 
 
-NO_SECTIONS: Mapping[str, Any] = MappingProxyType({})
+NO_SECTIONS: Mapping[str, BaseModel | None] = MappingProxyType({})
 """Sections of extensions where none has one."""
 
 
 def find_reader(
-    config: DataConfig, sections: Mapping[str, Any] = NO_SECTIONS
+    config: DataConfig, sections: Mapping[str, BaseModel | None] = NO_SECTIONS
 ) -> tuple[str, DatasetReader]:
     """Return the name and the reader of ``data.type``, or of the first that recognizes the folder.
 

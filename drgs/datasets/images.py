@@ -40,7 +40,7 @@ DEPTH_BYTES = 24
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) float32: 1 where a mask is opaque and brighter than half, 0 elsewhere; size: W, H.
+    """Return a mask (H, W) float32: 1 where opaque and brighter than half, else 0; size: W, H.
 
     A mask for a larger photograph of the same shape will do: a pixel counts where all that it
     covers does.
@@ -71,7 +71,7 @@ def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
 
 
 def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) float32, scene units, 0 where not known: not finite or not positive.
+    """Return depths (H, W) float32, scene units; 0 where not known: not finite or not positive.
 
     unit: scene units per number of the ``.npy`` file, or step of the 16 bit image; size: W, H.
     """
@@ -99,7 +99,7 @@ def is_array(path: Path) -> bool:
 
 
 def _stored_depth(path: Path) -> np.ndarray:
-    """(H, W) of an ``.npy`` file, mapped into memory."""
+    """Return the array (H, W) of an ``.npy`` file, mapped into memory."""
     open_regular(path, "depth", MAX_BYTES).close()
     try:
         with np.errstate(over="ignore"):  # of the size that a header claims
@@ -129,7 +129,7 @@ def _check_size(path: Path, got: tuple[int, int], size: tuple[int, int]) -> None
 
 
 def composite(image: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
-    """(H, W, 3): rgb * a + background * (1 - a), in display space; RGB images pass unchanged."""
+    """Return rgb * a + background * (1 - a), (H, W, 3), display space; RGB passes unchanged."""
     if image.shape[2] == 3:
         return image
     rgb, alpha = image[:, :, :3], image[:, :, 3:]
@@ -156,7 +156,7 @@ def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int
 
 
 def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
-    """(H, W) of 1 and 0: a pixel counts where all that it covers does."""
+    """Return a mask (H, W) of 1 and 0: a pixel counts where all that it covers does."""
     return _whole(downscale(mask, max_width))
 
 
@@ -165,7 +165,7 @@ def _whole(share: np.ndarray) -> np.ndarray:
 
 
 def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
-    """(H, W): the mean depth where all that a pixel covers has one, else 0."""
+    """Return mean depths (H, W) of what each pixel covers; 0 where a part of that has none."""
     known = downscale((depth > 0).astype(np.float32), max_width)
     return np.where(known > WHOLE, downscale(depth, max_width), 0).astype(np.float32)
 
@@ -176,7 +176,7 @@ def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _average_rows(image: np.ndarray, count: int) -> np.ndarray:
-    """(count, ...) float32: area average along the first axis."""
+    """Return the area average (count, ...) float32 along the first axis."""
     length = image.shape[0]
     if length % count == 0:
         return image.reshape(count, length // count, *image.shape[1:]).mean(axis=1)
@@ -194,7 +194,9 @@ def smaller_view(view: View, factor: int) -> View:
     width, height = downscaled_size(view.width, view.height, new_width)
     x, y = width / view.width, height / view.height
 
-    def smaller(image: Pixels | None, scale: Callable = downscale) -> LazyImage | None:
+    def smaller(
+        image: Pixels | None, scale: Callable[[np.ndarray, int | None], np.ndarray] = downscale
+    ) -> LazyImage | None:
         if image is None:
             return None
         shape = (height, width, *image.shape[2:])

@@ -18,10 +18,10 @@ from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.notices import Notices
-from drgs.datasets.reader import DatasetReader, describe_extras, load_views
+from drgs.datasets.reader import DatasetReader, ViewIntrinsics, describe_extras, load_views
 from drgs.datasets.transforms import (
-    Frame,
     TransformsFile,
+    TransformsFrame,
     focal_from_angle,
     frames_with_files,
     note_unread,
@@ -43,7 +43,6 @@ class NerfSyntheticReader(DatasetReader):
     """Reads folders of NeRF-synthetic."""
 
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        """See :class:`DatasetReader`."""
         del folder
         return "transforms_train.json" in names
 
@@ -100,7 +99,7 @@ def _transforms_path(config: DataConfig, split: str) -> Path:
     return config.path / f"transforms_{split}.json"
 
 
-def _frames(config: DataConfig, split: str, notes: list[str]) -> list[Frame]:
+def _frames(config: DataConfig, split: str, notes: list[str]) -> list[TransformsFrame]:
     """Return the frames of a split whose images are there."""
     meta = read_transforms(_transforms_path(config, split))
     if unread := [*meta.unread, *_unused(meta)]:
@@ -117,12 +116,14 @@ def _unused(meta: TransformsFile) -> list[str]:
 
 
 def _load_split(
-    config: DataConfig, frames: list[Frame], keeps: Keeps, notices: Notices
+    config: DataConfig, frames: list[TransformsFrame], keeps: Keeps, notices: Notices
 ) -> tuple[View, ...]:
     first = frames[0].files["image"]
     width, height = image_size(first)
 
-    def intrinsics(frame: Frame, shape: tuple[int, ...], size: tuple[int, int]) -> dict[str, float]:
+    def intrinsics(
+        frame: TransformsFrame, shape: tuple[int, ...], size: tuple[int, int]
+    ) -> ViewIntrinsics:
         file, angle = frame.files["image"], frame.values.camera_angle_x
         if shape[2] != 4:
             raise UserError(

@@ -33,12 +33,10 @@ class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        """See :class:`DatasetReader`."""
         del folder
         return "transforms.json" in names
 
     def photographs(self, config: DataConfig) -> Photographs:
-        """See :class:`DatasetReader`."""
         notes: list[str] = []
         meta = read_transforms(config.path / "transforms.json")
         frames = frames_with_files(config, meta, notes)
@@ -55,7 +53,7 @@ class NerfstudioReader(DatasetReader):
 
 def _lists(meta: TransformsFile, notes: list[str]) -> Lists | None:
     """Return the splits that the file lists, or other files, or folders."""
-    names = [frame.values.file_path for frame in meta.frames]
+    names = [frame.file_path for frame in meta.frames]
     if not meta.lists:
         return unlisted_splits((meta.path.parent,), names, notes)
     found = {

@@ -123,7 +123,7 @@ def near_plane_of(gaussians: Gaussians) -> float:
 
 
 def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
-    """(3,) unit: the world's up direction, estimated from how cameras were held.
+    """Return the world's up direction (3,), unit, estimated from how cameras were held.
 
     Minimises mean((r_i . u)^2) over unit vectors, r_i the cameras' right vectors: a camera that
     is tilted but not rolled keeps it horizontal. A small term draws u to the mean of the cameras'

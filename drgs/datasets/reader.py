@@ -14,9 +14,10 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypedDict, TypeVar
 
 import numpy as np
+from pydantic import BaseModel
 
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
@@ -40,7 +41,7 @@ from drgs.datasets.notices import Notices
 from drgs.datasets.splits import Lists, split_of
 from drgs.datasets.transforms import (
     CLOSE,
-    Frame,
+    TransformsFrame,
     focal_from_angle,
     focal_length,
     lens_of,
@@ -51,7 +52,7 @@ from drgs.datasets.transforms import (
 from drgs.datasets.types import Dataset, Keeps, View, all_of_them
 from drgs.io.pictures import read_header, read_pixels, upright
 
-__all__ = ["READERS", "DatasetReader", "Frame", "Photographs", "dataset_of"]
+__all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame", "dataset_of"]
 
 MAX_WIDTH = 1600
 """px: wider photographs are scaled down to this, as in the 3DGS reference, unless a size is set."""
@@ -69,7 +70,7 @@ class Photographs:
 
     layout: str  # its name
     source: Path  # the file or folder that specifies it, for messages
-    frames: Sequence[Frame]  # whose photographs are there
+    frames: Sequence[TransformsFrame]  # whose photographs are there
     lists: Lists | None = None  # of splits
     point_cloud: Path | None = None  # to start from
     note: str = ""  # for the dataset's description
@@ -79,8 +80,11 @@ class Photographs:
 class DatasetReader:
     """Base class of readers of a layout of folders."""
 
+    def __init__(self, section: BaseModel | None = None) -> None:
+        """section: the one that the reader has registered."""
+
     @classmethod
-    def from_config(cls, section: Any) -> DatasetReader:
+    def from_config(cls, section: BaseModel | None) -> DatasetReader:
         """Return the reader; section: the one that it has registered, or None."""
         return cls() if section is None else cls(section)
 
@@ -92,7 +96,7 @@ class DatasetReader:
     def photographs(self, config: DataConfig) -> Photographs:
         """Return where the photographs of a folder are, with their cameras.
 
-        A :class:`Frame` for each: ``Frame.from_camera`` makes those of pinhole cameras.
+        A :class:`TransformsFrame` for each: ``from_camera`` makes those of pinhole cameras.
         """
         raise NotImplementedError
 
@@ -113,8 +117,8 @@ def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_
 
     Raises :class:`UserError` as that does, and for a photograph or a frame that cannot be read.
     """
-    frames = sorted(photographs.frames, key=lambda frame: frame.values.file_path)
-    names = [frame.values.file_path for frame in frames]
+    frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
+    names = [frame.file_path for frame in frames]
     split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
     changes: dict[str, object] = {}
     if config.background is None:
@@ -146,14 +150,32 @@ def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_
     )
 
 
-Intrinsics = Callable[[Frame, tuple[int, ...], tuple[int, int]], dict[str, float]]
+class ViewIntrinsics(TypedDict):
+    """Intrinsics of a :class:`View`, px."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class ViewImages(TypedDict):
+    """Images of a :class:`View`."""
+
+    image: Pixels
+    alpha: Pixels | None
+    mask: Pixels | None
+    depth: Pixels | None
+
+
+Intrinsics = Callable[[TransformsFrame, tuple[int, ...], tuple[int, int]], ViewIntrinsics]
 """Takes a frame, the shape of its photograph (H, W, C) and the size W, H at which that is rendered;
-returns fx, fy, cx, cy at that size, px."""
+returns the intrinsics at that size."""
 
 
 def load_views(
     config: DataConfig,
-    frames: Sequence[Frame],
+    frames: Sequence[TransformsFrame],
     intrinsics: Intrinsics,
     keeps: Keeps,
     notices: Notices,
@@ -162,12 +184,12 @@ def load_views(
 
     Raises :class:`UserError` where the others do not fit into memory or cannot be read.
     """
-    names = unique_names([frame.values.file_path for frame in frames])
+    names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]
     kept = [file for file, name in zip(files, names, strict=True) if keeps(name)]
     check_room(kept, config.image_size)
 
-    def load(frame: Frame, name: str) -> View:
+    def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
         pixels = as_calibrated((read_pixels if is_read else placeholder_pixels)(file), frame)
         if is_read:
@@ -193,12 +215,12 @@ def load_views(
 def in_parallel(
     function: Callable[..., T], *arguments: Sequence[object], threads: int | None = None
 ) -> tuple[T, ...]:
-    """``map`` on threads, in order: decoding images releases Python's lock."""
+    """Map a function on threads, in order: decoding images releases Python's lock."""
     with ThreadPoolExecutor(threads) as pool:
         return tuple(pool.map(function, *arguments))
 
 
-def as_calibrated(pixels: np.ndarray, frame: Frame) -> np.ndarray:
+def as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
     """Return the pixels (H, W, C) of a photograph, turned as EXIF says if that is the frame's size.
 
     Viewers, OpenCV and Agisoft turn such a photograph; COLMAP, PyTorch's readers and the 3DGS
@@ -226,7 +248,9 @@ def as_calibrated(pixels: np.ndarray, frame: Frame) -> np.ndarray:
     )
 
 
-def _intrinsics(frame: Frame, shape: tuple[int, ...], size: tuple[int, int]) -> dict[str, float]:
+def _intrinsics(
+    frame: TransformsFrame, shape: tuple[int, ...], size: tuple[int, int]
+) -> ViewIntrinsics:
     values, (height, width) = frame.values, shape[:2]
     for key, given, actual in (("w", values.w, width), ("h", values.h, height)):
         if given is not None and given != actual:
@@ -242,7 +266,7 @@ def _intrinsics(frame: Frame, shape: tuple[int, ...], size: tuple[int, int]) -> 
     return {"fx": fx * x, "fy": fy * y, "cx": cx * x, "cy": cy * y}
 
 
-def _focal(frame: Frame, axis: str, side: int) -> float:
+def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
     focal, angle = (getattr(frame.values, f"{key}_{axis}") for key in ("fl", "camera_angle"))
     if focal is not None:
         return focal_length(focal, frame.where(f"fl_{axis}"), side)
@@ -253,7 +277,7 @@ def _focal(frame: Frame, axis: str, side: int) -> float:
     )
 
 
-def _principal(frame: Frame, key: str, side: int) -> float:
+def _principal(frame: TransformsFrame, key: str, side: int) -> float:
     value = getattr(frame.values, key)
     return side / 2 if value is None else principal_point(value, frame.where(key), side)
 
@@ -262,8 +286,8 @@ def _principal(frame: Frame, key: str, side: int) -> float:
 
 
 def _read_images(
-    config: DataConfig, frame: Frame, pixels: np.ndarray, size: tuple[int, int]
-) -> dict[str, Pixels | None]:
+    config: DataConfig, frame: TransformsFrame, pixels: np.ndarray, size: tuple[int, int]
+) -> ViewImages:
     """Return the images of a :class:`View`, at ``size``."""
     del size
     image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size)
@@ -276,8 +300,8 @@ def _read_images(
 
 
 def _unread_images(
-    config: DataConfig, frame: Frame, pixels: np.ndarray, size: tuple[int, int]
-) -> dict[str, Pixels | None]:
+    config: DataConfig, frame: TransformsFrame, pixels: np.ndarray, size: tuple[int, int]
+) -> ViewImages:
     """Return images that raise if their numbers are read."""
     del config
     files, (width, height), file = frame.files, size, frame.files["image"]
@@ -301,14 +325,16 @@ def _mask(config: DataConfig, file: Path, size: tuple[int, int]) -> Pixels:
     return compact_mask(mask)
 
 
-def _depth_unit(frame: Frame) -> float:
+def _depth_unit(frame: TransformsFrame) -> float:
     """Return the scene units of a number in the file of depths."""
     if (unit := frame.values.depth_unit_scale_factor) is not None:
         return unit
     return 1.0 if is_array(frame.files["depth"]) else DEPTH_IMAGE_UNIT
 
 
-def describe_extras(config: DataConfig, frames: Sequence[Frame]) -> tuple[tuple[str, ...], str]:
+def describe_extras(
+    config: DataConfig, frames: Sequence[TransformsFrame]
+) -> tuple[tuple[str, ...], str]:
     """Return the names of what some frames have and ``data.ignore_*`` leaves out; and a text.
 
     Names: ``distortion``, ``motion``, ``masks``, ``depth``. The text, for a description, has what

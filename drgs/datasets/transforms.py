@@ -19,8 +19,17 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetPydanticSchema,
+    Strict,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
+from pydantic_core.core_schema import no_info_after_validator_function
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.schema import DataConfig
@@ -29,7 +38,7 @@ from drgs.core.errors import UserError, listed, one_line
 from drgs.core.files import read_text, shortened
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.files import FileKind, find_files
-from drgs.datasets.types import Motion
+from drgs.datasets.types import CameraMotion
 from drgs.io.pictures import MAX_SIDE
 
 if TYPE_CHECKING:
@@ -119,7 +128,7 @@ POINT_CLOUD = FileKind(
 
 
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
-    """(4, 4) float64 camera to world in OpenCV axes, from the file's in OpenGL's."""
+    """Return the pose (4, 4) float64, camera to world, in OpenCV axes; the file's are OpenGL's."""
     if [len(row) for row in rows] != [4] * 4:
         raise ValueError("must be 4 x 4 numbers")
     matrix = np.array(rows, np.float64)
@@ -153,7 +162,12 @@ Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
 Angle = Annotated[Number, Field(ge=SMALLEST_ANGLE, le=LARGEST_ANGLE)]
 Text = Annotated[str, Field(min_length=1)]
 Rows = list[list[Annotated[Number, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]]]
-Pose = Annotated[Rows, AfterValidator(_opencv_pose)]
+Pose = Annotated[
+    np.ndarray,
+    GetPydanticSchema(
+        lambda _, handler: no_info_after_validator_function(_opencv_pose, handler(Rows))
+    ),
+]
 Model = Annotated[str, AfterValidator(_known_model)]
 
 
@@ -165,7 +179,7 @@ class CameraValues(BaseModel):
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
 
-    camera_angle_x: Angle | None = None  # radians, across the picture's width
+    camera_angle_x: Angle | None = None  # radians, across the image's width
     camera_angle_y: Angle | None = None
     fl_x: Positive | None = None  # px
     fl_y: Positive | None = None
@@ -200,7 +214,7 @@ class Transforms(CameraValues):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class TransformsFrame:
     """A photograph's camera, and its files."""
 
     values: FrameValues  # with those at the top of the file where the frame has none
@@ -218,7 +232,7 @@ class Frame:
         camera_to_world: np.ndarray,
         focal: tuple[float, float],
         principal: tuple[float, float] | None = None,
-    ) -> Frame:
+    ) -> TransformsFrame:
         """Return the frame of a photograph by a pinhole camera.
 
         source: the file or folder that has the pose, for messages; index: among the frames;
@@ -235,7 +249,13 @@ class Frame:
             own = FrameValues.model_validate({**values, "transform_matrix": opengl.tolist()})
         except ValidationError as error:
             raise UserError(f"{source}: frame {index}: {_explained(error.errors()[0])}") from None
-        return Frame(own, source, f"frames[{index}].", files={"image": image})
+        return TransformsFrame(own, source, f"frames[{index}].", files={"image": image})
+
+    @property
+    def file_path(self) -> str:
+        """The photograph's name in the file."""
+        assert self.values.file_path is not None, "frames without a name are rejected when read"
+        return self.values.file_path
 
     def where(self, key: str) -> str:
         """Return the file and the key, with the frame if that contains it, for messages."""
@@ -247,7 +267,7 @@ class TransformsFile:
     """A file and its frames."""
 
     path: Path
-    frames: Sequence[Frame]  # at least one
+    frames: Sequence[TransformsFrame]  # at least one
     point_cloud: str | None  # ply_file_path
     lists: Mapping[str, Sequence[str]]  # file names of train, val, test, where the file has them
     unread: Sequence[str]  # keys that are not read
@@ -260,21 +280,20 @@ def read_transforms(path: Path) -> TransformsFile:
     """
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     try:
-        content = json.loads(text)
-        meta = Transforms.model_validate(content)
+        meta = Transforms.model_validate(json.loads(text))
     except ValidationError as error:
         raise UserError(f"{path}: {_explained(error.errors()[0])}") from None
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
-    top = {name: getattr(meta, name) for name in CameraValues.model_fields} | meta.model_extra
+    top = {name: getattr(meta, name) for name in CameraValues.model_fields} | _extra(meta)
     frames = []
     for index, own in enumerate(meta.frames):
         inherited = {key: value for key, value in top.items() if getattr(own, key, None) is None}
         values = own.model_copy(update=inherited)
-        frames.append(Frame(values, path, f"frames[{index}].", inherited.keys()))
+        frames.append(TransformsFrame(values, path, f"frames[{index}].", inherited.keys()))
     names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
     lists = {split: listing for split, listing in names.items() if listing}
-    return TransformsFile(path, frames, meta.ply_file_path, lists, _unread(content))
+    return TransformsFile(path, frames, meta.ply_file_path, lists, _unread(meta))
 
 
 def note_unread(path: Path, keys: Sequence[str]) -> str:
@@ -282,13 +301,17 @@ def note_unread(path: Path, keys: Sequence[str]) -> str:
     return f"{path}: keys that are not read: {listed(keys, 8)}"
 
 
-def _unread(content: Mapping[str, object]) -> list[str]:
+def _extra(values: CameraValues) -> dict[str, object]:
+    """Return the values of keys that are no fields."""
+    return values.model_extra or {}
+
+
+def _unread(meta: Transforms) -> list[str]:
     """Return sorted keys; those of frames as ``frames[].key``."""
-    frames = content["frames"]
-    models = {values.get("camera_model") for values in (content, *frames)}
+    models = {values.camera_model for values in (meta, *meta.frames)}
     known = WITHOUT_EFFECT.union(*map(_coefficients, models))
-    top = content.keys() - Transforms.model_fields.keys() - known
-    in_frames = set().union(*frames) - FrameValues.model_fields.keys() - known
+    top = _extra(meta).keys() - known
+    in_frames = set().union(*map(_extra, meta.frames)) - known
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 
@@ -321,7 +344,9 @@ def _show(value: object) -> str:
 # Files of frames
 
 
-def frames_with_files(config: DataConfig, meta: TransformsFile, notes: list[str]) -> list[Frame]:
+def frames_with_files(
+    config: DataConfig, meta: TransformsFile, notes: list[str]
+) -> list[TransformsFrame]:
     """Return the frames whose files are there, with the paths of those that are not ignored.
 
     A frame without its depth stays. notes: on files that are taken under another name, and on
@@ -387,7 +412,7 @@ def principal_point(value: float, where: str, size: int) -> float:
     return value
 
 
-def lens_of(frame: Frame) -> Lens | None:
+def lens_of(frame: TransformsFrame) -> Lens | None:
     """Return the lens that a frame names, with its coefficients; None for a pinhole.
 
     Raises :class:`UserError` for coefficients that the lens does not have, and for a k4 that may be
@@ -397,14 +422,15 @@ def lens_of(frame: Frame) -> Lens | None:
     from drgs.cameras.lens import LENSES
 
     model, values = frame.values.camera_model, frame.values
-    name, is_of_colmap = LENS_OF_MODEL.get(model, model), model is None or model in LENS_OF_MODEL
+    name = "opencv" if model is None else LENS_OF_MODEL.get(model, model)
+    is_of_colmap = model is None or model in LENS_OF_MODEL
     given = {k: v for k in _coefficients(model) if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             raise UserError(f"{frame.where(key)} must be a finite number, got {_show(value)}")
     if is_of_colmap:
         given = {key: value for key, value in given.items() if value}
-        if name in (None, "opencv"):
+        if name == "opencv":
             name = "fisheye" if values.is_fisheye else "opencv" if given else "pinhole"
         elif given.keys() <= {"k1", "k2", "k3", "k4"}:  # thin prisms of zero
             name = "fisheye"
@@ -431,13 +457,13 @@ def lens_of(frame: Frame) -> Lens | None:
         raise UserError(f"{frame.where('camera_model')}: {error}") from error
 
 
-def motion_of(frame: Frame, samples: int) -> Motion | None:
+def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:
     """Return the camera's motion while the shutter was open; None: it stands still.
 
     samples: times at which what a global shutter blurs is rendered.
     """
     close = frame.values.transform_matrix_close
-    return None if close is None else Motion(close, frame.values.shutter or "global", samples)
+    return None if close is None else CameraMotion(close, frame.values.shutter or "global", samples)
 
 
 def unique_names(files: Sequence[str]) -> list[str]:

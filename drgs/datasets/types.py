@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import EllipsisType
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
@@ -32,7 +33,9 @@ class LazyImage:
             raise ValueError("a lazy image becomes an array only by a copy")
         return np.asarray(self.compute(), dtype)
 
-    def __getitem__(self, index: object) -> np.ndarray:
+    def __getitem__(
+        self, index: int | slice | tuple[int | slice | EllipsisType | None, ...] | np.ndarray
+    ) -> np.ndarray:
         """Return some of the numbers."""
         return self.compute()[index]
 
@@ -46,12 +49,12 @@ Pixels = np.ndarray | LazyImage
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class CameraMotion:
     """Motion of a camera while its shutter is open."""
 
     close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: the pose at the end
     shutter: str  # global: all pixels were open all the time; rolling: row after row
-    samples: int = SHUTTER_SAMPLES  # global: times at which the picture is rendered
+    samples: int = SHUTTER_SAMPLES  # global: times at which the image is rendered
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,21 +70,21 @@ class Viewpoint:
     width: int  # px
     height: int  # px
     lens: Lens | None = None  # with numbers of the host; None: a pinhole
-    motion: Motion | None = None  # while the shutter is open; None: the camera does not move
+    motion: CameraMotion | None = None  # while the shutter is open; None: the camera does not move
 
     @property
     def center(self) -> np.ndarray:
-        """(3,) position of the camera, world."""
+        """Position (3,) of the camera, world."""
         return self.camera_to_world[:3, 3]
 
     @property
     def K(self) -> np.ndarray:  # noqa: N802
-        """(3, 3) float64: camera coordinates to homogeneous pixel coordinates."""
+        """Matrix (3, 3) float64 from camera coordinates to homogeneous pixel coordinates."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
 
     @property
     def viewmat(self) -> np.ndarray:
-        """(4, 4) float64, world to camera, OpenCV axes, as ``drgs.rasterization`` takes it."""
+        """Pose (4, 4) float64, world to camera, OpenCV axes, as ``drgs.rasterization`` takes it."""
         rotation = self.camera_to_world[:3, :3].T
         viewmat = np.eye(4)
         viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])

@@ -12,12 +12,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import UserError, UserNote
 from drgs.datasets.transforms import (
     MAX_COORDINATE,
-    Frame,
+    TransformsFrame,
     focal_from_angle,
     focal_length,
     lens_of,
@@ -42,10 +43,11 @@ def pinhole(name: str, pose: np.ndarray, width: int, height: int, fov: float) ->
     return Viewpoint(name, pose, focal, focal, width / 2, height / 2, width, height)
 
 
-def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(4, 4) camera to world, OpenCV axes, of a camera at ``origin`` that looks at ``target``.
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
+    """Return the pose of a camera at ``origin`` that looks at ``target``.
 
-    origin, target, up: (3,) world; ``up`` points up in the picture and has any length.
+    The pose is (4, 4), camera to world, OpenCV axes. origin, target, up: (3,) world; ``up`` points
+    up in the image and has any length.
 
     Raises :class:`UserError` where they determine no camera.
     """
@@ -100,7 +102,7 @@ def read_viewpoints(
 
 
 def _viewpoint_of(
-    frame: Frame, name: str, size: tuple[int, int] | None, shutter_samples: int
+    frame: TransformsFrame, name: str, size: tuple[int, int] | None, shutter_samples: int
 ) -> Viewpoint:
     values = frame.values
 
@@ -111,8 +113,9 @@ def _viewpoint_of(
 
     if size is None:
         given = (value_of(side, "give --size WIDTH HEIGHT instead") for side in ("w", "h"))
-        size = tuple(max(1, round(side)) for side in given)
-    width, height = size
+        width, height = (max(1, round(side)) for side in given)
+    else:
+        width, height = size
 
     def scaled(key: str, side: str, check: Callable[[float, str, int], float]) -> float:
         """Return px of the wanted image from px of the file's."""

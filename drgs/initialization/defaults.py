@@ -54,7 +54,8 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     changes: dict[str, object] = {}
     if config.data.background is None:
         names = {color: name for name, color in NAMED_COLORS.items()}
-        background = tuple(map(float, dataset.background))
+        red, green, blue = map(float, dataset.background)
+        background = red, green, blue
         changes["data.background"] = names.get(background, background)
     distance = _viewing_distance(dataset)
     if config.model.near is None:

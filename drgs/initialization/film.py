@@ -56,7 +56,9 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
     return film.x.numpy(), film.y.numpy(), depth.numpy()
 
 
-def _through_pinhole(view: Viewpoint, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Columns:
+def _through_pinhole(
+    view: Viewpoint, x: np.ndarray, y: np.ndarray, z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     seen = z > 0
     inverse = 1 / np.where(seen, z, 1)
     u = float(view.fx) * (x * inverse) + float(view.cx)

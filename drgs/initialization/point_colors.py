@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from drgs.core.environment import denormals_kept
 from drgs.datasets.types import View
@@ -40,7 +40,7 @@ def colors_from_images(
     views: Sequence[View],
     background: tuple[float, float, float],
 ) -> np.ndarray | None:
-    """(N, 3) float32, display space 0..1; None: no image shows any of the points.
+    """Return colours (N, 3) float32, display space 0..1; None: no image shows any of the points.
 
     points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: of
     the composited images, display space. A point that no image shows gets the colour of the nearest
@@ -62,7 +62,7 @@ def colors_from_images(
         return None
     if unseen.any():
         with denormals_kept():
-            _, nearest = cKDTree(points[~unseen]).query(points[unseen])
+            _, nearest = KDTree(points[~unseen]).query(points[unseen])
         colors[unseen] = colors[~unseen][nearest]
     return colors
 
@@ -99,7 +99,7 @@ def _shown(
 
 
 def _middle(samples: np.ndarray) -> np.ndarray:
-    """(N, 3): means of the middle half of (V, N, 3), channel by channel; NaN: there are none.
+    """Return means (N, 3) of the middle half of (V, N, 3), channel by channel; NaN: there are none.
 
     inf: not a sample. Of n, floor(n / 4) are left out at either end.
     """

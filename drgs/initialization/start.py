@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.constants import SH_C0
@@ -23,10 +23,10 @@ from drgs.initialization.start_box import (
     box_looked_at,
     box_to_start_in,
     focus_of,
+    focus_text,
     num_looking,
     points_in_view,
     shown,
-    where_they_look,
 )
 from drgs.io.ply import read_points
 
@@ -148,7 +148,7 @@ def _on_hull(
         if config.init.half_extent is not None:
             raise
         return None
-    means = hull_points(silhouettes, box, config.init.num_points, config.seed)
+    means = hull_points(silhouettes, box, _num_points(config.init), config.seed)
     if len(means) <= NUM_NEIGHBOURS:
         return None
     what = f"{len(means):,} points on the hull of {len(silhouettes)} masks"
@@ -190,18 +190,23 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
     return positions, colors / np.float32(255), len(kept)
 
 
+def _num_points(init: InitConfig) -> int:
+    assert init.num_points is not None, "resolve_defaults sets it"
+    return init.num_points
+
+
 def _random_points(config: FitConfig, dataset: Dataset) -> Start:
     """Return random points in a box, or in all that the cameras see."""
-    init, rng = config.init, np.random.default_rng(config.seed)
-    box = box_to_start_in(init, dataset)
+    num_points, rng = _num_points(config.init), np.random.default_rng(config.seed)
+    box = box_to_start_in(config.init, dataset)
     if box is not None:
-        what = f"{init.num_points:,} random points in {box}"
-        return Start(box.points(init.num_points, rng), None, what)
-    means = points_in_view(dataset.train, init.num_points, rng)
+        what = f"{num_points:,} random points in {box}"
+        return Start(box.points(num_points, rng), None, what)
+    means = points_in_view(dataset.train, num_points, rng)
     focus, distance = focus_of(dataset.train)
     near = f"about within {distance:.3g} of {shown(focus, distance)}"
     far = f"the others up to {FARTHEST:g} times as far"
-    what = f"{init.num_points:,} random points that the cameras see, part of them {near}, {far}"
+    what = f"{num_points:,} random points that the cameras see, part of them {near}, {far}"
     return Start(means, None, what)
 
 
@@ -254,11 +259,11 @@ def _median_radius(points: np.ndarray) -> float:
 
 
 def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
-    """(N,) float64: mean squared distance of each of (N, 3) points to the 3 nearest others."""
+    """Return mean squared distances (N,) float64 of (N, 3) points to the 3 nearest others."""
     # SciPy divides points by the number next to the least. If that is taken for zero, it divides
     # points with a coordinate of zero for ever, until the stack ends.
     with denormals_kept():
-        distances, _ = cKDTree(points).query(points, k=NUM_NEIGHBOURS + 1)
+        distances, _ = KDTree(points).query(points, k=NUM_NEIGHBOURS + 1)
     # The nearest is the point itself, or one at the same place: at distance 0 either way.
     return np.mean(distances[:, 1:] ** 2, axis=1)
 
@@ -277,7 +282,7 @@ def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Da
     looking = num_looking(points, views)
     if looking < LEAST_LOOKING * len(views):
         raise UserError(
-            f"{file}: must hold what the cameras look at{where_they_look(dataset)}, in their frame "
+            f"{file}: must hold what the cameras look at{focus_text(dataset)}, in their frame "
             f"of reference, but only {looking} of {len(views)} have any of its {num:,} points in "
             "the middle of their pictures; give another init.point_cloud, or start from random "
             "points (init.point_cloud=null, data.ignore_points=true)"

@@ -56,7 +56,7 @@ class Box:
     half_extent: float  # world units
 
     def points(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """(count, 3) float64: uniform."""
+        """Return uniform random points (count, 3) float64."""
         return self.center + rng.uniform(-self.half_extent, self.half_extent, (count, 3))
 
     def __str__(self) -> str:
@@ -106,13 +106,13 @@ def _half_width(views: Sequence[Viewpoint]) -> float:
 
 
 def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3) float64: random points in the cameras' views, around their focus and behind it.
+    """Return random points (count, 3) float64 in the cameras' views, around and behind their focus.
 
     The cube's half extent is the distance D to the focus: it holds what is looked at and as much
     again behind it. Half of the points are uniform in it. The others are for walls and skies: in
     any direction uniform in one over the distance, out to 10 D, as Mip-NeRF 360 (Barron et al.
     2022) contracts space. Points that no camera sees would never be moved or removed, and one close
-    to a camera covers its picture, so only points are kept that lie in a picture and nowhere nearer
+    to a camera covers its image, so only points are kept that lie in an image and nowhere nearer
     than D / 4 to a camera.
     """
     focus, distance = focus_of(views)
@@ -130,7 +130,7 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
 
 
 def _near_and_far(count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3): in and around the cube [-1, 1]^3."""
+    """Return random points (count, 3) in and around the cube [-1, 1]^3."""
     points = rng.uniform(-1, 1, (count, 3))
     is_far = rng.random(count) < FAR_SHARE
     size = np.abs(points[is_far]).max(axis=1, keepdims=True)  # 1: on the cube's surface
@@ -139,7 +139,7 @@ def _near_and_far(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _are_seen(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
-    """(N,) bool: whether points (N, 3) are in an image, and ``keep_out`` from every camera."""
+    """Return whether (N,) points (N, 3) are in an image, and ``keep_out`` from every camera."""
     seen, clear = np.zeros(len(points), bool), np.ones(len(points), bool)
     for view in views:
         offsets = points - view.center
@@ -149,7 +149,7 @@ def _are_seen(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -
 
 
 def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndarray:
-    """(N,) bool: whether points are in the middle ``part`` of the image's width and height."""
+    """Return whether (N,) points are in the middle ``part`` of the image's width and height."""
     x, y, z = ((points - view.center) @ view.camera_to_world[:3, :3]).T
     # In pixels times z, so that nothing is divided by a depth near zero.
     u, v = view.fx * x + view.cx * z, view.fy * y + view.cy * z
@@ -170,7 +170,7 @@ def num_looking(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
     return sum(bool(_in_image(points, view, MIDDLE).any()) for view in views)
 
 
-def where_they_look(dataset: Dataset) -> str:
+def focus_text(dataset: Dataset) -> str:
     """Return the place that the cameras look at, world, for a message; "" where there is none."""
     try:
         focus, distance = focus_of(dataset.train)
@@ -193,7 +193,7 @@ def check_box(box: Box, dataset: Dataset) -> None:
     in_world = Box(box.center + dataset.origin, box.half_extent)
     raise UserError(
         f"init.half_extent: the start box {in_world} must be what the cameras look at"
-        f"{where_they_look(dataset)}, but {reason}; set init.half_extent=null, and it follows "
+        f"{focus_text(dataset)}, but {reason}; set init.half_extent=null, and it follows "
         "from them"
     )
 

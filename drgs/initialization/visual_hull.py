@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from drgs.core.environment import denormals_kept
 from drgs.datasets.types import View
@@ -84,11 +84,11 @@ def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
 
     A pixel that a mask leaves out is not known to be empty, and so is part of the silhouette.
     """
-    views = [v for v in thinned(views) if v.alpha is not None and is_projectable(v)]
+    views = [v for v in thin_out(views) if v.alpha is not None and is_projectable(v)]
     return [_silhouette(view) for view in views]
 
 
-def thinned(views: Sequence[View]) -> Sequence[View]:
+def thin_out(views: Sequence[View]) -> Sequence[View]:
     """Return all views, or every n-th of many."""
     return views[:: -(-len(views) // MAX_VIEWS) or 1]
 
@@ -123,7 +123,7 @@ def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
     """Return whether the alpha of nearly all ``views`` cuts out what is to be fitted."""
-    wanted = LEAST_MASKED * len(thinned(views))
+    wanted = LEAST_MASKED * len(thin_out(views))
     return num_transparent(silhouettes) >= max(LEAST_VIEWS, wanted)
 
 
@@ -146,22 +146,22 @@ class Cubes:
         return len(self.index)
 
     def centers(self) -> np.ndarray:
-        """(N, 3) float64, world."""
+        """Return centres (N, 3) float64, world."""
         return self.low + self.edge * (self.index + 0.5)
 
-    def divided(self) -> Cubes:
+    def divide(self) -> Cubes:
         """Return eight cubes in the place of each."""
         eighths = np.argwhere(np.ones((2, 2, 2), bool))
         index = (2 * self.index[:, None] + eighths).reshape(-1, 3)
         return Cubes(self.low, self.edge / 2, index)
 
-    def chosen(self, rows: np.ndarray) -> Cubes:
+    def select(self, rows: np.ndarray) -> Cubes:
         """Return some of the cubes; rows: a mask or indices."""
         return Cubes(self.low, self.edge, self.index[rows])
 
 
 def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: int) -> np.ndarray:
-    """(M, 3) float64, world: points on the surface of the visual hull within ``box``.
+    """Return points (M, 3) float64, world, on the surface of the visual hull within ``box``.
 
     At most ``count``, about evenly spread, each at a random place within a cube of its own: M is
     about ``count``, unless images contradict each other and there is no hull, which is M = 0.
@@ -190,36 +190,36 @@ def _surface(silhouettes: Sequence[Silhouette], cubes: Cubes, levels: int, enoug
     for level in range(levels + 1):
         centers, edge = cubes.centers(), MARGIN * cubes.edge
         shown = np.flatnonzero(_shown_by_all(silhouettes, centers, edge))
-        cubes = cubes.chosen(shown[_half_empty(silhouettes, centers[shown], edge)])
+        cubes = cubes.select(shown[_half_empty(silhouettes, centers[shown], edge)])
         if level == levels or len(cubes) >= enough or not len(cubes):
             break
-        cubes = cubes.divided()
+        cubes = cubes.divide()
     return cubes
 
 
 def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np.ndarray:
-    """(M, 3): points of the hull near its surface, at most one in each eighth of a cube."""
+    """Return points (M, 3) of the hull near its surface, at most one in each eighth of a cube."""
     random, found = np.random.Generator(np.random.Philox(key=seed)), [np.zeros((0, 3))]
     for some in _chunks(np.arange(len(cubes))):
-        eighths = cubes.chosen(some).divided()
+        eighths = cubes.select(some).divide()
         points = eighths.centers() + eighths.edge * (random.random((len(eighths), 3)) - 0.5)
         found.append(points[_shown_by_all(silhouettes, points, 0.0)])
     inside = np.concatenate(found)
     thin = cubes
     if len(inside):
         with denormals_kept():
-            distance, _ = cKDTree(inside).query(cubes.centers())
-        thin = cubes.chosen(distance > THIN * cubes.edge)
+            distance, _ = KDTree(inside).query(cubes.centers())
+        thin = cubes.select(distance > THIN * cubes.edge)
     surface = inside[_half_empty(silhouettes, inside, SHELL * cubes.edge / 2)]
     return np.concatenate([surface, _thin_points(silhouettes, thin)])
 
 
 def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
-    """(M, 3): where cubes without a point have parts of the hull, at most one in each eighth."""
+    """Return points (M, 3) of the hull in cubes without a point, at most one in each eighth."""
     levels = 0
     while levels == 0 or (levels < THIN_LEVELS and len(cubes) <= CHUNK):
-        cubes = cubes.divided()
-        cubes = cubes.chosen(_shown_by_all(silhouettes, cubes.centers(), cubes.edge))
+        cubes = cubes.divide()
+        cubes = cubes.select(_shown_by_all(silhouettes, cubes.centers(), cubes.edge))
         levels += 1
     _, first = np.unique(cubes.index >> (levels - 1), axis=0, return_index=True)
     return cubes.centers()[np.sort(first)]
@@ -228,7 +228,7 @@ def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
 def _shown_by_all(
     silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float
 ) -> np.ndarray:
-    """(N,) bool: cubes that no image shows empty, and that enough of the images show.
+    """Return which (N,) cubes no image shows empty, and enough of the images show.
 
     centers: (N, 3) world; edge 0: points.
     """
@@ -248,7 +248,7 @@ def _shown_by_all(
 
 
 def _half_empty(silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float) -> np.ndarray:
-    """(N,) bool: cubes that some image shows with a transparent pixel; centers: (N, 3) world."""
+    """Return which (N,) cubes some image shows with a transparent pixel; centers: (N, 3) world."""
     columns = [np.ascontiguousarray(c) for c in centers.T]
     rows, result = np.arange(len(centers)), np.zeros(len(centers), bool)
     for silhouette in silhouettes:

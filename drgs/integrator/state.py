@@ -321,11 +321,6 @@ class SplatsState:
         )
 
 
-def is_splats(node: object) -> bool:
-    """Return whether an object of Mitsuba is the integrator ``splats``."""
-    return isinstance(getattr(node, "state", None), SplatsState)
-
-
 def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
     """Return the columns of features by name; PluginError where objects differ."""
     found: dict[str, int] = {}

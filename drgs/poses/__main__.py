@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> None:
 def fit_command(folder: Path) -> str:
     """Return the command that fits the folder with its new model."""
     words = ["drgs", "fit", str(folder)]
-    if find_reader(DataConfig(path=folder))[0] != "colmap":
+    if find_reader(DataConfig.model_validate({"path": folder}))[0] != "colmap":
         words += ["--set", "data.type=colmap"]
     return shlex.join(words)
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from PIL import ExifTags, Image
@@ -34,6 +34,9 @@ from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
 from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.io.pictures import check_readable, image_size, write_png
+
+if TYPE_CHECKING:
+    import pycolmap
 
 CAMERA_MODELS = tuple(LENS_OF_MODEL)
 
@@ -71,6 +74,8 @@ SEED = 0
 
 REMEDY = "if memory or the disk is full, free some of it, or take fewer or smaller photographs"
 """Remedy where COLMAP gives up, which does not always tell the reason."""
+
+T = TypeVar("T")
 
 Watch = Callable[[str, int, int], None]
 """Takes the name of what is counted, the number done, and the total."""
@@ -257,7 +262,7 @@ class _Reconstruction:
     search: Search
     watch: Watch
 
-    def largest(self) -> tuple[Any, int]:
+    def largest(self) -> tuple[pycolmap.Reconstruction, int]:
         """Return the largest reconstruction, and the number of all."""
         if len(self.names) < LEAST_PLACED:
             raise UserError(
@@ -281,8 +286,8 @@ class _Reconstruction:
         return self.folder / "database.db"
 
     def _chunks(
-        self, what: str, items: Sequence[Any], size: int, done: int, total: int
-    ) -> Iterator:
+        self, what: str, items: Sequence[T], size: int, done: int, total: int
+    ) -> Iterator[Sequence[T]]:
         """Yield ``items`` in chunks of ``size``, counted from ``done`` of ``total``."""
         for start in range(0, len(items), size):
             self.watch(what, done + start, total)
@@ -387,7 +392,7 @@ class _Reconstruction:
             if compares_all or j - i in steps or (i % STRIDE == 0 and j % STRIDE == 0):
                 yield i, j
 
-    def _map(self) -> list[Any]:
+    def _map(self) -> list[pycolmap.Reconstruction]:
         """Reconstruct cameras and points."""
         options = self.pycolmap.IncrementalPipelineOptions()
         options.random_seed = SEED
@@ -422,7 +427,7 @@ def _size_and_lens(file: Path) -> tuple[object, ...]:
     return *image_size(file), *map(str, lens)
 
 
-def _described(found: Any, names: Sequence[str], num_models: int) -> Placed:
+def _described(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> Placed:
     placed = {image.name for image in found.images.values() if image.has_pose}
     cameras = tuple(
         f"{camera.model.name} {camera.width} x {camera.height} px "

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.history import FitHistory
@@ -51,7 +52,7 @@ THEMES = (LIGHT, DARK)
 
 @dataclass(frozen=True)
 class Panel:
-    """One curve."""
+    """A curve."""
 
     title: str
     x: np.ndarray  # (n,)
@@ -105,7 +106,9 @@ def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarr
 def write_curves(path: Path, history: FitHistory) -> None:
     """Write an image of all curves."""
     figure = new_figure(11, 6, paper=LIGHT.paper)
-    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
+    layout = figure.get_layout_engine()
+    assert isinstance(layout, ConstrainedLayoutEngine), "new_figure sets it"
+    layout.set(w_pad=0.1, h_pad=0.1)
     for axis, panel in zip(figure.subplots(2, 3).flat, panels_of(history), strict=True):
         _draw(axis, panel, LIGHT)
     write_figure(path, figure)

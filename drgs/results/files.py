@@ -28,4 +28,4 @@ RESULTS = (
     *(BUDGET_PLAN, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, RENDERS, REPORT, SIDE_BY_SIDE, TENSORBOARD),
     *(VIEWER, VIEWS),
 )
-"""All of them but ``config.yml``."""
+"""Files of a fit but for ``config.yml``."""

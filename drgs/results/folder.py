@@ -44,11 +44,11 @@ DATA_PATHS = ("data.path", "init.point_cloud")
 """Values that are also recorded relative to the folder."""
 
 
-def claim_output_folder(folder: Path, config: FitConfig, pictures: Sequence[str] = ()) -> None:
+def claim_output_folder(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
     """Make ``folder`` (absolute or relative to the current one) the output folder of a run.
 
     Creates it, with its parents, and writes ``config.yml``; what else it contains stays as it is.
-    pictures: names from :func:`pictures_of`.
+    images: names from :func:`image_names`.
 
     Raises :class:`UserError` as :func:`check_output_folder`, and where it cannot be written.
     """
@@ -56,11 +56,11 @@ def claim_output_folder(folder: Path, config: FitConfig, pictures: Sequence[str]
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unusable(folder, error) from error
-    check_output_folder(folder, config, pictures)
-    continue_run(folder, config, pictures)
+    check_output_folder(folder, config, images)
+    continue_run(folder, config, images)
 
 
-def check_output_folder(folder: Path, config: FitConfig, pictures: Sequence[str] = ()) -> None:
+def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
     """Raise :class:`UserError` for a folder with results of another run, or files of others."""
     if not (present := _visible_names(folder)):
         return
@@ -83,15 +83,15 @@ def check_output_folder(folder: Path, config: FitConfig, pictures: Sequence[str]
             f"{folder}: already holds another run, {differences}; choose another folder with "
             f"--out, continue that run with --resume {folder}, or replace it with --overwrite"
         )
-    record.check(_file_names(pictures), earlier=_file_names(pictures))
+    record.check(_file_names(images), earlier=_file_names(images))
 
 
-def continue_run(folder: Path, config: FitConfig, pictures: Sequence[str] = ()) -> None:
+def continue_run(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
     """Continue the run in ``folder``; config: its own, with the present paths of its data.
 
     Raises :class:`UserError` where files of others would be replaced.
     """
-    record, names = FolderRecord(folder, COMMAND), _file_names(pictures)
+    record, names = FolderRecord(folder, COMMAND), _file_names(images)
     record.check(names, earlier=names)
     remove_stale_temporaries(folder)
     paths = {
@@ -108,7 +108,7 @@ def seal_run(folder: Path) -> None:
     FolderRecord(folder, COMMAND).seal()
 
 
-def pictures_of(split: str, views: Sequence[str]) -> list[str]:
+def image_names(split: str, views: Sequence[str]) -> list[str]:
     """Return the images of a split with views of these names, relative to the folder."""
     return [f"{kind}/{split}/{view}.png" for kind in (RENDERS, SIDE_BY_SIDE) for view in views]
 
@@ -165,14 +165,14 @@ def load_moved_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
     overrides: see :func:`load_config`; a start point within the data has moved with it.
     """
     before = load_run_config(folder)
-    config = found_again(folder, load_run_config(folder, overrides))
+    config = relocate_data(folder, load_run_config(folder, overrides))
     cloud, data = config.init.point_cloud, before.data.path
     if cloud is None or cloud.exists() or not cloud.is_relative_to(data):
         return config
     return changed(config, {"init.point_cloud": config.data.path / cloud.relative_to(data)})
 
 
-def found_again(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PATHS) -> FitConfig:
+def relocate_data(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PATHS) -> FitConfig:
     """Return a run's configuration with the present paths of its data; keys: of DATA_PATHS.
 
     A path that does not exist is looked for at its recorded place relative to the folder, as both
@@ -190,11 +190,11 @@ def found_again(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PATH
     return changed(config, changes) if changes else config
 
 
-def remove_run(folder: Path, pictures: Sequence[str] = ()) -> None:
+def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
     """Remove the run in ``folder``, if any, to make room for another.
 
     ``metrics.json`` goes first and ``config.yml`` last: an interrupted removal leaves the folder of
-    an unfinished run. pictures: of the coming run.
+    an unfinished run. images: of the coming run.
 
     Raises :class:`UserError`, with nothing removed, where ``folder`` contains more than a run.
     """
@@ -202,7 +202,7 @@ def remove_run(folder: Path, pictures: Sequence[str] = ()) -> None:
     record, files = FolderRecord(folder, COMMAND), list(_files(folder))
     if names:
         load_run_config(folder)
-        _refuse_strangers(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, pictures)
+        _refuse_strangers(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, images)
     elif not os.path.lexists(folder):
         return
     remove_stale_temporaries(folder)
@@ -222,13 +222,13 @@ def _refuse_strangers(
     record: FolderRecord,
     strangers: list[str],
     files: list[str],
-    pictures: Sequence[str],
+    images: Sequence[str],
 ) -> None:
     """Raise :class:`UserError` for files that no fit has written, and the names ``strangers``."""
     if record.exists:
         strangers += record.strangers(files)
     else:
-        known = set(_file_names(pictures))
+        known = set(_file_names(images))
         strangers += [n for n in files if n not in known or not _is_file(folder / n)]
     if not _is_written_by_fit(folder / CONFIG):
         strangers.append(CONFIG)
@@ -253,9 +253,9 @@ def _files(folder: Path) -> Iterator[str]:
             yield from ((Path(inside).relative_to(folder) / file).as_posix() for file in kept)
 
 
-def _file_names(pictures: Sequence[str]) -> list[str]:
+def _file_names(images: Sequence[str]) -> list[str]:
     """Return the files that a fit writes, but for ``config.yml``: its content tells its writer."""
-    return [*(name for name in RESULTS if name not in FOLDERS), EVENTS, *pictures]
+    return [*(name for name in RESULTS if name not in FOLDERS), EVENTS, *images]
 
 
 def _visible_names(folder: Path) -> list[str]:
@@ -303,7 +303,7 @@ def _differences_of_run(folder: Path, config: FitConfig) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserNote)
-            run = found_again(folder, load_run_config(folder))
+            run = relocate_data(folder, load_run_config(folder))
     except UserError:
         return f"with a {CONFIG} that is not readable"
     theirs, ours = (

@@ -12,7 +12,7 @@ from drgs.core.files import atomic_path
 
 @dataclass(frozen=True)
 class HistoryRow:
-    """One line of ``history.csv``."""
+    """A line of ``history.csv``."""
 
     iteration: int  # the first is 1
     loss: float
@@ -38,7 +38,7 @@ class DensityReport:
 
 @dataclass(frozen=True, kw_only=True)
 class DensityRow(DensityReport):
-    """One line of ``density.csv``: changes after an iteration."""
+    """A line of ``density.csv``: changes after an iteration."""
 
     iteration: int  # the first is 1
 

@@ -1,6 +1,6 @@
 """Image quality as papers report it: PSNR and SSIM in float64 numpy.
 
-Reads finished pictures on the host, (H, W, 3) in display space, and shares no code with
+Reads finished images on the host, (H, W, 3) in display space, and shares no code with
 ``drgs.training.losses``: one checks the other. Not differentiated.
 """
 
@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
+
+if TYPE_CHECKING:
+    from typing_extensions import NotRequired
 
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 """The Gaussian window of Wang et al. 2004, section III.B: 11 pixels, sigma 1.5, unit sum."""
@@ -57,14 +60,14 @@ class FitMetrics(Circumstances):
     viewers: NotRequired[SplitMetrics]  # of the file for viewers, rendered as these do
     seed: int
     command: str  # the line that was typed
-    config: dict[str, object]
+    config: dict[str, Any]  # as YAML has it
 
 
 def psnr(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> float:
     """Return the peak signal-to-noise ratio in dB, -10 log10(mean squared error).
 
     image, target: (H, W, 3) display space, clamped to [0, 1] (the peak is 1). mask: (H, W), 1 where
-    a pixel counts. Infinite for equal pictures, NaN if a pixel is.
+    a pixel counts. Infinite for equal images, NaN if a pixel is.
     """
     image, target = _prepare("psnr()", image, target)
     with np.errstate(divide="ignore"):
@@ -98,13 +101,15 @@ def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarra
     return luminance * contrast_structure
 
 
-def mean_quality(pairs: Iterable[tuple[ArrayLike | None, ...]]) -> Quality:
+def mean_quality(
+    pairs: Iterable[tuple[ArrayLike, ArrayLike] | tuple[ArrayLike, ArrayLike, ArrayLike | None]],
+) -> Quality:
     """Return the means over views of PSNR and SSIM, each view weighing the same.
 
     pairs: (image, target) of each view, perhaps its mask; may be a generator, one view is held at a
     time.
     """
-    return mean_of([(psnr(*pair), ssim(*pair)) for pair in pairs])
+    return mean_of([(psnr(x, y, *mask), ssim(x, y, *mask)) for x, y, *mask in pairs])
 
 
 def mean_of(scores: Sequence[tuple[float, float]]) -> Quality:
@@ -117,7 +122,7 @@ def mean_of(scores: Sequence[tuple[float, float]]) -> Quality:
 
 def _mean(values: np.ndarray, mask: ArrayLike | None) -> float:
     """Return the mean over the pixels that count; NaN if none does."""
-    return np.mean(values) if mask is None else np.mean(values[np.asarray(mask) > 0])
+    return float(np.mean(values if mask is None else values[np.asarray(mask) > 0]))
 
 
 def _windowed(values: np.ndarray) -> np.ndarray:

@@ -25,8 +25,9 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
 from drgs.integrator.summary import described, summary_of_views
+from drgs.integrator.types import is_splats
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
-from drgs.results.folder import found_again
+from drgs.results.folder import relocate_data
 from drgs.results.refined_cameras import refined_dataset
 
 Background = tuple[float, float, float] | Path
@@ -120,7 +121,9 @@ class Model:
         if "distortion" not in self.ignored:
             check_lenses(self.settings, views, where="", remedy="give --ignore distortion")
         scene = self.scene()
-        summary = summary_of_views(scene.integrator().state, views, self.from_header)
+        integrator = scene.integrator()
+        assert is_splats(integrator), "scene() sets it"
+        summary = summary_of_views(integrator.state, views, self.from_header)
         print(described(summary), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
         return folder.claim(names, self.render(scene, views))
@@ -168,8 +171,8 @@ def load_model(
                 )
         config_path, path = scene or what / CONFIG, what / GAUSSIANS
     config = None if config_path is None else load_open_config(config_path, overrides, background)
-    if what.is_dir() and scene is None:
-        config = found_again(what, config, ("data.path",))
+    if config is not None and what.is_dir() and scene is None:
+        config = relocate_data(what, config, ("data.path",))
     gaussians = Gaussians.load(path)
     if config is not None:
         settings, default_background = config.model, config.data.background_rgb

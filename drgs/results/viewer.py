@@ -62,14 +62,14 @@ FILE_AXES = np.diag([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Standpoint:
+class InitialView:
     """The first camera of the page, and the orbit around which one walks."""
 
     camera: Viewpoint
     orbit: Orbit
 
     @staticmethod
-    def of_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> Standpoint:
+    def from_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> InitialView:
         """Return the training camera that is the nearest in direction to where orbits start.
 
         gaussians: tell the middle, where no cameras do.
@@ -80,18 +80,18 @@ class Standpoint:
         offsets = np.stack([view.center - orbit.focus for view in views])
         lengths = np.linalg.norm(offsets, axis=1)
         cosines = offsets @ start / np.where(lengths > 0, lengths, 1)
-        return Standpoint(views[int(np.argmax(cosines))], orbit)
+        return InitialView(views[int(np.argmax(cosines))], orbit)
 
     @staticmethod
-    def of_gaussians(gaussians: Gaussians, up: np.ndarray) -> Standpoint:
+    def from_gaussians(gaussians: Gaussians, up: np.ndarray) -> InitialView:
         """Return a camera with all but outliers in a square window; up: (3,) world, any length."""
         orbit = orbit_of_gaussians(gaussians, up, FIELD_OF_VIEW)
         (camera,) = orbit.viewpoints(1, 1, 1, FIELD_OF_VIEW)
-        return Standpoint(camera, orbit)
+        return InitialView(camera, orbit)
 
     @property
     def target(self) -> np.ndarray:
-        """(3,) world: the point on the camera's optical axis that is the nearest to the focus.
+        """Point (3,), world, on the camera's optical axis that is nearest to the focus.
 
         Where that is behind the camera or next to it: the point at the orbit's radius.
         """
@@ -125,7 +125,7 @@ def shows_as_fitted(approximations: Approximations) -> bool:
 
 
 def viewer_page(
-    title: str, shown: Shown, standpoint: Standpoint, background: tuple[float, float, float]
+    title: str, shown: Shown, initial_view: InitialView, background: tuple[float, float, float]
 ) -> bytes:
     """Return the page, UTF-8; equal arguments give equal bytes.
 
@@ -134,7 +134,7 @@ def viewer_page(
 
     Raises ``drgs.core.errors.UserError`` for Gaussians with numbers that are not finite.
     """
-    move = standpoint.to_page
+    move = initial_view.to_page
     in_file = Similarity(move.scale, FILE_AXES @ move.rotation, FILE_AXES @ move.translation)
     gaussians = replace(shown.gaussians.numpy(), origin=WORLD)  # the page has no world
     splats = in_file.of_gaussians(gaussians).to_bytes("compressed-ply")
@@ -144,7 +144,7 @@ def viewer_page(
         title=html.escape(title),
         licence=program.joinpath("LICENSE").read_text("utf-8"),
         style=program.joinpath("viewer.css").read_text("utf-8"),
-        scene=_in_script(_scene(shown.approximations, standpoint, background)),
+        scene=_in_script(_scene(shown.approximations, initial_view, background)),
         code=_text(program.joinpath("viewer.js.gz").read_bytes()),
         splats=_text(gzip.compress(splats, GZIP_LEVEL, mtime=0)),
     )
@@ -170,10 +170,11 @@ def write_viewer(out: Path, dataset: Dataset, shown: Shown) -> None:
     """
     gaussians = shown.gaussians
     size, least = least_bytes(gaussians.num_gaussians, gaussians.sh_degree), "at least "
+    page = b""
     if size <= MAX_PAGE_BYTES:
         views = refined_viewpoints(out, dataset.origin) or dataset.train
-        standpoint = Standpoint.of_views(views, gaussians)
-        page = viewer_page(out.resolve().name, shown, standpoint, dataset.background)
+        initial_view = InitialView.from_views(views, gaussians)
+        page = viewer_page(out.resolve().name, shown, initial_view, dataset.background)
         size, least = len(page), ""
     if size > MAX_PAGE_BYTES:
         note = (
@@ -192,10 +193,12 @@ def _bytes_of_file(num_gaussians: int, sh_degree: int) -> int:
 
 
 def _scene(
-    approximations: Approximations, standpoint: Standpoint, background: tuple[float, float, float]
+    approximations: Approximations,
+    view: InitialView,
+    background: tuple[float, float, float],
 ) -> Mapping[str, object]:
     """Return the data that the page's script reads."""
-    camera, move = standpoint.camera, standpoint.to_page
+    camera, move = view.camera, view.to_page
     position = move.scale * move.rotation @ camera.center + move.translation
     return {
         "settings": _settings(position, background),

@@ -13,15 +13,12 @@ from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-import drgs
 from drgs.config.approximations import Approximations
 from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.files import atomic_path
 from drgs.core.folders import sole_writer
-from drgs.core.private import llvm_version
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import (
@@ -40,8 +37,8 @@ from drgs.results.folder import (
     claim_output_folder,
     continue_run,
     has_results,
+    image_names,
     is_finished,
-    pictures_of,
     remove_run,
     require_no_run,
     seal_run,
@@ -61,6 +58,7 @@ from drgs.results.report import Fitted, write_pictures, write_results
 from drgs.results.viewer import Shown, shows_as_fitted
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.training.loop import History
+from drgs.training.parallel.inputs import versions
 from drgs.training.trainer import Trainer
 
 if TYPE_CHECKING:  # imported where it is needed
@@ -104,7 +102,7 @@ class FitFolder:
     def take(self, config: FitConfig, dataset: Dataset) -> None:
         """Make the folder that of the fit, or raise ``UserError`` and leave it as it is."""
         self._keep()
-        images = pictures_of(dataset.test_split, [view.name for view in dataset.test])
+        images = image_names(dataset.test_split, [view.name for view in dataset.test])
         if self.overwrites:
             remove_run(self.path, images)
         if self.resumes:
@@ -242,14 +240,15 @@ def _split_metrics(quality: Quality, split: str) -> SplitMetrics:
 
 
 def _circumstances() -> Circumstances:
+    known = versions()
     return {
         "versions": {
-            "drgs": drgs.__version__,
-            "mitsuba": str(mi.__version__),
-            "drjit": dr.__version__,  # pyright: ignore[reportAttributeAccessIssue]  # not in the stub
-            "numpy": np.__version__,
+            "drgs": known["drgs"],
+            "mitsuba": known["Mitsuba"],
+            "drjit": known["Dr.Jit"],
+            "numpy": known["numpy"],
             "python": platform.python_version(),
-            "llvm": ".".join(map(str, llvm_version())),
+            "llvm": known["LLVM"],
         },
         "variant": mi.variant() or "",
         "threads": dr.thread_count(),

@@ -79,7 +79,7 @@ class FrameRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ViewerFrame:
     """A rendered frame."""
 
     pixels: np.ndarray  # (H, W, 3) uint8, display space
@@ -107,7 +107,7 @@ class LiveScene:
         """The approximations that the Gaussians were fitted with."""
         return self._model.approximations
 
-    def frame(self, request: FrameRequest) -> Frame:
+    def frame(self, request: FrameRequest) -> ViewerFrame:
         """Render a frame.
 
         Raises :class:`drgs.core.errors.UserError` for settings that do not go together, such as an
@@ -143,38 +143,42 @@ class LiveScene:
 # ----------------------------------------------------------------------------------------------
 
 
-def _color(scene: LiveScene, request: FrameRequest) -> Frame:
+def _color(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request)
-    return Frame(to_bytes(image), seconds)
+    return ViewerFrame(to_bytes(image), seconds)
 
 
-def _opacity(scene: LiveScene, request: FrameRequest) -> Frame:
+def _opacity(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request, "alpha:alpha")
-    return Frame(to_bytes(np.repeat(image[:, :, 3:4], 3, axis=2)), seconds)
+    return ViewerFrame(to_bytes(np.repeat(image[:, :, 3:4], 3, axis=2)), seconds)
 
 
-def _depth(scene: LiveScene, request: FrameRequest) -> Frame:
+def _depth(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request, "depth:depth, alpha:alpha")
     depth, alpha = image[:, :, 3], image[:, :, 4]
     depth = depth / np.maximum(alpha, 1e-6)
     seen = depth[alpha >= MIN_DEPTH_ALPHA]
     if not len(seen):
-        return Frame(to_bytes(np.full((*depth.shape, 3), BACKDROP)), seconds, "nothing is seen")
+        return ViewerFrame(
+            to_bytes(np.full((*depth.shape, 3), BACKDROP)), seconds, "nothing is seen"
+        )
     near, far = (float(end) for end in np.percentile(seen, DEPTH_RANGE))
     place = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
     colors = colormaps["turbo"](place)[:, :, :3]
-    return Frame(over_backdrop(colors, alpha), seconds, f"red {near:.3g} to blue {far:.3g}")
+    return ViewerFrame(over_backdrop(colors, alpha), seconds, f"red {near:.3g} to blue {far:.3g}")
 
 
-def _normals(scene: LiveScene, request: FrameRequest) -> Frame:
+def _normals(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request, "normal:normal, alpha:alpha")
     normal, alpha = image[:, :, 3:6], image[:, :, 6]
     length = np.linalg.norm(normal, axis=2, keepdims=True)
     colors = 0.5 + 0.5 * normal / np.maximum(length, 1e-9)
-    return Frame(over_backdrop(colors, alpha), seconds, "x, y, z of the world as red, green, blue")
+    return ViewerFrame(
+        over_backdrop(colors, alpha), seconds, "x, y, z of the world as red, green, blue"
+    )
 
 
-def _error(scene: LiveScene, request: FrameRequest) -> Frame:
+def _error(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request)
     given = request.approximations or scene.approximations
     projection = VIEWER_LENSES[request.lens].most_accurate
@@ -183,10 +187,10 @@ def _error(scene: LiveScene, request: FrameRequest) -> Frame:
     distance = psnr(image, accurate)
     compared = "the same as" if math.isinf(distance) else f"PSNR {distance:.1f} dB to"
     note = f"{compared} the most accurate picture, which took {1e3 * accurate_seconds:.0f} ms"
-    return Frame(to_bytes(0.5 + ERROR_GAIN * (image - accurate)), seconds, note)
+    return ViewerFrame(to_bytes(0.5 + ERROR_GAIN * (image - accurate)), seconds, note)
 
 
-SHOWN: dict[str, Callable[[LiveScene, FrameRequest], Frame]] = {
+SHOWN: dict[str, Callable[[LiveScene, FrameRequest], ViewerFrame]] = {
     "color": _color,
     "depth": _depth,
     "normals": _normals,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,11 +18,18 @@ from drgs.core.errors import UserError, one_line
 from drgs.datasets.orbits import up_of
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import focus_of, look_at
-from drgs.viewer.frames import SHOWN, VIEWER_LENSES, Frame, FrameRequest, ViewerCamera
+from drgs.viewer.frames import SHOWN, VIEWER_LENSES, FrameRequest, ViewerCamera, ViewerFrame
 from drgs.viewer.scheduler import RenderRequests
 
 if TYPE_CHECKING:
     import viser
+
+    FrustumClick = viser.SceneNodePointerEvent[viser.CameraFrustumHandle]
+
+Control = TypeVar("Control", bound="viser.GuiInputHandle[Any]")
+
+EventHandler = Callable[[object], Coroutine[None, None, None]]
+"""Handles an event of viser's in its event loop."""
 
 JPEG_QUALITY = {False: 70, True: 92}  # quality of images of a moving camera, and of whole ones
 MAX_FRUSTUMS = 200  # training cameras that are drawn, spread over all of them
@@ -94,7 +101,7 @@ class StartView:
         return StartView(replace(camera, camera_to_world=pose), up / np.linalg.norm(up))
 
 
-def event_handler(function: Callable[[], None]) -> Callable[[object], Coroutine]:
+def event_handler(function: Callable[[], None]) -> EventHandler:
     """Return a handler of any event of viser's, which its event loop runs."""
 
     async def handle(event: object) -> None:
@@ -129,7 +136,7 @@ class CameraControls:
 
     @property
     def is_straight(self) -> bool:
-        """Whether the lens shows straight lines where the browser's pinhole draws them."""
+        """True if the lens shows straight lines where the browser's pinhole draws them."""
         return self._lens.value in ("pinhole", "thin lens")
 
     def fov(self, camera: viser.CameraHandle) -> float:
@@ -168,7 +175,7 @@ class CameraControls:
         values |= {name: DECLARED[name].kind(c.value) for name, c in self._values.items()}
         return Approximations(**values)
 
-    def _control(self, name: str) -> Any:
+    def _control(self, name: str) -> viser.GuiInputHandle[Any]:
         """Return an input of viser's for an approximation."""
         declared, gui, value = DECLARED[name], self._gui, getattr(self._fitted, name)
         hint = declared.description
@@ -177,11 +184,12 @@ class CameraControls:
         if declared.kind is bool:
             return gui.add_checkbox(name, value, hint=hint)
         limits = declared.limits
+        assert limits is not None, "numbers have limits"
         step = 1 if declared.kind is int else 1e-4
         largest = max(MAX_NUMBER, value) if limits.le is None else limits.le
         return gui.add_number(name, value, min=limits.ge, max=largest, step=step, hint=hint)
 
-    def _observed(self, control: Any) -> Any:
+    def _observed(self, control: Control) -> Control:
         control.on_update(self._changed)
         return control
 
@@ -255,7 +263,7 @@ class Page:
         for client in self.server.get_clients().values():
             self._follow(client)
 
-    def show(self, client: int, request: FrameRequest, frame: Frame, is_whole: bool) -> None:
+    def show(self, client: int, request: FrameRequest, frame: ViewerFrame, is_whole: bool) -> None:
         """Show a frame to a client, unless it has gone; is_whole: it is as large as requested."""
         handle = self.server.get_clients().get(client)
         if handle is None:
@@ -271,7 +279,7 @@ class Page:
         """Show in one line why there is no frame."""
         self._set_text(client, f"**No picture:** {one_line(reason)}")
 
-    def _describe(self, client: int, request: FrameRequest, frame: Frame) -> str:
+    def _describe(self, client: int, request: FrameRequest, frame: ViewerFrame) -> str:
         """Return how long an image took, and what its colours mean."""
         took, size = 1e3 * frame.seconds, (request.width, request.height)
         text = f"**{took:.0f} ms** for {size[0]}×{size[1]}"
@@ -310,8 +318,10 @@ class Page:
         for frustum in self._frustums:
             frustum.visible = self._cameras.value and self.controls.is_straight
 
-    def _look_through(self, view: Viewpoint) -> Callable[..., Coroutine]:
-        async def look_through(event: viser.SceneNodePointerEvent) -> None:
+    def _look_through(
+        self, view: Viewpoint
+    ) -> Callable[[FrustumClick], Coroutine[None, None, None]]:
+        async def look_through(event: FrustumClick) -> None:
             camera = event.client.camera
             with event.client.atomic():
                 camera.position = tuple(view.center)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drgs.core.errors import UserError, reason_of_mitsuba
-from drgs.viewer.frames import Frame, FrameRequest, LiveScene
+from drgs.viewer.frames import FrameRequest, LiveScene, ViewerFrame
 
 MOVING_SECONDS = 0.08
 """Longest time of a frame while its camera moves: twelve a second look like a motion."""
@@ -113,7 +113,7 @@ class RenderScheduler:
     """Renders the requests of all clients in turn."""
 
     requests: RenderRequests
-    show: Callable[[int, FrameRequest, Frame, bool], None]  # to a client; whether it is whole
+    show: Callable[[int, FrameRequest, ViewerFrame, bool], None]  # to a client; whether it is whole
     refuse: Callable[[int, str], None]  # a client's request, for a reason of one line
     refresh_after: Callable[[float], float] | None = None
     """Seconds until a whole frame is rendered again, given those that it took; None: never."""
@@ -128,11 +128,11 @@ class RenderScheduler:
         pending, now = self.requests.pending, time.monotonic()
         self._clients = {c: self._clients.get(c) or _ClientState() for c in pending}
         divisors = {c: self._due_divisor(pending[c], self._clients[c], now) for c in pending}
-        due = [client for client, divisor in divisors.items() if divisor is not None]
+        due = {client: divisor for client, divisor in divisors.items() if divisor is not None}
         if not due:
             return False
         client = min(due, key=lambda each: self._clients[each].at)
-        self._render(client, pending[client], divisors[client], scene)
+        self._render(client, pending[client], due[client], scene)
         return True
 
     def _due_divisor(self, pending: PendingRequest, state: _ClientState, now: float) -> int | None:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, cast
 from urllib.parse import unquote, urlsplit
 
 import msgspec
@@ -25,7 +25,8 @@ import viser
 import websockets.asyncio.server
 from msgspec import Meta
 from viser import infra
-from websockets.asyncio.server import Request, Response, ServerConnection
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 from drgs.core.errors import UserError, UserNote, one_line
 
@@ -34,6 +35,18 @@ ADDRESS = "127.0.0.1"  # only this machine reaches it
 LOOPBACK = (ADDRESS, "localhost", "::1")
 
 FIRST_PORTS = range(8080, 8100)  # tried one after the other, unless a port is given
+
+
+class ValueControl(Protocol):
+    """A control of viser's: an input or a button."""
+
+    @property
+    def value(self) -> object:
+        """The value that a browser may set."""
+
+
+ControlOf = Callable[[str], ValueControl | None]
+"""Returns the control with a uuid, among those that all clients share, or None."""
 
 
 class LocalServer(viser.ViserServer):
@@ -54,7 +67,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
     """
     port = free_port(address, port, options)
 
-    def control(uuid: str) -> Any:
+    def control(uuid: str) -> ValueControl | None:
         return server.gui._gui_input_handle_from_uuid.get(uuid)
 
     with _silent(), _guarded(address, control):
@@ -63,7 +76,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     try:
         with warnings.catch_warnings():
-            # A browser may be closed while its picture is being sent.
+            # A browser may be closed while its image is being sent.
             warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
             yield server
     finally:
@@ -123,17 +136,21 @@ def _refusal(request: Request, address: str) -> str:
 
 
 @contextmanager
-def _guarded(address: str, control: Callable[[str], Any]) -> Iterator[None]:
+def _guarded(address: str, control: ControlOf) -> Iterator[None]:
     """Let servers that viser starts within the block serve only valid requests and messages.
 
-    viser has no setting for it. control: see :func:`is_valid`. The logger is
-    silent: websockets would print a traceback for each connection that breaks.
+    viser has no setting for it. The logger is silent: websockets would print a traceback for each
+    connection that breaks.
     """
     serve = websockets.asyncio.server.serve
     connection_type = partial(PageConnection, control=control, connections=set())
     logger = logging.Logger("page", logging.CRITICAL)
 
-    def guarded(*arguments: Any, process_request: Callable, **settings: Any) -> object:
+    def guarded(
+        *arguments: Any,
+        process_request: Callable[[ServerConnection, Request], Response | None],
+        **settings: Any,
+    ) -> object:
         def process(connection: ServerConnection, request: Request) -> Response | None:
             if reason := _refusal(request, address):
                 return connection.respond(HTTPStatus.FORBIDDEN, reason)
@@ -150,11 +167,11 @@ def _guarded(address: str, control: Callable[[str], Any]) -> Iterator[None]:
         websockets.asyncio.server.serve = serve
 
 
-def _note_errors_once() -> Callable[[asyncio.AbstractEventLoop, dict[str, Any]], None]:
+def _note_errors_once() -> Callable[[asyncio.AbstractEventLoop, dict[str, object]], None]:
     """Return an event loop's exception handler that notes each type of error in one line."""
     noted = set()
 
-    def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    def handle(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
         error = context.get("exception")
         kind = type(error).__name__
         if kind not in noted:
@@ -233,11 +250,8 @@ class GuiUpdateMessage(msgspec.Struct, tag=True, tag_field="type"):
 DECODER = msgspec.msgpack.Decoder(ViewerCameraMessage | SceneNodeClickMessage | GuiUpdateMessage)
 
 
-def is_valid(data: bytes | str, control: Callable[[str], Any]) -> bool:
-    """Return whether a message is one that a page sends, with values that the page offers.
-
-    control: returns the control with a uuid, among those that all clients share, or None.
-    """
+def is_valid(data: bytes | str, control: ControlOf) -> bool:
+    """Return whether a message is one that a page sends, with values that the page offers."""
     if not isinstance(data, bytes):
         return False
     try:
@@ -253,16 +267,15 @@ def is_valid(data: bytes | str, control: Callable[[str], Any]) -> bool:
     return True
 
 
-def offers(control: Any, value: bool | float | str) -> bool:
-    """Return whether a control of viser's (None: a button of one client's dialog) has a value."""
+def offers(control: ValueControl | None, value: bool | float | str) -> bool:
+    """Return whether a control (None: a button of one client's dialog) has a value."""
     if control is None or isinstance(control.value, bool):
         return isinstance(value, bool)
-    if hasattr(control, "options"):
-        return value in control.options
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not hasattr(control, "min") or not is_number or not math.isfinite(value):
+    if (options := getattr(control, "options", None)) is not None:
+        return value in options
+    if not hasattr(control, "min") or isinstance(value, bool | str) or not math.isfinite(value):
         return False
-    low, high = control.min, control.max
+    low, high = (getattr(control, limit) for limit in ("min", "max"))
     return (low is None or value >= low) and (high is None or value <= high)
 
 
@@ -272,18 +285,18 @@ class PageConnection(ServerConnection):
     def __init__(
         self,
         *arguments: Any,
-        control: Callable[[str], Any],
+        control: ControlOf,
         connections: set[PageConnection],
         **settings: Any,
     ) -> None:
-        """control: see :func:`is_valid`; connections: the open ones of the server."""
+        """connections: the open ones of the server."""
         super().__init__(*arguments, **settings)
         self._control, self._connections = control, connections
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Close the connection at once if there are :data:`MAX_CONNECTIONS`."""
         if len(self._connections) >= MAX_CONNECTIONS:
-            transport.abort()
+            cast(asyncio.Transport, transport).abort()
         else:
             self._connections.add(self)
             super().connection_made(transport)
@@ -294,7 +307,9 @@ class PageConnection(ServerConnection):
             self._connections.remove(self)
             super().connection_lost(exc)
 
-    async def recv(self, decode: bool | None = None) -> bytes | str:
+    async def recv(  # pyright: ignore[reportIncompatibleMethodOverride]  # overloads
+        self, decode: bool | None = None
+    ) -> bytes | str:
         """Return the next valid message."""
         while not is_valid(message := await super().recv(decode), self._control):
             pass

@@ -23,6 +23,7 @@ from drgs.viewer.scheduler import RenderRequests, RenderScheduler
 
 if TYPE_CHECKING:
     import viser
+    from viser import uplot
 
 REFRESH_SECONDS = 1.0  # shortest time between two frames of a camera that is still
 REFRESH_SHARE = 0.05  # largest part of the time for frames of a camera that is still
@@ -37,7 +38,7 @@ STEP_BACK = 1.25
 Curve = tuple[np.ndarray, np.ndarray]
 """Iterations and values, each (n,)."""
 
-CURVES = {
+CURVES: dict[str, uplot.Series] = {
     "training views": {"stroke": "#7fb0ff", "width": 2, "points": {"show": False}},
     "test views": {"stroke": "#f0937b", "width": 2, "points": {"show": True}},
 }
@@ -54,12 +55,13 @@ class EarlyStop:
         """See :class:`StopCriterion`; an end by request revises the configuration."""
         done = trainer.iteration
         if self._requests.ended and 0 < done < trainer.config.iterations:
-            trainer.reschedule(done, trainer.config.densify.stop)
+            stop = trainer.config.densify.stop
+            assert stop is not None, "a configuration sets it"
+            trainer.reschedule(done, stop)
             return False
         return self._criterion.should_continue(trainer)
 
     def num_iterations(self, trainer: Trainer) -> int:
-        """See :class:`StopCriterion`."""
         return self._criterion.num_iterations(trainer)
 
 
@@ -120,11 +122,14 @@ class TrainingPage(Page):
 
     def add_controls(self) -> None:
         """Add progress, buttons and a curve."""
+        from viser import Icon
+
         gui = self.server.gui
+        self._icons = {True: Icon.PLAYER_PLAY, False: Icon.PLAYER_PAUSE}  # by "is paused"
         self._status = gui.add_markdown("The first iterations compile kernels …")
         self._bar = gui.add_progress_bar(0.0)
-        self._pause = gui.add_button("Pause", icon="player-pause")
-        self._end = gui.add_button("End and write results", icon="flag", color="gray")
+        self._pause = gui.add_button("Pause", icon=self._icons[False])
+        self._end = gui.add_button("End and write results", icon=Icon.FLAG, color="gray")
         self._pause.on_click(event_handler(self._toggle_pause))
         self._end.on_click(self._confirm_end)
         self._charts: list[viser.GuiUplotHandle] = []
@@ -177,9 +182,10 @@ class TrainingPage(Page):
         paused = not self.requests.paused
         self.requests.pause(paused)
         self._pause.label = "Go on" if paused else "Pause"
-        self._pause.icon = "player-play" if paused else "player-pause"
+        self._pause.icon = self._icons[paused]
 
-    async def _confirm_end(self, event: viser.GuiEvent) -> None:
+    async def _confirm_end(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        assert event.client is not None, "a client has clicked"
         gui = event.client.gui
         with gui.add_modal("End the fit here?") as modal:
             gui.add_markdown("The results are those of a fit of as many iterations as are done.")

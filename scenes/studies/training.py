@@ -90,7 +90,7 @@ def fit_curves(out: Path, only: list[int], threads: int | None) -> None:
 def apply(choice: Strategy | dict[str, object], config: FitConfig) -> FitConfig:
     """Return a configuration with a choice."""
     if isinstance(choice, Strategy):
-        return choice.applied(config, config.init.num_points)
+        return choice.apply(config, config.init.num_points)
     return changed(config, choice)
 
 

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from drgs.config.section import Section
 from drgs.core.errors import UserError
-from drgs.datasets.reader import READERS, DatasetReader, Frame, Photographs
+from drgs.datasets.reader import READERS, DatasetReader, Photographs, TransformsFrame
 
 
 class NumpyPosesSection(Section):
@@ -42,7 +42,7 @@ class NumpyPoses(DatasetReader):
         focal, principal = (camera["fx"], camera["fy"]), (camera["cx"], camera["cy"])
         pairs = zip(images, poses, strict=True)
         frames = [
-            Frame.from_camera(source, index, image, pose, focal, principal)
+            TransformsFrame.from_camera(source, index, image, pose, focal, principal)
             for index, (image, pose) in enumerate(pairs)
         ]
         return Photographs("numpy_poses", source, frames)

@@ -37,6 +37,18 @@ def test_names_are_imported_when_they_are_used(run_python, name):
     assert result.returncode == 0, result.stderr
 
 
+def test_a_type_checker_imports_the_same_names():
+    package = REPOSITORY / "drgs"
+    (block,) = (
+        node
+        for node in ast.parse((package / "__init__.py").read_text()).body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    )
+    seen = {alias.name: imports.module for imports in block.body for alias in imports.names}
+    assert seen == drgs._MODULES and seen.keys() == PUBLIC
+    assert (package / "py.typed").is_file()
+
+
 def test_another_name_is_refused():
     with pytest.raises(AttributeError, match="module 'drgs' has no attribute 'fitt'"):
         _ = drgs.fitt

@@ -34,7 +34,8 @@ MAY_IMPORT = {
     "training": TRAINING,
     "plugins": {"integrator", *INTEGRATOR},
     "_registration": {"plugins", *GROUND},
-    "": {"_registration", "core"},  # drgs/__init__.py; what it offers is imported when it is used
+    # drgs/__init__.py; its public names are imported when they are used, and by type checkers.
+    "": {"_registration", "core", "datasets", "gaussians", "gsplat_api", "training"},
     "gsplat_api": {"accuracy", "effects", "splatting", "config", *METHOD},
     "viewer": {"training", *TRAINING},
     "commands": {"viewer", "training", "cli", "plugins", *TRAINING},

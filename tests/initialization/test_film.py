@@ -9,7 +9,7 @@ from support.datasets import view_at
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
-from drgs.datasets.types import Motion
+from drgs.datasets.types import CameraMotion
 from drgs.initialization.film import is_projectable, to_camera, to_film
 from drgs.reference import effects as reference
 from drgs.reference.splatting import Camera
@@ -67,4 +67,4 @@ def test_what_is_straight_ahead_is_at_the_principal_point():
 def test_a_camera_that_moves_has_no_one_place_for_a_point():
     view = view_at((0, -2, 0), (0, 0, 0))
     assert is_projectable(view)
-    assert not is_projectable(replace(view, motion=Motion(np.eye(4), "global")))
+    assert not is_projectable(replace(view, motion=CameraMotion(np.eye(4), "global")))

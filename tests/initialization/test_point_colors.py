@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.bodies import WHITE, box, colors_at, directions_to, pictures_of, sphere, together
 
-from drgs.datasets.types import Motion
+from drgs.datasets.types import CameraMotion
 from drgs.initialization import point_colors
 from drgs.initialization.point_colors import colors_from_images
 
@@ -93,7 +93,7 @@ def test_nothing_is_known_where_no_picture_shows_a_point(ball):
     points, spacing = on_the_ball()
     assert colors_from_images(100 + points, spacing, ball, WHITE) is None
     assert colors_from_images(points, spacing, [], WHITE) is None
-    moving = [replace(view, motion=Motion(np.eye(4), "global")) for view in ball]
+    moving = [replace(view, motion=CameraMotion(np.eye(4), "global")) for view in ball]
     assert colors_from_images(points, spacing, moving, WHITE) is None
 
 

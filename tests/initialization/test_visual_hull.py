@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.bodies import box, opaque_at, pictures_of, sphere, together
 
-from drgs.datasets.types import Motion
+from drgs.datasets.types import CameraMotion
 from drgs.initialization.start_box import Box
 from drgs.initialization.visual_hull import are_masks, hull_points, silhouettes_of
 from drgs.reference import effects as reference
@@ -134,7 +134,7 @@ def test_pixels_that_a_mask_leaves_out_say_nothing(ball):
 
 
 def test_a_camera_that_moves_is_left_out(ball):
-    moving = replace(ball[0], motion=Motion(np.eye(4), "global"), alpha=0 * ball[0].alpha)
+    moving = replace(ball[0], motion=CameraMotion(np.eye(4), "global"), alpha=0 * ball[0].alpha)
     assert len(silhouettes_of([moving, *ball[1:]])) == 15
     assert len(carved([moving, *ball[1:]], 300)) > 200
 

@@ -6,7 +6,7 @@ import pytest
 
 from drgs.core.errors import PluginError, PluginTypeError, UnsupportedError, UserError
 from drgs.integrator.sensors import CameraSensor, is_batch, read_sensor
-from drgs.integrator.state import is_splats
+from drgs.integrator.types import is_splats
 
 
 @pytest.fixture(autouse=True)

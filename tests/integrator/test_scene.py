@@ -21,7 +21,7 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.config.approximations import Approximations
 from drgs.config.schema import DataConfig, ModelConfig
-from drgs.datasets.types import Motion, View
+from drgs.datasets.types import CameraMotion, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -72,7 +72,7 @@ def test_a_moving_views_sensor_blurs_with_as_many_times(samples):
     """Of those of the configuration; by default as many as the sensor's own default."""
     data = DataConfig(path=".", **({} if samples is None else {"shutter_samples": samples}))
     view = make_view()
-    view = replace(view, motion=Motion(view.camera_to_world, "global", data.shutter_samples))
+    view = replace(view, motion=CameraMotion(view.camera_to_world, "global", data.shutter_samples))
     (sensor,) = make_sensors([view])
     expected = mi.load_dict({"type": "calibrated"}).shutter_samples if samples is None else samples
     assert sensor.shutter_samples == expected

@@ -18,7 +18,7 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.datasets.fingerprint import fingerprint_of
-from drgs.datasets.types import Motion
+from drgs.datasets.types import CameraMotion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -101,7 +101,7 @@ def rich_dataset():
     mask = np.ones((first.height, first.width), np.float32)
     first = replace(first, lens=RadialTangential.from_coefficients(k1=0.1, k2=0.01), mask=mask)
     second = replace(second, lens=Fisheye.from_coefficients(k1=0.1), mask=mask)
-    third = replace(third, motion=Motion(first.camera_to_world, "rolling"))
+    third = replace(third, motion=CameraMotion(first.camera_to_world, "rolling"))
     return replace(dataset, train=(first, second, third, *others))
 
 

@@ -10,13 +10,13 @@ from drgs.results.files import CAMERAS, COLORS, METRICS, RESULTS
 from drgs.results.folder import (
     FOLDERS,
     claim_output_folder,
+    image_names,
     is_finished,
     load_run_config,
-    pictures_of,
     remove_run,
 )
 
-PICTURES = pictures_of("test", ["r_0", "r_1"])
+PICTURES = image_names("test", ["r_0", "r_1"])
 
 
 @pytest.fixture

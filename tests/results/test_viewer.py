@@ -23,7 +23,7 @@ from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import viewer
 from drgs.results.refined_cameras import write_views
-from drgs.results.viewer import Shown, Standpoint, viewer_page
+from drgs.results.viewer import InitialView, Shown, viewer_page
 
 SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
 MANIFEST = json.loads(SHIPPED.joinpath("MANIFEST.json").read_text())
@@ -50,18 +50,18 @@ class Page(HTMLParser):
         self.texts[self._inside] = self.texts.get(self._inside, "") + data
 
 
-def page_of(gaussians, standpoint, title="title", background=(0.1, 0.2, 0.3)):
-    return viewer_page(title, Shown(gaussians, OWN), standpoint, background)
+def page_of(gaussians, initial_view, title="title", background=(0.1, 0.2, 0.3)):
+    return viewer_page(title, Shown(gaussians, OWN), initial_view, background)
 
 
 @pytest.fixture(scope="module")
-def standpoint():
-    return Standpoint.of_views(make_dataset().train, blobs())
+def initial_view():
+    return InitialView.from_views(make_dataset().train, blobs())
 
 
 @pytest.fixture(scope="module")
-def page(standpoint):
-    return page_of(blobs(), standpoint, TITLE)
+def page(initial_view):
+    return page_of(blobs(), initial_view, TITLE)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -98,8 +98,8 @@ def test_the_licences_come_with_the_files_and_with_each_page(page):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_equal_gaussians_give_equal_bytes(page, standpoint):
-    assert page_of(blobs(), standpoint, TITLE) == page
+def test_equal_gaussians_give_equal_bytes(page, initial_view):
+    assert page_of(blobs(), initial_view, TITLE) == page
 
 
 def test_the_page_refers_to_nothing_and_may_connect_to_nothing(page):
@@ -130,7 +130,7 @@ def test_the_page_says_what_gaussians_are_shown_with(page):
     assert scene["settings"]["background"]["color"] == [0.1, 0.2, 0.3]
 
 
-def test_the_page_holds_the_gaussians_as_its_first_camera_sees_them(page, standpoint, tmp_path):
+def test_the_page_holds_the_gaussians_as_its_first_camera_sees_them(page, initial_view, tmp_path):
     """Their means in the camera's axes: y is up on the page, which turns files by 180 degrees."""
     parsed = Page(page)
     scene = json.loads(parsed.texts["scene"])
@@ -143,7 +143,7 @@ def test_the_page_holds_the_gaussians_as_its_first_camera_sees_them(page, standp
     axes = [v / np.linalg.norm(v) for v in (right, np.cross(right, back), -back)]  # OpenCV's
     seen = (found.means * [-1, -1, 1] - back) @ np.transpose(axes)
 
-    camera = standpoint.camera
+    camera = initial_view.camera
     expected = (blobs().means - camera.center) @ camera.camera_to_world[:3, :3]
     scale = 3 / RADIUS
     order = np.argsort(seen[:, 2]), np.argsort(expected[:, 2])
@@ -154,11 +154,11 @@ def test_the_page_holds_the_gaussians_as_its_first_camera_sees_them(page, standp
     assert scene["tangents"] == pytest.approx([np.tan(0.35), np.tan(0.35) * 24 / 32])
 
 
-def test_numbers_that_are_not_finite_are_refused(standpoint):
+def test_numbers_that_are_not_finite_are_refused(initial_view):
     wrong = blobs()
     wrong.sh0[3, 0, 1] = np.nan
     with pytest.raises(UserError, match="sh0 of Gaussian 3 is"):
-        page_of(wrong, standpoint)
+        page_of(wrong, initial_view)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -174,25 +174,25 @@ def test_one_stands_at_the_camera_next_to_where_orbits_start():
     """At their mean height, in the direction that most of them have."""
     azimuths = [(0.9, 0.2), (1.0, 0.6), (1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.4, 0.1)]
     views = cameras([pose_around(*angles) for angles in azimuths])
-    standpoint = Standpoint.of_views(views, blobs())
-    start = standpoint.orbit.viewpoints(1, 32, 24, 40.0)[0].center
+    initial_view = InitialView.from_views(views, blobs())
+    start = initial_view.orbit.viewpoints(1, 32, 24, 40.0)[0].center
     distances = [np.linalg.norm(view.center - start) for view in views]
-    assert standpoint.camera is views[int(np.argmin(distances))]
-    np.testing.assert_allclose(standpoint.target, FOCUS, atol=1e-6)
+    assert initial_view.camera is views[int(np.argmin(distances))]
+    np.testing.assert_allclose(initial_view.target, FOCUS, atol=1e-6)
 
 
-def test_what_is_walked_around_is_in_front_of_a_camera_that_looks_elsewhere(standpoint):
+def test_what_is_walked_around_is_in_front_of_a_camera_that_looks_elsewhere(initial_view):
     away = pose_around(0.3, 0.2)
     away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1, -1])
-    standpoint = replace(standpoint, camera=cameras([away])[0])
-    expected = away[:3, 3] + standpoint.orbit.radius * away[:3, 2]
-    np.testing.assert_allclose(standpoint.target, expected, rtol=1e-12)
+    initial_view = replace(initial_view, camera=cameras([away])[0])
+    expected = away[:3, 3] + initial_view.orbit.radius * away[:3, 2]
+    np.testing.assert_allclose(initial_view.target, expected, rtol=1e-12)
 
 
 def test_of_gaussians_alone_all_are_in_the_window():
     up = Rotation.from_euler("xyz", [30, 50, 0], degrees=True).apply([0, 0, 1])
-    standpoint = Standpoint.of_gaussians(blobs(), up)
-    camera = standpoint.camera
+    initial_view = InitialView.from_gaussians(blobs(), up)
+    camera = initial_view.camera
     seen = (blobs().means - camera.center) @ camera.camera_to_world[:3, :3]
     tangents = np.abs(seen[:, :2] / seen[:, 2:])
     assert (tangents < np.tan(np.radians(40) / 2)).mean() > 0.95
@@ -236,10 +236,12 @@ def test_what_is_too_large_by_its_number_alone_is_not_built(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
-def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(standpoint, sh_degree):
+def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(initial_view, sh_degree):
     """All: in base64, of them and of 72 bytes for each group of 256, and 1 % that gzip adds."""
     counts = 256, 256 * 12
-    one, twelve = (len(page_of(gaussians_within_ranges(n, sh_degree), standpoint)) for n in counts)
+    one, twelve = (
+        len(page_of(gaussians_within_ranges(n, sh_degree), initial_view)) for n in counts
+    )
     least = viewer.least_bytes(counts[1] - counts[0], sh_degree)
     assert least <= twelve - one <= 1.01 * (least / viewer.MIN_GZIP_RATIO + 11 * 72 * 4 / 3)
 

@@ -13,7 +13,7 @@ from drgs.config.schema import ModelConfig
 from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.results.viewer import Shown, Standpoint, viewer_page
+from drgs.results.viewer import InitialView, Shown, viewer_page
 
 browsers = pytest.importorskip("support.browser", reason="needs POSIX", exc_type=ImportError)
 
@@ -69,18 +69,18 @@ def gaussians():
 
 
 @pytest.fixture(scope="module")
-def standpoint(gaussians):
+def initial_view(gaussians):
     poses = [pose_around(azimuth, 0.4) for azimuth in np.arange(8) * np.pi / 4]
     turned = [np.block([[TURN @ pose[:3]], [pose[3:]]]) for pose in poses]
     cameras = [pinhole(f"{i}", pose, WIDTH, HEIGHT, FIELD_OF_VIEW) for i, pose in enumerate(turned)]
-    return Standpoint.of_views(cameras, gaussians)
+    return InitialView.from_views(cameras, gaussians)
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory, gaussians, standpoint):
+def path(tmp_path_factory, gaussians, initial_view):
     shown = Shown(gaussians, Approximations(**FITTED_WITH))
     path = tmp_path_factory.mktemp("viewer") / "a page & größe.html"
-    path.write_bytes(viewer_page(TITLE, shown, standpoint, BACKGROUND))
+    path.write_bytes(viewer_page(TITLE, shown, initial_view, BACKGROUND))
     return path
 
 
@@ -109,9 +109,9 @@ def ours(camera, gaussians, **model) -> np.ndarray:
     return image
 
 
-def shown_camera(page, standpoint):
+def shown_camera(page, initial_view):
     """The page's camera in the world of the Gaussians."""
-    in_page, move = np.reshape(page.evaluate(CAMERA), (4, 4)).T, standpoint.to_page
+    in_page, move = np.reshape(page.evaluate(CAMERA), (4, 4)).T, initial_view.to_page
     pose = np.eye(4)
     pose[:3, :3] = move.rotation.T @ in_page[:3, :3] * [1, -1, -1]
     pose[:3, 3] = move.rotation.T @ (in_page[:3, 3] - move.translation) / move.scale
@@ -138,19 +138,19 @@ def test_it_opens_from_disk_without_a_request_or_an_error(page, path):
     assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
 
 
-def test_the_first_view_is_that_of_the_training_camera(page, gaussians, standpoint):
-    camera = shown_camera(page, standpoint)
+def test_the_first_view_is_that_of_the_training_camera(page, gaussians, initial_view):
+    camera = shown_camera(page, initial_view)
     np.testing.assert_allclose(
-        camera.camera_to_world, standpoint.camera.camera_to_world, atol=1e-5 * RADIUS
+        camera.camera_to_world, initial_view.camera.camera_to_world, atol=1e-5 * RADIUS
     )
-    assert_shown_as_fitted(page.picture(), standpoint.camera, gaussians)
+    assert_shown_as_fitted(page.picture(), initial_view.camera, gaussians)
 
 
-def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, standpoint):
-    before, first = shown_camera(page, standpoint), page.picture()
+def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, initial_view):
+    before, first = shown_camera(page, initial_view), page.picture()
     page.drag((30, 90), (210, 90))
     settle(page)
-    after = shown_camera(page, standpoint)
+    after = shown_camera(page, initial_view)
     offsets = [camera.center - TURN @ FOCUS for camera in (before, after)]
     heights = [offset @ UP for offset in offsets]
     assert heights[0] == pytest.approx(heights[1], abs=1e-3 * RADIUS)

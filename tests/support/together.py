@@ -97,7 +97,7 @@ def _blurred() -> Any:
     """Photographs of which every other one was taken by a camera that moved."""
     from dataclasses import replace
 
-    from drgs.datasets.types import Motion
+    from drgs.datasets.types import CameraMotion
     from support import small_fits as fits
 
     dataset = fits.plain_dataset()
@@ -105,7 +105,7 @@ def _blurred() -> Any:
     for index in range(0, len(views), 2):
         closed = views[index].camera_to_world.copy()
         closed[:3, 3] += 0.05
-        views[index] = replace(views[index], motion=Motion(closed, "global", samples=3))
+        views[index] = replace(views[index], motion=CameraMotion(closed, "global", samples=3))
     return replace(dataset, train=tuple(views))
 
 

@@ -16,7 +16,7 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.core.errors import UserError
 from drgs.datasets.images import smaller_view
-from drgs.datasets.types import Motion
+from drgs.datasets.types import CameraMotion
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.scene import render_views
@@ -394,7 +394,7 @@ def test_a_dataset_is_read_with_the_cameras_that_were_refined(tmp_path):
     """Also at another size, and with both poses of a camera that moves."""
     dataset = fits.plain_dataset()
     close = moved(dataset.train[1], turns=(0.02, 0.01, 0), moves=(0.1, 0, 0)).camera_to_world
-    first = replace(dataset.train[0], motion=Motion(close, "rolling"))
+    first = replace(dataset.train[0], motion=CameraMotion(close, "rolling"))
     dataset = replace(dataset, train=(first, *dataset.train[1:]))
     trainer = with_numbers(make_trainer(dataset, **ALL_RATES), **random_numbers())
     effect_of(trainer).write(tmp_path, dataset)
@@ -490,7 +490,7 @@ def test_a_camera_that_moves_while_it_exposes_is_refined_as_well():
     dataset = fits.plain_dataset()
     start = dataset.train[0]
     close = moved(start, turns=(0.02, 0.01, 0), moves=(0.1, 0, 0)).camera_to_world
-    dataset = replace(dataset, train=(replace(start, motion=Motion(close, "rolling")),))
+    dataset = replace(dataset, train=(replace(start, motion=CameraMotion(close, "rolling")),))
     trainer = make_trainer(dataset)
     numbers = {"turns": [[0.01, 0.02, -0.01]], "moves": [[0.1, -0.2, 0.05]]}
     with_numbers(trainer, **numbers)
@@ -508,7 +508,7 @@ def test_a_camera_that_moves_while_it_exposes_is_refined_as_well():
 def test_moving_cameras_are_written_as_they_are_read(tmp_path):
     dataset = fits.plain_dataset()
     close = moved(dataset.train[1], turns=(0.02, 0.01, 0), moves=(0.1, 0, 0)).camera_to_world
-    view = replace(dataset.train[0], motion=Motion(close, "rolling"))
+    view = replace(dataset.train[0], motion=CameraMotion(close, "rolling"))
     dataset = replace(dataset, train=(view,))
     effect_of(make_trainer(dataset)).write(tmp_path, dataset)
     (frame,) = json.loads((tmp_path / CAMERAS).read_text())["frames"]
@@ -523,7 +523,7 @@ def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
     for shutter in (None, "rolling", "global"):
         dataset = fits.plain_dataset()
         photo = dataset.train[1]
-        motion = None if shutter is None else Motion(photo.camera_to_world, shutter)
+        motion = None if shutter is None else CameraMotion(photo.camera_to_world, shutter)
         trainer = make_trainer(replace(dataset, train=(replace(photo, motion=motion),)))
         trainer.iteration = 1
         effect, view = effect_of(trainer), trainer.views[0]

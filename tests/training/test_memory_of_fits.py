@@ -16,7 +16,7 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.types import Dataset, LazyImage, Motion, View
+from drgs.datasets.types import CameraMotion, Dataset, LazyImage, View
 from drgs.datasets.viewpoints import look_at, pinhole
 from drgs.initialization.start import initial_gaussians
 from drgs.integrator.scene import make_scene, make_sensors
@@ -121,7 +121,7 @@ def test_photographs_count_as_they_are_kept():
 def test_each_time_of_a_shutter_counts():
     config, dataset = config_of(1000, 1000), dataset_of(60, 40, 3)
     first = dataset.train[0]
-    blurred = replace(first, motion=Motion(first.camera_to_world, "global", 10))
+    blurred = replace(first, motion=CameraMotion(first.camera_to_world, "global", 10))
     blurred = replace(dataset, train=(blurred, *dataset.train[1:]))
     once, often = (estimated(config, data) for data in (dataset, blurred))
     assert often.splats > 3 * once.splats and often.pixels > 3 * once.pixels

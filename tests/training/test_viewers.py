@@ -40,7 +40,7 @@ def shown_by_viewers(gaussians, dataset):
 
 
 def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
-    monkeypatch.setattr(viewers, "SHARE", 1.0)
+    monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 1.0)
     trainer, dataset, gaussians = ended_fit()
     before = list(trainer.images(dataset.test))
     closed = viewers._closed_form(trainer, gaussians)
@@ -88,7 +88,7 @@ def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
     trainer, _, gaussians = ended_fit(8)
     expected = viewers._closed_form(trainer, gaussians)
     monkeypatch.setitem(viewers.RATES, "scales_lr", 10.0)
-    monkeypatch.setattr(viewers, "SHARE", 0.5)
+    monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 0.5)
     step = Trainer.step
 
     def step_and_break(self):

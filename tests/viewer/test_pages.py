@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.training.loop import History, HistoryRow
-from drgs.viewer.frames import SHOWN, VIEWER_LENSES, Frame
+from drgs.viewer.frames import SHOWN, VIEWER_LENSES, ViewerFrame
 from drgs.viewer.page import CONTROLLED, Page, StartView
 from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.server import free_port, is_own, serving, url
@@ -126,7 +126,7 @@ def test_times_are_compared_with_those_of_the_same_picture_as_fitted(page):
     page._texts[7] = SimpleNamespace(content="")
     switched = Approximations(order="pixel")
     frames = [
-        Frame(np.zeros((2, 2, 3), np.uint8), s, note) for s, note in ((0.02, ""), (0.05, "x"))
+        ViewerFrame(np.zeros((2, 2, 3), np.uint8), s, note) for s, note in ((0.02, ""), (0.05, "x"))
     ]
     request = asked(page)
     other = replace(request, approximations=switched)

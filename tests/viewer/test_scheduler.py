@@ -7,7 +7,7 @@ import pytest
 
 from drgs.core.errors import UserError
 from drgs.viewer import scheduler
-from drgs.viewer.frames import Frame, FrameRequest, ViewerCamera
+from drgs.viewer.frames import FrameRequest, ViewerCamera, ViewerFrame
 from drgs.viewer.scheduler import (
     MOVING_SECONDS,
     STILL_SECONDS,
@@ -47,7 +47,7 @@ class Stage:
             raise UserError("that cannot be seen")
         seconds = self.seconds_a_pixel * request.width * request.height
         self.clock.now += seconds
-        return Frame(np.zeros((request.height, request.width, 3), np.uint8), seconds)
+        return ViewerFrame(np.zeros((request.height, request.width, 3), np.uint8), seconds)
 
     def show(self, client, request, frame, is_whole):
         assert frame.pixels.shape == (request.height, request.width, 3)
