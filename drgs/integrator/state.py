@@ -32,9 +32,8 @@ from drgs.splatting import rendering
 
 if TYPE_CHECKING:
     from drgs.integrator.gathering import Gathered, Part, Placement, Turn
-    from drgs.integrator.surfaces import Surfaces
 else:
-    Gathered = Turn = Surfaces = Any
+    Gathered = Turn = Any
 
 T = TypeVar("T")
 
@@ -80,7 +79,7 @@ class RenderCache:
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
     sensor: mi.Sensor | None = None  # the last that was rendered
-    surfaces: Surfaces | None = None  # of the last scene that had some
+    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
     too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
     shaded: Gaussians | None = None  # in the shadow of surfaces; None: there are no such shadows
 
