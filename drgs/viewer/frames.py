@@ -24,7 +24,7 @@ from drgs.config.schema import ModelConfig
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.scene import NEAR_CLIP, film_of, make_scene, make_sensors
+from drgs.integrator.scene import NEAR_CLIP, film_description, make_scene, make_sensors
 from drgs.results.metrics import psnr
 
 MAX_SCENES = 2  # scenes kept, each with a copy of the Gaussians: ``error`` needs two
@@ -284,7 +284,7 @@ def _mitsuba_sensor(
             "to_world": mi.ScalarTransform4f(to_world),
             "near_clip": NEAR_CLIP,
             "sampler": {"type": "independent", "sample_count": 1},
-            "film": film_of(width, height),
+            "film": film_description(width, height),
             **settings,
         }
     )
