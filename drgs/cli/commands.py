@@ -154,6 +154,8 @@ def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable
 
 def file_or_folder(text: str) -> Path:
     """Return the path of an argument that is a file or folder, which need not exist."""
+    if "\0" in text:
+        raise argparse.ArgumentTypeError("a path has no zero byte")
     try:
         return Path(text).expanduser()
     except RuntimeError as error:  # there is no such user

@@ -10,6 +10,7 @@ import errno
 import os
 import re
 import stat
+import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -127,7 +128,12 @@ def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
 
     with open_regular(path, what) as file:
         try:
-            require_memory(path, os.fstat(file.fileno()).st_size, f"the {what}")
+            size = os.fstat(file.fileno()).st_size
+            with zipfile.ZipFile(file) as archive:
+                if sum(part.file_size for part in archive.infolist()) > size:
+                    raise ValueError("its arrays are larger than the file")
+            file.seek(0)
+            require_memory(path, size, f"the {what}")
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
         except UserError:

@@ -92,6 +92,10 @@ def with_header(shape):
     return apply
 
 
+def compress(checkpoint):
+    np.savez_compressed(checkpoint, **arrays_of(checkpoint), zeros=np.zeros(10**7, np.uint8))
+
+
 def as_pipe(checkpoint):
     checkpoint.unlink()
     os.mkfifo(checkpoint)
@@ -138,6 +142,7 @@ DAMAGE = {
     "negative time": (edit("wall_s", lambda a: a * 0 - 1), "density and wall_s must hold"),
     "8 TB": (with_header((10**12,)), "cannot read the checkpoint"),
     "8 EB": (with_header((10**6, 10**6, 10**6)), "cannot read the checkpoint"),
+    "a bomb": (compress, "its arrays are larger than the file"),
     "a pipe": (as_pipe, "must be a regular file, got a named pipe"),
     "cut off": (lambda path: os.truncate(path, 999), "cannot read the checkpoint"),
     "empty": (lambda path: path.write_bytes(b""), "cannot read the checkpoint"),
