@@ -36,7 +36,7 @@ class Planned:
 @pytest.fixture
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
-    rehearsal = SimpleNamespace(trainer=SimpleNamespace(full_scene=lambda: None), iteration_s=0.1)
+    rehearsal = SimpleNamespace(trainer=SimpleNamespace(full_scene=object), iteration_s=0.1)
     monkeypatch.setattr(
         budget, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0)
     )
