@@ -23,7 +23,7 @@ COUNT, WIDTH, HEIGHT, FOCAL = 40, 48, 36, 60.0
 BACKGROUND = np.array([0.9, 0.2, 0.4])
 
 STEP = 1e-5
-"""Of the central differences, whose error is STEP^2 (truncation) plus 1e-16 / STEP (rounding)."""
+"""Step of central differences; their error is STEP^2 (truncation) plus 1e-16 / STEP (rounding)."""
 
 IMAGE_TOLERANCE = 1e-13
 """Some 40 additions of numbers below 1, in another order than the reference's."""

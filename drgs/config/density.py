@@ -31,7 +31,7 @@ SCHEDULES = {
     "budget": DEFAULT_SCHEDULE,
     "mcmc": Schedule(1 / 20, 5 / 7),
 }
-"""By shipped strategy. Of 7,000 iterations, adc leaves 2,000 for the last opacities to settle."""
+"""Schedules by strategy. Of 7,000 iterations, adc leaves 2,000 for the last opacities to settle."""
 
 
 def schedule_of(strategy: str) -> Schedule:

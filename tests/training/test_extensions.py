@@ -134,7 +134,7 @@ def test_a_fit_uses_what_its_configuration_names():
 
 
 def test_an_effect_decides_by_the_dataset_whether_it_takes_part(examples, monkeypatch):
-    """Where its section is there."""
+    """Return whether its section is present."""
     needs = lambda config, dataset: any(view.depth is not None for view in dataset.train)  # noqa: E731
     monkeypatch.setattr(examples["vignetting"].Vignetting, "is_used", needs)
     for dataset, used in ((fits.plain_dataset(), []), (fits.true_dataset(), ["vignetting"])):
