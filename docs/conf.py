@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import is_dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import get_args
 
 from pydantic import BaseModel
 
@@ -51,7 +52,7 @@ LITERAL = re.compile(r"(``.+?``|:\w+(?::\w+)?:`.+?`)")
 
 def as_restructured_text(app, what, name, obj, options, lines):
     """Escape what reStructuredText would read as markup, and set indented blocks as they are."""
-    del app, name, options
+    del app, what, name, options
     lines, original = list(_with_argument_lists(obj, lines)), lines
     result, literal = [], False
     for k, line in enumerate(lines):
@@ -65,7 +66,9 @@ def as_restructured_text(app, what, name, obj, options, lines):
         elif line.strip() and not indented:
             literal = False
         result.append(line if literal else _escaped(line))
-    original[:] = result + (["", *_fields(obj), ""] if what == "class" else [])
+    original[:] = result + (
+        ["", *_fields(obj), ""] if inspect.isclass(obj) and not get_args(obj) else []
+    )
 
 
 def _with_argument_lists(obj, lines):

@@ -63,6 +63,7 @@ class Copies:
                 for name in ("moments", "derivatives", "pack_tangents", "tangent")
             ],
             forward=["RayFalloff.footprint", "RayFalloff.geometry", "RayFalloff.bounds"],
+            RayFootprint=exact.RayFootprint,  # footprints are the package's
         )
         order = Instrumented(
             board,
