@@ -70,6 +70,7 @@ class Copies:
             pixel_order,
             derivatives=["PixelOrder.adjoint", "PixelOrder.tangent"],
             forward=["PixelOrder.composite", "PixelOrder.keys"],
+            _OrderedLayers=pixel_order._OrderedLayers,  # as are layers
         )
         colors = Instrumented(
             board,
