@@ -1,6 +1,6 @@
-"""The picture of tile, micro-tile, lane and slot: ``python docs/draw_tiles.py [--out FILE.png]``.
+"""The image of tile, micro-tile, lane and slot: ``python docs/draw_tiles.py [--out FILE.png]``.
 
-The documents show it as ``scenes/pictures/tiles.png``.
+The documents show it as ``scenes/images/tiles.png``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pictures of Gaussians as one function of arrays, with gsplat's names and conventions.
+"""Images of Gaussians as one function of arrays, with gsplat's names and conventions.
 
 No Mitsuba: :func:`rasterization` composes the stages of ``drgs.splatting`` for cameras given as
 matrices, and hands their adjoint and tangent to Dr.Jit as a custom operation.
@@ -136,7 +136,7 @@ def rasterization(
     :class:`drgs.config.approximations.Approximations`, such as ``projection="exact"`` or
     ``order="pixel"``.
 
-    Returns pictures (C, H, W, X), X = D, 1 or D + 1 with the depth last; alphas (C, H, W, 1); and a
+    Returns images (C, H, W, X), X = D, 1 or D + 1 with the depth last; alphas (C, H, W, 1); and a
     dictionary with ``means2d`` (C, N, 2) px, ``depths`` (C, N), ``conics`` (C, N, 3), the numbers
     a, b, c of exp(-(a dx^2 + 2 b dx dy + c dy^2) / 2), ``opacities`` (C, N), ``radii`` (C, N, 2)
     px, integers, 0 where a splat is not seen, ``width``, ``height`` and ``n_cameras``.
@@ -150,13 +150,13 @@ def rasterization(
 
         @dr.wrap(source="torch", target="drjit")
         def rasterize(means, quats, scales, opacities, colors, viewmats, Ks):
-            pictures, alphas, _ = drgs.rasterization(
+            images, alphas, _ = drgs.rasterization(
                 means, quats, scales, opacities, colors, viewmats, Ks, width=640, height=480
             )
-            return pictures, alphas
+            return images, alphas
 
-        pictures, alphas = rasterize(means, quats, scales, opacities, colors, viewmats, Ks)
-        torch.nn.functional.l1_loss(pictures, photographs).backward()
+        images, alphas = rasterize(means, quats, scales, opacities, colors, viewmats, Ks)
+        torch.nn.functional.l1_loss(images, photographs).backward()
 
     Raises TypeError and ValueError, naming the parameter, what was expected and what was got.
     """

@@ -50,7 +50,7 @@ from drgs.effects.compose import IGNORABLE
 from drgs.integrator.scene import render_views
 from drgs.integrator.types import is_splats
 from drgs.io.formats import format_for, readable_formats
-from drgs.io.pictures import (
+from drgs.io.images import (
     MITSUBA_FORMATS,
     check_animation,
     read_header,
@@ -143,7 +143,7 @@ def _add_cameras(parser: CommandParser) -> None:
     one_of("--origin", **vector, help="one camera, here")
     add = group.add_argument
     add("--target", **vector, help="what it looks at (default: the model's origin, 0 0 0)")
-    add("--up", **vector, help="up in the picture, of --origin or --orbit (default: 0 0 1)")
+    add("--up", **vector, help="up in the image, of --origin or --orbit (default: 0 0 1)")
     add(
         "--fov",
         type=degrees,
@@ -190,7 +190,7 @@ def add_background(parser: argparse._ActionsContainer) -> None:
         "--background",
         nargs="+",
         metavar="COLOR",
-        help="white, black, R G B in 0..1, or a picture's file (default: the configuration's; "
+        help="white, black, R G B in 0..1, or a image's file (default: the configuration's; "
         "without one, black)",
     )
 
@@ -201,7 +201,7 @@ def run(args: argparse.Namespace) -> None:
         run_with(args, render_views)
         return
     start_mpi()
-    from drgs.training.parallel.pictures import run_together
+    from drgs.training.parallel.images import run_together
 
     run_together(args, partial(run_with, args))
 
@@ -429,7 +429,7 @@ def _check_cameras(args: argparse.Namespace) -> None:
     _check_options(args, used, place)
     if way == "split" and isinstance(parse_background(args.background), Path):
         raise UserError(
-            "--background: a picture is not what the photographs were composited over; use it with "
+            "--background: a image is not what the photographs were composited over; use it with "
             "--orbit, --camera or --origin"
         )
 
@@ -463,7 +463,7 @@ def parse_background(words: Sequence[str] | None) -> Background | None:
         read_pixels(path)
         if (name := read_header(path).format) not in MITSUBA_FORMATS:
             raise UserError(
-                f"--background: {path} must be a PNG, JPEG, BMP, PPM or TGA picture, got {name}; "
+                f"--background: {path} must be a PNG, JPEG, BMP, PPM or TGA image, got {name}; "
                 "convert it"
             )
         return path
@@ -473,7 +473,7 @@ def parse_background(words: Sequence[str] | None) -> Background | None:
         color = ()
     if len(color) != 3 or not all(0 <= value <= 1 for value in color):
         raise UserError(
-            "--background: must be white, black, three numbers in 0..1 or a picture's file, got "
+            "--background: must be white, black, three numbers in 0..1 or a image's file, got "
             + one_line(" ".join(words), 60)
         )
     return color

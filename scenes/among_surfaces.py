@@ -17,7 +17,7 @@ from drgs.cli.commands import at_least
 from drgs.reference.splatting import C_00, Gaussians
 
 PATHS = 64
-"""Of a pixel, in each of :data:`ROUNDS` pictures."""
+"""Of a pixel, in each of :data:`ROUNDS` images."""
 
 ROUNDS = 8
 
@@ -86,7 +86,7 @@ def balls(means: np.ndarray, scale: float, opacities: np.ndarray, color: float) 
 
 
 def furnace(size: int, settings: dict, objects: dict, rounds: int = ROUNDS) -> tuple[float, float]:
-    """Mean over a picture of the furnace, and its standard error by pictures of several seeds."""
+    """Mean over a image of the furnace, and its standard error by images of several seeds."""
     sky = {"sky": {"type": "constant", "radiance": WHITE}} if "background" not in settings else {}
     scene = load(white_cloud(), [0, 0, 4], size, settings, objects | sky)
     means = [np.mean(mi.render(scene, seed=seed)) for seed in range(rounds)]
@@ -138,7 +138,7 @@ def lamp(name: str) -> dict:
     return {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area"}}
 
 
-def floor_picture(size: int, name: str, ball: dict, splats: Gaussians) -> np.ndarray:
+def floor_image(size: int, name: str, ball: dict, splats: Gaussians) -> np.ndarray:
     """What a camera that does not see the ball sees of the floor below it."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)}
     objects = {"floor": floor, "lamp": lamp(name)} | ball
@@ -154,9 +154,9 @@ def shadow_rows(size: int, count: int) -> list[tuple[str, float, float, float]]:
     black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
     rows = []
     for name in LAMPS:
-        lit = floor_picture(size, name, {}, nothing)
-        known = floor_picture(size, name, {"ball": sphere | {"bsdf": black}}, nothing)
-        found = floor_picture(size, name, {}, black_ball(count, sphere["radius"]))
+        lit = floor_image(size, name, {}, nothing)
+        known = floor_image(size, name, {"ball": sphere | {"bsdf": black}}, nothing)
+        found = floor_image(size, name, {}, black_ball(count, sphere["radius"]))
         shares = (known.sum() / lit.sum(), found.sum() / lit.sum())
         rows.append((name, *map(float, shares), float(np.abs(found - known).mean() / lit.mean())))
     return rows

@@ -1,7 +1,7 @@
 """One scene file by two integrators: ``python scenes/compare_shapes.py [MODEL.ply] [--out FILE]``.
 
 Renders ``scenes/shapes.xml`` with Mitsuba's ``volprim_rf_basic`` and with ``splats``, and writes
-the two pictures side by side under their times: the median of several renderings after a first one,
+the two images side by side under their times: the median of several renderings after a first one,
 which compiles. Without a model, that of the scene: ``scenes/knot.py``.
 """
 
@@ -24,7 +24,7 @@ from drgs.cli.ending import exit_on_user_error
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
-from drgs.io.pictures import to_uint8
+from drgs.io.images import to_uint8
 from drgs.results import metrics
 
 SCENE = Path(__file__).parent / "shapes.xml"
@@ -67,7 +67,7 @@ def main() -> None:
     for name, result in results.items():
         print(f"{name}: {result.seconds * 1e3:.4g} ms")
     print(f"ratio of the times: {first.seconds / second.seconds:.3g}")
-    print(f"difference of the pictures: {metrics.psnr(second.image, first.image):.2f} dB")
+    print(f"difference of the images: {metrics.psnr(second.image, first.image):.2f} dB")
     draw(args.out, results)
     print(f"written: {args.out}")
 
@@ -102,7 +102,7 @@ def measure(integrator: str, settings: dict[str, str]) -> Result:
 
 
 def draw(path: Path, results: dict[str, Result]) -> None:
-    """Write the pictures side by side."""
+    """Write the images side by side."""
     figure = new_figure(7.6, 4.1)
     for axes, (name, result) in zip(figure.subplots(1, len(results)), results.items(), strict=True):
         axes.imshow(to_uint8(result.image), interpolation="none")

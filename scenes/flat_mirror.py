@@ -2,7 +2,7 @@
 
 A cloud of splats hangs over a mirror, out of the camera's sight. What the mirror shows is what the
 camera that is mirrored in its plane sees: float64 rays of that (``drgs.reference.light``) through
-every pixel give the picture that all are compared with. Prints a table.
+every pixel give the image that all are compared with. Prints a table.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def main() -> None:
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     splats = cloud(args.splats)
-    pictures = {name: render(splats, args.size, settings) for name, settings in LIGHTS.items()}
-    print(table(pictures, mirrored_camera(splats, args.size)))
+    images = {name: render(splats, args.size, settings) for name, settings in LIGHTS.items()}
+    print(table(images, mirrored_camera(splats, args.size)))
 
 
 def cloud(count: int) -> Gaussians:
@@ -59,7 +59,7 @@ def cloud(count: int) -> Gaussians:
 
 
 def render(splats: Gaussians, size: int, light: dict[str, object]) -> np.ndarray:
-    """Linear picture (H, W, 3) of the mirror."""
+    """Linear image (H, W, 3) of the mirror."""
     T = mi.ScalarTransform4f
     tensors = {k: mi.TensorXf(np.float32(values)) for k, values in vars(splats).items()}
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
@@ -91,7 +91,7 @@ def render(splats: Gaussians, size: int, light: dict[str, object]) -> np.ndarray
 
 
 def mirrored_camera(splats: Gaussians, size: int) -> np.ndarray:
-    """The same picture as the mirrored camera sees it, in float64."""
+    """The same image as the mirrored camera sees it, in float64."""
     origin, target = np.array([0.3, -1.0, -2.6]), np.array([0, 0.9, 0])
     forward = (target - origin) / np.linalg.norm(target - origin)
     right = np.cross(forward, [0, 1, 0])
@@ -109,11 +109,11 @@ def mirrored_camera(splats: Gaussians, size: int) -> np.ndarray:
     return (coverage * linear).reshape(size, SIDE, size, SIDE, 3).mean((1, 3))
 
 
-def table(pictures: dict[str, np.ndarray], expected: np.ndarray) -> str:
-    """Errors of pictures, and how much of the light they have."""
+def table(images: dict[str, np.ndarray], expected: np.ndarray) -> str:
+    """Errors of images, and how much of the light they have."""
     rows = [
-        (name, f"{picture.mean() / expected.mean():.1%}", f"{metrics.psnr(picture, expected):.1f}")
-        for name, picture in pictures.items()
+        (name, f"{image.mean() / expected.mean():.1%}", f"{metrics.psnr(image, expected):.1f}")
+        for name, image in images.items()
     ]
     return markdown_table(("`light`", "light in the mirror", "PSNR [dB]"), rows)
 

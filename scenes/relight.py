@@ -1,11 +1,11 @@
-"""Find what a picture of a fitted model in a path-traced scene was made of.
+"""Find what a image of a fitted model in a path-traced scene was made of.
 
     python scenes/relight.py out/lego --out out/relight
     python scenes/relight.py out/lego --case mirror --out out/mirror
 
 A model that was fitted to photographs (``python -m drgs.fit``) stands among path-traced surfaces:
-what a splat trainer cannot render, and Mitsuba alone cannot either. A picture of this is taken, and
-what it was made of is forgotten. From wrong values, gradient descent through the composited picture
+what a splat trainer cannot render, and Mitsuba alone cannot either. A image of this is taken, and
+what it was made of is forgotten. From wrong values, gradient descent through the composited image
 finds the true ones. The unit of length is the model's radius.
 
 Case ``objects``: the model stands on a floor under a lamp, behind a globe and before a ball.
@@ -22,23 +22,23 @@ have soft edges. The nested integrator is Mitsuba's ``prb`` (path tracing whose 
 replays its paths). It finds the gradients of the globe's pose, through the texture that turns with
 it, and those of paint and light.
 
-Case ``mirror``: behind the model is a sheet of metal, larger than the picture, under a sky of one
+Case ``mirror``: behind the model is a sheet of metal, larger than the image, under a sky of one
 colour. Unknown are
 
 - how the sheet is turned: its normal
 - how rough it is: alpha of its microfacets
 - its colour
 
-Without the splats that the sheet reflects, its picture would have one colour whatever its turn and
+Without the splats that the sheet reflects, its image would have one colour whatever its turn and
 its roughness. So these are found through splats that rays meet behind a surface: the nested
 integrator is ``splatpath``, with ``light`` set to ``rays``.
 
 Not differentiated: whether a splat is in front of a surface, and the outlines of surfaces. So the
-globe turns where it is, and the sheet has no outline in the picture: to move one would need
+globe turns where it is, and the sheet has no outline in the image: to move one would need
 derivatives of its silhouette. Nor is how what a ray meets of splats changes with the ray: a sheet
 that turns reflects each direction with another weight, and that is differentiated, but it also
 moves the points that rays start from. So the gradient of the normal is not exact; where the
-pictures are equal, it vanishes all the same.
+images are equal, it vanishes all the same.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.sh import sh_basis
 from drgs.gaussians.similarity import Similarity
 from drgs.io.figures import new_figure, write_figure
-from drgs.io.pictures import write_animation, write_png
+from drgs.io.images import write_animation, write_png
 from drgs.reference import splatting as reference
 
 
@@ -178,17 +178,17 @@ def main() -> None:
 
 
 def relight(case: Case, model: Gaussians, size: int, iterations: int, out: Path) -> None:
-    """Forget what a picture was made of, find it again, and write what happened."""
+    """Forget what a image was made of, find it again, and write what happened."""
     stage = case.stage.of(model, size)
     stage.show(case.true.variables())
-    target = stage.picture(seed=0, spp=TARGET_SPP)
+    target = stage.rendered(seed=0, spp=TARGET_SPP)
     optimizer = mi.ad.Adam(lr=RATE, params=case.start.variables())
     losses, frames, start = [], [], time.perf_counter()
     for iteration in range(iterations):
         cooling = max(0, 2 * iteration / iterations - 1)  # in the second half
         optimizer.set_learning_rate(RATE * (LAST_RATE / RATE) ** cooling)
         stage.show(optimizer)
-        image = stage.picture(seed=1 + iteration, spp=case.spp)
+        image = stage.rendered(seed=1 + iteration, spp=case.spp)
         loss = distance(image, target)
         dr.backward(loss)
         optimizer.step()
@@ -200,15 +200,15 @@ def relight(case: Case, model: Gaussians, size: int, iterations: int, out: Path)
         if iteration % 10 == 0 or iteration == iterations - 1:
             seconds = time.perf_counter() - start
             print(f"iteration {iteration}: loss {losses[-1]:.2e}, {seconds:.0f} s", flush=True)
-    pictures = {"target": encoded(target)}
+    images = {"target": encoded(target)}
     for name, variables in {"start": case.start.variables(), "end": optimizer}.items():
         stage.show(variables)
-        pictures[name] = encoded(stage.picture(seed=0, spp=TARGET_SPP))
-    write(out, pictures, frames, losses, [case.true, case.start, case.start.of(optimizer)])
+        images[name] = encoded(stage.rendered(seed=0, spp=TARGET_SPP))
+    write(out, images, frames, losses, [case.true, case.start, case.start.of(optimizer)])
 
 
 def distance(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Of two pictures (H, W, 3): the mean square of their difference at each of :data:`SCALES`.
+    """Of two images (H, W, 3): the mean square of their difference at each of :data:`SCALES`.
 
     The sum weights them by s, for what is left of noise and detail in a block shrinks with it.
     """
@@ -239,7 +239,7 @@ class Stage(ABC):
 
     @classmethod
     def of(cls, model: Gaussians, size: int) -> Stage:
-        """Set it up; model: as :func:`load` gives it; size: px, of the picture's sides."""
+        """Set it up; model: as :func:`load` gives it; size: px, of the image's sides."""
         names = [*PARAMETER_NAMES, *(["smoothing"] if model.smoothing is not None else [])]
         tensors = {name: mi.TensorXf(getattr(model, name)) for name in names}
         said = said_by("the model's file", model.rendered_with or {})
@@ -263,7 +263,7 @@ class Stage(ABC):
     def show(self, unknowns: Any) -> None:
         """Make the scene's parameters functions of these variables."""
 
-    def picture(self, seed: int, spp: int) -> mi.TensorXf:
+    def rendered(self, seed: int, spp: int) -> mi.TensorXf:
         """The composited one, linear; spp: paths per pixel. Splats need one sample."""
         self.scene.integrator().nested_spp = spp
         return mi.render(self.scene, self.params, seed=seed)
@@ -404,7 +404,7 @@ def sh_rotation(rotation: mi.Matrix3f, degree: int) -> mi.TensorXf:
 
 
 def camera(size: int) -> dict[str, Any]:
-    """For ``mi.load_dict``; size: px, of the picture's sides."""
+    """For ``mi.load_dict``; size: px, of the image's sides."""
     to_world = mi.ScalarTransform4f().look_at([1.1, -2.7, 1.3], [0, 0, -0.05], [0, 0, 1])
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb"}
     film["rfilter"] = {"type": "box"}
@@ -439,16 +439,16 @@ def encoded(image: mi.TensorXf) -> np.ndarray:
 
 def write(
     out: Path,
-    pictures: dict[str, np.ndarray],
+    images: dict[str, np.ndarray],
     frames: list[np.ndarray],
     losses: list[float],
     values: list[Unknowns],
 ) -> None:
-    """Pictures, an animation, the losses, and a table of the true, first and found values."""
-    target = pictures["target"]
-    pictures["difference"] = 0.5 + 5 * (pictures["end"] - target)
-    for name, picture in pictures.items():
-        write_png(out / f"{name}.png", picture)
+    """Images, an animation, the losses, and a table of the true, first and found values."""
+    target = images["target"]
+    images["difference"] = 0.5 + 5 * (images["end"] - target)
+    for name, rendered in images.items():
+        write_png(out / f"{name}.png", rendered)
     write_animation(out / "relight.webp", [np.hstack([frame, target]) for frame in frames])
     figure = new_figure(5, 3)
     axes = figure.add_subplot()

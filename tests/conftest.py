@@ -50,7 +50,7 @@ def fox_folder():
 
 @pytest.fixture(scope="module")
 def gsplat():
-    """10,000 Gaussians, their camera, and gsplat's float32 picture, cotangent and gradients."""
+    """10,000 Gaussians, their camera, and gsplat's float32 image, cotangent and gradients."""
     from drgs.reference.splatting import Camera, Gaussians
 
     folder = _shared("gsplat_reference")

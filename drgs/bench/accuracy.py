@@ -392,7 +392,7 @@ def table(results: Sequence[AccuracyMeasurement]) -> str:
         ("largest error", "{0[m].largest_error:.2g}"),
         ("PSNR, photographs", "{0[photographs]}"),
     ]
-    note = "* on the Pareto front of the approximations; (in brackets) other pictures"
+    note = "* on the Pareto front of the approximations; (in brackets) other images"
     return f"{columns_table(columns, rows)}\n\n{note}"
 
 

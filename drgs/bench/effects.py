@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> None:
     gaussians = bench_gaussians(count)
     print(f"{machine()}\nbench scene, {count:,} Gaussians, {SIZE}x{SIZE}")
     rendered = measure(rendering_cases(), lambda case: CaseRenderer(case, gaussians), rounds)
-    print(f"\n{table(rendered, 'picture', 'picture + derivatives')}", flush=True)
+    print(f"\n{table(rendered, 'rendered', 'rendered + derivatives')}", flush=True)
     fitted = measure(fitting_cases(), lambda case: Fitter(case, gaussians), rounds)
     print(f"\n{table(fitted, '', 'training iteration')}")
     fitted = [replace(p, forward_ms=math.nan, forward_ratio=math.nan) for p in fitted]
@@ -130,7 +130,7 @@ def rendering_cases() -> list[RenderingCase]:
         RenderingCase("none", "none"),
         *(RenderingCase("view dependence", f"SH degree {k}", sh_degree=k) for k in range(3)),
         RenderingCase("background", "environment", scene={"sky": sky}),
-        RenderingCase("background", "picture", integrator={"background": behind}),
+        RenderingCase("background", "image", integrator={"background": behind}),
         RenderingCase("lens", "distortion: k1 k2 p1 p2", lens("opencv", fox)),
         RenderingCase("lens", "distortion: k1 to k6, p1 p2", lens("opencv", rational)),
         RenderingCase("lens", "fisheye: k1 k2", lens("fisheye", fisheye)),
@@ -293,7 +293,7 @@ def table(prices: list[Price], forward: str, both: str) -> str:
 
 def plot(rendered: list[Price], fitted: list[Price]) -> Figure:
     """Draw a bar for what each effect adds to the time."""
-    parts = {"picture and derivatives": rendered[1:], "training iteration": fitted[1:]}
+    parts = {"image and derivatives": rendered[1:], "training iteration": fitted[1:]}
     heights = [len(prices) for prices in parts.values()]
     figure = new_figure(8, 0.28 * sum(heights) + 1.5)
     all_axes = figure.subplots(len(parts), sharex=True, height_ratios=heights)

@@ -165,7 +165,7 @@ def bench_config(gaussians: Gaussians) -> FitConfig:
 def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:
     """Return a scene that is hard for the affine approximation and one order for all pixels.
 
-    A lens of 110 degrees; two layers of flat discs that cross in the middle of the picture; large,
+    A lens of 110 degrees; two layers of flat discs that cross in the middle of the image; large,
     faint splats before the camera; a shell of splats around everything.
     """
     rng = np.random.default_rng(seed)

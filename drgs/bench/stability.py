@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
-"""px: small pictures, since the reference draws each of them many times."""
+"""px: small images, since the reference draws each of them many times."""
 
 COUNT = 60
 """Gaussians in a scene, but for the stacks."""
@@ -60,8 +60,8 @@ class StabilityMeasurement:
     """Errors at one step of a sweep, relative to the largest value of each array."""
 
     value: float
-    picture: float  # largest error of any pixel
-    picture_noise: float
+    image: float  # largest error of any pixel
+    image_noise: float
     gradient: float  # largest error of any derivative, over the five parameters
     gradient_noise: float
     storage: float  # largest change of any pixel by storing the scene in float32
@@ -69,8 +69,8 @@ class StabilityMeasurement:
 
 
 ERRORS = [
-    ("picture", "{.picture:.1e}"),
-    ("its noise", "{.picture_noise:.1e}"),
+    ("image", "{.image:.1e}"),
+    ("its noise", "{.image_noise:.1e}"),
     ("gradients", "{.gradient:.1e}"),
     ("their noise", "{.gradient_noise:.1e}"),
     ("stored in float32", "{.storage:.1e}"),
@@ -200,13 +200,13 @@ def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
     """Measure errors and noise of one scene; both sides start from the same, rounded numbers."""
     exact = sweep.scene(value)
     gaussians, camera = _stored(*exact)
-    picture = reference.render(gaussians, camera, threshold_width=MARKED_WITHIN)
-    kept = ~picture.near_threshold
-    cotangent = np.random.default_rng(5).normal(size=picture.image.shape) * kept[..., None]
+    rendered = reference.render(gaussians, camera, threshold_width=MARKED_WITHIN)
+    kept = ~rendered.near_threshold
+    cotangent = np.random.default_rng(5).normal(size=rendered.image.shape) * kept[..., None]
     image, gradients = _by_reference(gaussians, camera, cotangent)
     image32, gradients32 = _by_kernels(gaussians, camera, cotangent)
 
-    def picture_error(other: np.ndarray) -> float:
+    def image_error(other: np.ndarray) -> float:
         return np.abs(other - image)[kept].max(initial=0) / np.abs(image).max()
 
     def gradient_error(other: dict[str, np.ndarray]) -> float:
@@ -218,15 +218,15 @@ def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
     errors = []
     for sample in range(samples):
         moved = _by_reference(*_moved(gaussians, camera, sample), cotangent)
-        errors.append([picture_error(moved[0]), gradient_error(moved[1])])
-    picture_noise, gradient_noise = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
+        errors.append([image_error(moved[0]), gradient_error(moved[1])])
+    image_noise, gradient_noise = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
     return StabilityMeasurement(
         value=value,
-        picture=picture_error(image32),
-        picture_noise=picture_noise,
+        image=image_error(image32),
+        image_noise=image_noise,
         gradient=gradient_error(gradients32),
         gradient_noise=gradient_noise,
-        storage=picture_error(_by_reference(*exact, cotangent)[0]),
+        storage=image_error(_by_reference(*exact, cotangent)[0]),
         left_out=float(np.mean(~kept)),
     )
 
@@ -289,14 +289,14 @@ def plot(results: dict[str, list[StabilityMeasurement]]) -> Figure:
         steps = results[sweep.name]
         x = [m.value for m in steps]
         for color, what, label in (
-            ("tab:blue", "picture", "picture"),
+            ("tab:blue", "image", "image"),
             ("tab:orange", "gradient", "gradients"),
         ):
             panel.loglog(x, [getattr(m, what) for m in steps], "o-", color=color, label=label)
             noise = [getattr(m, f"{what}_noise") for m in steps]
             panel.loglog(x, noise, "--", color=color, label=f"{label}: one rounding of the inputs")
         storage = [m.storage for m in steps]
-        panel.loglog(x, storage, ":", color="0.4", label="picture: scene stored in float32")
+        panel.loglog(x, storage, ":", color="0.4", label="image: scene stored in float32")
         panel.set(title=sweep.name, xlabel=sweep.axis)
         panel.grid(alpha=0.3)
     for panel in axes[::2]:

@@ -251,7 +251,7 @@ class Perspective(Lens):
 
     def frustum(self, camera: CameraParameters) -> tuple[Array2f, Array2f]:
         """Return the least and the largest slopes on the film."""
-        # Of the whole film: a crop window is a part of the same picture.
+        # Of the whole film: a crop window is a part of the same image.
         start = (camera.film_start - camera.principal) / camera.focal
         end = (camera.film_end - camera.principal) / camera.focal
         return start, end

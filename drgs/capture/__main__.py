@@ -37,9 +37,9 @@ from drgs.core.memory import why_too_large
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 WHOLE_NUMBERS = {
-    "views": (1, 100_000, "pictures to train on"),
-    "val_views": (0, 100_000, "pictures of the split val"),
-    "test_views": (0, 100_000, "pictures of the split test"),
+    "views": (1, 100_000, "images to train on"),
+    "val_views": (0, 100_000, "images of the split val"),
+    "test_views": (0, 100_000, "images of the split test"),
     "spp": (1, 2**20, "paths per pixel"),
     "max_depth": (1, 2**16, "longest path"),
     "points": (0, 5_000_000, f"number of points in {POINTS}"),
@@ -99,7 +99,7 @@ def _add_cameras(parser: CommandParser) -> None:
     add(
         "--distance",
         type=finite_number,
-        help="of the cameras from the target (default: the whole scene is in the picture)",
+        help="of the cameras from the target (default: the whole scene is in the image)",
     )
     add(
         "--target",

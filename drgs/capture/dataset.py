@@ -37,7 +37,7 @@ from drgs.capture.path_tracing import (
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries
-from drgs.io.pictures import read_image, to_uint8, write_png
+from drgs.io.images import read_image, to_uint8, write_png
 
 POINTS = "points3d.ply"
 MANIFEST = "capture.json"
@@ -124,11 +124,11 @@ class CaptureFolder:
         camera = CaptureCamera(scene, self._settings)
         missing = spread_first([view for view in views if not self.image_path(view).exists()])
         if num_done := len(views) - len(missing):
-            print(f"{num_done} of {len(views)} pictures are there already")
+            print(f"{num_done} of {len(views)} images are there already")
         if not missing:
             self.claim()
         shown, num_first = [], min(NUM_FIRST, len(missing))
-        with RunProgress("picture", len(views), num_done) as progress:
+        with RunProgress("image", len(views), num_done) as progress:
             for done, view in enumerate(missing, num_done + 1):
                 image = camera.image(view)
                 if not shown:
@@ -141,7 +141,7 @@ class CaptureFolder:
 
     def _warn_of_empty(self, num_empty: int, num_first: int) -> None:
         print(
-            f"warning: {num_empty} of the first {num_first} pictures are empty or black: "
+            f"warning: {num_empty} of the first {num_first} images are empty or black: "
             f"{REMEDIES[self._settings.cameras]}, and another --out; or give the scene light",
             file=sys.stderr,
             flush=True,
@@ -156,7 +156,7 @@ class CaptureFolder:
                 write_points(points_path, positions, colors)
                 print(f"{len(positions):,} points: {points_path}")
             else:
-                print("no points: the pictures to train on show no surface")
+                print("no points: the images to train on show no surface")
         # The layout is recognised by the training split's file, so that one comes last.
         for split in reversed(SPLITS):
             path = self.path / f"transforms_{split}.json"
@@ -206,7 +206,7 @@ class CaptureFolder:
         image = read_image(path)
         if image.shape != (height, width, 4):
             raise UserError(
-                f"{path}: must be an RGBA picture of {width} x {height} px of this capture, got "
+                f"{path}: must be an RGBA image of {width} x {height} px of this capture, got "
                 f"{image.shape[1]} x {image.shape[0]} with {image.shape[2]} channels; remove it, "
                 "and the same command takes it again"
             )

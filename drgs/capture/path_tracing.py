@@ -30,7 +30,7 @@ from drgs.cameras.axes import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
 from drgs.core.types import Bool
 from drgs.integrator.types import is_splats
-from drgs.io.pictures import to_uint8
+from drgs.io.images import to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
 
 NERF_SYNTHETIC_FOV = 0.6911112070083618  # radians: the original's ``camera_angle_x``
@@ -198,7 +198,7 @@ def refuse_splats(path: Path, scene: mi.Scene) -> None:
     else:
         return
     raise UserError(
-        f"{path}: the scene holds splats ({found}), which path tracing leaves out; take pictures "
+        f"{path}: the scene holds splats ({found}), which path tracing leaves out; take images "
         f"of it with python -m drgs.render {path} --out DIR, or remove the splats from the file"
     )
 

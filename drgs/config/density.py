@@ -81,7 +81,7 @@ class BudgetConfig(Section):
     gaussians: Resolved[Count] = Field(
         UNRESOLVED,
         ge=4,
-        description="How many there are to be at densify.stop. null: as many as suit the pictures' "
+        description="How many there are to be at densify.stop. null: as many as suit the images' "
         "size, 250 times the square root of the number of their pixels: 100,000 for 400 x 400 px.",
     )
     error_every: Count = Field(
@@ -117,7 +117,7 @@ class McmcConfig(Section):
         ge=0,
         le=1e12,
         description="Of the noise on means, times their rate and the covariance in squared scene "
-        "extents. The paper's would be 1e7, at its scenes' extents; in small pictures, where "
+        "extents. The paper's would be 1e7, at its scenes' extents; in small images, where "
         "Gaussians are large, that costs 2 dB.",
     )
     opacity_weight: float = Field(
@@ -137,7 +137,7 @@ class PruneConfig(Section):
     method: Literal["selection", "importance"] = Field(
         "selection",
         description="selection: opacities are lowered until what the photographs do not defend is "
-        "transparent. importance: what contributes least to pictures goes.",
+        "transparent. importance: what contributes least to images goes.",
     )
     start: Count | None = Field(
         None,

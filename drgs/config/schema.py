@@ -74,7 +74,7 @@ ColorField = Annotated[Color | None, PlainValidator(_color), PlainSerializer(_co
 PathField = Annotated[Path, Field(strict=False)]
 
 CameraRate = Annotated[float, Field(le=1)]
-"""The same: a radian, a scene's extent, a factor e of focal lengths, a picture's size."""
+"""The same: a radian, a scene's extent, a factor e of focal lengths, a image's size."""
 
 Decay = Annotated[float, Field(ge=0, le=0.999999)]
 """A mean over a million steps; float32 knows few numbers between this and 1."""
@@ -97,11 +97,11 @@ class DataConfig(Section):
         None,
         ge=1,
         description="px. Wider images are scaled down to this width by area averaging; null: "
-        "photographs to 1600, as in the reference; pictures of the NeRF-synthetic layout are not.",
+        "photographs to 1600, as in the reference; images of the NeRF-synthetic layout are not.",
     )
     downscale: Literal[1, 2, 4, 8] | None = Field(
         None,
-        description="COLMAP's layout: read the pictures of images, images_2, images_4 or images_8; "
+        description="COLMAP's layout: read the images of images, images_2, images_4 or images_8; "
         "null: the smallest that are not smaller than image_size.",
     )
     test_split: Literal["train", "val", "test"] | None = Field(
@@ -123,7 +123,7 @@ class DataConfig(Section):
     )
     random_background: bool = Field(
         False,
-        description="Each iteration puts another colour behind the transparent pictures and the "
+        description="Each iteration puts another colour behind the transparent images and the "
         "splats, so that splats cannot pass for the background.",
     )
     ignore_distortion: bool = Field(
@@ -136,8 +136,8 @@ class DataConfig(Section):
         SHUTTER_SAMPLES,
         ge=1,
         le=MAX_SHUTTER_SAMPLES,
-        description="Times at which a picture is rendered that a moving camera with a global "
-        "shutter blurs; each takes as much memory and time as a picture.",
+        description="Times at which a image is rendered that a moving camera with a global "
+        "shutter blurs; each takes as much memory and time as a image.",
     )
     ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
     ignore_depth: bool = Field(
@@ -161,10 +161,10 @@ class InitConfig(Section):
 
     start: Literal["auto", "masks", "points", "random"] = Field(
         "auto",
-        description="What the points are. masks: the surface of what no picture's alpha shows "
-        "empty, coloured from the pictures, which have to be transparent where there is nothing. "
+        description="What the points are. masks: the surface of what no image's alpha shows "
+        "empty, coloured from the images, which have to be transparent where there is nothing. "
         "points: a point cloud. random: in the start box, or where the cameras look. auto: the "
-        "point_cloud or the half_extent that is given; else masks if nearly all training pictures "
+        "point_cloud or the half_extent that is given; else masks if nearly all training images "
         "are partly transparent; else the dataset's point cloud if it names one; else random.",
     )
     num_points: Count | None = Field(
@@ -232,8 +232,8 @@ class _Model(Section):
 
 
 FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
-"""Approximations that fits make by default, where pictures of files make others: they gave the best
-pictures of views that were not trained on. What was fitted says so in its file."""
+"""Approximations that fits make by default, where images of files make others: they gave the best
+images of views that were not trained on. What was fitted says so in its file."""
 
 
 def _as_field(name: str, declared: Declared) -> tuple[object, FieldInfo]:
@@ -310,7 +310,7 @@ class OptimizerConfig(Section):
     means_lr_aims: list[RateAim] = Field(
         default_factory=list,
         description="When the means' rate is to be the last one, as a plan was revised: a list of "
-        "{after: iteration, end: iteration}; empty: at the last iteration. It falls when pictures "
+        "{after: iteration, end: iteration}; empty: at the last iteration. It falls when images "
         "are no longer coarse.",
     )
     sh0_lr: Rate = Field(5e-3, ge=0, description="Degree-0 colour coefficients.")
@@ -396,7 +396,7 @@ class ColorConfig(Section):
 class CamerasConfig(Section):
     """Refinement of the training cameras; first rates per step, which fall as that of the means.
 
-    A camera's pose gets a step when its picture is drawn: of 7,000 iterations with 100 pictures 70.
+    A camera's pose gets a step when its image is drawn: of 7,000 iterations with 100 images 70.
     Fits that short need higher rates than 30,000 iterations, which these are for.
     """
 
@@ -408,7 +408,7 @@ class CamerasConfig(Section):
         0.0, ge=0, description="Relative to the focal lengths, which all views share."
     )
     principal_lr: CameraRate = Field(
-        0.0, ge=0, description="In parts of the picture's size; all views share it."
+        0.0, ge=0, description="In parts of the image's size; all views share it."
     )
 
 
@@ -438,7 +438,7 @@ class OutputConfig(Section):
 
 
 class CoarseStage(Section):
-    """Iterations that see smaller pictures."""
+    """Iterations that see smaller images."""
 
     until: Count = Field(ge=1, description="The stage's last iteration.")
     factor: int = Field(ge=2, le=64, description="Width and height are divided by this.")
@@ -478,7 +478,7 @@ class FitConfig(Section):
     )
     coarse: Resolved[list[CoarseStage]] = Field(
         UNRESOLVED,
-        description="Stages of smaller training pictures, before those of full size: a list of "
+        description="Stages of smaller training images, before those of full size: a list of "
         "{until: iteration, factor: 4}. null: half the size for the first 35 % of a fit to "
         "photographs of at least 100 px that are not cut out, else none; with the strategy adc "
         "none, as in the paper.",

@@ -28,7 +28,7 @@ _EXHAUSTED = re.compile(
 MAX_LANES = 2**32 - 1
 """Entries of an array of Dr.Jit, which counts them in 32 bits."""
 
-PICTURE_BYTES = 250
+IMAGE_BYTES = 250
 """Bytes for a pixel, about: splats in its tile, planes, the film's block, the image, its copy on
 the host."""
 
@@ -37,13 +37,13 @@ SAMPLE_BYTES = 80
 
 CHANNEL_BYTES = 24
 """Bytes for each channel of the film besides colour: its plane, and its part of the block, of
-the picture and of the copy."""
+the image and of the copy."""
 
 UNASKED_FILE_BYTES = 1 << 24
 """A file that takes less is read without asking: a fit reads hundreds of photographs."""
 
 UNASKED_BYTES = 1 << 28
-"""A picture that needs less is rendered without asking what there is, which may take a millisecond:
+"""A image that needs less is rendered without asking what there is, which may take a millisecond:
 fits render hundreds in a second."""
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
@@ -124,7 +124,7 @@ def why_out_of_memory(error: BaseException) -> str | None:
 
 
 def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) -> str | None:
-    """Return why a picture of ``width`` x ``height`` px cannot be rendered here; None: it can.
+    """Return why a image of ``width`` x ``height`` px cannot be rendered here; None: it can.
 
     channels: of the film, without alpha; samples: per pixel, times those of an open shutter.
     """
@@ -136,7 +136,7 @@ def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) 
             f"{MAX_LANES // widest:,} pixels fit"
         )
     of_channels = CHANNEL_BYTES * (channels - 3)
-    of_pixel = PICTURE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
+    of_pixel = IMAGE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
     available = _if_insufficient(pixels * of_pixel, UNASKED_BYTES)
     if available is None:
         return None

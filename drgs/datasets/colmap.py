@@ -25,7 +25,7 @@ from drgs.datasets.reader import MAX_WIDTH, DatasetReader, Photographs
 from drgs.datasets.splits import unlisted_splits
 from drgs.datasets.transforms import LENS_OF_MODEL, FrameValues, TransformsFrame
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
-from drgs.io.pictures import MAX_SIDE, read_header
+from drgs.io.images import MAX_SIDE, read_header
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Folders of COLMAP's models in datasets."""
@@ -67,7 +67,7 @@ class ColmapReader(DatasetReader):
             place = f"image {one_line(image.name, 100)}: "
             frames.append(TransformsFrame(values, folder, place, is_as_stored=True, files=found))
         lists = unlisted_splits((folder, root), [image.name for image in model.images], notes)
-        cloud, note = model.points_file if model.has_points else None, f"; pictures of {below.name}"
+        cloud, note = model.points_file if model.has_points else None, f"; images of {below.name}"
         if cloud is not None and config.ignore_points:
             cloud, note = None, f"{note}; points of the model ignored"
         return Photographs("COLMAP", folder, frames, lists, cloud, note, notes)
@@ -174,7 +174,7 @@ def _values(
     if camera.model not in LENS_OF_MODEL:
         raise UserError(
             f"{folder}: camera {camera.number} is of the model {camera.model}, which cannot be "
-            f"rendered (those that can: {', '.join(LENS_OF_MODEL)}); undistort the pictures "
+            f"rendered (those that can: {', '.join(LENS_OF_MODEL)}); undistort the images "
             "(colmap image_undistorter), or have COLMAP find another model"
         )
     width, height = _size_as_calibrated(file, camera, image, folder)
@@ -217,6 +217,6 @@ def _size_as_calibrated(
             return size
     raise UserError(
         f"{folder}: image {one_line(image.name, 100)} was {camera.width} x {camera.height} px for "
-        f"COLMAP, and {file} is {width} x {height} px, of another shape; give the pictures that "
+        f"COLMAP, and {file} is {width} x {height} px, of another shape; give the images that "
         "COLMAP saw, or smaller ones of the same shape"
     )

@@ -19,7 +19,7 @@ from drgs.datasets.types import Dataset, Keeps, View, all_of_them
 TOLERANCE = 1e-9
 """Relative and absolute, of a camera's numbers: rounding of another machine's mathematics."""
 
-FILE_NAMES = {"image": "the picture", "mask": "the mask", "depth": "the depth"}
+FILE_NAMES = {"image": "the image", "mask": "the mask", "depth": "the depth"}
 
 
 class ViewPrint(BaseModel):

@@ -19,7 +19,7 @@ from drgs.datasets.colmap import find_model, folders_in
 from drgs.datasets.files import images_in
 from drgs.datasets.images import downscaled_size
 from drgs.datasets.reader import DatasetReader
-from drgs.io.pictures import image_size
+from drgs.io.images import image_size
 
 MAX_PIXELS = 600_000
 """Pixels of an image that is fitted, as 894 x 671. The width of larger ones is divided by the
@@ -29,7 +29,7 @@ ITERATIONS = {"nerf_synthetic": 4500, "nerfstudio": 4000, "colmap": 4000}
 """Iterations by layout, as ``scenes/lego.yml`` and ``scenes/photos.yml`` have them."""
 
 NAMES = {
-    "nerf_synthetic": "cut-out pictures in the layout of NeRF-synthetic",
+    "nerf_synthetic": "cut-out images in the layout of NeRF-synthetic",
     "nerfstudio": "photographs with the cameras of transforms.json",
     "colmap": "photographs with the cameras of COLMAP's model",
 }

@@ -16,7 +16,7 @@ from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
 from drgs.core.memory import available_memory, readable, require_memory
 from drgs.datasets.types import LazyImage, Pixels, View
-from drgs.io.pictures import (
+from drgs.io.images import (
     BITS,
     MAX_16_BITS,
     MAX_BYTES,
@@ -85,7 +85,7 @@ def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
         mode = read_header(path).mode
         if BITS.get(mode) != 16:  # of 8 bits, all depths would be 257 times as large
             raise UserError(
-                f"{path}: must be a grey picture of 16 bits or an .npy file, got one of Pillow's "
+                f"{path}: must be a grey image of 16 bits or an .npy file, got one of Pillow's "
                 f"mode {mode}; convert it"
             )
         _check_size(path, image_size(path), size)
@@ -228,7 +228,7 @@ def compact_photograph(
     The pixels of the file; numbers, where they take less; and where the photograph is scaled by no
     whole factor, which takes long, numbers rounded to 16 bits.
 
-    pixels: of :func:`drgs.io.pictures.read_pixels`; background: behind transparent pixels, display
+    pixels: of :func:`drgs.io.images.read_pixels`; background: behind transparent pixels, display
     space; max_width: see :func:`downscale`.
     """
     height, width, channels = pixels.shape

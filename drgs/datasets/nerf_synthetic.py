@@ -28,7 +28,7 @@ from drgs.datasets.transforms import (
     read_transforms,
 )
 from drgs.datasets.types import Dataset, Keeps, View, all_of_them
-from drgs.io.pictures import image_size
+from drgs.io.images import image_size
 
 START_HALF_EXTENT = 1.3
 """The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes

@@ -13,7 +13,7 @@ import numpy as np
 from drgs.core.errors import UserNote, listed, one_line
 from drgs.core.folders import digest
 from drgs.datasets.types import View
-from drgs.io.pictures import unused_content
+from drgs.io.images import unused_content
 
 MAX_NOTE_CHARACTERS = 1000
 

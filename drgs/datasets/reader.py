@@ -50,7 +50,7 @@ from drgs.datasets.transforms import (
     unique_names,
 )
 from drgs.datasets.types import Dataset, Keeps, View, all_of_them
-from drgs.io.pictures import read_header, read_pixels, upright
+from drgs.io.images import read_header, read_pixels, upright
 
 __all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame", "dataset_of"]
 

@@ -39,7 +39,7 @@ from drgs.core.files import read_text, shortened
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.files import FileKind, find_files
 from drgs.datasets.types import CameraMotion
-from drgs.io.pictures import MAX_SIDE
+from drgs.io.images import MAX_SIDE
 
 if TYPE_CHECKING:
     from drgs.cameras.lens import Lens
@@ -407,7 +407,7 @@ def principal_point(value: float, where: str, size: int) -> float:
     """Return ``value``, px, if it is not too far from an image of ``size`` px; where: the key."""
     if abs(value) > MAX_OFFSET * size:
         raise UserError(
-            f"{where} must be within {MAX_OFFSET * size} px of the picture, got {value:g}"
+            f"{where} must be within {MAX_OFFSET * size} px of the image, got {value:g}"
         )
     return value
 

@@ -92,10 +92,10 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
             if (start := _on_hull(config, dataset, silhouettes)) is not None:
                 _check_unfiltered(init, start.description)
                 return start
-            note = f" (the masks of {len(silhouettes)} pictures have no hull to start from)"
+            note = f" (the masks of {len(silhouettes)} images have no hull to start from)"
         elif init.start == "masks":
             raise UserError(
-                "init.start: masks needs nearly all training pictures to be transparent where "
+                "init.start: masks needs nearly all training images to be transparent where "
                 "there is nothing, from cameras that stand still, but only "
                 f"{num_transparent(silhouettes)} are; cut out what is to be fitted, or set "
                 "init.start=auto"
@@ -284,6 +284,6 @@ def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Da
         raise UserError(
             f"{file}: must hold what the cameras look at{focus_text(dataset)}, in their frame "
             f"of reference, but only {looking} of {len(views)} have any of its {num:,} points in "
-            "the middle of their pictures; give another init.point_cloud, or start from random "
+            "the middle of their images; give another init.point_cloud, or start from random "
             "points (init.point_cloud=null, data.ignore_points=true)"
         )

@@ -185,9 +185,9 @@ def check_box(box: Box, dataset: Dataset) -> None:
     looking = num_looking(points, views)
     covered = float(np.median([_covered(points, view) for view in views]))
     if looking < LEAST_LOOKING * len(views):
-        reason = f"only {looking} of {len(views)} have it in the middle of their pictures"
+        reason = f"only {looking} of {len(views)} have it in the middle of their images"
     elif covered < LEAST_COVERED:
-        reason = f"it covers only {100 * covered:.2g} % of a picture (the median)"
+        reason = f"it covers only {100 * covered:.2g} % of a image (the median)"
     else:
         return
     in_world = Box(box.center + dataset.origin, box.half_extent)

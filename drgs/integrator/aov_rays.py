@@ -43,7 +43,7 @@ ROUNDING = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class ImageRays:
-    """Rays of a whole picture, and where they start. Equality is identity."""
+    """Rays of a whole image, and where they start. Equality is identity."""
 
     ray: mi.RayDifferential3f  # (H * W * count,): those of a pixel are neighbours
     count: int  # rays per pixel

@@ -90,9 +90,9 @@ def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]
 
 
 def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: int) -> None:
-    """Raise PluginError for a picture that would take more than there is.
+    """Raise PluginError for a image that would take more than there is.
 
-    spp: of the splats; poses: of the sensor, whose pictures are averaged; num_aovs: channels
+    spp: of the splats; poses: of the sensor, whose images are averaged; num_aovs: channels
     besides colour and alpha; nested_spp: of the nested integrator, 0 where there is none.
     """
     width, height = film.crop_size()
@@ -107,7 +107,7 @@ def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: 
         times = f" times {poses:,} poses of the shutter (shutter_samples)" if poses > 1 else ""
         raise PluginError(
             f"splats: a pixel can have at most {MAX_SAMPLES:,} samples, got {spp:,}{times}; take "
-            "the mean of pictures with other seeds, or, for surfaces alone, set nested_spp"
+            "the mean of images with other seeds, or, for surfaces alone, set nested_spp"
         )
     why = why_too_large(width, height, 3 + num_aovs, spp * poses)
     if why is not None:
@@ -118,7 +118,7 @@ def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: 
     if samples > most:
         raise PluginError(
             f"splats: on a film of {width} x {height} px, nested_spp (or spp) must be at most "
-            f"{most // (width * height):,}, got {nested_spp:,}; take the mean of pictures "
+            f"{most // (width * height):,}, got {nested_spp:,}; take the mean of images "
             "with other seeds"
         )
 

@@ -83,7 +83,7 @@ def check_derivatives(
         if dr.grad_enabled(value):
             raise UnsupportedError(
                 f"splats: {sensor.id()}.{name} is not differentiated in a scene with surfaces, as "
-                "it moves these in the picture; detach it, or leave out the surfaces"
+                "it moves these in the image; detach it, or leave out the surfaces"
             )
     parameters, reasons = list(attached_parameters(scene)), {}
     for parameter in parameters:

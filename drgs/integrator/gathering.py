@@ -398,7 +398,7 @@ DATA = 10
 """Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""
 
 OPACITIES = (2.0**-64, 1 - 2.0**-24)
-"""The largest float32 below 1, whose logit is 16.6; and an opacity that no picture shows, so far
+"""The largest float32 below 1, whose logit is 16.6; and an opacity that no image shows, so far
 from zero that neither it nor its reciprocal leaves float32."""
 
 HIDDEN = -1e4

@@ -39,7 +39,7 @@ FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
 from which on there are fewer than one."""
 
 BORDER = 8
-"""Texels around a picture: filters of the film reach beyond its edge."""
+"""Texels around a image: filters of the film reach beyond its edge."""
 
 FLAT = 1e-5
 """Largest distance of a vertex from the plane of a flat shape, relative to the shape's size."""
@@ -153,7 +153,7 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
 
 @dataclass(frozen=True, eq=False)
 class Mirrors:
-    """Pictures of the splats that cameras see in mirrors."""
+    """Images of the splats that cameras see in mirrors."""
 
     planes: Plane  # by mirror
     views: list[_View]  # by camera
@@ -204,7 +204,7 @@ class Mirrors:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Pictures of what one camera sees in each mirror."""
+    """Images of what one camera sees in each mirror."""
 
     camera: Camera  # of a film that has a pixel for each texel
     size: mi.Vector2u  # width and height, not to be compiled into kernels

@@ -147,6 +147,6 @@ def _has_square_pixels(view: Viewpoint) -> bool:
 def render_views(scene: mi.Scene, views: Iterable[Viewpoint]) -> Iterator[np.ndarray]:
     """Yield images (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
     for sensor in make_sensors(views):
-        with dr.suspend_grad():  # ends before the picture is out: nobody may ask for the next one
+        with dr.suspend_grad():  # ends before the image is out: nobody may ask for the next one
             image = np.array(mi.render(scene, sensor=sensor, spp=1))
         yield np.clip(image[:, :, :3], 0, 1)  # what else is put out comes behind the colours

@@ -85,7 +85,7 @@ class SensorRender:
             channels = self.channels(planes, constant)
             dr.accum_grad(channels, d_channels)
             dr.enqueue(dr.ADMode.Backward, channels)
-            # Other views, the nested integrator, and other pictures of the same pass go back along
+            # Other views, the nested integrator, and other images of the same pass go back along
             # what textures were computed from again.
             dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
             d_planes = dr.grad(planes)

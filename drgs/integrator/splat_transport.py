@@ -175,7 +175,7 @@ others."""
 
 TOO_CLOSE = (
     "splats: splats are so close to '{}' for its size that its surface sees others than its middle "
-    "does, where its probe is: its picture may be far from that of light 'rays'"
+    "does, where its probe is: its image may be far from that of light 'rays'"
 )
 
 NOBODY = 0xFFFFFFFF

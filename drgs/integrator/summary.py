@@ -87,7 +87,7 @@ def summary_of_sensors(
     ]
     surfaces = SimulatedEffect(
         "surfaces",
-        "a nested integrator's picture, between the splats" if num_surfaces else None,
+        "a nested integrator's image, between the splats" if num_surfaces else None,
         f"{num_surfaces} of the scene's shapes",
     )
     light = SimulatedEffect(
@@ -122,7 +122,7 @@ def _summary_of_integrator(
     if environment is not None and not splats.hide_emitters:
         background = SimulatedEffect("background", "an environment", "the scene's emitter")
     elif isinstance(splats.background, mi.Texture):
-        background = SimulatedEffect("background", "a picture", "the integrator's background")
+        background = SimulatedEffect("background", "a image", "the integrator's background")
     smooth = splats.gaussians.smoothing is not None
     antialiased = AS_THE_FILE_SAYS if "antialiased" in said else "antialiased"
     effects = [

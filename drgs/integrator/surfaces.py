@@ -46,7 +46,7 @@ from drgs.integrator.visible_surfaces import SurfaceLayers, rest_behind
 T = TypeVar("T")
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")
-"""Words of errors of Dr.Jit and ``splatpath`` about a picture that no parameter changes."""
+"""Words of errors of Dr.Jit and ``splatpath`` about a image that no parameter changes."""
 
 UNBOUNDED = 0xFFFFFFFF
 """``max_depth`` of Mitsuba's integrators where there is no limit."""
@@ -123,7 +123,7 @@ def scene_of(objects: list[mi.Object]) -> mi.Scene:
 
 
 # ----------------------------------------------------------------------------------------------
-# The nested picture between the splats
+# The nested image between the splats
 # ----------------------------------------------------------------------------------------------
 
 
@@ -132,7 +132,7 @@ class Insertion:
     """Puts nested images into that of the splats; all are developed already.
 
     That of the splats has channels of its own at its end: for each surface its share p_k T_k and
-    its coverage p_k, and where the nested picture shows a background, (1 - sum p_k) B in linear
+    its coverage p_k, and where the nested image shows a background, (1 - sum p_k) B in linear
     RGB.
     """
 
@@ -140,12 +140,12 @@ class Insertion:
     maps: dict[str, np.ndarray]  # see drgs.integrator.film
     aovs: Sequence[str]  # that the user asked for
     shows_background: bool
-    display_space: bool  # of the splats' picture; the nested one is linear
+    display_space: bool  # of the splats' image; the nested one is linear
     num_surfaces: int = 1  # that are seen one through the other
 
     @property
     def channels(self) -> list[str]:
-        """Names of the channels that the picture of the splats must have at its end."""
+        """Names of the channels that the image of the splats must have at its end."""
         names = ["share", "coverage"] * self.num_surfaces + ["R", "G", "B"] * self.shows_background
         return [f"surface.{k}.{name}" for k, name in enumerate(names)]
 
@@ -265,7 +265,7 @@ class Hybrid:
     """The part of the surfaces in a rendering of splats and surfaces."""
 
     surfaces: Surfaces
-    integrator: mi.SamplingIntegrator  # of the picture
+    integrator: mi.SamplingIntegrator  # of the image
     adjoint_integrator: mi.SamplingIntegrator  # of its derivatives
     sensor: mi.Sensor
     seed: int | mi.UInt32
@@ -301,9 +301,9 @@ class Hybrid:
             found.append(weight * mi.Color3f(radiance))
         return found
 
-    def backward(self, params: object, d_pictures: list[mi.TensorXf]) -> None:
+    def backward(self, params: object, d_images: list[mi.TensorXf]) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
-        gradients = iter(d_pictures)
+        gradients = iter(d_images)
 
         def add(sensor: mi.Sensor) -> None:
             self.adjoint_integrator.render_backward(

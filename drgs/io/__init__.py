@@ -1,4 +1,4 @@
-"""Files: Gaussians, points, COLMAP's models, pictures, animations, figures; needs no libLLVM.
+"""Files: Gaussians, points, COLMAP's models, images, animations, figures; needs no libLLVM.
 
 May import ``core``.
 """

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from drgs.core.errors import Place, UserError, did_you_mean, one_line
 from drgs.core.files import read_bytes, read_text
-from drgs.io.pictures import MAX_SIDE
+from drgs.io.images import MAX_SIDE
 
 _BROWN = ("k1", "k2", "p1", "p2")
 _ONE, _TWO = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")

@@ -35,10 +35,10 @@ LEVELS = 7
 """Cubes of a probe; each has half the edges of the one before."""
 
 LOW_PASS = 0.03
-"""px^2 of the pictures: rays have none at all."""
+"""px^2 of the images: rays have none at all."""
 
 FINE = 2
-"""The last level in which distances are searched: those of smaller pictures are no surface."""
+"""The last level in which distances are searched: those of smaller images are no surface."""
 
 STEPS = 8
 """Places of a ray that are looked at, at most."""
@@ -50,7 +50,7 @@ SOLID = 0.5
 """Coverage of what ends a ray."""
 
 BORDER = 1
-"""Texels around each picture that show what the neighbours do, for interpolation."""
+"""Texels around each image that show what the neighbours do, for interpolation."""
 
 LEAST_REACH = 0.1
 """Part of the distance to the nearest splats: the first steps of a ray from the centre."""

@@ -33,7 +33,7 @@ from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
 from drgs.datasets.transforms import LENS_OF_MODEL
-from drgs.io.pictures import check_readable, image_size, write_png
+from drgs.io.images import check_readable, image_size, write_png
 
 if TYPE_CHECKING:
     import pycolmap

@@ -1,10 +1,10 @@
 """The reference of the effects a scene may call for: lenses, defocus, moving cameras, smoothing.
 
 It imports nothing of this package but ``reference``, and is to be read after it. Each effect
-replaces one stage of ``reference.render``, or is the mean of many of its pictures::
+replaces one stage of ``reference.render``, or is the mean of many of its images::
 
     Lens, ThinLens     project, sh_colors     where splats lie, how large, seen along what
-    render_lens_samples, render_motion_blur, render_rolling_shutter     many pictures
+    render_lens_samples, render_motion_blur, render_rolling_shutter     many images
     smoothing_filter   the scales and opacities that everything starts from
 
 The Jacobian of a lens is a difference quotient of its ``film_points``: no derivative is written
@@ -35,13 +35,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drgs.reference import splatting as reference
-from drgs.reference.splatting import Camera, Gaussians, Picture, Projection
+from drgs.reference.splatting import Camera, Gaussians, Projection, RenderedImage
 
 FISHEYE_MAX_ANGLE = 0.95 * pi
 """rad: at pi, straight behind, a fisheye smears one point over a circle and J is infinite."""
 
 BORDER_SAMPLES = 65
-"""Points of each edge of the film, corners included, whose slopes bound an OpenCV lens's picture.
+"""Points of each edge of the film, corners included, whose slopes bound an OpenCV lens's image.
 Between two of 65, a border bent like a circle arc bulges 1 / 64^2 of its own bulge."""
 
 FOLD_RADII, FOLD_STEPS = (1e-3, 1e6), 1000
@@ -162,7 +162,7 @@ class OpenCV(Lens):
     def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return (M,) bool: z >= near, and the slope's length is below ``valid_radius``.
 
-        Slopes beyond would fold back into the picture.
+        Slopes beyond would fold back into the image.
         """
         in_front = points[:, 2] >= camera.near
         z = np.where(in_front, points[:, 2], 1.0)
@@ -584,7 +584,7 @@ def _widened(axes2d: np.ndarray, widening: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
@@ -609,8 +609,8 @@ def render(
     defocus: ThinLens | None = None,
     degree: int | None = None,
     threshold_width: float = reference.THRESHOLD_WIDTH,
-) -> Picture:
-    """Return the picture of Gaussians behind a lens; its depth sums the lens's ``depths``.
+) -> RenderedImage:
+    """Return the image of Gaussians behind a lens; its depth sums the lens's ``depths``.
 
     background: (3,) display space; antialiased, defocus: see ``project``; degree: see
     ``sh_colors``; threshold_width: see ``reference.composite``.
@@ -634,11 +634,11 @@ def render_lens_samples(
 
     They are means over ``lens_cameras``, and what defocus in ``project`` approximates.
     """
-    pictures = [
+    images = [
         reference.render(gaussians, lens_camera, background)
         for lens_camera in lens_cameras(camera, defocus, num_samples)
     ]
-    mean = _mean_picture(pictures)
+    mean = _mean_image(images)
     return mean.image, mean.alpha
 
 
@@ -668,14 +668,14 @@ def _disc_points(count: int) -> np.ndarray:
     return radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _mean_picture(pictures: list[Picture]) -> Picture:
-    """Return the mean of pictures; a pixel that any of them marks as near a threshold is marked."""
+def _mean_image(images: list[RenderedImage]) -> RenderedImage:
+    """Return the mean of images; a pixel that any of them marks as near a threshold is marked."""
     means = {
-        name: np.mean([getattr(picture, name) for picture in pictures], axis=0)
+        name: np.mean([getattr(rendered, name) for rendered in images], axis=0)
         for name in ("image", "alpha", "depth", "transmittance")
     }
-    marked = np.any([picture.near_threshold for picture in pictures], axis=0)
-    return Picture(**means, near_threshold=marked)
+    marked = np.any([rendered.near_threshold for rendered in images], axis=0)
+    return RenderedImage(**means, near_threshold=marked)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -746,10 +746,10 @@ def render_motion_blur(
     num_samples: int,
     background: ArrayLike = (0.0, 0.0, 0.0),
     lens: Lens = Pinhole(),
-) -> Picture:
-    """Return the mean of n = num_samples pictures, at the times (k + 0.5) / n of the exposure."""
+) -> RenderedImage:
+    """Return the mean of n = num_samples images, at the times (k + 0.5) / n of the exposure."""
     times = (np.arange(num_samples) + 0.5) / num_samples
-    return _mean_picture(
+    return _mean_image(
         [
             render(gaussians, camera_at(camera_open, camera_close, t), lens, background)
             for t in times
@@ -763,19 +763,19 @@ def render_rolling_shutter(
     camera_close: Camera,
     background: ArrayLike = (0.0, 0.0, 0.0),
     lens: Lens = Pinhole(),
-) -> Picture:
-    """Return the picture whose row j is row j of the picture at time (j + 0.5) / H."""
+) -> RenderedImage:
+    """Return the image whose row j is row j of the image at time (j + 0.5) / H."""
     height = camera_open.height
-    pictures = [
+    images = [
         render(
             gaussians, camera_at(camera_open, camera_close, (j + 0.5) / height), lens, background
         )
         for j in range(height)
     ]
-    return Picture(
+    return RenderedImage(
         **{
-            field.name: np.stack([getattr(p, field.name)[j] for j, p in enumerate(pictures)])
-            for field in fields(Picture)
+            field.name: np.stack([getattr(p, field.name)[j] for j, p in enumerate(images)])
+            for field in fields(RenderedImage)
         }
     )
 
@@ -836,7 +836,7 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class SurfacePicture:
+class SurfaceImage:
     """The view of splats, and of surfaces between them, from one camera."""
 
     color: np.ndarray  # (H, W, 3) display space, of the splats: premultiplied
@@ -848,7 +848,7 @@ class SurfacePicture:
 
 def render_with_surfaces(
     gaussians: Gaussians, camera: Camera, surfaces: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> SurfacePicture:
+) -> SurfaceImage:
     """Composite splats and K surfaces front to back, a surface as one more layer.
 
     surfaces: nearest first, depth (H, W) camera z, world units, and alpha (H, W) in [0, 1]. A splat
@@ -890,4 +890,4 @@ def render_with_surfaces(
         depth += seen * alpha * splats.depths[i]
         seen, without = seen * (1 - alpha), without * (1 - alpha)
     seen = pass_surfaces(np.ones_like(passed))
-    return SurfacePicture(color, coverage, depth, before, seen)
+    return SurfaceImage(color, coverage, depth, before, seen)

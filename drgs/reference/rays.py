@@ -49,7 +49,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from drgs.reference import splatting as reference
-from drgs.reference.splatting import Camera, Gaussians, Picture
+from drgs.reference.splatting import Camera, Gaussians, RenderedImage
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -151,12 +151,12 @@ class _Peaks:
 
 @dataclass(frozen=True)
 class _Block:
-    """A rectangle of the picture and the parts of the splats' boxes within it."""
+    """A rectangle of the image and the parts of the splats' boxes within it."""
 
     rows: slice
     columns: slice
     splats: np.ndarray  # (B,) indices of the splats that reach into it, ascending
-    boxes: np.ndarray  # (B, 2, 2) [first, end) columns and rows of the picture
+    boxes: np.ndarray  # (B, 2, 2) [first, end) columns and rows of the image
 
 
 @dataclass(frozen=True)
@@ -167,12 +167,12 @@ class _Pairs:
     splats: np.ndarray  # (M,)
     alphas: np.ndarray  # (M,) clamped; 0 where the splat does not exist
     keys: np.ndarray  # (M,) world units
-    depths: np.ndarray  # (M,) world units, what the picture's depth sums
+    depths: np.ndarray  # (M,) world units, what the image's depth sums
     undecided: np.ndarray  # (M,) bool: a decision about this splat may flip in float32
 
 
 # ----------------------------------------------------------------------------------------------
-# The picture
+# The image
 # ----------------------------------------------------------------------------------------------
 
 
@@ -184,17 +184,17 @@ def render(
     region: tuple[slice, slice] | None = None,
     positions: np.ndarray | None = None,
     threshold_width: float = reference.THRESHOLD_WIDTH,
-) -> Picture:
-    """Return the picture of Gaussians under a model; with a region, that part of it.
+) -> RenderedImage:
+    """Return the image of Gaussians under a model; with a region, that part of it.
 
     background: (3,) display space; region: rows and columns of the film, None for all; positions:
     (camera.height, camera.width, 2) px, film, the (x, y) at which each pixel is evaluated, None
     for the centres; threshold_width: relative distance from a threshold within which a pixel is
-    marked in ``Picture.near_threshold``: alpha from the cut and the clamp, transmittance from the
-    stop, rho^2 from extent^2, the peak (or entry) from the ray's origin, and, unless order is
-    ``"center"``, the sort keys of consecutive splats from each other.
+    marked in ``RenderedImage.near_threshold``: alpha from the cut and the clamp, transmittance
+    from the stop, rho^2 from extent^2, the peak (or entry) from the ray's origin, and, unless order
+    is ``"center"``, the sort keys of consecutive splats from each other.
 
-    ``Picture.depth`` sums the means' camera z for order ``"center"``, else that of the peaks.
+    ``RenderedImage.depth`` sums the means' camera z for order ``"center"``, else that of the peaks.
 
     """
     positions = pixel_centers(camera) if positions is None else np.asarray(positions, np.float64)
@@ -226,7 +226,7 @@ def render(
         depth[place] = sums[:, 3].reshape(block_shape)
         transmittance[place] = behind.reshape(block_shape)
         near_threshold[place] = near.reshape(block_shape)
-    return Picture(image, 1 - transmittance, depth, transmittance, near_threshold)
+    return RenderedImage(image, 1 - transmittance, depth, transmittance, near_threshold)
 
 
 def _pair_colors(
@@ -503,7 +503,7 @@ def _is_near(values: np.ndarray, threshold: float, width: float) -> np.ndarray:
 def _boxes(
     splats: _Splats, model: ImageModel, positions: np.ndarray, threshold_width: float
 ) -> np.ndarray:
-    """Return (N, 2, 2) [first, end) columns and rows of the picture that each splat may reach.
+    """Return (N, 2, 2) [first, end) columns and rows of the image that each splat may reach.
 
     positions: (H, W, 2) px, film. One pixel is added for rounding.
     """

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 # The two thresholds on alpha are the single-precision numbers of the CUDA rasterizer (0.99f and
-# 1.0f / 255.0f), not the decimals. For the clamp this decides pictures: behind one clamped
+# 1.0f / 255.0f), not the decimals. For the clamp this decides images: behind one clamped
 # splat T = 1 - 0.99, and a second one leaves (1 - 0.99)^2, which is just above 1e-4 with the
 # double nearest to 0.99, and 2e-6 (relative) below it with 0.99f. So every single-precision
 # rasterizer stops there, and so does this one.
@@ -148,7 +148,7 @@ class Projection:
 
 
 @dataclass(frozen=True)
-class Picture:
+class RenderedImage:
     """The image of a camera."""
 
     image: np.ndarray  # (H, W, 3) display space, background included
@@ -325,7 +325,7 @@ def _local_affine(gaussians: Gaussians, camera: Camera) -> _LocalAffine:
 
     M = J W R(q) diag(s), with W the camera's rotation and J the Jacobian of
     (fx x/z + cx, fy y/z + cy). In J only, x/z and y/z are clamped: far outside the film the
-    affine approximation makes splats so large that they would reach back into the picture.
+    affine approximation makes splats so large that they would reach back into the image.
     """
     camera_means = (gaussians.means - camera.center) @ camera.rotation.T
     in_front = camera_means[:, 2] >= camera.near
@@ -488,8 +488,8 @@ def composite(
     height: int,
     threshold_width: float = THRESHOLD_WIDTH,
     cuts: np.ndarray | float | None = None,
-) -> Picture:
-    """Return the picture of N splats: C = sum_i T_i alpha_i c_i + T background (3DGS, equation 3).
+) -> RenderedImage:
+    """Return the image of N splats: C = sum_i T_i alpha_i c_i + T background (3DGS, equation 3).
 
     T_i = prod_{j < i} (1 - alpha_j), alpha_i = min(0.99, o_i exp(-d^T A_i d / 2)), over the
     splats i in ascending depth (ties by index) whose alpha is at least ``cuts``, (N,) or for all;
@@ -499,15 +499,15 @@ def composite(
     means2d (N, 2) px; conics (N, 2, 2) px^-2, symmetric; opacities (N,); colors (N, 3) display
     space; depths (N,) camera z; visible (N,) bool: the others are left out; background (3,)
     display space; width and height of the film, px; threshold_width: relative distance from a
-    threshold within which a pixel is marked in ``Picture.near_threshold``. Marked are pixels at
+    threshold within which ``RenderedImage.near_threshold`` marks a pixel. Marked are pixels at
     which an alpha, evaluated before the pixel is finished, is that close to the cut or (before
     clamping) to the clamp, or the transmittance behind a splat is that close to the stop.
     """
-    picture, _ = _composite_and_stops(
+    rendered, _ = _composite_and_stops(
         means2d, conics, opacities, colors, depths, visible, background, width, height,
         threshold_width, cuts,
     )  # fmt: skip
-    return picture
+    return rendered
 
 
 def _composite_and_stops(
@@ -522,8 +522,8 @@ def _composite_and_stops(
     height: int,
     threshold_width: float,
     cuts: np.ndarray | float | None = None,
-) -> tuple[Picture, np.ndarray]:
-    """Return ``composite``'s picture and the rank in depth (H, W) at which each pixel stopped."""
+) -> tuple[RenderedImage, np.ndarray]:
+    """Return ``composite``'s image and the rank in depth (H, W) at which each pixel stopped."""
     means2d, conics, opacities, colors, depths, background = _as_float64(
         means2d, conics, opacities, colors, depths, background
     )
@@ -562,7 +562,7 @@ def _composite_and_stops(
         transmittance[box] = np.where(contributes, behind, transmittance[box])
 
     image += transmittance[..., None] * background
-    return Picture(image, 1 - transmittance, depth, transmittance, near_threshold), stops
+    return RenderedImage(image, 1 - transmittance, depth, transmittance, near_threshold), stops
 
 
 def render(
@@ -572,8 +572,8 @@ def render(
     sh_degree: int | None = None,
     antialiased: bool = False,
     threshold_width: float = THRESHOLD_WIDTH,
-) -> Picture:
-    """Return the picture of Gaussians.
+) -> RenderedImage:
+    """Return the image of Gaussians.
 
     background: (3,) display space; sh_degree: None for all that is stored; antialiased: see
     ``project``; threshold_width: see ``composite``.
@@ -636,7 +636,7 @@ def composite_gradients(
     d_alpha, d_depth = _as_float64(
         zeros if d_alpha is None else d_alpha, zeros if d_depth is None else d_depth
     )
-    picture, stops = _composite_and_stops(
+    rendered, stops = _composite_and_stops(
         means2d, conics, opacities, colors, depths, visible, background, width, height,
         THRESHOLD_WIDTH,
     )  # fmt: skip
@@ -649,9 +649,9 @@ def composite_gradients(
     d_opacities = np.zeros(n)
     d_colors = np.zeros((n, 3))
     d_depths = np.zeros(n)
-    d_background = np.einsum("hw,hwc->c", picture.transmittance, d_image)
+    d_background = np.einsum("hw,hwc->c", rendered.transmittance, d_image)
 
-    transmittance = picture.transmittance.copy()
+    transmittance = rendered.transmittance.copy()
     suffix_sum = transmittance * (d_image @ background)
     for rank in reversed(range(len(order))):
         i, box = order[rank], boxes[rank]

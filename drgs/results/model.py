@@ -72,7 +72,7 @@ class ImageFolder:
         images = [n for n in sorted(os.listdir(self.path)) if n.lower().endswith(PHOTOGRAPHS)]
         if photographs := FolderRecord(self.path, COMMAND).strangers(images):
             raise UserError(
-                f"--out {self.path}: holds pictures of the dataset ({listed(photographs)}); choose "
+                f"--out {self.path}: holds images of the dataset ({listed(photographs)}); choose "
                 "a folder of its own"
             )
 

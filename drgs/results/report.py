@@ -1,6 +1,6 @@
 """The report of a fit: comparisons, curves, an orbit, and a page with all of it.
 
-A fit calls :func:`write_pictures` and :func:`write_results` at its end.
+A fit calls :func:`write_images` and :func:`write_results` at its end.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from drgs.datasets.viewpoints import field_of_view
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import pixels_of
-from drgs.io.pictures import encode, write_animation, write_png
+from drgs.io.images import encode, write_animation, write_png
 from drgs.results.curves import NUM_PANELS, THEMES, Panel, draw_curve, panels_of, write_curves
 from drgs.results.files import (
     CURVES,
@@ -76,7 +76,7 @@ class Score(NamedTuple):
     ssim: float
 
 
-def write_pictures(
+def write_images(
     out: Path, dataset: Dataset, render: Render, with_renders: bool, with_comparisons: bool
 ) -> list[Score]:
     """Score the test views, and write ``renders/`` and ``side_by_side/`` if wanted."""
@@ -311,15 +311,15 @@ def _comparison(dataset: Dataset, render: Render, label: str, index: int, score:
     view = dataset.test[index]
     (image,) = render((view,))
     panels = {"Fitted": image, _truth(dataset): view.image, "Difference": difference(image, view)}
-    pictures = "".join(
+    renders = "".join(
         f'<div><img alt="{name} {html.escape(view.name)}" '
-        f'src="{_data_uri(downscale(np.clip(picture, 0, 1), PANEL_WIDTH), **PANEL_QUALITY)}">'
+        f'src="{_data_uri(downscale(np.clip(rendered, 0, 1), PANEL_WIDTH), **PANEL_QUALITY)}">'
         f"<span>{name}</span></div>"
-        for name, picture in panels.items()
+        for name, rendered in panels.items()
     )
     psnr = f"{score.psnr:.2f} dB" if math.isfinite(score.psnr) else "infinite"
     caption = f"<b>{label}: {html.escape(view.name)}</b> PSNR {psnr}, SSIM {score.ssim:.4f}"
-    return f'<figure><figcaption>{caption}</figcaption><div class="three">{pictures}</div></figure>'
+    return f'<figure><figcaption>{caption}</figcaption><div class="three">{renders}</div></figure>'
 
 
 def _truth(dataset: Dataset) -> str:

@@ -77,7 +77,7 @@ class Strategy:
     """A choice of a plan besides the number of iterations."""
 
     name: str  # of its curve
-    half_size: float | None = None  # share of the iterations, at the start, with small pictures
+    half_size: float | None = None  # share of the iterations, at the start, with small images
     share: float | None = None  # of the number of Gaussians; None: as configured
 
     def applies_to(self, config: FitConfig) -> bool:
@@ -230,7 +230,7 @@ def make_plan(
         raise UserError(
             f"--budget: must leave time for {MIN_ITERATIONS} iterations, got "
             f"{max(seconds, 0):.0f} s where an iteration takes {1e3 * start_s:.0f} ms; give more "
-            "time, or smaller pictures (--set data.image_size=...)"
+            "time, or smaller images (--set data.image_size=...)"
         )
     chosen = max(candidates, key=lambda candidate: candidate.psnr)
     planned = with_iterations(config, chosen.iterations)
@@ -305,18 +305,18 @@ def plan_fit(
     scene, degree = rehearsal.trainer.full_scene(), config.model.sh_degree
     assert scene is not None, "rank 0 plans"
     results = seconds_of_results(scene, dataset, max(num_points, most), degree)
-    pictures = results.renders if config.output.save_renders else 0.0
-    pictures += results.report + seconds_of_curves() if config.output.report else 0.0
-    if pictures > MAX_IMAGES_SHARE * (end - time.perf_counter()):
+    images = results.renders if config.output.save_renders else 0.0
+    images += results.report + seconds_of_curves() if config.output.report else 0.0
+    if images > MAX_IMAGES_SHARE * (end - time.perf_counter()):
         note = (
-            "--budget: the time is needed for iterations: no report, orbit and pictures are "
+            "--budget: the time is needed for iterations: no report, orbit and images are "
             "written (output.report, output.save_renders); python -m drgs.render OUT_DIR --out DIR "
-            "makes pictures"
+            "makes images"
         )
         warnings.warn(UserNote(note), stacklevel=2)
         config = changed(config, {"output.report": False, "output.save_renders": False})
     else:
-        end -= pictures
+        end -= images
     has_one_file = config.model.approximations.are_usual
     end -= results.measuring * (1 if has_one_file else 2)
     if not has_one_file:

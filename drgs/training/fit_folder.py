@@ -54,7 +54,7 @@ from drgs.results.metrics import (
     mean_quality,
 )
 from drgs.results.refined_cameras import write_views
-from drgs.results.report import Fitted, write_pictures, write_results
+from drgs.results.report import Fitted, write_images, write_results
 from drgs.results.viewer import Shown, shows_as_fitted
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.training.loop import History
@@ -147,7 +147,7 @@ class FitFolder:
         write_views(out / VIEWS, dataset)
         write_run_config(out, config)
         output, split = config.output, dataset.test_split
-        scores = write_pictures(out, dataset, render, output.save_renders, output.report)
+        scores = write_images(out, dataset, render, output.save_renders, output.report)
         metrics: FitMetrics = {
             "iterations": config.iterations,
             "num_gaussians": gaussians.num_gaussians,
@@ -162,7 +162,7 @@ class FitFolder:
         if for_viewers is not None:
             other = for_viewers.gaussians
             other.save(out / GAUSSIANS_FOR_VIEWERS)
-            images = zip(for_viewers.pictures(dataset.test), dataset.test, strict=True)
+            images = zip(for_viewers.renders(dataset.test), dataset.test, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             metrics["viewers"] = _split_metrics(quality, split)
         if output.report:

@@ -80,7 +80,7 @@ class FitMemory:
 class Share:
     """The part that one of several processes has of a fit and of its machine."""
 
-    processes: int = 1  # that share the Gaussians; each renders pictures of all of them
+    processes: int = 1  # that share the Gaussians; each renders images of all of them
     on_machine: int = 1  # of these, that share the machine's memory
 
 
@@ -132,9 +132,9 @@ def max_num_gaussians(config: FitConfig, start: int) -> int:
 
 def _kept_bytes(view: View, scale: float) -> float:
     """Return the bytes of a view's images, or of the numbers of smaller ones if these take less."""
-    pictures = [p for p in (view.image, view.alpha, view.mask, view.depth) if p is not None]
-    numbers = 4 * scale**2 * sum(math.prod(picture.shape) for picture in pictures)
-    return min(sum(picture.nbytes for picture in pictures), numbers)
+    images = [p for p in (view.image, view.alpha, view.mask, view.depth) if p is not None]
+    numbers = 4 * scale**2 * sum(math.prod(rendered.shape) for rendered in images)
+    return min(sum(rendered.nbytes for rendered in images), numbers)
 
 
 @np.errstate(over="ignore")  # of scales beyond all images
@@ -219,7 +219,7 @@ def _refusal(
         f"memory: {who} needs about {readable(memory.needed)} "
         f"({readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
         f"{readable(memory.gaussians)} for {part}{count:,} Gaussians, "
-        f"{readable(memory.splats + memory.pixels)} for a picture of them), and may take "
+        f"{readable(memory.splats + memory.pixels)} for a image of them), and may take "
         f"{readable(usable)}, nine tenths of what is available; {advice}"
     )
 

@@ -59,7 +59,7 @@ class ForViewers:
     background: tuple[float, float, float]
     effects: Iterable[TrainingEffect]  # of the fit
 
-    def pictures(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
+    def images(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
         """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
         for effect in self.effects:
             views = effect.measured(views)

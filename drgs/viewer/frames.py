@@ -186,7 +186,7 @@ def _error(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     accurate, accurate_seconds = scene.image(replace(request, approximations=best))
     distance = psnr(image, accurate)
     compared = "the same as" if math.isinf(distance) else f"PSNR {distance:.1f} dB to"
-    note = f"{compared} the most accurate picture, which took {1e3 * accurate_seconds:.0f} ms"
+    note = f"{compared} the most accurate image, which took {1e3 * accurate_seconds:.0f} ms"
     return ViewerFrame(to_bytes(0.5 + ERROR_GAIN * (image - accurate)), seconds, note)
 
 

@@ -277,7 +277,7 @@ class Page:
 
     def refuse(self, client: int, reason: str) -> None:
         """Show in one line why there is no frame."""
-        self._set_text(client, f"**No picture:** {one_line(reason)}")
+        self._set_text(client, f"**No image:** {one_line(reason)}")
 
     def _describe(self, client: int, request: FrameRequest, frame: ViewerFrame) -> str:
         """Return how long an image took, and what its colours mean."""

@@ -1,10 +1,10 @@
 """Fit spoiled images with the effect that is made for it, and without.
 
-The shipped scene is fitted at a small size to pictures that were spoiled in a known way, with the
+The shipped scene is fitted at a small size to images that were spoiled in a known way, with the
 effect that is made for it and without: other exposures, something before the lens that a mask
-leaves out, few pictures with and without depth, cameras that are somewhere else than the data says,
-colours behind transparent pictures; and renderings at other sizes than that of the fit. All fits
-are measured on pictures that were not spoiled.
+leaves out, few images with and without depth, cameras that are somewhere else than the data says,
+colours behind transparent images; and renderings at other sizes than that of the fit. All fits
+are measured on images that were not spoiled.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from drgs.datasets.types import Dataset, View
 from drgs.initialization.start import initial_gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.figures import new_figure, write_figure
-from drgs.io.pictures import to_uint8
+from drgs.io.images import to_uint8
 from drgs.results.metrics import mean_quality
 from drgs.training.trainer import Trainer
 
@@ -45,7 +45,7 @@ SCENE = LEGO
 """The shipped scene, at a smaller size."""
 
 SIZE = 100
-"""px: width and height of the pictures that are fitted."""
+"""px: width and height of the images that are fitted."""
 
 ITERATIONS = 3000
 
@@ -55,7 +55,7 @@ DARK = 0.65
 """Factor of all colours, where exposures are to vary."""
 
 FEW = 8
-"""Pictures, where depth is to help."""
+"""Images, where depth is to help."""
 
 SIZES = {"2x": 2.0, "1x": 1.0, "1/2": 0.5, "1/4": 0.25}
 """Sizes of renderings, relative to that of the fit."""
@@ -115,7 +115,7 @@ def _each_train(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
 
 
 def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Darken all pictures, so that no gain of :func:`spoil_exposure` clips a colour."""
+    """Darken all images, so that no gain of :func:`spoil_exposure` clips a colour."""
     del rng
 
     def dark(view: View) -> View:
@@ -125,7 +125,7 @@ def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Give each training picture its own gain for each colour; their mean is 1."""
+    """Give each training image its own gain for each colour; their mean is 1."""
     gains = rng.uniform(0.6, 1.4, (len(dataset.train), 3))
     gains = iter(gains / gains.mean(axis=0))
     return _each_train(
@@ -134,7 +134,7 @@ def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Hide a sixth of each training picture with a red square."""
+    """Hide a sixth of each training image with a red square."""
 
     def hidden(view: View) -> View:
         mask, side = np.ones((view.height, view.width), np.float32), round(0.4 * view.width)
@@ -148,7 +148,7 @@ def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def few_views(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """:data:`FEW` training pictures are left, with the depth of the scene that they show."""
+    """:data:`FEW` training images are left, with the depth of the scene that they show."""
     del rng
     scene = load_scene(GENERATOR)
     step = len(dataset.train) // FEW
@@ -203,7 +203,7 @@ def quality(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, f
 def quality_as_exposed(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
     """Return the PSNR of test views as dark as the training views are on average.
 
-    Also with each picture's colours fitted to the photograph's by an affine transform: what is lost
+    Also with each image's colours fitted to the photograph's by an affine transform: what is lost
     besides the exposure.
     """
     del dataset
@@ -216,7 +216,7 @@ def quality_as_exposed(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> 
 
 
 def fitted_colors(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """A picture (H, W, 3) after the affine map of colours that brings it closest to another."""
+    """A image (H, W, 3) after the affine map of colours that brings it closest to another."""
     colors = np.concatenate([image, np.ones_like(image[:, :, :1])], axis=2).reshape(-1, 4)
     matrix, *_ = np.linalg.lstsq(colors, target.reshape(-1, 3), rcond=None)
     return np.clip(colors @ matrix, 0, 1).reshape(image.shape)
@@ -250,9 +250,9 @@ def photographs_at_sizes(config: FitConfig) -> list[np.ndarray]:
 
 
 def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
-    """Compare the training cameras with the true ones, and what they see with their pictures.
+    """Compare the training cameras with the true ones, and what they see with their images.
 
-    What all have in common (a similarity) is undone first. *Shift* is how far the picture of a
+    What all have in common (a similarity) is undone first. *Shift* is how far the image of a
     point at the middle of the scene, or a tenth of the distance around it, is from its place.
     """
     refinements = [effect for effect in trainer.effects if effect.name == "cameras"]
@@ -302,8 +302,8 @@ def _pixels(view: View) -> np.ndarray:
 
 
 def _psnr(trainer: Trainer, views: Sequence[View]) -> float:
-    pictures = render_views(trainer.scene, tuple(views))
-    return mean_quality((p, v.image) for p, v in zip(pictures, views, strict=True)).psnr
+    renders = render_views(trainer.scene, tuple(views))
+    return mean_quality((p, v.image) for p, v in zip(renders, views, strict=True)).psnr
 
 
 # ----------------------------------------------------------------------------------------------
@@ -313,7 +313,7 @@ def _psnr(trainer: Trainer, views: Sequence[View]) -> float:
 EXPOSURE = "exposure and white balance"
 
 BLACK = (("data.background", "black"),)
-"""A gain does not change what is behind transparent pictures."""
+"""A gain does not change what is behind transparent images."""
 
 REFINED = (("cameras.optimise", True),)
 
@@ -367,12 +367,12 @@ def table(results: Sequence[Result]) -> str:
 
 
 def plot(rows: dict[str, list[np.ndarray]]) -> Figure:
-    """Pictures, a row for each name, a column for each of :data:`SIZES`."""
+    """Images, a row for each name, a column for each of :data:`SIZES`."""
     figure = new_figure(2 * len(SIZES) + 0.4, 2 * len(rows))
     grid = figure.subplots(len(rows), len(SIZES), squeeze=False)
-    for name, pictures, of_row in zip(rows, rows.values(), grid, strict=True):
-        for axes, picture in zip(of_row, pictures, strict=True):
-            axes.imshow(to_uint8(picture), interpolation="none")
+    for name, renders, of_row in zip(rows, rows.values(), grid, strict=True):
+        for axes, rendered in zip(of_row, renders, strict=True):
+            axes.imshow(to_uint8(rendered), interpolation="none")
             axes.set(xticks=[], yticks=[])
         of_row[0].set_ylabel(name)
     for axes, name in zip(grid[0], SIZES, strict=True):

@@ -2,9 +2,9 @@
 
 A fitted model is rendered with a mirror ball behind it, a glossy ring there, and a white plinth
 under it that lies in its shadow, each alone; and in the scene of a file, ``scenes/hybrid.xml``.
-Every way of passing light is compared with the rays' picture of many paths, over the pixels that
+Every way of passing light is compared with the rays' image of many paths, over the pixels that
 show the object and no splats before it. So an error is the sum of what is approximated and of the
-noise of the paths; that of as many paths as the compared picture has is nearly free of noise.
+noise of the paths; that of as many paths as the compared image has is nearly free of noise.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ PATHS, QUICK_PATHS = (1, 4, 16, 64), (1,)
 """Per pixel."""
 
 MANY, QUICK_MANY = 512, 4
-"""Paths of the pictures that are compared."""
+"""Paths of the images that are compared."""
 
 AT_ONCE = 64
-"""Paths of one picture; more are means of several."""
+"""Paths of one image; more are means of several."""
 
 SIZE = (300, 200)
 """px: width, height."""
@@ -86,10 +86,10 @@ class Measurement:
 
     stage: str
     subject: str
-    share: float  # of the picture's pixels
+    share: float  # of the image's pixels
     light: str
     paths: int
-    seconds: float  # of the whole picture; median
+    seconds: float  # of the whole image; median
     factor: float  # times as long as without light
     psnr: float  # dB, against many paths of rays
 
@@ -201,7 +201,7 @@ def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
 def measure(
     stage: Stage, paths: Sequence[int], many: int, rounds: int
 ) -> tuple[list[Measurement], list[tuple[str, list[np.ndarray]]]]:
-    """All ways and numbers of paths, in turns; and by object, its pictures of many paths.
+    """All ways and numbers of paths, in turns; and by object, its images of many paths.
 
     The last number of paths is the many, with other random numbers than what is compared.
     """
@@ -212,36 +212,36 @@ def measure(
     for n in (*paths, many):
         seconds = _times(scenes, n, rounds)
         for way, scene in scenes.items():
-            picture = _mean(scene, n, first=0)
+            image = _mean(scene, n, first=0)
             for name, mask in masks.items():
-                error = metrics.psnr(picture, accurate, mask.astype(np.float64))
+                error = metrics.psnr(image, accurate, mask.astype(np.float64))
                 factor = seconds[way] / seconds["none"]
                 results.append(
                     Measurement(stage.name, name, mask.mean(), way, n, seconds[way], factor, error)
                 )
                 if n == many:
-                    shown[name].append(_cropped(picture, mask))
-    return results, [(f"{stage.name}: {name}", pictures) for name, pictures in shown.items()]
+                    shown[name].append(_cropped(image, mask))
+    return results, [(f"{stage.name}: {name}", images) for name, images in shown.items()]
 
 
-def _picture(scene: mi.Scene, paths: int, seed: int) -> mi.TensorXf:
+def _image(scene: mi.Scene, paths: int, seed: int) -> mi.TensorXf:
     """(H, W, 3) linear."""
     scene.integrator().nested_spp = paths
     return mi.render(scene, seed=seed)
 
 
 def _mean(scene: mi.Scene, paths: int, first: int) -> np.ndarray:
-    """(H, W, 3) display space, of as many pictures as have ``paths`` together."""
+    """(H, W, 3) display space, of as many images as have ``paths`` together."""
     seeds, each = range(first, first + max(1, paths // AT_ONCE)), min(paths, AT_ONCE)
-    linear = np.mean([np.array(_picture(scene, each, seed)) for seed in seeds], axis=0)
+    linear = np.mean([np.array(_image(scene, each, seed)) for seed in seeds], axis=0)
     return np.array(mi.math.linear_to_srgb(mi.Float(linear.ravel()))).reshape(linear.shape)
 
 
 def _times(scenes: dict[str, mi.Scene], paths: int, rounds: int) -> dict[str, float]:
-    """Seconds of a picture, medians; in turns. Of many paths: of as many pictures as it takes."""
+    """Seconds of a image, medians; in turns. Of many paths: of as many images as it takes."""
     each, spent = min(paths, AT_ONCE), {name: [] for name in scenes}
     for scene in scenes.values():
-        for _ in range(2):  # compiles the kernels of the first picture, and of others
+        for _ in range(2):  # compiles the kernels of the first image, and of others
             _seconds(scene, each)
     for _ in range(rounds if each < AT_ONCE else 1):
         for name, scene in scenes.items():
@@ -250,22 +250,22 @@ def _times(scenes: dict[str, mi.Scene], paths: int, rounds: int) -> dict[str, fl
 
 
 def _seconds(scene: mi.Scene, paths: int) -> float:
-    """Time a picture from another place, so that no splats are known."""
+    """Time a image from another place, so that no splats are known."""
     params = mi.traverse(scene.sensors()[0])
     params["to_world"] = mi.Transform4f(params["to_world"].matrix + dr.opaque(mi.Float, 0))
     params.update()
     dr.eval(params["to_world"])
     dr.sync_thread()
     started = time.perf_counter()
-    dr.eval(_picture(scene, paths, 0))
+    dr.eval(_image(scene, paths, 0))
     dr.sync_thread()
     return time.perf_counter() - started
 
 
-def _cropped(picture: np.ndarray, mask: np.ndarray, border: int = 8) -> np.ndarray:
+def _cropped(image: np.ndarray, mask: np.ndarray, border: int = 8) -> np.ndarray:
     """To what surrounds a mask."""
     rows, columns = (np.nonzero(mask.any(axis=axis))[0] for axis in (1, 0))
-    return picture[
+    return image[
         max(rows[0] - border, 0) : rows[-1] + border,
         max(columns[0] - border, 0) : columns[-1] + border,
     ]
@@ -305,7 +305,7 @@ def plot(results: Sequence[Measurement]) -> Figure:
             axis.plot([m.seconds for m in found], [m.psnr for m in found], ".-", label=way.name)
         axis.set_xscale("log")
         axis.set_title(": ".join(panel), fontsize=9)
-        axis.set_xlabel("seconds a picture")
+        axis.set_xlabel("seconds a image")
         axis.grid(alpha=0.3)
     for axis in axes[len(panels) :]:
         axis.axis("off")
@@ -314,16 +314,16 @@ def plot(results: Sequence[Measurement]) -> Figure:
     return figure
 
 
-def show(pictures: Sequence[tuple[str, list[np.ndarray]]]) -> Figure:
+def show(images: Sequence[tuple[str, list[np.ndarray]]]) -> Figure:
     """A row an object: by each way, and four times the error of all but the last."""
     names = [way.name for way in WAYS]
     titles = [*names, *(f"error x4: {name}" for name in names[:-1])]
-    figure = new_figure(2 * len(titles), 1.6 * len(pictures))
-    axes = figure.subplots(len(pictures), len(titles), squeeze=False)
-    for row, (name, by_way) in zip(axes, pictures, strict=True):
-        errors = [4 * np.abs(picture - by_way[-1]) for picture in by_way[:-1]]
-        for axis, picture in zip(row, [*by_way, *errors], strict=True):
-            axis.imshow(np.clip(picture, 0, 1), interpolation="nearest")
+    figure = new_figure(2 * len(titles), 1.6 * len(images))
+    axes = figure.subplots(len(images), len(titles), squeeze=False)
+    for row, (name, by_way) in zip(axes, images, strict=True):
+        errors = [4 * np.abs(image - by_way[-1]) for image in by_way[:-1]]
+        for axis, image in zip(row, [*by_way, *errors], strict=True):
+            axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
             axis.set_xticks([])
             axis.set_yticks([])
         row[0].set_ylabel(name, fontsize=7)
@@ -333,7 +333,7 @@ def show(pictures: Sequence[tuple[str, list[np.ndarray]]]) -> Figure:
 
 
 def main() -> None:
-    """Measure all stages; write a plot and pictures."""
+    """Measure all stages; write a plot and images."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     add_scene(parser)
     parser.add_argument("--quick", action="store_true", help="few paths and rounds")
@@ -344,16 +344,16 @@ def main() -> None:
     ply = path / GAUSSIANS if path.is_dir() else path
     counts = (QUICK_PATHS, QUICK_MANY, QUICK_ROUNDS) if args.quick else (PATHS, MANY, ROUNDS)
     results: list[Measurement] = []
-    pictures: list[tuple[str, list[np.ndarray]]] = []
+    images: list[tuple[str, list[np.ndarray]]] = []
     for stage in stages(ply, SCENES / "hybrid.xml"):
         found, shown = measure(stage, *counts)
         results += found
-        pictures += shown
+        images += shown
         print(f"\n{table(found)}", flush=True)
     args.out.mkdir(parents=True, exist_ok=True)
     write_figure(args.out / "light.png", plot(results))
-    write_figure(args.out / "light_pictures.png", show(pictures))
-    print(f"\n{machine()}; plot and pictures: {args.out}")
+    write_figure(args.out / "light_images.png", show(images))
+    print(f"\n{machine()}; plot and images: {args.out}")
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@ undistorted beforehand, as other trainers need it (a folder of COLMAP's, by pyco
 points instead of those of structure from motion; and with the cameras thrown away and found again
 by ``drgs poses``.
 
-A fit is measured on test views as it sees them: of pictures that were undistorted, and thereby
-blurred, on such pictures. Where its world is that of the folder, it is measured a second time on
+A fit is measured on test views as it sees them: of images that were undistorted, and thereby
+blurred, on such images. Where its world is that of the folder, it is measured a second time on
 the photographs as they were taken, through the lens that they were taken with. Results:
 ``photographs.md``.
 """
@@ -34,7 +34,7 @@ from drgs.datasets.folders import config_for, find_reader
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
-from drgs.io.pictures import image_size, read_image, write_png
+from drgs.io.images import image_size, read_image, write_png
 from drgs.poses.structure_from_motion import Search, place
 from drgs.results.files import GAUSSIANS
 from drgs.results.folder import load_run_config
@@ -42,7 +42,7 @@ from drgs.results.metrics import mean_of
 from drgs.results.report import score
 
 JPEG_QUALITY = 95
-"""Quality of the pictures that undistorting writes."""
+"""Quality of the images that undistorting writes."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ def undistorted(config: FitConfig, folder: Path) -> Path:
     """
     pycolmap = required("pycolmap", "colmap", "undistorting")
     model = model_folder(config.data.path)
-    pictures = image_folder(config.data, read_model(model))
+    renders = image_folder(config.data, read_model(model))
     found = pycolmap.Reconstruction(str(model))
     sizes = {}
     for image in found.images.values():
-        sizes[image.camera_id] = size = image_size(pictures / image.name)
+        sizes[image.camera_id] = size = image_size(renders / image.name)
         scale = size[0] / found.cameras[image.camera_id].width
         for point in image.points2D:
             point.xy = point.xy * scale
@@ -76,7 +76,7 @@ def undistorted(config: FitConfig, folder: Path) -> Path:
     with tempfile.TemporaryDirectory() as scaled:
         found.write_binary(scaled)
         pycolmap.logging.minloglevel = 2
-        pycolmap.undistort_images(folder, scaled, pictures, jpeg_quality=JPEG_QUALITY)
+        pycolmap.undistort_images(folder, scaled, renders, jpeg_quality=JPEG_QUALITY)
     return folder
 
 
@@ -123,7 +123,7 @@ def psnr_as_taken(fitted: Path, config: FitConfig) -> float:
         mi.set_variant("llvm_ad_rgb")
     scene = make_scene(gaussians, run_config.model, run_config.data.background_rgb)
     pairs = zip(render_views(scene, dataset.test), dataset.test, strict=True)
-    return mean_of([score(picture, view) for picture, view in pairs]).psnr
+    return mean_of([score(rendered, view) for rendered, view in pairs]).psnr
 
 
 def main() -> None:

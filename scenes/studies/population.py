@@ -1,8 +1,8 @@
 """Count how many Gaussians the reference recipe keeps, and why; takes hours.
 
 The recipe of the 3DGS paper (``scenes/lego_paper.yml``, 30,000 iterations) at three sizes of the
-pictures, and at the smallest with one of its rules changed at a time, as other implementations
-have it. Pictures of 200 and 400 px are NeRF-synthetic's Lego (``--data``), those of 800 px come
+images, and at the smallest with one of its rules changed at a time, as other implementations
+have it. Images of 200 and 400 px are NeRF-synthetic's Lego (``--data``), those of 800 px come
 from the shipped generator. Results: ``population.md``.
 """
 
@@ -43,7 +43,7 @@ ITERATIONS = 30_000
 """The length of the recipe."""
 
 SMALL, MEDIUM, LARGE = 200, 400, 800
-"""px, width and height of the pictures."""
+"""px, width and height of the images."""
 
 
 @contextmanager
@@ -106,7 +106,7 @@ class Case:
 
     name: str
     size: int = SMALL  # px
-    generated: bool = False  # pictures of the shipped generator
+    generated: bool = False  # images of the shipped generator
     overrides: Callable[[FitConfig, float], dict[str, object]] = lambda config, extent: {}
     rules: Callable[[], object] = nullcontext  # a context in which the fit runs
 

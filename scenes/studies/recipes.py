@@ -246,10 +246,10 @@ CASES = (
 def config_of(case: Case, scene: Scene, data: Path | None = None) -> FitConfig:
     """The configuration of a recipe on a scene; data: its folder, if not the configuration's."""
     overrides = [] if data is None else [f"data.path={data}"]
-    pictures = load_config(scene.config, overrides).data
+    images = load_config(scene.config, overrides).data
     config = FitConfig.model_validate(
         {
-            "data": pictures.model_dump(),
+            "data": images.model_dump(),
             "iterations": scene.iterations,
             "output": {"save_renders": False},
         }

@@ -1,7 +1,7 @@
 """Fit the shipped scene at 200x200 with other lengths and settings; takes half an hour.
 
 ``scenes/lego_mini.yml`` is fitted with different numbers of iterations, and with one other choice
-at a time: smaller pictures first, fewer Gaussians, spherical harmonics of a lower degree, no SSIM.
+at a time: smaller images first, fewer Gaussians, spherical harmonics of a lower degree, no SSIM.
 Each choice is a curve of the quality on the test views over the time that the fit took;
 ``drgs/training/training_curves.csv`` has the curves from which ``drgs fit --budget`` plans.
 

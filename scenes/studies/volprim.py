@@ -62,7 +62,7 @@ FACTORS = (1, 16, 64)
 
 @dataclass(frozen=True)
 class Row:
-    """The difference of two pictures."""
+    """The difference of two images."""
 
     factor: int  # by which all lengths are multiplied
     what: str
@@ -87,7 +87,7 @@ def enlarged(subject: Subject, factor: int) -> Subject:
 
 
 def compare(subject: Subject, factor: int) -> list[Row]:
-    """All changes of the reference, against Mitsuba's picture of the first view."""
+    """All changes of the reference, against Mitsuba's image of the first view."""
     camera = subject.cameras[0]
     image = volprim_image(subject.gaussians, camera)
     gaussians = reference.Gaussians(
@@ -96,8 +96,8 @@ def compare(subject: Subject, factor: int) -> list[Row]:
     rows = []
     for what, change in CHANGES.items():
         model = replace(VOLPRIM, **change)
-        picture = reference_rays.render(gaussians, camera, (0, 0, 0), model)
-        rows.append(_row(factor, what, picture.image, image))
+        rendered = reference_rays.render(gaussians, camera, (0, 0, 0), model)
+        rows.append(_row(factor, what, rendered.image, image))
     return rows
 
 

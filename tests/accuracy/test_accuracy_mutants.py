@@ -149,7 +149,7 @@ def outcome():
             checks.check_behind_hundreds_of_layers_gradients_keep_their_accuracy
         ),
         "twins": rendering_with_copies(
-            checks.check_twins_are_composited_in_one_order_by_picture_and_derivative
+            checks.check_twins_are_composited_in_one_order_by_image_and_derivative
         ),
     }
     with pytest.MonkeyPatch.context() as patch:

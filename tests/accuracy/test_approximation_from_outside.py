@@ -88,14 +88,14 @@ def compact_image(arrays):
     return [passed.ravel(), *image.reshape(3, -1)]
 
 
-def test_the_picture_is_that_of_the_equation():
+def test_the_image_is_that_of_the_equation():
     found, expected = planes_of(values(), falloff="compact"), compact_image(values())
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
     assert np.abs(np.array(found) - planes_of(values())).max() > 0.01
 
 
 @pytest.mark.parametrize("order", ["center", "pixel"])
-def test_the_gradients_are_those_of_the_picture(order):
+def test_the_gradients_are_those_of_the_image(order):
     """Against central differences, and the tangent against the adjoint."""
     rng, arrays = np.random.default_rng(4), values()
     weights = rng.normal(size=(4, WIDTH * HEIGHT))
@@ -174,7 +174,7 @@ def test_an_order_is_found_by_name(others):
     arrays = values()
     middle = arrays["means"][:, 2:].copy()
     assert np.abs(np.array(found) - planes_of(arrays)).max() > 0.01
-    scale = (6 - middle) / middle  # the same pictures of the splats, at 6 - z
+    scale = (6 - middle) / middle  # the same images of the splats, at 6 - z
     arrays["means"] = arrays["means"] * scale
     arrays["log_scales"] = arrays["log_scales"] + np.log(scale)
     np.testing.assert_allclose(found, planes_of(arrays), rtol=0, atol=1e-12)

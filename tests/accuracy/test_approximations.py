@@ -1,4 +1,4 @@
-"""Each approximation against the float64 reference: picture, gradients, tangents, kernels."""
+"""Each approximation against the float64 reference: image, gradients, tangents, kernels."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ from support.approximation_checks import (
     check_behind_hundreds_of_layers_gradients_keep_their_accuracy,
     check_gradients_equal_central_differences_of_the_reference,
     check_sums_of_products_are_exact_to_twice_the_precision,
-    check_twins_are_composited_in_one_order_by_picture_and_derivative,
+    check_twins_are_composited_in_one_order_by_image_and_derivative,
 )
 from support.helpers import (
     FLOAT32,
@@ -53,34 +53,34 @@ all_scenes = pytest.mark.parametrize("scene", ("random", "close"))
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
 @both_precisions
 @all_scenes
 @all_approximations
-def test_picture_equals_the_reference(precision, scene, name):
+def test_image_equals_the_reference(precision, scene, name):
     problem = Problem(name, scene)
-    picture = problem.picture(MARKED[precision])
-    kept = ~picture.near_threshold
+    rendered = problem.rendered(MARKED[precision])
+    kept = ~rendered.near_threshold
     assert kept.mean() > 0.9
     actual = {"planes": problem.kernel_planes(precision)[kept]}
-    assert_arrays_agree(actual, {"planes": _planes(picture)[kept]}, PLANES[precision])
+    assert_arrays_agree(actual, {"planes": _planes(rendered)[kept]}, PLANES[precision])
 
 
 @all_approximations
-def test_approximation_changes_the_picture(name):
+def test_approximation_changes_the_image(name):
     """Otherwise the tests above would compare the default with itself."""
     default = [reference.render(*_inputs(scene)) for scene in SCENES]
-    chosen = [Problem(name, scene).picture(1e-9) for scene in SCENES]
+    chosen = [Problem(name, scene).rendered(1e-9) for scene in SCENES]
     assert any(np.abs(a.image - b.image).max() > 1e-3 for a, b in zip(chosen, default, strict=True))
 
 
 def test_order_converges_with_the_window():
     """A layer of discs tilted every way: their order differs from pixel to pixel."""
     scene = Problem("exact, pixel order", "close")
-    expected = scene.picture(1e-9)
+    expected = scene.rendered(1e-9)
     errors = []
     for window in (1, 2, 4, 8):
         pipeline = pipeline_of(replace(scene.approximations, order_window=window), 1)
@@ -202,8 +202,8 @@ def test_sums_of_products_are_exact_to_twice_the_precision():
     check_sums_of_products_are_exact_to_twice_the_precision()
 
 
-def test_twins_are_composited_in_one_order_by_picture_and_derivative():
-    check_twins_are_composited_in_one_order_by_picture_and_derivative()
+def test_twins_are_composited_in_one_order_by_image_and_derivative():
+    check_twins_are_composited_in_one_order_by_image_and_derivative()
 
 
 def test_a_peak_in_the_plane_of_the_camera_shows_nothing():

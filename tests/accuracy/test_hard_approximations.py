@@ -1,7 +1,7 @@
 """Hard inputs under the approximations: finite, and as accurate as float32 can be.
 
-The families are those of ``test_hard_cases``. In float64 the kernels' picture has to be that of the
-float64 reference. In float32, picture and gradients may differ from those in float64 by the bound
+The families are those of ``test_hard_cases``. In float64 the kernels' image has to be that of the
+float64 reference. In float32, image and gradients may differ from those in float64 by the bound
 of ``test_hard_cases``, whose noise comes of the float64 kernels here: inputs, and what the
 projection hands on, are moved by one rounding each.
 """
@@ -65,16 +65,16 @@ def planes_and_gradients(gaussians, camera, pipeline, weights, precision) -> tup
 
 @cache
 def expected(name, approximation):
-    """The reference's picture, and weights that are zero where it is near a decision."""
+    """The reference's image, and weights that are zero where it is near a decision."""
     case, values = FAMILIES[name], Approximations(**APPROXIMATIONS[approximation])
     fields = set(reference_rays.ImageModel.__dataclass_fields__) & set(vars(values))
     model = reference_rays.ImageModel(**{field: getattr(values, field) for field in fields})
-    picture = reference_rays.render(
+    rendered = reference_rays.render(
         case.gaussians, case.camera, (0, 0, 0), model, threshold_width=MARKED
     )
-    planes = np.concatenate([picture.transmittance[..., None], picture.image], axis=-1)
+    planes = np.concatenate([rendered.transmittance[..., None], rendered.image], axis=-1)
     weights = np.random.default_rng(0).normal(size=planes.shape)
-    return planes, single(weights * ~picture.near_threshold[..., None]), picture.near_threshold
+    return planes, single(weights * ~rendered.near_threshold[..., None]), rendered.near_threshold
 
 
 def noises(case, pipeline, weights, base) -> tuple[dict, dict]:
@@ -143,7 +143,7 @@ def rounded_axes(seed):
 
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
 @pytest.mark.parametrize("name", SMALL)
-def test_picture_and_gradients_are_within_the_bound(name, approximation):
+def test_image_and_gradients_are_within_the_bound(name, approximation):
     case = FAMILIES[name]
     planes, weights, marked = expected(name, approximation)
     assert marked.sum() <= max(2, 0.01 * marked.size)

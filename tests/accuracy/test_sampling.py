@@ -16,7 +16,7 @@ from support.approximation_checks import (
     _planes,
     direction,
 )
-from support.backgrounds import CLOSE, EMITTERS, picture, texels
+from support.backgrounds import CLOSE, EMITTERS, rendered, texels
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -60,7 +60,7 @@ class Sampled(Problem):
         corners = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
         return corners + self.points
 
-    def picture(self, threshold_width) -> reference.Picture:
+    def rendered(self, threshold_width) -> reference.RenderedImage:
         return reference_rays.render(
             *self.inputs, (0, 0, 0), self.model, None, self.positions, threshold_width
         )
@@ -92,13 +92,13 @@ all_cases = pytest.mark.parametrize("problem", CASES, ids=lambda p: f"{p.name}, 
 
 @both_precisions
 @all_cases
-def test_picture_at_points_equals_the_reference(precision, problem):
-    picture = problem.picture(MARKED[precision])
-    kept = ~picture.near_threshold
+def test_image_at_points_equals_the_reference(precision, problem):
+    rendered = problem.rendered(MARKED[precision])
+    kept = ~rendered.near_threshold
     assert kept.mean() > 0.9
     actual = problem.kernel_planes(precision)
     assert_arrays_agree(
-        {"planes": actual[kept]}, {"planes": _planes(picture)[kept]}, PLANES[precision]
+        {"planes": actual[kept]}, {"planes": _planes(rendered)[kept]}, PLANES[precision]
     )
     centers = Problem(problem.name, problem.scene).kernel_planes(precision)
     assert np.abs(actual - centers).max() > 0.01
@@ -157,15 +157,15 @@ def exposure_of(loaded, samples, seed=0):
     return np.concatenate(passes)
 
 
-def pictures_at(points) -> np.ndarray:
+def images_at(points) -> np.ndarray:
     """(samples, H, W, 4): colour and alpha by the reference, at each sample's points."""
     camera, window = SCENE.camera, SCENE.view.window
     corners = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    pictures = []
+    images = []
     for inside in points:
         positions = corners + 0.5
         positions[window] = corners[window] + inside
-        picture = reference_rays.render(
+        rendered = reference_rays.render(
             SCENE.gaussians,
             camera,
             SCENE.background,
@@ -173,11 +173,11 @@ def pictures_at(points) -> np.ndarray:
             window,
             positions,
         )
-        pictures.append(np.dstack([picture.image, picture.alpha]))
-    return np.array(pictures)
+        images.append(np.dstack([rendered.image, rendered.alpha]))
+    return np.array(images)
 
 
-# Single precision; a pixel that is near a decision may flip: the picture is bounded in the mean.
+# Single precision; a pixel that is near a decision may flip: the image is bounded in the mean.
 MEAN_ERROR = 1e-5
 
 
@@ -188,7 +188,7 @@ def test_a_box_filter_averages_the_samples(sampler):
     loaded = SCENE.load(samples=4, sampler=sampler)
     image = image_of(loaded, seed=3)
     points = exposure_of(loaded, 4, seed=3)
-    assert np.abs(image - pictures_at(points).mean(axis=0)).mean() < MEAN_ERROR
+    assert np.abs(image - images_at(points).mean(axis=0)).mean() < MEAN_ERROR
     assert np.abs(image - image_of(SCENE.load())).max() > 0.01
 
 
@@ -208,19 +208,19 @@ def test_a_seed_that_was_changed_in_place_gives_other_points():
     integrator, sensor = loaded.integrator(), loaded.sensors()[0]
     seed = mi.UInt32(0)
 
-    def picture(seed):
+    def rendered(seed):
         return np.array(integrator.render(loaded, sensor, seed=seed))
 
-    before = picture(seed)
+    before = rendered(seed)
     frames = integrator.state.cache.kept["frames 0"]
-    np.testing.assert_array_equal(picture(seed), before)
+    np.testing.assert_array_equal(rendered(seed), before)
     assert integrator.state.cache.kept["frames 0"] is frames
     seed += 1
-    np.testing.assert_array_equal(picture(seed), picture(1))
-    assert np.abs(picture(1) - before).max() > 1e-3
+    np.testing.assert_array_equal(rendered(seed), rendered(1))
+    assert np.abs(rendered(1) - before).max() > 1e-3
     dr.make_opaque(seed)
     seed += 1
-    np.testing.assert_array_equal(picture(seed), picture(2))
+    np.testing.assert_array_equal(rendered(seed), rendered(2))
 
 
 def test_samples_of_one_call_replace_those_of_the_sampler():
@@ -236,7 +236,7 @@ def test_a_filter_weighs_the_samples_around_a_pixel(name, samples):
     loaded = SCENE.load(samples=samples, rfilter=name)
     image = image_of(loaded)
     points = exposure_of(loaded, samples)
-    values = pictures_at(points)
+    values = images_at(points)
     rfilter = mi.load_dict({"type": name})
     radius, (_, height, width, _) = rfilter.radius(), values.shape
     reach = int(np.ceil(radius))
@@ -293,13 +293,13 @@ def test_gradients_are_the_transpose_of_the_tangents(samples, rfilter):
 def test_no_samples_are_taken_beyond_the_film():
     """Whether or not it has a border for them."""
     loaded = SCENE.load(samples=2)
-    pictures = [
+    images = [
         image_of(loaded, sensor=mi.load_dict(sensor))
         for border in (False, True)
         for sensor in [SCENE.view.sensor(rfilter="gaussian", samples=2, sample_border=border)]
     ]
     # Atomic additions round in an order of their own.
-    np.testing.assert_allclose(*pictures, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(*images, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("action", ["develop", "adjoint"])
@@ -411,7 +411,7 @@ SCENES = {
     "features in groups": lambda: scene_with(
         {"aovs": "z:depth, n:normal, f:feature_f", "feature_f": feature_tensor(4)}
     ),
-    "texture": lambda: scene_with({"background": picture(texels())}),
+    "texture": lambda: scene_with({"background": rendered(texels())}),
     "environment, thin lens": lambda: scene_with(sensor=thin_lens(), sky=EMITTERS["envmap"]()),
     "surface, environment": lambda: load_wall(FEW, sky=True, wall=Wall(half=0.5), aovs="z:depth"),
     "batch": lambda: scene_with({"aovs": "z:depth"}, batch_of_two()),

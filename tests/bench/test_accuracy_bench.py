@@ -99,7 +99,7 @@ def test_the_front_holds_what_none_is_both_faster_and_closer_than():
 
 
 def test_the_stress_scene_is_what_it_says():
-    """Its layers cross in the middle of the picture, and splats are large and near."""
+    """Its layers cross in the middle of the image, and splats are large and near."""
     gaussians, (camera,) = stress_scene(64)
     assert 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) == pytest.approx(110, abs=1e-3)
     first, second = gaussians.means[:700], gaussians.means[700:1400]

@@ -40,17 +40,17 @@ def test_stability_finds_no_error_beyond_the_conditioning(stability_run):
         for row in csv.DictReader(file):
             layers = float(row["value"]) if row["sweep"] == "Stack depth" else 60
             rounding = stability.UNIT_ROUNDOFF * (4 + np.sqrt(layers))
-            for what in ("picture", "gradient"):
+            for what in ("image", "gradient"):
                 allowed = 30 * (float(row[f"{what}_noise"]) + rounding)
                 assert 0 < float(row[what]) <= allowed, row
             assert float(row["left_out"]) < 0.1
 
 
 def test_noise_is_that_of_single_precision():
-    """Rounding the scene to float32 changes the picture by about as much as the noise says."""
+    """Rounding the scene to float32 changes the image by about as much as the noise says."""
     sweep = next(s for s in stability.sweeps() if s.name == "Anisotropy")
     found = stability.measure(sweep, 100.0, samples=4)
-    assert 0.1 < found.storage / found.picture_noise < 10
+    assert 0.1 < found.storage / found.image_noise < 10
 
 
 # ----------------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ def test_the_command_writes_its_table_and_plot(small, tmp_path, capsys):
 
 
 def test_effects_add_operations_and_lower_degrees_take_some_away(small):
-    """Of the kernels of a picture and its derivatives: what the table's last column says."""
+    """Of the kernels of a image and its derivatives: what the table's last column says."""
     gaussians = scenes.bench_gaussians(150)
     cases = {(c.effect, c.variant): c for c in effects.rendering_cases()}
     plain = effects.operations(effects.CaseRenderer(cases["none", "none"], gaussians))
@@ -63,8 +63,8 @@ def test_effects_add_operations_and_lower_degrees_take_some_away(small):
         assert (count > plain) == adds and count != plain, (effect, name, count, plain)
 
 
-def test_every_case_is_another_picture(small):
-    """But for derivatives, which are no picture's, and effects that a single sample cannot show."""
+def test_every_case_is_another_image(small):
+    """But for derivatives, which are no image's, and effects that a single sample cannot show."""
     gaussians = scenes.bench_gaussians(150)
     images = {}
     for case in effects.rendering_cases():
@@ -77,7 +77,7 @@ def test_every_case_is_another_picture(small):
         assert (np.abs(image - plain).max() < 1e-4) == same, key
 
 
-def test_a_picture_is_never_reused(small):
+def test_a_image_is_never_reused(small):
     """Each is rendered: the second launches what the first did."""
     renderer = effects.CaseRenderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
     counts = [effects.operations(renderer) for _ in range(2)]
@@ -117,7 +117,7 @@ def test_prices_are_medians_against_the_first_case(monkeypatch):
     assert [(p.forward_ratio, p.both_ratio) for p in prices] == [(1, 1), (2, 2)]
     assert prices[1].forward_ms == 2000 and prices[1].both_ms == 6000
     assert [p.operations_more for p in prices] == [0, 100]
-    table = effects.table(prices, "picture", "both")
+    table = effects.table(prices, "image", "both")
     assert "| slow | x | 2000.0 ms | 2.00 | 6000.0 ms | 2.00 | +100 |" in table.splitlines()
     short = effects.table(prices, "", "both").splitlines()
     assert "| slow | x | 6000.0 ms | 2.00 | +100 |" in short

@@ -15,7 +15,7 @@ from support.helpers import (
 )
 from support.lens_checks import (
     FORMS,
-    PICTURE,
+    IMAGE,
     case_of,
     covariances,
     every_lens,
@@ -132,7 +132,7 @@ def direction_of_pixels(case) -> np.ndarray:
     ids=[*FORMS, "rational, float32"],
 )
 def test_colours_are_seen_in_the_directions_of_the_pixels_rays(precision, name):
-    """One reference picture for each pixel, of that pixel."""
+    """One reference image for each pixel, of that pixel."""
     case = clear(LensCase("small", 12, 9, 1, 20, lens=LENSES[name]))
     pipeline = pipeline_of(Approximations(sh_direction="pixel"), 1)
     _, frame = case.render(precision, pipeline)
@@ -149,7 +149,7 @@ def test_colours_are_seen_in_the_directions_of_the_pixels_rays(precision, name):
         ).image[0, 0]  # fmt: skip
     shown = ~np.isnan(directions_of).any(axis=1)
     assert shown.mean() > 0.7 and np.isfinite(color).all()
-    tolerance = PICTURE[precision] * np.abs(expected[shown]).max()
+    tolerance = IMAGE[precision] * np.abs(expected[shown]).max()
     np.testing.assert_allclose(color[shown], expected[shown], rtol=0, atol=tolerance)
 
 
@@ -250,7 +250,7 @@ def needles(case, rng):
     ids=lambda value: value if isinstance(value, str) else ", ".join(value),
 )
 def test_gradients_equal_their_own_central_differences(name, approximations):
-    """The kernels' adjoint against the kernels' picture. So small a step meets no jump, neither of
+    """The kernels' adjoint against the kernels' image. So small a step meets no jump, neither of
     a cut nor of the order of splats at a pixel.
     """
     case = LensCase("choices", 19, 14, 1, 20, lens=LENSES[name])

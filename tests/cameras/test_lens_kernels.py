@@ -229,7 +229,7 @@ def test_each_coefficient_of_a_fisheye_adds_operations():
     ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
 )
 def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
-    """As with them far away: the same picture and the same gradients of all others."""
+    """As with them far away: the same image and the same gradients of all others."""
     case = clear(case_of(name, count=30))
     means = case.gaussians.means.copy()
     bad = np.array([

@@ -80,7 +80,7 @@ def test_coefficients_that_change_nothing_are_zero(lens, tiny):
 
 
 def folded_points(lens) -> np.ndarray:
-    """Points in front of the lens that it would fold back to the middle of the picture.
+    """Points in front of the lens that it would fold back to the middle of the image.
 
     In the direction (3, -4), in which the tangential terms of "tangential" fold first.
     """

@@ -1,4 +1,4 @@
-"""Lenses against the float64 reference: what they see, pictures, gradients; and by themselves."""
+"""Lenses against the float64 reference: what they see, images, gradients; and by themselves."""
 
 import numpy as np
 import pytest
@@ -8,14 +8,14 @@ from support.helpers import (
     FLOAT64,
     Cotangents,
     assert_arrays_agree,
-    assert_pictures_agree,
+    assert_images_agree,
     both_precisions,
     clear,
-    picture_of,
+    image_planes,
 )
 from support.lens_checks import (
     FORMS,
-    PICTURE,
+    IMAGE,
     case_of,
     every_lens,
     keep_bounds,
@@ -46,7 +46,7 @@ antialiased_too = pytest.mark.parametrize(
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
@@ -66,10 +66,10 @@ def large_scene(case, rng):
 
 @both_precisions
 @antialiased_too
-def test_picture_equals_the_reference(precision, name, antialiased):
+def test_image_equals_the_reference(precision, name, antialiased):
     case = clear(case_of(name, antialiased=antialiased))
     _, frame = case.render(precision)
-    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
 
 
 @both_precisions
@@ -78,19 +78,19 @@ def test_tiles_hold_all_that_large_splats_reach(precision, name):
     """The reference evaluates every splat at every pixel."""
     case = clear(case_of(name, recipe=large_scene, count=20))
     _, frame = case.render(precision)
-    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
     splats = effects.project(*case.scene, case.lens)
     x, y = splats.means2d[splats.visible].T
     beside = (x < 0) | (y < 0) | (x > case.width) | (y > case.height)
-    assert beside.sum() >= 5 and (case.picture.alpha > 0.5).mean() > 0.3
+    assert beside.sum() >= 5 and (case.rendered.alpha > 0.5).mean() > 0.3
 
 
 @every_lens
-def test_a_lens_changes_the_picture(name):
+def test_a_lens_changes_the_image(name):
     """Otherwise the tests above would compare a pinhole with itself."""
     case = clear(case_of(name))
     plain = reference.render(*case.scene, case.background)
-    assert np.abs(plain.image - case.picture.image).max() > 0.01
+    assert np.abs(plain.image - case.rendered.image).max() > 0.01
 
 
 # ----------------------------------------------------------------------------------------------
@@ -117,8 +117,8 @@ def test_each_number_of_the_gradients_equals_a_difference_of_the_reference(name,
     weights = [cotangents.d_image, cotangents.d_alpha, cotangents.d_depth]
 
     def outputs(**parameters):
-        picture = case.reference_picture(reference.Gaussians(**parameters))
-        return [picture.image, picture.alpha, picture.depth]
+        rendered = case.reference_image(reference.Gaussians(**parameters))
+        return [rendered.image, rendered.alpha, rendered.depth]
 
     parameters = {n: getattr(case.gaussians, n) for n in PARAMETER_NAMES}
     expected = numeric_gradients(outputs, weights, parameters)

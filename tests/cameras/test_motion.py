@@ -14,12 +14,12 @@ from support.helpers import (
     FLOAT64,
     Cotangents,
     assert_arrays_agree,
-    assert_pictures_agree,
+    assert_images_agree,
     both_precisions,
     clear,
     device_gaussians,
     frame_adjoint,
-    picture_of,
+    image_planes,
     plane_cotangents,
     rows,
     single,
@@ -42,7 +42,7 @@ from drgs.splatting import rendering
 from drgs.splatting.projection import load_rows
 
 # Those of test_lenses.
-PICTURE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
+IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 
 
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
@@ -69,7 +69,7 @@ KINDS = {
 all_kinds = pytest.mark.parametrize("name", KINDS)
 
 
-# The pictures that blurred ones are a mean of have no derivatives of their own.
+# The images that blurred ones are a mean of have no derivatives of their own.
 kinds_and_samples = pytest.mark.parametrize(
     ("name", "samples"),
     [("pinhole", 2), *((name, 0) for name in KINDS)],
@@ -99,9 +99,9 @@ def test_poses_are_those_of_the_reference(precision, turn):
 
 
 def blurred(frames, case) -> dict[str, np.ndarray]:
-    """The mean of pictures."""
-    pictures = [picture_of(frame, case) for frame in frames]
-    return {name: np.mean([p[name] for p in pictures], axis=0) for name in pictures[0]}
+    """The mean of images."""
+    images = [image_planes(frame, case) for frame in frames]
+    return {name: np.mean([p[name] for p in images], axis=0) for name in images[0]}
 
 
 @pytest.mark.parametrize(
@@ -110,18 +110,18 @@ def blurred(frames, case) -> dict[str, np.ndarray]:
     ids=["pinhole, float32", "pinhole", "rational"],
 )
 def test_motion_blur_equals_the_reference(precision, name):
-    """Pictures of one camera at other places: what a lens does to each is in test_lenses."""
+    """Images of one camera at other places: what a lens does to each is in test_lenses."""
     case = clear(case_of(name))
     expected = effects.render_motion_blur(
         case.gaussians, case.camera, case.close_camera, 3, case.background, case.lens
     )
-    assert not case.picture.near_threshold.any()
-    np.testing.assert_array_equal(expected.image, case.picture.image)
+    assert not case.rendered.near_threshold.any()
+    np.testing.assert_array_equal(expected.image, case.rendered.image)
     _, frames = case.frames(precision)
     assert len(frames) == 3
-    assert_pictures_agree(blurred(frames, case), case.picture, PICTURE[precision])
+    assert_images_agree(blurred(frames, case), case.rendered, IMAGE[precision])
     still = (
-        case.reference_picture(case.gaussians).image
+        case.reference_image(case.gaussians).image
         - effects.render(*case.scene, case.lens, case.background).image
     )
     assert np.abs(still).max() > 0.03
@@ -129,7 +129,7 @@ def test_motion_blur_equals_the_reference(precision, name):
 
 @both_precisions
 @pytest.mark.parametrize("samples", [0, 1, 4])
-def test_a_still_camera_takes_the_plain_picture(precision, samples):
+def test_a_still_camera_takes_the_plain_image(precision, samples):
     """To the last bit: turns of zero are the identity."""
     case = clear(case_of("pinhole", samples=samples))
     zero = precision.Array3f(0, 0, 0)
@@ -146,7 +146,7 @@ def test_a_still_camera_takes_the_plain_picture(precision, samples):
     again = replace(case, turn=0.0, travel=0.0)
     _, frames = again.frames(precision)
     for frame in frames:
-        np.testing.assert_allclose(planes_of(frame), plain, rtol=0, atol=PICTURE[precision])
+        np.testing.assert_allclose(planes_of(frame), plain, rtol=0, atol=IMAGE[precision])
 
 
 # ----------------------------------------------------------------------------------------------
@@ -162,9 +162,9 @@ def test_rolling_shutter_equals_splats_at_the_time_of_their_row(precision, name)
     times = np.array([time_of(case, mean) for mean in case.gaussians.means])
     assert (times == 0).any() and (times == 1).any() and ((times > 0) & (times < 1)).sum() >= 8
     _, (frame,) = case.frames(precision)
-    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
     still = effects.render(*case.scene, case.lens, case.background)
-    assert np.abs(case.picture.image - still.image).max() > 0.02
+    assert np.abs(case.rendered.image - still.image).max() > 0.02
 
 
 def small_scene(case, rng):
@@ -192,7 +192,7 @@ def small_scene(case, rng):
     )
 
 
-def test_small_splats_look_as_if_each_row_had_a_picture_of_its_own():
+def test_small_splats_look_as_if_each_row_had_a_image_of_its_own():
     """While a row is read, splats move by up to V / H = 4.9 px / 40 = 0.12 px; d rows from its mean
     a splat is off by so much d. With a standard deviation of sigma = 0.74 px and more, low-pass
     included, and an opacity of 0.82, alpha is off by 0.12 d 0.82 exp(-1/2) / sigma exp(-d^2 / 2
@@ -200,7 +200,7 @@ def test_small_splats_look_as_if_each_row_had_a_picture_of_its_own():
     """
     case = MovingCase("small", 48, 40, 0, 25, recipe=small_scene, turn=0.1, travel=0.05, samples=0)
     _, (frame,) = case.frames(FLOAT64)
-    actual = picture_of(frame, case)
+    actual = image_planes(frame, case)
     expected = effects.render_rolling_shutter(
         case.gaussians, case.camera, case.close_camera, case.background
     )

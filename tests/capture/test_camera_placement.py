@@ -61,10 +61,10 @@ def test_cornells_box_is_photographed_from_inside():
     assert np.abs(centers(scene, settings)).max() < 1
     camera = CaptureCamera(scene, settings)
     for view in camera_placement.views_of(scene, settings):
-        picture = camera.image(view)
-        assert lit_part(picture) > 0.8
-        # Its front is open, and a picture may look through it.
-        assert (picture[:, :, 3] > 0).mean() > 0.15
+        rendered = camera.image(view)
+        assert lit_part(rendered) > 0.8
+        # Its front is open, and a image may look through it.
+        assert (rendered[:, :, 3] > 0).mean() > 0.15
 
 
 def test_a_room_of_two_sided_walls_is_photographed_from_inside():
@@ -140,7 +140,7 @@ BALL = {
 }
 
 
-def test_many_sensors_take_the_pictures_themselves():
+def test_many_sensors_take_the_images_themselves():
     scene = loaded(ball=BALL, sky=SKY, **ring(17))
     settings = derived(scene, size=(8, 8), spp=64)
     assert (settings.cameras, settings.views, settings.test_views) == ("sensors", 14, 3)

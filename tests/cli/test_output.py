@@ -19,7 +19,7 @@ from drgs.cli.commands import at_least, file_or_folder, run_command
 from drgs.cli.ending import exit_on_interrupt, printable_anywhere
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
-from drgs.io.pictures import image_size, write_png
+from drgs.io.images import image_size, write_png
 
 
 def command(act):
@@ -74,7 +74,7 @@ def test_a_note_is_a_line_of_the_output():
 
 
 def test_pillow_notes_nothing(tmp_path, monkeypatch):
-    """Of a picture that is large, but not too large for us."""
+    """Of a image that is large, but not too large for us."""
     write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
 

@@ -22,16 +22,16 @@ def lines(capsys):
 
 
 def test_a_log_file_gets_a_line_every_ten_seconds_and_the_last(clock, capsys):
-    with RunProgress("picture", 50) as shown:
+    with RunProgress("image", 50) as shown:
         for done in range(1, 51):
             clock[0] += 1.0
             shown.update(done, 50)
     assert lines(capsys) == [
-        "picture 10/50  left 0:40",
-        "picture 20/50  left 0:30",
-        "picture 30/50  left 0:20",
-        "picture 40/50  left 0:10",
-        "picture 50/50  left 0:00",
+        "image 10/50  left 0:40",
+        "image 20/50  left 0:30",
+        "image 30/50  left 0:20",
+        "image 40/50  left 0:10",
+        "image 50/50  left 0:00",
     ]
 
 
@@ -64,7 +64,7 @@ def no_notebook(monkeypatch):
 
 
 def written_to(monkeypatch, is_terminal, **variables):
-    """By 2 of 3 pictures, and then the third."""
+    """By 2 of 3 images, and then the third."""
 
     class Stream(io.StringIO):
         def isatty(self):
@@ -74,7 +74,7 @@ def written_to(monkeypatch, is_terminal, **variables):
     monkeypatch.setattr(sys, "stdout", stream)
     for name, value in {"TERM": "xterm", "COLUMNS": "100", **variables}.items():
         monkeypatch.setenv(name, value)
-    with RunProgress("picture", 3) as shown:
+    with RunProgress("image", 3) as shown:
         shown.update(2, 3, "loss 0.1")
         shown.update(3, 3, "loss 0.05")
     return stream.getvalue()
@@ -82,7 +82,7 @@ def written_to(monkeypatch, is_terminal, **variables):
 
 def test_a_terminal_gets_a_bar(monkeypatch, no_notebook):
     written = written_to(monkeypatch, is_terminal=True)
-    assert "picture" in written and "3/3" in written and "loss 0.05" in written
+    assert "image" in written and "3/3" in written and "loss 0.05" in written
     assert "\x1b[" in written
 
 
@@ -101,4 +101,4 @@ def test_notebooks_and_logs_get_lines_without_escape_codes(
     monkeypatch, no_notebook, is_terminal, variables
 ):
     written = written_to(monkeypatch, is_terminal, **variables)
-    assert written == "picture 3/3  loss 0.05  left 0:00\n"
+    assert written == "image 3/3  loss 0.05  left 0:00\n"

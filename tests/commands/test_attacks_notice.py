@@ -141,7 +141,7 @@ def test_the_workshop_is_put_back(workshop):
     before = contents(workshop.folder)
     (workshop.folder / "sky.png").unlink()
     (workshop.folder / "mine" / "notes.txt").write_text("changed")
-    (workshop.folder / "photos").rename(workshop.folder / "pictures")
+    (workshop.folder / "photos").rename(workshop.folder / "images")
     (workshop.folder / "new").mkdir()
     os.mkfifo(workshop.folder / "new" / "pipe")
     assert contents(workshop.folder) != before

@@ -118,7 +118,7 @@ def edit_means(row, value):
     return apply
 
 
-def write_picture(shape):
+def write_image(shape):
     return lambda folder: iio.imwrite(folder / "train" / "1.png", np.zeros(shape, np.uint8))
 
 
@@ -195,8 +195,8 @@ WRONG_INPUTS = {
     "image not an image": (write("train/1.png", b"hello"), "1.png: cannot read the image"),
     "image empty": (write("train/1.png", b""), "1.png: cannot read the image"),
     "image truncated": (cut("train/1.png", 700), "1.png: cannot read the image: image file is tr"),
-    "image of another size": (write_picture((15, 20, 4)), "1.png: must be 20 x 16 px"),
-    "image too large": (write_picture((1, (1 << 26) + 1)), "1.png: must have at most 67,108,864 p"),
+    "image of another size": (write_image((15, 20, 4)), "1.png: must be 20 x 16 px"),
+    "image too large": (write_image((1, (1 << 26) + 1)), "1.png: must have at most 67,108,864 p"),
     "image of four inks": (
         lambda f: Image.new("CMYK", (20, 16)).save(f / "train" / "1.png", "TIFF"),
         "1.png: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's mode CMYK",
@@ -213,7 +213,7 @@ WRONG_INPUTS = {
         edit_settings(cameras={"optimise": True}, model={"sh_direction": "pixel"}),
         "a.yml: model.sh_direction must be mean where cameras.optimise is true",
     ),
-    "alpha missing": (write_picture((16, 20, 3)), "1.png: must have an alpha channel"),
+    "alpha missing": (write_image((16, 20, 3)), "1.png: must have an alpha channel"),
     "point cloud missing": (lambda f: (f / "points.ply").unlink(), "points.ply: cannot read"),
     "point cloud is a folder": (put_folder_in_place_of("points.ply"), "points.ply: cannot read"),
     "point cloud truncated": (
@@ -262,7 +262,7 @@ def test_a_fit_opens_depths_if_its_loss_looks_at_them(scene, capsys, weight, fir
 
 
 @pytest.mark.parametrize("size", [10**6, 2**31 - 1])
-def test_a_picture_that_claims_to_be_huge_takes_no_memory(scene, size):
+def test_a_image_that_claims_to_be_huge_takes_no_memory(scene, size):
     path = scene / "train" / "1.png"
     content = bytearray(path.read_bytes())
     content[16:24] = struct.pack(">II", size, size)

@@ -1,4 +1,4 @@
-"""``python -m drgs.capture``, on scenes whose pictures are known in closed form.
+"""``python -m drgs.capture``, on scenes whose images are known in closed form.
 
 A convex diffuse body under a sky of constant radiance L sends albedo x L everywhere and in all
 directions: nothing shades it and nothing is reflected onto it twice.
@@ -113,16 +113,16 @@ def test_layout_is_that_of_nerf_synthetic(captured):
     assert [frame["file_path"] for frame in transforms["frames"]] == [
         f"./train/r_{i}" for i in range(6)
     ]
-    picture = iio.imread(captured / "train" / "r_0.png")
-    assert picture.shape == (20, 20, 4)
-    assert picture.dtype == np.uint8
+    rendered = iio.imread(captured / "train" / "r_0.png")
+    assert rendered.shape == (20, 20, 4)
+    assert rendered.dtype == np.uint8
 
 
 def test_dataset_loads_and_its_cameras_look_at_the_object_from_above(captured):
     dataset = load_dataset(DataConfig(path=captured))
     assert len(dataset.train) == 6
     assert len(dataset.test) == 3
-    # Without --distance the bounding box's sphere touches the edges of the picture.
+    # Without --distance the bounding box's sphere touches the edges of the image.
     distance = RADIUS * math.sqrt(3) / math.sin(path_tracing.NERF_SYNTHETIC_FOV / 2)
     for view in dataset.train + dataset.test:
         rotation = view.camera_to_world[:3, :3]
@@ -132,7 +132,7 @@ def test_dataset_loads_and_its_cameras_look_at_the_object_from_above(captured):
         assert y / z == pytest.approx(10, abs=1e-4)
         assert z == pytest.approx(distance, rel=1e-5)
         assert view.center[2] > CENTER[2]
-        assert rotation[2, 1] < 0, "the picture's downward axis points up"
+        assert rotation[2, 1] < 0, "the image's downward axis points up"
         assert rotation[2, 0] == pytest.approx(0, abs=1e-12), "the horizon is not level"
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
 
@@ -173,11 +173,11 @@ def test_hemisphere_stands_on_the_chosen_axis(axis):
         assert np.linalg.det(view.pose[:3, :3]) == pytest.approx(1)
 
 
-# Pictures
+# Images
 
 
 def outline_radius(size):
-    """px: a sphere in the middle of the picture is a disc of this radius."""
+    """px: a sphere in the middle of the image is a disc of this radius."""
     distance = RADIUS * math.sqrt(3) / math.sin(path_tracing.NERF_SYNTHETIC_FOV / 2)
     focal = size / 2 / math.tan(path_tracing.NERF_SYNTHETIC_FOV / 2)
     return focal * math.tan(math.asin(RADIUS / distance))
@@ -300,7 +300,7 @@ def test_points_of_a_python_scene_lie_on_the_cube(tmp_path):
     positions, _ = read_points(out / "points3d.ply")
     assert len(positions) == 100
     np.testing.assert_allclose(abs(positions).max(axis=1), 0.5, atol=1e-5)
-    # Its pictures are not cut by their edges.
+    # Its images are not cut by their edges.
     corners = np.array(list(product((-0.5, 0.5), repeat=3)))
     for view in load_dataset(DataConfig(path=out)).train:
         projected = (corners - view.center) @ view.camera_to_world[:3, :3] @ view.K.T
@@ -323,7 +323,7 @@ def test_the_same_command_gives_the_same_bytes(ball, captured, tmp_path):
     assert contents(tmp_path / "again") == contents(captured)
 
 
-def test_another_seed_gives_other_pictures(ball, captured, tmp_path):
+def test_another_seed_gives_other_images(ball, captured, tmp_path):
     run(ball, tmp_path / "other", *SMALL, "--seed", 1)
     for name in ("train/r_0.png", "test/r_0.png", "points3d.ply"):
         assert (tmp_path / "other" / name).read_bytes() != (captured / name).read_bytes()
@@ -333,11 +333,11 @@ def test_a_folder_that_another_capture_writes_to_is_refused(ball, captured, tmp_
     out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
     write_png, refused = dataset.write_png, []
 
-    def write_while_another_begins(path, picture):
+    def write_while_another_begins(path, rendered):
         if not refused:
             refused.append(path)
             assert_refused(capture.main, ball, "--out", out, *SMALL, folder=out, message=message)
-        write_png(path, picture)
+        write_png(path, rendered)
 
     monkeypatch.setattr(dataset, "write_png", write_while_another_begins)
     run(ball, out, *SMALL)
@@ -365,7 +365,7 @@ def test_interrupted_capture_continues_to_the_same_bytes(
         *(f"train/r_{i}.png" for i in range(3)),
     }
     run(ball, tmp_path / "out", *SMALL)
-    assert len(calls) == 4 + 6, "pictures that were there were taken again"
+    assert len(calls) == 4 + 6, "images that were there were taken again"
     assert contents(tmp_path / "out") == contents(captured)
 
 
@@ -439,8 +439,8 @@ def test_folders_of_others_are_left_alone(ball, captured, tmp_path, capsys):
     assert "the folder holds another capture: scene_sha256" in capsys.readouterr().err
 
 
-def test_cameras_that_see_nothing_are_refused_before_pictures_are_taken(ball, tmp_path, capsys):
-    """Of points there are none then, which was found out after all of the pictures."""
+def test_cameras_that_see_nothing_are_refused_before_images_are_taken(ball, tmp_path, capsys):
+    """Of points there are none then, which was found out after all of the images."""
     with pytest.raises(SystemExit) as stop:
         run(ball, tmp_path / "out", *SMALL, "--distance", 3, "--target", 900, 0, 0)
     assert stop.value.code == 2
@@ -474,7 +474,7 @@ def test_the_command_runs_as_a_module(ball, tmp_path):
         [*command, *options], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
     )
     assert result.returncode == 0, result.stderr
-    assert "picture 3/3" in result.stdout
+    assert "image 3/3" in result.stdout
     assert "50 points" in result.stdout
     assert "\r" not in result.stdout and "WARN" not in result.stdout + result.stderr
 
@@ -482,7 +482,7 @@ def test_the_command_runs_as_a_module(ball, tmp_path):
 # The shipped scene
 
 
-def test_shipped_scene_is_in_the_picture_and_has_hundreds_of_parts():
+def test_shipped_scene_is_in_the_image_and_has_hundreds_of_parts():
     path = REPOSITORY / "scenes" / "brick_crane.py"
     scene = path_tracing.load_scene(path)
     low, high = path_tracing.bounding_box(scene)

@@ -21,7 +21,7 @@ BALL = """
 
 TINY = ["--views", 2, "--test-views", 1, "--size", 4, 4, "--spp", 1, "--points", 8]
 FILES = 7
-"""The settings, three pictures, points, two transforms files."""
+"""The settings, three images, points, two transforms files."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -64,7 +64,7 @@ def refused(outcome):
 
 
 def test_files_that_were_edited_since_are_kept(ball, captured, tmp_path):
-    """A mask in a frame, a picture that was touched up; what is missing is made again."""
+    """A mask in a frame, a image that was touched up; what is missing is made again."""
     run(ball, tmp_path / "out")
     edited = ("transforms_train.json", "points3d.ply", "train/r_0.png")
     for name in edited:
@@ -151,7 +151,7 @@ def test_what_cannot_be_held_is_refused_with_the_limit(ball, tmp_path, options, 
     assert not (tmp_path / "out").exists()
 
 
-def test_pictures_that_the_memory_does_not_hold_are_refused_with_its_size(
+def test_images_that_the_memory_does_not_hold_are_refused_with_its_size(
     ball, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(memory, "available_memory", lambda: 2 * 10**9)
@@ -180,14 +180,14 @@ def test_strange_notes_of_a_capture_are_refused_and_kept(ball, tmp_path, content
     assert contents(tmp_path) == {"capture.json": content.encode()}
 
 
-def test_a_picture_of_another_size_among_the_captures_is_refused(ball, captured, tmp_path):
+def test_a_image_of_another_size_among_the_captures_is_refused(ball, captured, tmp_path):
     assert run(ball, tmp_path / "out").returncode == 0
     assert run(ball, tmp_path / "other", "--size", 5, 4).returncode == 0
     path = tmp_path / "out" / "train" / "r_1.png"
     path.write_bytes((tmp_path / "other" / "train" / "r_1.png").read_bytes())
-    (tmp_path / "out" / "points3d.ply").unlink()  # or no picture would be looked at
+    (tmp_path / "out" / "points3d.ply").unlink()  # or no image would be looked at
     line = refused(run(ball, tmp_path / "out"))
-    assert f"{path}: must be an RGBA picture of 4 x 4 px of this capture, got 5 x 4" in line
+    assert f"{path}: must be an RGBA image of 4 x 4 px of this capture, got 5 x 4" in line
     path.unlink()
     assert run(ball, tmp_path / "out").returncode == 0
     assert contents(tmp_path / "out") == captured

@@ -60,8 +60,8 @@ def test_a_room_is_photographed_from_inside_and_nothing_is_dark(inside):
     assert len(parts) == 12
     assert min(parts) > 0.7
     # Of its lamp, too: white, as a photograph would have it.
-    pictures = [iio.imread(path) for path in out.glob("*/*.png")]
-    assert any((picture[:, :, :3] == 255).all(axis=2).any() for picture in pictures)
+    images = [iio.imread(path) for path in out.glob("*/*.png")]
+    assert any((rendered[:, :, :3] == 255).all(axis=2).any() for rendered in images)
 
 
 def fitting_command(outcome):
@@ -86,7 +86,7 @@ def test_it_ends_with_the_command_that_fits_its_result(inside):
 
 @pytest.mark.slow
 def test_a_fit_of_a_room_shows_the_room(cornell, tmp_path):
-    """On views that it has not seen; a picture's mean colour alone is at 12 dB."""
+    """On views that it has not seen; a image's mean colour alone is at 12 dB."""
     larger = ["--views", 40, "--test-views", 8, "--size", 32, 32, "--spp", 64, "--points", 4000]
     outcome = run(cornell, tmp_path / "room", *larger)
     path, words = fitting_command(outcome)
@@ -98,22 +98,22 @@ def test_a_fit_of_a_room_shows_the_room(cornell, tmp_path):
 
 
 @pytest.mark.parametrize("options", [["--cameras", "around"], ["--distance", "4"]])
-def test_pictures_that_are_mostly_black_are_warned_of_in_one_line(cornell, tmp_path, options):
+def test_images_that_are_mostly_black_are_warned_of_in_one_line(cornell, tmp_path, options):
     outcome = run(cornell, tmp_path / "out", *options)
     assert outcome.returncode == 0
     (line,) = outcome.stderr.splitlines()
     assert line.startswith("warning: ")
-    assert "of the first 10 pictures are empty or black: give --cameras inside" in line
+    assert "of the first 10 images are empty or black: give --cameras inside" in line
 
 
-def test_pictures_that_are_mostly_empty_are_warned_of_in_one_line(cornell, tmp_path):
+def test_images_that_are_mostly_empty_are_warned_of_in_one_line(cornell, tmp_path):
     outcome = run(cornell, tmp_path / "out", "--target", 50, 0, 0, "--distance", 9, "--points", 0)
     assert outcome.returncode == 0
     (line,) = outcome.stderr.splitlines()
-    assert "warning: 10 of the first 10 pictures are empty or black" in line
+    assert "warning: 10 of the first 10 images are empty or black" in line
 
 
-def test_the_first_pictures_are_spread_over_all():
+def test_the_first_images_are_spread_over_all():
     """Else those near the horizon would decide whether a warning is due."""
     order = dataset.spread_first(list(range(125)))
     assert order[:10] == list(range(0, 120, 12))

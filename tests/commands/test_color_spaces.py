@@ -1,4 +1,4 @@
-"""In which space ``drgs.render`` takes the pictures of a scene's integrator to be."""
+"""In which space ``drgs.render`` takes the images of a scene's integrator to be."""
 
 import mitsuba as mi
 import pytest

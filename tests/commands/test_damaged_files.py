@@ -24,7 +24,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.images import composite
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.start import initial_gaussians
-from drgs.io.pictures import read_image
+from drgs.io.images import read_image
 from drgs.io.ply import read_points
 
 pytestmark = pytest.mark.filterwarnings("ignore::drgs.core.errors.UserNote")
@@ -222,7 +222,7 @@ def test_strange_names_are_found_or_said(photographs):
     assert 0.1 * COUNT < sum(refused) < 0.9 * COUNT
 
 
-def test_damaged_pictures_are_read_or_refused(tmp_path):
+def test_damaged_images_are_read_or_refused(tmp_path):
     path = tmp_path / "a.png"
     write_image(path, 0)
     content = path.read_bytes()

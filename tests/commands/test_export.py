@@ -124,8 +124,8 @@ def test_what_is_written_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
         render.main(
             [str(word) for word in (tmp_path / name, *camera, "--out", tmp_path / name[:5])]
         )
-    pictures = [(tmp_path / folder / "camera.png").read_bytes() for folder in ("model", "again")]
-    assert pictures[0] == pictures[1]
+    images = [(tmp_path / folder / "camera.png").read_bytes() for folder in ("model", "again")]
+    assert images[0] == images[1]
     mi.set_variant("llvm_ad_rgb")
     plugin = mi.load_dict({"type": "splats", "filename": str(tmp_path / f"model{suffix}")})
     expected = Gaussians.load(tmp_path / "again.ply")

@@ -59,7 +59,7 @@ def orbit_pose(angle):
 
 
 def write_view(folder, split, index, angle, blobs):
-    """Render one RGBA picture (straight alpha) with the reference; returns its frame."""
+    """Render one RGBA image (straight alpha) with the reference; returns its frame."""
     pose = orbit_pose(angle)
     focal = SIZE / 2 / np.tan(FIELD_OF_VIEW / 2)
     camera = reference.Camera(
@@ -72,9 +72,9 @@ def write_view(folder, split, index, angle, blobs):
         width=SIZE,
         height=SIZE,
     )
-    picture = reference.render(blobs, camera)
-    straight = picture.image / np.maximum(picture.alpha[:, :, None], 1e-9)
-    rgba = np.dstack([np.clip(straight, 0, 1), picture.alpha])
+    rendered = reference.render(blobs, camera)
+    straight = rendered.image / np.maximum(rendered.alpha[:, :, None], 1e-9)
+    rgba = np.dstack([np.clip(straight, 0, 1), rendered.alpha])
     (folder / split).mkdir(exist_ok=True)
     name = f"{split}/r_{index}"
     iio.imwrite(folder / f"{name}.png", np.round(rgba * 255).astype(np.uint8))
@@ -137,8 +137,8 @@ def fitted(configuration, tmp_path_factory):
 def test_fit_writes_its_outputs_and_nothing_temporary(fitted):
     result, out = fitted
     assert result.returncode == 0, result.stderr
-    pictures = {f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(3)}
-    assert visible(out) == {*OUTPUTS, *pictures}
+    images = {f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(3)}
+    assert visible(out) == {*OUTPUTS, *images}
 
 
 def test_the_terminal_ends_with_what_to_open(fitted):
@@ -162,7 +162,7 @@ def test_the_report_says_how_where_and_when_it_was_made(fitted, configuration):
     assert float(measured["300"]) == pytest.approx(metrics["test"]["psnr"], abs=1e-3)
 
 
-def test_fit_reaches_a_good_picture_of_views_it_has_not_seen(fitted):
+def test_fit_reaches_a_good_image_of_views_it_has_not_seen(fitted):
     _, out = fitted
     metrics = json.loads((out / "metrics.json").read_text())
     # 300 random points reach 27 dB and more; a fit that does not learn stays below 15 dB.
@@ -174,7 +174,7 @@ def test_fit_reaches_a_good_picture_of_views_it_has_not_seen(fitted):
     assert metrics["seed"] == 0
 
 
-def test_metrics_agree_with_the_pictures_written(fitted, dataset):
+def test_metrics_agree_with_the_images_written(fitted, dataset):
     _, out = fitted
     scores = []
     for i in range(3):
@@ -183,7 +183,7 @@ def test_metrics_agree_with_the_pictures_written(fitted, dataset):
         image = iio.imread(out / "renders" / "test" / f"r_{i}.png") / 255
         scores.append(-10 * np.log10(np.mean((image - photo) ** 2)))
     metrics = json.loads((out / "metrics.json").read_text())
-    # The pictures are rounded to 8 bits: at 30 dB that moves the PSNR by about 0.01 dB.
+    # The images are rounded to 8 bits: at 30 dB that moves the PSNR by about 0.01 dB.
     assert np.mean(scores) == pytest.approx(metrics["test"]["psnr"], abs=0.1)
 
 

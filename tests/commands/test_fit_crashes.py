@@ -12,7 +12,7 @@ from support.fit_command import (
     ITERATIONS,
     assert_fits,
     run_fit,
-    without_pictures,
+    without_images,
     write_project,
 )
 from support.folders import visible
@@ -64,7 +64,7 @@ class Revised:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """No time is spent on plans and reports."""
-    without_pictures(monkeypatch)
+    without_images(monkeypatch)
 
     def plan(config, *_):
         return SimpleNamespace(

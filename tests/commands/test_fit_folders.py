@@ -13,7 +13,7 @@ from support.fit_command import (
     assert_fits,
     run_fit,
     stop_after,
-    without_pictures,
+    without_images,
     write_project,
 )
 from support.folders import contents, visible
@@ -30,7 +30,7 @@ POINTS = "out/point_cloud.ply"
 def projects(tmp_path_factory):
     """The folders of a project whose fit has ended, and of one whose fit was stopped."""
     with pytest.MonkeyPatch.context() as patched:
-        without_pictures(patched)
+        without_images(patched)
         folder = tmp_path_factory.mktemp("projects")
         for name in ("ended", "stopped"):
             (folder / name).mkdir()
@@ -65,7 +65,7 @@ def copied(project, folder):
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch):
-    without_pictures(monkeypatch)
+    without_images(monkeypatch)
 
 
 def assert_as_uninterrupted(folder, projects):
@@ -147,7 +147,7 @@ def test_results_that_were_changed_are_not_removed(ended):
     assert_fit_refused(*arguments, folder=ended, message="got history.csv; move")
 
 
-def test_a_picture_of_the_users_in_the_way_of_a_fit_is_kept(stopped):
+def test_a_image_of_the_users_in_the_way_of_a_fit_is_kept(stopped):
     (stopped / "out" / "renders" / "test").mkdir(parents=True)
     (stopped / "out" / "renders" / "test" / "r_1.png").symlink_to(
         stopped / "data" / "test" / "r_1.png"
@@ -175,12 +175,12 @@ def edit(folder, change, split="train"):
     path.write_text(json.dumps(values))
 
 
-def another_picture(folder, split="train"):
+def another_image(folder, split="train"):
     shutil.copy(folder / split / "r_0.png", folder / split / "r_1.png")
 
 
 def other_sizes(folder):
-    """Of all training pictures."""
+    """Of all training images."""
     from PIL import Image
 
     for path in (folder / "train").iterdir():
@@ -206,12 +206,12 @@ CHANGES = {
         edit(data, lambda frames: frames.append({**frames[0], "file_path": "train/r_9"})),
     ),
     "the training views are in another order": lambda data: edit(data, list.reverse),
-    "the picture of training view r_1": another_picture,
-    "the size (32x24, now 16x12) of training view r_0, the picture of training view r_0, the size "
+    "the image of training view r_1": another_image,
+    "the size (32x24, now 16x12) of training view r_0, the image of training view r_0, the size "
     "(32x24, now 16x12) of training view r_1 and 3 more": other_sizes,
     "the camera of training view r_2": lambda data: edit(data, moved_camera),
     "the mask of training view r_0": masked,
-    "the picture of test view r_1": lambda data: another_picture(data, "test"),
+    "the image of test view r_1": lambda data: another_image(data, "test"),
 }
 
 
@@ -225,7 +225,7 @@ def test_a_fit_whose_data_has_changed_is_not_continued(stopped, text):
 
 
 @pytest.mark.slow
-def test_the_same_pictures_written_again_in_place_are_the_same_data(stopped, projects):
+def test_the_same_images_written_again_in_place_are_the_same_data(stopped, projects):
     for path in (stopped / "data").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes())
@@ -285,9 +285,9 @@ def test_a_path_may_be_corrected_by_hand(stopped, projects, tmp_path):
 
 def test_other_data_is_refused_by_its_content(stopped, tmp_path):
     shutil.copytree(stopped / "data", tmp_path / "other")
-    another_picture(tmp_path / "other")
+    another_image(tmp_path / "other")
     arguments = ("--resume", stopped / "out", "--data", tmp_path / "other")
-    message = f"belongs to other data than {tmp_path / 'other'}: the picture of training view r_1;"
+    message = f"belongs to other data than {tmp_path / 'other'}: the image of training view r_1;"
     assert_fit_refused(*arguments, folder=stopped, message=message)
 
 
@@ -318,7 +318,7 @@ def test_a_fit_without_a_record_that_was_moved_is_continued(stopped, projects, t
 
 
 def test_an_orbit_needs_nothing_but_the_folder_of_a_fit(ended, tmp_path):
-    """Neither its data nor a path to it; the pictures are those of the cameras of the data."""
+    """Neither its data nor a path to it; the images are those of the cameras of the data."""
     orbit = ("--orbit", 2, "--out")
     arguments = (ended / "out", "--data", ended / "data", *orbit, tmp_path / "by data")
     assert_ends_well(render.main, *arguments)

@@ -59,10 +59,10 @@ def test_a_budget_leaves_time_for_the_second_file(planned):
     assert end == pytest.approx(84 * (1 - TIME_SHARE))
 
 
-def test_a_short_budget_is_for_iterations_and_not_for_pictures(planned):
+def test_a_short_budget_is_for_iterations_and_not_for_images(planned):
     end, config = planned(config_of(), 13.0)
     assert end == 3 and config.output.report and config.output.save_renders
-    with pytest.warns(UserNote, match=r"no report, orbit and pictures are written"):
+    with pytest.warns(UserNote, match=r"no report, orbit and images are written"):
         end, config = planned(config_of(), 12.0)
     assert end == 6 and not config.output.report and not config.output.save_renders
     end, config = planned(changed(config_of(), {"output.report": False}), 12.0)

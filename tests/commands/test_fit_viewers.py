@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.commands import assert_ends_well
-from support.fit_command import VALUES, assert_fits, without_pictures, write_project
+from support.fit_command import VALUES, assert_fits, without_images, write_project
 from support.folders import contents
 from support.render_command import run as render
 from support.small_capture import decibels
@@ -34,7 +34,7 @@ def fitted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewers")
     config = write_project(folder, model={**VALUES["model"], **OTHERWISE})
     with pytest.MonkeyPatch.context() as patch:
-        without_pictures(patch)
+        without_images(patch)
         outcome = assert_fits(config, "--out", folder / "out", "--threads", 1)
     return folder / "out", outcome
 
@@ -92,7 +92,7 @@ def test_a_fit_that_goes_on_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     """Stopped when its iterations are done, with what is for viewers still to come."""
     out, _ = fitted
     config = write_project(tmp_path, model={**VALUES["model"], **OTHERWISE})
-    without_pictures(monkeypatch)
+    without_images(monkeypatch)
     with monkeypatch.context() as broken:
         broken.setattr(session.FitSession, "_fit_for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
@@ -106,7 +106,7 @@ def test_a_fit_that_goes_on_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
 
 
 def test_a_fit_as_viewers_render_has_one_file(tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
+    without_images(monkeypatch)
     monkeypatch.delitem(sys.modules, "drgs.training.viewers", raising=False)
     monkeypatch.delitem(sys.modules, "drgs.effects.smoothing", raising=False)
     assert_fits(write_project(tmp_path), "--out", tmp_path / "out")
@@ -117,7 +117,7 @@ def test_a_fit_as_viewers_render_has_one_file(tmp_path, monkeypatch):
 
 
 def test_a_file_of_somebody_else_is_not_replaced(tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
+    without_images(monkeypatch)
     config = write_project(tmp_path)
     assert_fits(config, "--out", tmp_path / "out")
     replace(Gaussians.load(tmp_path / "out" / GAUSSIANS), rendered_with=None).save(

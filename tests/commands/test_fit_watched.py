@@ -12,7 +12,7 @@ from support.commands import run_in_process
 from support.fit_command import (
     assert_fit_refused,
     assert_fits,
-    without_pictures,
+    without_images,
     write_project,
 )
 from support.small_capture import HEIGHT, WIDTH, pose_around
@@ -28,7 +28,7 @@ EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
 
 
 class Screen:
-    """Somebody who asks for more with each picture, and for an end at an iteration."""
+    """Somebody who asks for more with each image, and for an end at an iteration."""
 
     def __init__(self, queue, end_at):
         self.queue, self.end_at, self.shown = queue, end_at, 0
@@ -75,7 +75,7 @@ def looked_on(monkeypatch):
         monkeypatch.setattr(training_viewer, "watch", watch)
         return screens
 
-    without_pictures(monkeypatch)
+    without_images(monkeypatch)
     return look_on
 
 
@@ -119,7 +119,7 @@ def test_a_fit_that_was_ended_and_then_killed_writes_its_results_when_resumed(
     looked_on(end_at=4)
     with monkeypatch.context() as patch:
         patch.setattr(
-            fit_folder, "write_pictures", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
+            fit_folder, "write_images", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
         )
         assert run_in_process(fit.main, config, "--out", out, "--view").returncode == 130
     assert_fits("--resume", out)

@@ -8,7 +8,7 @@ from support.fit_command import (
     assert_fits,
     run_fit,
     stop_after,
-    without_pictures,
+    without_images,
     write_project,
 )
 from support.folders import contents
@@ -23,7 +23,7 @@ MESSAGE = (
 
 @pytest.fixture
 def project(tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
+    without_images(monkeypatch)
     return write_project(tmp_path)
 
 

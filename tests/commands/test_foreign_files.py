@@ -30,9 +30,9 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("way", VIEWS)
-def test_pictures_are_not_rendered_among_photographs(fitted, way):
+def test_images_are_not_rendered_among_photographs(fitted, way):
     data = fitted.parent / "data"
-    message = f"--out {data / 'test'}: holds pictures of the dataset (r_0.png, r_1.png); choose"
+    message = f"--out {data / 'test'}: holds images of the dataset (r_0.png, r_1.png); choose"
     arguments = [fitted, *VIEWS[way], "--out", data / "test"]
     assert_refused(render.main, *arguments, folder=fitted.parent, message=message)
 
@@ -47,7 +47,7 @@ def test_pictures_are_not_rendered_among_photographs(fitted, way):
         ("origin", "camera.png"),
     ],
 )
-def test_a_file_of_the_users_is_not_replaced_by_a_picture(fitted, tmp_path, way, name):
+def test_a_file_of_the_users_is_not_replaced_by_a_image(fitted, tmp_path, way, name):
     out = tmp_path / "out"
     out.mkdir()
     (out / name).write_text("[]")
@@ -66,7 +66,7 @@ def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
     assert_ends_well(render.main, scene, "--out", tmp_path)
 
 
-def test_pictures_are_rendered_again_into_their_own_folder_until_they_are_changed(fitted, tmp_path):
+def test_images_are_rendered_again_into_their_own_folder_until_they_are_changed(fitted, tmp_path):
     out = tmp_path / "out"
     for way in VIEWS:
         assert_ends_well(render.main, fitted, *VIEWS[way], "--out", out)
@@ -78,7 +78,7 @@ def test_pictures_are_rendered_again_into_their_own_folder_until_they_are_change
 
 
 def test_a_folder_that_another_command_writes_to_is_refused(fitted, tmp_path, monkeypatch):
-    """The one that was refused leaves what the other notes of its pictures alone."""
+    """The one that was refused leaves what the other notes of its images alone."""
     out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
     write_png, refused = render.write_png, []
 
@@ -93,9 +93,7 @@ def test_a_folder_that_another_command_writes_to_is_refused(fitted, tmp_path, mo
     assert refused and visible(out) == {"r_0.png", "r_1.png", "metrics.json"}
 
 
-def test_pictures_that_an_interrupted_command_left_are_rendered_again(
-    fitted, tmp_path, monkeypatch
-):
+def test_images_that_an_interrupted_command_left_are_rendered_again(fitted, tmp_path, monkeypatch):
     expected, out = tmp_path / "whole", tmp_path / "out"
     assert_ends_well(render.main, fitted, "--out", expected)
     write_png, written = render.write_png, []
@@ -110,11 +108,11 @@ def test_pictures_that_an_interrupted_command_left_are_rendered_again(
         patched.setattr(render, "write_png", write_one)
         assert run_in_process(render.main, fitted, "--out", out).returncode == 130
     assert visible(out) == {"r_0.png"}
-    picture = (out / "r_0.png").read_bytes()
+    rendered = (out / "r_0.png").read_bytes()
     (out / "r_0.png").write_text("mine")
     message = "holds r_0.png, which this command would replace"
     assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
-    (out / "r_0.png").write_bytes(picture)
+    (out / "r_0.png").write_bytes(rendered)
     assert_ends_well(render.main, fitted, "--out", out)
     assert contents(out) == contents(expected)
 

@@ -53,7 +53,7 @@ def test_the_first_interrupt_saves_and_the_second_ends_without_a_traceback(scene
 
 
 def rename_view(folder, split, name):
-    """Give the picture of the split's first view another name."""
+    """Give the image of the split's first view another name."""
     path = folder / "data" / f"transforms_{split}.json"
     meta = json.loads(path.read_text())
     old = folder / "data" / f"{meta['frames'][0]['file_path']}.png"
@@ -62,14 +62,14 @@ def rename_view(folder, split, name):
     path.write_text(json.dumps(meta))
 
 
-def test_pictures_with_long_names_are_fitted_and_shown_under_shorter_ones(scene, monkeypatch):
+def test_images_with_long_names_are_fitted_and_shown_under_shorter_ones(scene, monkeypatch):
     monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     for split in ("train", "test"):
         rename_view(scene, split, "\u4e2d" * 83)  # 249 bytes
     outcome = run_in_process(fit.main, scene / "a.yml", "--out", scene / "out")
     assert outcome.returncode == 0, outcome.stderr
-    (picture,) = os.listdir(scene / "out" / "renders" / "test")
-    assert picture.startswith("0000_\u4e2d") and len(os.fsencode(picture)) < 220
+    (rendered,) = os.listdir(scene / "out" / "renders" / "test")
+    assert rendered.startswith("0000_\u4e2d") and len(os.fsencode(rendered)) < 220
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ def ball(tmp_path):
     return path
 
 
-def test_a_picture_is_as_wide_and_high_and_sees_as_many_degrees_as_was_asked(ball, tmp_path):
+def test_a_image_is_as_wide_and_high_and_sees_as_many_degrees_as_was_asked(ball, tmp_path):
     out = tmp_path / "out"
     options = ["--views", 1, "--test-views", 0, "--spp", 1, "--points", 20]
     options += ["--size", 24, 12, "--fov", 60]
@@ -67,7 +67,7 @@ def test_a_picture_is_as_wide_and_high_and_sees_as_many_degrees_as_was_asked(bal
     alpha = iio.imread(out / "train" / "r_0.png")[:, :, 3]
     assert alpha.shape == (12, 24)
     assert alpha[6, 12] == 255
-    # The ball is within the picture's smaller side as well.
+    # The ball is within the image's smaller side as well.
     assert not alpha[[0, -1]].any()
     transforms = json.loads((out / "transforms_train.json").read_text())
     assert transforms["camera_angle_x"] == math.radians(60)

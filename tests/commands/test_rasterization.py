@@ -73,23 +73,23 @@ def tensors(arrays, tensor_type=llvm.TensorXf64):
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_pictures_equal_the_reference(mode):
-    pictures, alphas, meta = drgs.rasterization(
+def test_images_equal_the_reference(mode):
+    images, alphas, meta = drgs.rasterization(
         **scene(), **FILM, sh_degree=3, render_mode="RGB+D", rasterize_mode=mode
     )
-    assert isinstance(pictures, np.ndarray) and pictures.dtype == np.float64
-    assert pictures.shape == (2, CASE.height, CASE.width, 4) and alphas.shape[-1] == 1
+    assert isinstance(images, np.ndarray) and images.dtype == np.float64
+    assert images.shape == (2, CASE.height, CASE.width, 4) and alphas.shape[-1] == 1
     gaussians, antialiased = clear(CASE).gaussians, mode == "antialiased"
     for index, camera in enumerate(cameras()):
         background = scene()["backgrounds"][index]
         expected = reference.render(gaussians, camera, background, 3, antialiased)
         # Both are float64; scales and opacities went through logarithms in one of them.
-        found = pictures[index, ..., :3], pictures[index, ..., 3], alphas[index, ..., 0]
+        found = images[index, ..., :3], images[index, ..., 3], alphas[index, ..., 0]
         for a, b in zip(found, (expected.image, expected.depth, expected.alpha), strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
 
@@ -120,16 +120,16 @@ def test_colors_of_any_number_of_channels_are_composited():
     many = np.concatenate([flat, flat[:, ::-1]], axis=1)
     backgrounds = np.concatenate([arrays["backgrounds"], arrays["backgrounds"][:, ::-1]], axis=1)
     arrays = {**arrays, "colors": many, "backgrounds": backgrounds}
-    pictures, alphas, _ = drgs.rasterization(**arrays, **FILM)
-    np.testing.assert_allclose(pictures[..., :3], expected, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(pictures[..., :2:-1], expected, rtol=0, atol=1e-12)
+    images, alphas, _ = drgs.rasterization(**arrays, **FILM)
+    np.testing.assert_allclose(images[..., :3], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(images[..., :2:-1], expected, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(alphas, expected_alphas)
 
     for_each = np.stack([many, 2 * many])
     twice, _, _ = drgs.rasterization(**{**arrays, "colors": for_each}, **FILM)
-    np.testing.assert_array_equal(twice[0], pictures[0])
+    np.testing.assert_array_equal(twice[0], images[0])
     missing = (1 - alphas[1]) * backgrounds[1]
-    np.testing.assert_allclose(twice[1] - missing, 2 * (pictures[1] - missing), atol=1e-12)
+    np.testing.assert_allclose(twice[1] - missing, 2 * (images[1] - missing), atol=1e-12)
 
 
 def test_depths_are_sums_or_expectations_and_come_last():
@@ -151,14 +151,14 @@ def test_depths_are_sums_or_expectations_and_come_last():
 def test_approximations_are_options():
     arrays = {name: value for name, value in scene().items() if name != "backgrounds"}
 
-    def picture(**options):
+    def rendered(**options):
         return drgs.rasterization(**arrays, **FILM, sh_degree=3, **options)[0]
 
-    plain = picture()
+    plain = rendered()
     for options in ({"projection": "exact"}, {"order": "pixel"}, {"sh_direction": "pixel"}):
-        assert np.isfinite(picture(**options)).all()
-        assert not np.array_equal(picture(**options), plain), options
-    assert np.abs(picture(eps2d=1.0) - plain).max() > 1e-3
+        assert np.isfinite(rendered(**options)).all()
+        assert not np.array_equal(rendered(**options), plain), options
+    assert np.abs(rendered(eps2d=1.0) - plain).max() > 1e-3
 
 
 # ----------------------------------------------------------------------------------------------
@@ -194,8 +194,8 @@ def direction(arrays):
 
 
 def results(arrays, name):
-    pictures, alphas, _ = drgs.rasterization(**arrays, **FILM, **SETTINGS[name])
-    return pictures, alphas
+    images, alphas, _ = drgs.rasterization(**arrays, **FILM, **SETTINGS[name])
+    return images, alphas
 
 
 STEP = 1e-5
@@ -205,7 +205,7 @@ less than 1e-7."""
 
 
 def tangents_of(arrays, tangents, name, fixed=()):
-    """Tangents of pictures and alphas, numpy; fixed: inputs that are not differentiated."""
+    """Tangents of images and alphas, numpy; fixed: inputs that are not differentiated."""
     inputs, directions = tensors(arrays), tensors(tangents)
     for key in inputs.keys() - set(fixed):
         dr.enable_grad(inputs[key])
@@ -216,7 +216,7 @@ def tangents_of(arrays, tangents, name, fixed=()):
 
 
 def gradients_of(arrays, weights, name, fixed=()):
-    """Of the sum of weighted pictures and alphas, numpy, by input that is not fixed."""
+    """Of the sum of weighted images and alphas, numpy, by input that is not fixed."""
     inputs = tensors(arrays)
     dr.enable_grad([value for key, value in inputs.items() if key not in fixed])
     found = results(inputs, name)
@@ -260,7 +260,7 @@ def check_gradients_are_the_transpose_of_the_tangents(arrays, tangents, name):
     [{}, {"order": "pixel"}, {"sh_direction": "pixel", "sh_degree": 1}],
     ids=["center", "pixel order", "pixel colors"],
 )
-def test_groups_of_channels_change_no_picture(monkeypatch, options):
+def test_groups_of_channels_change_no_image(monkeypatch, options):
     """All channels in one kernel, and three at a time; tangents and gradients to rounding."""
     arrays = dict(scene())
     if not options.get("sh_degree"):
@@ -271,17 +271,17 @@ def test_groups_of_channels_change_no_picture(monkeypatch, options):
     weights = [rng.normal(0, 1, output.shape) for output in results(arrays, "groups")]
 
     def found():
-        pictures = results(arrays, "groups")
+        images = results(arrays, "groups")
         return (
-            pictures,
+            images,
             tangents_of(arrays, tangents, "groups", fixed),
             gradients_of(arrays, weights, "groups", fixed),
         )
 
-    pictures, ahead, back = found()
+    images, ahead, back = found()
     monkeypatch.setitem(FEATURES_AT_ONCE, 8, 3)
     grouped, grouped_ahead, grouped_back = found()
-    for a, b in zip(pictures, grouped, strict=True):
+    for a, b in zip(images, grouped, strict=True):
         np.testing.assert_array_equal(a, b)
     for a, b in zip(ahead, grouped_ahead, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -304,10 +304,10 @@ def test_gradients_are_the_same_in_every_run_and_use_no_atomics():
     def gradients():
         inputs = tensors(scene(), llvm.TensorXf)
         dr.enable_grad(inputs)
-        pictures, alphas, _ = drgs.rasterization(**inputs, **FILM, sh_degree=3)
-        weights = llvm.TensorXf(np.random.default_rng(6).normal(0, 1, pictures.shape))
-        dr.set_grad(pictures, weights)
-        dr.enqueue(dr.ADMode.Backward, pictures, alphas)
+        images, alphas, _ = drgs.rasterization(**inputs, **FILM, sh_degree=3)
+        weights = llvm.TensorXf(np.random.default_rng(6).normal(0, 1, images.shape))
+        dr.set_grad(images, weights)
+        dr.enqueue(dr.ADMode.Backward, images, alphas)
         dr.traverse(dr.ADMode.Backward)
         return {name: dr.grad(value).numpy() for name, value in inputs.items()}
 
@@ -324,9 +324,9 @@ def test_extreme_values_have_finite_gradients():
     arrays["scales"][12:16] = 0
     inputs = tensors(arrays, llvm.TensorXf)
     dr.enable_grad(inputs)
-    pictures, _, _ = drgs.rasterization(**inputs, **FILM, sh_degree=3)
-    dr.backward(dr.sum(pictures.array))
-    assert np.isfinite(pictures.numpy()).all()
+    images, _, _ = drgs.rasterization(**inputs, **FILM, sh_degree=3)
+    dr.backward(dr.sum(images.array))
+    assert np.isfinite(images.numpy()).all()
     for name, value in inputs.items():
         assert np.isfinite(dr.grad(value).numpy()).all(), name
     assert dr.grad(inputs["opacities"]).numpy()[1:12:2].any()
@@ -337,14 +337,14 @@ def test_extreme_values_have_finite_gradients():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_picture_and_gradients_agree_with_gsplat():
+def test_image_and_gradients_agree_with_gsplat():
     if not GSPLAT.is_dir():
         pytest.skip("needs the gsplat reference data beside the repository")
     data, pose = np.load(GSPLAT / "gauss_10k.npz"), np.load(GSPLAT / "cam.npz")
     names = ("means", "quats", "scales", "opacities", "sh")
     inputs = [llvm.TensorXf(data[name]) for name in names]
     dr.enable_grad(inputs)
-    pictures, _, _ = drgs.rasterization(
+    images, _, _ = drgs.rasterization(
         *inputs,
         pose["viewmat"][None],
         pose["K"][None],
@@ -353,13 +353,13 @@ def test_picture_and_gradients_agree_with_gsplat():
         sh_degree=3,
         backgrounds=np.ones((1, 3)),
     )
-    errors = np.abs(pictures.numpy()[0] - np.load(GSPLAT / "ref_10k.npy"))
+    errors = np.abs(images.numpy()[0] - np.load(GSPLAT / "ref_10k.npy"))
     # Both are single precision: see test_reference_splatting.py.
     assert errors.mean() <= 2e-6
     assert (errors.max(axis=-1) > 1e-4).mean() <= 1e-4
 
     expected = np.load(GSPLAT / "refgrad_10k.npz")
-    dr.backward(dr.sum(pictures.array * llvm.Float(expected["w"].ravel())))
+    dr.backward(dr.sum(images.array * llvm.Float(expected["w"].ravel())))
     for name, value in zip(names, inputs, strict=True):
         found, theirs = dr.grad(value).numpy().astype(float), expected[name].astype(float)
         norm = np.linalg.norm(theirs)
@@ -374,24 +374,24 @@ def test_torch_differentiates_it():
 
     @dr.wrap(source="torch", target="drjit")
     def rasterize(means, quats, scales, opacities, colors, viewmats, Ks):
-        pictures, alphas, _ = drgs.rasterization(
+        images, alphas, _ = drgs.rasterization(
             means, quats, scales, opacities, colors, viewmats, Ks, **FILM, sh_degree=3
         )
-        return pictures, alphas
+        return images, alphas
 
     arrays = [np.asarray(scene()[name], np.float32) for name in INPUTS[:7]]
     leaves = [torch.tensor(array, requires_grad=True) for array in arrays]
-    pictures, alphas = rasterize(*leaves)
-    assert pictures.shape == (2, CASE.height, CASE.width, 3) and alphas.shape[-1] == 1
-    weights = np.random.default_rng(9).normal(0, 1, pictures.shape).astype(np.float32)
-    ((pictures * torch.tensor(weights)).sum() + alphas.square().sum()).backward()
+    images, alphas = rasterize(*leaves)
+    assert images.shape == (2, CASE.height, CASE.width, 3) and alphas.shape[-1] == 1
+    weights = np.random.default_rng(9).normal(0, 1, images.shape).astype(np.float32)
+    ((images * torch.tensor(weights)).sum() + alphas.square().sum()).backward()
 
     inputs = [llvm.TensorXf(array) for array in arrays]
     dr.enable_grad(inputs)
     own, own_alphas, _ = drgs.rasterization(*inputs, **FILM, sh_degree=3)
     loss = dr.sum(own.array * llvm.Float(weights.ravel())) + dr.sum(dr.square(own_alphas.array))
     dr.backward(loss)
-    np.testing.assert_array_equal(pictures.detach().numpy(), own.numpy())
+    np.testing.assert_array_equal(images.detach().numpy(), own.numpy())
     for name, leaf, value in zip(INPUTS, leaves, inputs, strict=False):
         expected = dr.grad(value).numpy()
         # The two sum alphas' squares in orders of their own; the rest is the same computation.

@@ -13,7 +13,7 @@ from support.render_command import (
     EIGHT_BITS,
     WHITE,
     assert_shows,
-    picture,
+    rendered,
     run,
     sensor,
     write_scene,
@@ -135,10 +135,10 @@ def test_depths_are_not_opened(tmp_path):
 
 def test_values_of_the_configuration_can_be_set(fit, tmp_path):
     run(fit, "--set", "data.image_size=16", "--out", tmp_path)
-    assert picture(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)
+    assert rendered(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)
 
 
-def test_a_picture_equal_to_its_photograph_has_no_number_in_json():
+def test_a_image_equal_to_its_photograph_has_no_number_in_json():
     quality = {"psnr": float("inf"), "views": {"a": {"psnr": 3.5}}}
     assert render._without_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
 
@@ -166,7 +166,7 @@ def test_an_orbit_of_a_ply_needs_no_photographs(fit, tmp_path):
         assert_shows(tmp_path / f"orbit_{index:03d}.png", camera, (0, 0, 0))
 
 
-def test_cameras_of_a_transforms_file_give_the_pictures_of_the_split(fit, tmp_path):
+def test_cameras_of_a_transforms_file_give_the_images_of_the_split(fit, tmp_path):
     run(fit, "--out", tmp_path / "split")
     transforms = fit.parent / "data" / "transforms_test.json"
     size = ("--size", WIDTH, HEIGHT)
@@ -200,8 +200,8 @@ def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path, samples):
     ):
         camera = write_camera(tmp_path / f"{name}.json", begin, close, shutter=shutter)
         run(fit, "--camera", camera, *settings, "--out", tmp_path / name)
-    shown = {path.parent.name: picture(path) for path in tmp_path.glob("*/camera_0.png")}
-    # The average of equal pictures, rounded to 8 bits.
+    shown = {path.parent.name: rendered(path) for path in tmp_path.glob("*/camera_0.png")}
+    # The average of equal images, rounded to 8 bits.
     assert np.abs(shown["same"] - shown["still"]).max() <= 1 / 255 + 1e-9
     for name in ("global", "rolling"):
         assert np.abs(shown[name] - shown["still"]).max() > 0.1

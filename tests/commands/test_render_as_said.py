@@ -31,8 +31,8 @@ def files(tmp_path):
 
 def shown(files, out, *arguments):
     run(*arguments, "--out", files / out)
-    (picture,) = (files / out).glob("*.png")
-    return picture.read_bytes()
+    (rendered,) = (files / out).glob("*.png")
+    return rendered.read_bytes()
 
 
 def test_a_file_alone_is_shown_as_it_says(files, capsys):

@@ -12,7 +12,7 @@ from support.small_capture import blobs, pose_around
 from drgs import fit, render
 from drgs.capture import __main__ as capture
 from drgs.core.errors import UserError
-from drgs.io.pictures import check_animation
+from drgs.io.images import check_animation
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +71,11 @@ def test_the_suffix_may_have_capital_letters(model, tmp_path):
 
 @pytest.mark.parametrize("suffix", ["webp", "gif", "ico", "tif"])
 def test_a_background_that_mitsuba_cannot_read_is_refused(model, tmp_path, suffix):
-    picture = Image.fromarray(np.zeros((16, 16, 3), np.uint8))
-    picture.save(tmp_path / f"a.{suffix}")
+    rendered = Image.fromarray(np.zeros((16, 16, 3), np.uint8))
+    rendered.save(tmp_path / f"a.{suffix}")
     background = ("--background", tmp_path / f"a.{suffix}")
     line = refused(render.main, tmp_path / "out", model, *CAMERA, *background)
-    assert "must be a PNG, JPEG, BMP, PPM or TGA picture, got " in line
+    assert "must be a PNG, JPEG, BMP, PPM or TGA image, got " in line
 
 
 def test_a_background_for_print_is_refused(model, tmp_path):
@@ -112,7 +112,7 @@ def test_folders_of_names_that_none_can_have_are_refused(tmp_path, main):
     assert os.listdir(tmp_path) == ["a.yml"]
 
 
-def test_pictures_of_a_scene_with_a_long_name_have_a_shorter_one(tmp_path):
+def test_images_of_a_scene_with_a_long_name_have_a_shorter_one(tmp_path):
     scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
     long = scene.rename(scene.with_name("x" * 251 + ".xml"))
     outcome = run_in_process(render.main, long, "--out", tmp_path / "out")

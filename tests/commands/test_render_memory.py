@@ -1,4 +1,4 @@
-"""Pictures that cannot be held are refused with the limit and the estimate, before anything is."""
+"""Images that cannot be held are refused with the limit and the estimate, before anything is."""
 
 import json
 import os
@@ -43,13 +43,13 @@ def refused(main, out, *arguments):
 
 
 def gigabytes(pixels):
-    return memory.readable(pixels * memory.PICTURE_BYTES)
+    return memory.readable(pixels * memory.IMAGE_BYTES)
 
 
 def test_a_size_that_cannot_be_held_is_refused(model, tmp_path):
     """With what it needs, what there is, and what fits."""
     camera = ("--origin", 0, -4, 1)
-    most = 8 * 10**9 // memory.PICTURE_BYTES
+    most = 8 * 10**9 // memory.IMAGE_BYTES
     assert refused(render.main, tmp_path / "out", model, *camera, "--size", 20000, 20000) == (
         f"view camera: 20000 x 20000 px need about {gigabytes(4e8)} of memory, of which 8 GB are "
         f"available; at most {most:,} pixels fit; give a smaller --size"
@@ -67,7 +67,7 @@ def test_so_is_a_camera_of_a_file(model, tmp_path, width):
 
 
 def test_each_time_of_an_open_shutter_counts(photographs, model, tmp_path):
-    """A picture that would fit once does not a thousand times; more times are refused."""
+    """A image that would fit once does not a thousand times; more times are refused."""
     path = cameras(tmp_path, camera_angle_x=0.7, w=800, h=800)
     values = json.loads(path.read_text())
     values["frames"][0]["transform_matrix_close"] = look_at((4, 0.1, 1), (0, 0, 0)).tolist()

@@ -11,7 +11,7 @@ from support.render_command import (
     EIGHT_BITS,
     WHITE,
     assert_shows,
-    picture,
+    rendered,
     run,
     sensor,
     write_scene,
@@ -19,7 +19,7 @@ from support.render_command import (
 from support.small_capture import (
     HEIGHT,
     WIDTH,
-    assert_pictures_agree,
+    assert_images_agree,
     blobs,
     photograph,
     pose_around,
@@ -27,7 +27,7 @@ from support.small_capture import (
 from support.small_capture import view as small_view
 
 from drgs import render
-from drgs.io.pictures import write_exr
+from drgs.io.images import write_exr
 
 
 def to_linear(x):
@@ -42,13 +42,13 @@ def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
     pose = pose_around(0.8, 0.3)
     run(write_scene(tmp_path, sensor(pose)), "--out", tmp_path / "out")
     assert visible(tmp_path / "out") == {"blobs.exr", "blobs.png"}
-    picture_on_black = photograph(blobs(), small_view("", pose, None), (0, 0, 0))
-    linear = to_linear(picture_on_black.image + picture_on_black.transmittance[..., None])
+    image_on_black = photograph(blobs(), small_view("", pose, None), (0, 0, 0))
+    linear = to_linear(image_on_black.image + image_on_black.transmittance[..., None])
     exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
-    assert_pictures_agree(exr, linear, picture_on_black, 1e-4)
+    assert_images_agree(exr, linear, image_on_black, 1e-4)
     encoded = np.clip(to_srgb(linear), 0, 1)
-    png = picture(tmp_path / "out" / "blobs.png")
-    assert_pictures_agree(png, encoded, picture_on_black, EIGHT_BITS)
+    png = rendered(tmp_path / "out" / "blobs.png")
+    assert_images_agree(png, encoded, image_on_black, EIGHT_BITS)
 
 
 def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
@@ -59,7 +59,7 @@ def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
     assert_shows(tmp_path / "out" / "blobs.png", camera, WHITE)
     expected = photograph(blobs(), camera, WHITE)
     exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
-    assert_pictures_agree(exr, expected.image, expected, 1e-4)
+    assert_images_agree(exr, expected.image, expected, 1e-4)
 
 
 def test_a_scene_in_display_space_inside_aov_is_not_encoded_again(tmp_path):
@@ -74,7 +74,7 @@ def test_a_scene_in_display_space_inside_aov_is_not_encoded_again(tmp_path):
     run(path, "--out", tmp_path / "out")
     root = read_exr(tmp_path / "out" / "blobs.exr").split()[0][1]
     colors = np.clip(np.array(root.convert(mi.Bitmap.PixelFormat.RGB)), 0, 1)
-    assert np.abs(picture(tmp_path / "out" / "blobs.png") - colors).max() <= EIGHT_BITS
+    assert np.abs(rendered(tmp_path / "out" / "blobs.png") - colors).max() <= EIGHT_BITS
     assert np.abs(to_srgb(colors) - colors).max() > 0.1
 
 
@@ -84,7 +84,7 @@ def test_every_sensor_of_a_scene_is_rendered(tmp_path):
     expected = {f"blobs_{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")}
     assert visible(tmp_path / "out") == expected
     assert np.array(read_exr(tmp_path / "out" / "blobs_1.exr")).shape == (HEIGHT, WIDTH, 4)
-    assert picture(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
+    assert rendered(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
 
 
 def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
@@ -94,7 +94,7 @@ def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
         <shape type="sphere"/><emitter type="constant"/></scene>"""
     )
     run(path, "--out", tmp_path / "out")
-    assert picture(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
+    assert rendered(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
 
 
 def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path):
@@ -120,8 +120,8 @@ def test_parameters_of_a_scene_file_can_be_given(tmp_path):
     run(path, "-D", "model=a=b.ply", "--define", "color=1, 1, 1", "--out", tmp_path / "given")
     (tmp_path / "a=b.ply").rename(tmp_path / "model.ply")
     run(write_scene(tmp_path, sensor(pose_around(0.8, 0.3))), "--out", tmp_path / "written")
-    pictures = [picture(tmp_path / folder / "blobs.png") for folder in ("given", "written")]
-    np.testing.assert_array_equal(*pictures)
+    images = [rendered(tmp_path / folder / "blobs.png") for folder in ("given", "written")]
+    np.testing.assert_array_equal(*images)
 
 
 def test_the_shipped_scene_shows_objects_among_splats(tmp_path):

@@ -118,16 +118,16 @@ def eight_gigabytes(monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 8 * GB)
 
 
-def test_a_picture_that_fits_is_not_refused(eight_gigabytes):
+def test_a_image_that_fits_is_not_refused(eight_gigabytes):
     assert memory.why_too_large(400, 400) is None
     assert memory.why_too_large(4000, 5000) is None
 
 
-def test_a_picture_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
-    needed = 20_000**2 * memory.PICTURE_BYTES / GB
+def test_a_image_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
+    needed = 20_000**2 * memory.IMAGE_BYTES / GB
     assert memory.why_too_large(20_000, 20_000) == (
         f"20000 x 20000 px need about {needed:g} GB of memory, of which 8 GB are available; at "
-        f"most {8 * GB // memory.PICTURE_BYTES:,} pixels fit"
+        f"most {8 * GB // memory.IMAGE_BYTES:,} pixels fit"
     )
     assert "with 1,000 samples each need about" in memory.why_too_large(400, 400, samples=1000)
 

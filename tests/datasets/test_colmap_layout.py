@@ -1,4 +1,4 @@
-"""COLMAP's layout: models, pictures of several sizes, masks, lenses and points to start from."""
+"""COLMAP's layout: models, images of several sizes, masks, lenses and points to start from."""
 
 import math
 
@@ -14,7 +14,7 @@ from support.colmap_models import (
     some_model,
     write_binary,
     write_dataset,
-    write_pictures,
+    write_images,
 )
 from support.datasets import load, load_noting, refusal
 
@@ -59,15 +59,15 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
 def test_folders_may_be_called_in_another_case(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "Images")
-    write_pictures(tmp_path / "IMAGES_2", size=(320, 240))
+    write_images(tmp_path / "IMAGES_2", size=(320, 240))
     assert load(tmp_path).train[0].files["image"].parent == tmp_path / "Images"
     assert load(tmp_path, downscale=2).train[0].width == 320
 
 
-def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
+def test_the_images_own_size_decides_the_intrinsics(tmp_path):
     write_dataset(tmp_path)
     for factor in (2, 4):
-        write_pictures(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
+        write_images(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
     for factor in (1, 2, 4):
         view = load(tmp_path, downscale=factor).train[0]
         expected = [value / factor for value in (600, 620, 320.5, 239, 640, 480)]
@@ -78,16 +78,16 @@ def test_the_pictures_own_size_decides_the_intrinsics(tmp_path):
     # The smallest that are large enough, and from there to the width that is asked for.
     for width, folder, factor in ((640, "images", 1), (320, "images_2", 2), (100, "images_4", 6.4)):
         dataset = load(tmp_path, image_size=width)
-        assert f"pictures of {folder}" in dataset.description
+        assert f"images of {folder}" in dataset.description
         assert dataset.train[0].width == width
         assert dataset.train[0].fx == pytest.approx(600 / factor)
 
 
-def test_the_largest_pictures_there_are_may_be_smaller_than_what_is_asked_for(tmp_path):
+def test_the_largest_images_there_are_may_be_smaller_than_what_is_asked_for(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "originals")
     for factor in (4, 8):
-        write_pictures(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
+        write_images(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
     assert load(tmp_path).train[0].width == 160
 
 
@@ -115,7 +115,7 @@ def film_points(view, points):
 
 @pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
 def test_points_are_seen_where_colmap_projects_them(tmp_path, name):
-    """In double precision, over the picture and somewhat beyond, to a few roundings of 1,000 px."""
+    """In double precision, over the image and somewhat beyond, to a few roundings of 1,000 px."""
     pycolmap = pytest.importorskip("pycolmap")
     write_dataset(tmp_path, [name])
     theirs = pycolmap.Camera(model=name, width=640, height=480, params=PARAMETERS[name])
@@ -156,7 +156,7 @@ def test_other_lenses_are_refused_by_name(tmp_path, name):
     assert "colmap image_undistorter" in message
 
 
-def test_masks_lie_beside_their_pictures(tmp_path):
+def test_masks_lie_beside_their_images(tmp_path):
     write_dataset(tmp_path)
     mask = np.zeros((480, 640), np.uint8)
     mask[:, :320] = 255
@@ -217,10 +217,10 @@ def test_the_mask_of_the_whole_name_is_preferred(tmp_path):
     assert len(notes) == 1 and "masks of no photograph that has a camera: masks/a.png" in notes[0]
 
 
-def test_masks_may_be_for_larger_pictures(tmp_path):
-    """Those of COLMAP's are for the pictures that it saw. A pixel counts where all of it does."""
+def test_masks_may_be_for_larger_images(tmp_path):
+    """Those of COLMAP's are for the images that it saw. A pixel counts where all of it does."""
     write_dataset(tmp_path)
-    write_pictures(tmp_path / "images_2", size=(320, 240))
+    write_images(tmp_path / "images_2", size=(320, 240))
     mask = np.full((480, 640), 255, np.uint8)
     mask[4:7, 10:12] = 0
     (tmp_path / "masks").mkdir()
@@ -300,7 +300,7 @@ def test_photographs_may_lie_beside_the_model(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("place", "model", "pictures"),
+    ("place", "model", "images"),
     [
         ("flat", ".", "images"),
         ("flat, beside", ".", "."),
@@ -310,23 +310,23 @@ def test_photographs_may_lie_beside_the_model(tmp_path):
 )
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_models_and_photographs_are_found_where_programs_put_them(
-    tmp_path, place, model, pictures, write
+    tmp_path, place, model, renders, write
 ):
     there = some(NAMES)
     write(tmp_path / model, there)
-    write_pictures(tmp_path / pictures)
+    write_images(tmp_path / renders)
     if place in ("workspace", "undistorted"):  # beside the model of the photographs as taken
         write(tmp_path / "sparse" / "0", some_model(np.random.default_rng(2), NAMES))
     dataset, notes = load_noting(tmp_path)
     view = dataset.test[0]
     np.testing.assert_allclose(view.camera_to_world, there.images[0][2], atol=1e-14)
-    assert view.files["image"] == tmp_path / pictures / "a.jpg" and notes == []
+    assert view.files["image"] == tmp_path / renders / "a.jpg" and notes == []
 
 
 def test_a_model_with_its_photographs_is_preferred_to_an_undistorted_one(tmp_path):
     write_dataset(tmp_path)
     write_binary(tmp_path / "dense" / "sparse", some_model(np.random.default_rng(2), NAMES))
-    write_pictures(tmp_path / "dense" / "images")
+    write_images(tmp_path / "dense" / "images")
     assert load(tmp_path).train[0].files["image"].parent == tmp_path / "images"
 
 
@@ -350,7 +350,7 @@ def test_a_photograph_is_found_under_nearly_its_name(tmp_path, call, is_said):
     model = some(NAMES)
     model.images = [(call(name), camera, pose) for name, camera, pose in model.images]
     write_binary(tmp_path / "sparse" / "0", model)
-    write_pictures(tmp_path / "images")
+    write_images(tmp_path / "images")
     dataset, notes = load_noting(tmp_path, test_every=2)
     views = [view for pair in zip(dataset.test, dataset.train, strict=True) for view in pair]
     assert [view.files["image"] for view in views] == [tmp_path / "images" / n for n in NAMES]
@@ -362,7 +362,7 @@ def test_a_photograph_is_found_under_nearly_its_name(tmp_path, call, is_said):
 def test_a_file_is_not_taken_for_two_photographs(tmp_path):
     """Nor one that another is called by, nor one of several: none of these is the only one."""
     write_binary(tmp_path / "sparse" / "0", some(["a.jpg", "A.tif", "b.jpg", "c.jpg", "d.bmp"]))
-    write_pictures(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
+    write_images(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
     dataset, notes = load_noting(tmp_path)
     assert [view.name for view in (*dataset.test, *dataset.train)] == ["a", "c", "d"]
     assert len(notes) == 1 and "2 of 5 photographs (A.tif, b.jpg); left out" in notes[0]
@@ -386,7 +386,7 @@ def test_test_views_are_those_of_a_list(tmp_path, below):
 def test_folders_may_be_the_splits(tmp_path):
     names = ("train/a.jpg", "test/a.jpg", "test/b.jpg", "train/c.jpg")
     write_binary(tmp_path / "sparse" / "0", some(names))
-    write_pictures(tmp_path / "images", names)
+    write_images(tmp_path / "images", names)
     dataset = load(tmp_path)
     assert [view.name for view in dataset.test] == ["test_a", "test_b"]
     assert [view.name for view in dataset.train] == ["train_a", "train_c"]
@@ -397,7 +397,7 @@ def test_folders_may_be_the_splits(tmp_path):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_picture_that_is_not_there_is_left_out_unless_most_are(tmp_path):
+def test_a_image_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images" / "b.jpg").unlink()
     dataset, notes = load_noting(tmp_path)
@@ -410,14 +410,14 @@ def test_a_picture_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     assert message.endswith("; not there: 3 of 4 photographs")
 
 
-def test_a_picture_of_another_shape_is_refused(tmp_path):
+def test_a_image_of_another_shape_is_refused(tmp_path):
     write_dataset(tmp_path)
-    write_pictures(tmp_path / "images", ["b.jpg"], (480, 640))
+    write_images(tmp_path / "images", ["b.jpg"], (480, 640))
     assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize("original", [(4032, 3024), (3000, 4003), (101, 997)])
-def test_scaled_pictures_are_told_from_cropped_ones(original):
+def test_scaled_images_are_told_from_cropped_ones(original):
     """However their sides were rounded; a crop by three px of each is none of them."""
     width, height = original
     for factor in (1.7, 2, 4, 5.003, 8):
@@ -429,23 +429,23 @@ def test_scaled_pictures_are_told_from_cropped_ones(original):
     assert is_scaled(original, original) and not is_scaled((width, height - 1), original)
 
 
-def test_a_picture_that_was_turned_since_is_turned_as_exif_says(tmp_path):
-    """COLMAP reads pictures as they are stored: where the stored size is the camera's, it is right.
+def test_a_image_that_was_turned_since_is_turned_as_exif_says(tmp_path):
+    """COLMAP reads images as they are stored: where the stored size is the camera's, it is right.
 
     Where another program has turned what COLMAP saw, EXIF says how it is turned back.
     """
     write_dataset(tmp_path)
     exif = Image.Exif()
     exif[0x0112] = 6
-    write_pictures(tmp_path / "images", ["b.jpg"], (480, 640), exif=exif)
+    write_images(tmp_path / "images", ["b.jpg"], (480, 640), exif=exif)
     view = next(view for view in load(tmp_path).train if view.name == "b")
     assert np.asarray(view.image).shape == (480, 640, 3)
-    write_pictures(tmp_path / "images", ["b.jpg"], (640, 480), exif=exif)
+    write_images(tmp_path / "images", ["b.jpg"], (640, 480), exif=exif)
     view = next(view for view in load(tmp_path).train if view.name == "b")
     assert np.asarray(view.image).shape == (480, 640, 3)
 
 
-def test_a_picture_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
+def test_a_image_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
     """Its size does not tell, but COLMAP turns nothing."""
     pycolmap = pytest.importorskip("pycolmap")
     write_dataset(tmp_path)
@@ -459,7 +459,7 @@ def test_a_picture_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
     np.testing.assert_array_equal(np.round(np.asarray(view.image) * 255), read)
 
 
-def test_folders_without_pictures_and_models_without_folders_are_explained(tmp_path):
+def test_folders_without_images_and_models_without_folders_are_explained(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "originals")
     assert "there is no folder images (or images_2, images_4, images_8)" in refusal(tmp_path)

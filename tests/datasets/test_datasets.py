@@ -177,7 +177,7 @@ def test_a_matrix_is_rigid_to_1e_4(blender, shear, is_accepted):
         assert "must be rigid (rotation, translation, row 0 0 0 1) to 0.0001" in refusal(blender[0])
 
 
-def test_a_picture_without_alpha_is_refused(blender):
+def test_a_image_without_alpha_is_refused(blender):
     path = blender[0] / "val" / "r_2.png"
     iio.imwrite(path, np.zeros((4, 6, 3), np.uint8))
     assert refusal(blender[0]) == (
@@ -186,7 +186,7 @@ def test_a_picture_without_alpha_is_refused(blender):
     )
 
 
-def test_a_picture_of_another_size_is_refused(blender):
+def test_a_image_of_another_size_is_refused(blender):
     path = blender[0] / "train" / "r_2.png"
     iio.imwrite(path, np.zeros((6, 4, 4), np.uint8))
     assert refusal(blender[0]) == (
@@ -212,7 +212,7 @@ def test_a_missing_image_is_left_out_and_named(blender):
 
 def test_a_broken_image_is_named(blender):
     broken = blender[0] / "train" / "r_1.png"
-    broken.write_bytes(b"not a picture")
+    broken.write_bytes(b"not a image")
     assert refusal(blender[0]).startswith(f"{broken}: cannot read the image: ")
 
 
@@ -242,7 +242,7 @@ def test_every_eighth_view_by_file_name_is_test(photographs):
     assert [view.name for view in dataset.test] == ["00", "08"]
     assert [view.name for view in dataset.train] == ["01", "02", "03", "04", "05", "06", "07", "09"]
     assert dataset.test_split == "test"
-    # Each view kept its own picture and its own camera.
+    # Each view kept its own image and its own camera.
     for view in (*dataset.train, *dataset.test):
         i = int(view.name)
         np.testing.assert_allclose(view.image, 20 * i / 255, rtol=1e-6)
@@ -327,7 +327,7 @@ def test_a_fourth_coefficient_that_is_opencvs_is_read(photographs, says):
     )
 
 
-def test_coefficients_do_not_depend_on_the_size_of_the_picture(photographs):
+def test_coefficients_do_not_depend_on_the_size_of_the_image(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1))
     view = load(photographs, image_size=4).train[0]
     assert view.lens == RadialTangential.from_coefficients(k1=0.1) and view.fx == 4.5
@@ -348,7 +348,7 @@ def test_distortion_coefficients_of_zero_are_accepted(photographs):
             lambda m: m.update(fl_x=1e-3),
             "fl_x must be between 0.08 and 80000 px for 8 px, got 0.001",
         ),
-        (lambda m: m.update(cy=-700), "cy must be within 600 px of the picture, got -700"),
+        (lambda m: m.update(cy=-700), "cy must be within 600 px of the image, got -700"),
         (lambda m: m.update(cx="4"), 'cx must be a number, got "4"'),
         (
             lambda m: m.update(camera_model="EQUIRECTANGULAR"),

@@ -1,4 +1,4 @@
-"""Cameras that no picture can have are refused, and none makes NumPy warn."""
+"""Cameras that no image can have are refused, and none makes NumPy warn."""
 
 import json
 import warnings
@@ -30,7 +30,7 @@ def warnings_are_errors():
         ({"w": 1e9}, "w must be <= 16777216, got 1000000000.0"),
         ({"h": 1e20}, "h must be <= 16777216, got 1e+20"),
         ({"h": 1e-300}, "h must be >= 1, got 1e-300"),
-        ({"cx": 1e300, "cy": 0.0}, "cx must be within 1600 px of the picture, got 1e+300"),
+        ({"cx": 1e300, "cy": 0.0}, "cx must be within 1600 px of the image, got 1e+300"),
         (
             {"k1": 1e308},
             "camera_model: k1 must be a coefficient of at most 1e+06 in size, got 1e+308",
@@ -39,7 +39,7 @@ def warnings_are_errors():
             {"p2": -2e6},
             "camera_model: p2 must be a coefficient of at most 1e+06 in size, got -2e+06",
         ),
-        ({"cx": 8.0, "cy": -1e5}, "cy must be within 1200 px of the picture, got -100000"),
+        ({"cx": 8.0, "cy": -1e5}, "cy must be within 1200 px of the image, got -100000"),
     ],
 )
 def test_numbers_that_no_camera_has_are_refused(tmp_path, values, message):

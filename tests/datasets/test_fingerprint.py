@@ -68,7 +68,7 @@ def test_what_a_frame_says_is_named(rich, text):
 
 
 @pytest.mark.parametrize(
-    ("name", "what"), [("mask.png", "mask"), ("depth.npy", "depth"), ("images/05.png", "picture")]
+    ("name", "what"), [("mask.png", "mask"), ("depth.npy", "depth"), ("images/05.png", "image")]
 )
 def test_the_content_of_each_file_counts(rich, name, what):
     """Though the pixels may be the same: bytes are compared."""

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from conftest import REPOSITORY
-from support.colmap_models import NAMES, write_dataset, write_pictures
+from support.colmap_models import NAMES, write_dataset, write_images
 
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
@@ -16,7 +16,7 @@ SCENES = REPOSITORY / "scenes"
 def test_photographs_are_scaled_by_a_whole_number_and_fitted_as_in_photos_yml(tmp_path):
     write_dataset(tmp_path)
     for size, expected in (((640, 480), 640), ((1600, 1200), 800), ((2400, 1800), 800)):
-        write_pictures(tmp_path / "images", size=size)
+        write_images(tmp_path / "images", size=size)
         config, reasons = config_for(tmp_path)
         assert config.data.image_size == expected
         assert expected**2 * 3 / 4 <= MAX_PIXELS
@@ -33,7 +33,7 @@ def test_photographs_are_scaled_by_a_whole_number_and_fitted_as_in_photos_yml(tm
 @pytest.mark.parametrize("size", [(4032, 3024), (3023, 4031), (901, 667), (41, 60001)])
 def test_widths_are_divided_by_the_smallest_whole_number_that_will_do(tmp_path, size):
     write_dataset(tmp_path)
-    write_pictures(tmp_path / "images", size=size)
+    write_images(tmp_path / "images", size=size)
     config, _ = config_for(tmp_path)
     width, height = size
     factor = width // config.data.image_size
@@ -43,25 +43,25 @@ def test_widths_are_divided_by_the_smallest_whole_number_that_will_do(tmp_path, 
     assert larger * round(height * larger / width) > MAX_PIXELS
 
 
-def test_the_largest_picture_decides(tmp_path):
+def test_the_largest_image_decides(tmp_path):
     write_dataset(tmp_path)
     sizes = [(640, 480), (1600, 1200), (1200, 1600), (700, 500)]
     for name, size in zip(NAMES, sizes, strict=True):
-        write_pictures(tmp_path / "images", [name], size)
+        write_images(tmp_path / "images", [name], size)
     config, reasons = config_for(tmp_path)
     assert config.data.image_size == 600 and MAX_PIXELS >= 600 * 800
     assert "scaled from 1200 x 1600 px, the largest, to a width of 600" in reasons
     for name, size in zip(NAMES, [(640, 480), (480, 640), (900, 20), (64, 48)], strict=True):
-        write_pictures(tmp_path / "images", [name], size)
+        write_images(tmp_path / "images", [name], size)
     assert config_for(tmp_path)[0].data.image_size == 900
 
 
-def test_cut_out_pictures_are_fitted_as_in_lego_yml():
+def test_cut_out_images_are_fitted_as_in_lego_yml():
     config, reasons = config_for(SCENES / "lego")
     example = load_config(SCENES / "lego.yml")
     assert config.data.type == "nerf_synthetic" and config.iterations == example.iterations
     assert config.data.image_size == example.data.image_size
-    assert "cut-out pictures in the layout of NeRF-synthetic, as they are" in reasons
+    assert "cut-out images in the layout of NeRF-synthetic, as they are" in reasons
 
 
 def test_transforms_json_is_recognised(photographs):
@@ -78,7 +78,7 @@ def test_what_is_given_is_not_chosen(tmp_path):
 
 def test_folders_that_are_none_are_explained(tmp_path):
     with pytest.raises(UserError, match=r"drgs poses"):
-        write_pictures(tmp_path / "images")
+        write_images(tmp_path / "images")
         config_for(tmp_path)
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": []}))
     with pytest.raises(UserError, match=r"transforms\.json: frames"):

@@ -61,9 +61,9 @@ def test_a_mask_counts_pixels_brighter_than_half(photographs, pixels):
 
 def test_a_mask_of_one_bit_is_read(photographs):
     kept = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
-    picture = Image.fromarray(kept)
-    assert picture.mode == "1"
-    picture.save(photographs / "mask.png")
+    rendered = Image.fromarray(kept)
+    assert rendered.mode == "1"
+    rendered.save(photographs / "mask.png")
     give(photographs, mask_path="mask.png")
     np.testing.assert_array_equal(view_named(load(photographs)).mask, kept)
 
@@ -88,7 +88,7 @@ def test_a_smaller_mask_counts_pixels_all_of_which_count(photographs):
 
 
 @pytest.mark.parametrize("kind", ["mask", "depth"])
-def test_a_picture_of_another_size_than_the_photograph_is_refused(photographs, kind):
+def test_a_image_of_another_size_than_the_photograph_is_refused(photographs, kind):
     key = {"mask": "mask_path", "depth": "depth_file_path"}[kind]
     iio.imwrite(photographs / "other.png", np.ones((4, 8), np.uint16))
     give(photographs, **{key: "other.png"})
@@ -135,18 +135,18 @@ def test_a_mask_may_be_an_alpha_channel_or_any_colour(photographs):
     """What is transparent, or dark in all channels, does not count."""
     counts = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
     white, zero = np.full((6, 8, 3), 255), 0 * counts
-    pictures = {}
-    pictures["01"] = Image.fromarray(np.dstack([white, 255 * counts]).astype(np.uint8))
-    pictures["02"] = pictures["01"].convert("LA")
-    pictures["03"] = Image.fromarray(counts.astype(np.uint8))
-    pictures["03"].putpalette([0, 0, 0, 0, 128, 0])  # labels, as annotation tools write them
-    pictures["04"] = Image.fromarray((40_000 * counts).astype(np.uint16))
-    pictures["05"] = Image.fromarray(np.dstack([zero, 255 * counts, zero]).astype(np.uint8))
-    for name, picture in pictures.items():
-        picture.save(photographs / f"mask{name}.png")
+    renders = {}
+    renders["01"] = Image.fromarray(np.dstack([white, 255 * counts]).astype(np.uint8))
+    renders["02"] = renders["01"].convert("LA")
+    renders["03"] = Image.fromarray(counts.astype(np.uint8))
+    renders["03"].putpalette([0, 0, 0, 0, 128, 0])  # labels, as annotation tools write them
+    renders["04"] = Image.fromarray((40_000 * counts).astype(np.uint16))
+    renders["05"] = Image.fromarray(np.dstack([zero, 255 * counts, zero]).astype(np.uint8))
+    for name, rendered in renders.items():
+        rendered.save(photographs / f"mask{name}.png")
         give(photographs, f"{name}.png", mask_path=f"mask{name}.png")
     dataset = load(photographs)
-    for name in pictures:
+    for name in renders:
         np.testing.assert_array_equal(view_named(dataset, name).mask, counts, err_msg=name)
     assert dataset.description.endswith("; masks of 5 of 10 photographs")
 
@@ -175,7 +175,7 @@ def test_a_mask_that_leaves_out_every_pixel_is_refused(photographs, name):
     assert view_named(load(photographs, ignore_masks=True)).mask is None
 
 
-def test_a_mask_that_leaves_out_every_pixel_of_a_smaller_picture_is_refused(photographs):
+def test_a_mask_that_leaves_out_every_pixel_of_a_smaller_image_is_refused(photographs):
     """One of each block of 2 x 2 pixels: none of the larger pixels counts as a whole."""
     mask = np.full((6, 8), 255, np.uint8)
     mask[::2, ::2] = 0
@@ -190,7 +190,7 @@ def test_a_mask_that_leaves_out_every_pixel_of_a_smaller_picture_is_refused(phot
 
 
 def test_a_broken_mask_is_named(photographs):
-    (photographs / "mask.png").write_bytes(b"no picture")
+    (photographs / "mask.png").write_bytes(b"no image")
     give(photographs, mask_path="mask.png")
     assert refusal(photographs).startswith(f"{photographs / 'mask.png'}: cannot read the image: ")
 
@@ -207,7 +207,7 @@ STEPS = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
     ],
     ids=["default", "top", "frame"],
 )
-def test_depths_of_a_picture_are_in_steps_of_a_unit(photographs, place, values, unit):
+def test_depths_of_a_image_are_in_steps_of_a_unit(photographs, place, values, unit):
     iio.imwrite(photographs / "depth.png", STEPS)
     give(photographs, depth_file_path="depth.png")
     if place == "top":
@@ -293,12 +293,12 @@ def test_an_array_that_holds_no_depths_is_refused(photographs, write, message):
     [(np.full((6, 8), 9, np.uint8), "L"), (np.full((6, 8, 3), 9, np.uint8), "RGB")],
     ids=["8 bits", "colours"],
 )
-def test_a_picture_of_depths_has_16_bits(photographs, pixels, mode):
+def test_a_image_of_depths_has_16_bits(photographs, pixels, mode):
     """Of 8 bits its numbers would be read as others."""
     iio.imwrite(photographs / "depth.png", pixels)
     give(photographs, depth_file_path="depth.png")
     assert refusal(photographs) == (
-        f"{photographs / 'depth.png'}: must be a grey picture of 16 bits or an .npy file, got one "
+        f"{photographs / 'depth.png'}: must be a grey image of 16 bits or an .npy file, got one "
         f"of Pillow's mode {mode}; convert it"
     )
 
@@ -414,7 +414,7 @@ def test_transparency_is_kept(photographs):
     np.testing.assert_allclose(smaller.alpha, blocks, rtol=1e-6)
 
 
-def test_transparency_of_synthetic_pictures_is_kept(blender):
+def test_transparency_of_synthetic_images_is_kept(blender):
     """Of those to train on."""
     folder, images = blender
     for width, shape in ((None, (4, 1, 6, 1)), (3, (2, 2, 3, 2))):

@@ -98,14 +98,14 @@ def test_smaller_views_keep_nothing_of_their_own():
     np.testing.assert_allclose(smaller.image, blocks, atol=2e-7)
 
 
-def test_a_kept_picture_says_that_it_has_to_be_copied():
+def test_a_kept_image_says_that_it_has_to_be_copied():
     image, _ = compact_photograph(np.zeros((2, 2, 3), np.uint8), GREY, None)
     assert np.asarray(image, np.float64).dtype == np.float64
     with pytest.raises(ValueError, match="only by a copy"):
         image.__array__(copy=False)
 
 
-def test_a_kept_picture_computes_as_an_array_does():
+def test_a_kept_image_computes_as_an_array_does():
     pixels = RNG.integers(0, 255, (4, 6, 3), np.uint8)
     image, _ = compact_photograph(pixels, GREY, None)
     numbers = numbers_of(pixels)

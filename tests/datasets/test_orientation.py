@@ -8,7 +8,7 @@ from PIL import ExifTags, Image, ImageOps
 from support.datasets import load, look_at
 
 from drgs.core.errors import UserError
-from drgs.io.pictures import image_size, read_header, read_pixels, upright
+from drgs.io.images import image_size, read_header, read_pixels, upright
 
 STORED = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
 
@@ -20,7 +20,7 @@ def save(path, orientation, pixels=STORED, **options):
 
 
 def dataset(folder, orientation, pixels=STORED, **size):
-    """Two views of one picture, whose camera has this size in px."""
+    """Two views of one image, whose camera has this size in px."""
     frames = []
     for i in range(2):
         save(folder / f"{i}.png", orientation, pixels)
@@ -32,7 +32,7 @@ def dataset(folder, orientation, pixels=STORED, **size):
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pictures_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix):
+def test_images_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix):
     path = tmp_path / f"a.{suffix}"
     save(path, orientation)
     found = read_header(path).orientation
@@ -60,7 +60,7 @@ def test_numbers_that_mean_nothing_are_none(tmp_path, orientation):
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_the_cameras_size_tells_whether_its_picture_was_turned(tmp_path, orientation):
+def test_the_cameras_size_tells_whether_its_image_was_turned(tmp_path, orientation):
     dataset(tmp_path, orientation, w=6, h=8)  # stored is 8 wide
     view = load(tmp_path).train[0]
     assert (view.width, view.height) == (6, 8)
@@ -94,7 +94,7 @@ def test_an_orientation_that_may_or_may_not_count_is_refused(tmp_path, orientati
         load(tmp_path)
 
 
-def test_a_wrong_size_of_a_turned_picture_names_both(tmp_path):
+def test_a_wrong_size_of_a_turned_image_names_both(tmp_path):
     dataset(tmp_path, 6, w=7, h=8)
     message = r"w and h do not tell .* \(.*json: w\) are for .* stored, 8 x 6 px, or as"
     with pytest.raises(UserError, match=message):

@@ -17,7 +17,7 @@ from drgs.core import registry
 from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
 from drgs.datasets.folders import find_reader
-from drgs.io.pictures import write_png
+from drgs.io.images import write_png
 
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "numpy_poses.py"
 

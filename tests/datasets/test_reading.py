@@ -33,8 +33,8 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_pictures_of_others_are_not_read(folder):
-    """What is behind their headers is damaged; all but their pictures is known."""
+def test_images_of_others_are_not_read(folder):
+    """What is behind their headers is damaged; all but their images is known."""
     config = DataConfig(path=folder, image_size=6)
     every = load_dataset(config)
     for name in ("2.png", "5.png"):
@@ -49,17 +49,17 @@ def test_pictures_of_others_are_not_read(folder):
         for name in ("fx", "fy", "cx", "cy", "width", "height", "files"):
             assert getattr(view, name) == getattr(expected, name)
         for name in ("image", "alpha", "mask", "depth"):
-            picture, of_all = getattr(view, name), getattr(expected, name)
-            assert picture.shape == of_all.shape
+            rendered, of_all = getattr(view, name), getattr(expected, name)
+            assert rendered.shape == of_all.shape
             if view.name[0] not in "25":
-                np.testing.assert_array_equal(np.asarray(picture), np.asarray(of_all))
+                np.testing.assert_array_equal(np.asarray(rendered), np.asarray(of_all))
                 continue
-            assert picture.nbytes == 0
+            assert rendered.nbytes == 0
             with pytest.raises(RuntimeError, match="another process has its image"):
-                np.asarray(picture)
+                np.asarray(rendered)
 
 
-def test_pictures_that_were_read_can_be_left_to_others(folder):
+def test_images_that_were_read_can_be_left_to_others(folder):
     view = load_dataset(DataConfig(path=folder, ignore_depth=True)).train[0]
     without = without_images(view)
     assert without.depth is None and without.mask.shape == view.mask.shape

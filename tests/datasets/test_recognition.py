@@ -79,7 +79,7 @@ def test_a_model_with_its_photographs_one_folder_below(tmp_path):
     ],
     ids=["one", "several", "of images"],
 )
-def test_pictures_in_folders_of_the_folder(tmp_path, files, message):
+def test_images_in_folders_of_the_folder(tmp_path, files, message):
     touch(tmp_path, *files, ".thumbs/a.jpg", "._a.jpg")
     pattern = message.format(tmp_path)
     assert re.search(f"holds photographs .*{pattern}", refusal(tmp_path))

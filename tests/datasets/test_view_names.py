@@ -1,4 +1,4 @@
-"""Names of views, which name the files of their pictures."""
+"""Names of views, which name the files of their images."""
 
 import os
 

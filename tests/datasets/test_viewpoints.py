@@ -33,7 +33,7 @@ def rolled(v, angle):
 
 
 def assert_looks_at(viewpoint, target):
-    """The target is on the optical axis, in front, and projects to the middle of the picture."""
+    """The target is on the optical axis, in front, and projects to the middle of the image."""
     x, y, z = viewpoint.camera_to_world[:3, :3].T @ (target - viewpoint.camera_to_world[:3, 3])
     assert z > 0
     assert [x, y] == pytest.approx([0, 0], abs=1e-9 * z)
@@ -144,7 +144,7 @@ def test_an_orbit_straight_above_is_still_an_orbit():
 @pytest.mark.parametrize(
     ("size", "expected"), [((800, 800), (400, 400)), ((270, 480), (225, 400)), ((32, 24), (32, 24))]
 )
-def test_orbit_pictures_have_the_photographs_shape_and_at_most_400_px(size, expected):
+def test_orbit_images_have_the_photographs_shape_and_at_most_400_px(size, expected):
     first = replace(make_dataset().train[0], width=size[0], height=size[1])
     assert orbit_size([first]) == expected
 

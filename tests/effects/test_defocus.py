@@ -14,12 +14,12 @@ from support.helpers import (
     FLOAT64,
     Cotangents,
     assert_arrays_agree,
-    assert_pictures_agree,
+    assert_images_agree,
     both_precisions,
     clear,
     device_gaussians,
     frame_adjoint,
-    picture_of,
+    image_planes,
     plane_cotangents,
     render_composed,
     rows,
@@ -58,7 +58,7 @@ SCENES = {
 all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 
 # Those of test_lenses.
-PICTURE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
+IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 DIFFERENCES = 1e-6
 
@@ -68,22 +68,22 @@ def case_of(scene, **others) -> LensCase:
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
 @both_precisions
 @all_scenes
-def test_picture_equals_the_reference(precision, scene):
+def test_image_equals_the_reference(precision, scene):
     case = clear(case_of(scene))
     _, frame = case.render(precision)
-    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
     in_focus = effects.render(*case.scene, case.lens, case.background, case.antialiased)
-    assert np.abs(case.picture.image - in_focus.image).max() > 0.05
+    assert np.abs(case.rendered.image - in_focus.image).max() > 0.05
 
 
 @both_precisions
-def test_an_aperture_of_zero_takes_the_pinholes_picture(precision):
+def test_an_aperture_of_zero_takes_the_pinholes_image(precision):
     case = clear(case_of({}, defocus=ThinLens(0.0, 2.0)))
     gaussians, frame = case.render(precision)
     in_focus = render_composed(gaussians, replace(frame.camera, aperture=None), case.pipeline)
@@ -185,13 +185,13 @@ def separate_scene() -> tuple[reference.Gaussians, reference.Camera]:
     return replace(gaussians, sh0=rng.uniform(-1, 1.7, (12, 1, 3))), camera
 
 
-# By aperture: PSNR (dB) of the blurred picture and of the one in focus. Measured: 73.8 and 52.6,
+# By aperture: PSNR (dB) of the blurred image and of the one in focus. Measured: 73.8 and 52.6,
 # 63.5 and 41.7, 51.6 and 33.1, 45.5 and 27.7.
 SAMPLED = {0.03125: (73, 53), 0.0625: (63, 42), 0.125: (51, 34), 0.25: (45, 28)}
 
 
 @pytest.mark.parametrize("aperture_radius", SAMPLED)
-def test_pictures_are_nearly_those_of_many_samples_of_the_aperture(aperture_radius):
+def test_images_are_nearly_those_of_many_samples_of_the_aperture(aperture_radius):
     """A disc and a Gaussian of its variance differ in shape, by the square of its area over the
     splat's. The splats have standard deviations of 1 to 1.6 px, the discs radii of up to 0.9, 1.9,
     3.8 and 7.5 px.
@@ -242,18 +242,18 @@ def planes_of_wall(precision=FLOAT64, pipeline=None) -> np.ndarray:
 
 
 def test_a_wall_out_of_focus_keeps_its_alpha_and_its_colour():
-    """As many pinhole pictures have them.
+    """As many pinhole images have them.
 
     With S the sum of all alphas at a pixel, a wall of splats that are hardly there lets exp(-S)
     through; one of splats of opacity o lets exp(-S (1 + o / 4 + o^2 / 9 + ...)) through, where the
     integral of -ln(1 - alpha) over a splat is that of alpha times the parenthesis: for S = 1.55,
-    0.212 and 0.201. What remains is the grain of 64 pictures. Measured: 0.001.
+    0.212 and 0.201. What remains is the grain of 64 images. Measured: 0.001.
     """
     gaussians, camera = wall()
     device = device_gaussians(gaussians, FLOAT64)
     pinholes = [aperture_camera(c, FLOAT64, None) for c in effects.lens_cameras(camera, FAR, 64)]
-    pictures = [planes_of(render_composed(device, c, rendering.Pipeline(0))) for c in pinholes]
-    mean, found = np.mean(pictures, axis=0), planes_of_wall()
+    images = [planes_of(render_composed(device, c, rendering.Pipeline(0))) for c in pinholes]
+    mean, found = np.mean(images, axis=0), planes_of_wall()
     thicker = 1 + 0.2 / 4 + 0.2**2 / 9 + 0.2**3 / 16
     np.testing.assert_allclose(found[0] ** thicker, mean[0], rtol=0, atol=0.004)
     np.testing.assert_allclose(found[1:] / (1 - found[0]), mean[1:] / (1 - mean[0]), atol=0.004)
@@ -324,8 +324,8 @@ def test_each_number_of_the_gradients_equals_a_difference_of_the_reference():
     weights = [cotangents.d_image, cotangents.d_alpha, cotangents.d_depth]
 
     def outputs(**parameters):
-        picture = case.reference_picture(reference.Gaussians(**parameters))
-        return [picture.image, picture.alpha, picture.depth]
+        rendered = case.reference_image(reference.Gaussians(**parameters))
+        return [rendered.image, rendered.alpha, rendered.depth]
 
     parameters = {n: getattr(case.gaussians, n) for n in PARAMETER_NAMES}
     expected = numeric_gradients(outputs, weights, parameters)

@@ -33,7 +33,7 @@ from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.grid import TileGrid
 
 # As in test_rendering.
-PICTURE = {name: limit for name, limit in (("Float64", 1e-12), ("Float", 2e-5))}
+IMAGE = {name: limit for name, limit in (("Float64", 1e-12), ("Float", 2e-5))}
 GRADIENTS = {name: limit for name, limit in (("Float64", 1e-7), ("Float", 1e-4))}
 
 CASES = [
@@ -93,12 +93,12 @@ def occluded_pipeline(case, precision, features=DEFAULT.features, degree=None):
 
 def expected_planes(case, gaussians=None) -> np.ndarray:
     """(7, H W): the splats' own transmittance, color, depth, weights in front of each surface."""
-    picture = render_with_surfaces(gaussians or case.gaussians, case.camera, surfaces_of(case))
+    rendered = render_with_surfaces(gaussians or case.gaussians, case.camera, surfaces_of(case))
     from drgs.reference import splatting as reference
 
     plain = reference.render(gaussians or case.gaussians, case.camera)
-    planes = [plain.transmittance, *np.moveaxis(picture.color, -1, 0), picture.depth]
-    return np.reshape([*planes, *(1 - picture.before)], (7, -1))
+    planes = [plain.transmittance, *np.moveaxis(rendered.color, -1, 0), rendered.depth]
+    return np.reshape([*planes, *(1 - rendered.before)], (7, -1))
 
 
 def render(case, precision):
@@ -118,7 +118,7 @@ def test_planes_are_those_of_the_reference(precision, case):
     assert_arrays_agree(
         dict(zip(names, planes, strict=True)),
         dict(zip(names, expected, strict=True)),
-        of(PICTURE, precision),
+        of(IMAGE, precision),
     )
 
 
@@ -127,9 +127,9 @@ def test_what_is_seen_past_all_follows_from_the_planes(case):
     """The reference composites surfaces as layers; the kernels scale."""
     case = clear(case)
     rest = np.prod([1 - alpha.ravel() for _, alpha in surfaces_of(case)], axis=0)
-    picture = render_with_surfaces(case.gaussians, case.camera, surfaces_of(case))
+    rendered = render_with_surfaces(case.gaussians, case.camera, surfaces_of(case))
     transmittance, *_ = expected_planes(case)
-    np.testing.assert_allclose(picture.transmittance.ravel(), transmittance * rest, atol=1e-15)
+    np.testing.assert_allclose(rendered.transmittance.ravel(), transmittance * rest, atol=1e-15)
 
 
 @both_precisions

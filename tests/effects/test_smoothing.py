@@ -13,14 +13,14 @@ from support.helpers import (
     Case,
     Cotangents,
     assert_arrays_agree,
-    assert_pictures_agree,
+    assert_images_agree,
     both_precisions,
     clear,
     device_camera,
     device_gaussians,
     frame_adjoint,
     frame_tangent,
-    picture_of,
+    image_planes,
     plane_cotangents,
     render_composed,
     rows,
@@ -38,11 +38,11 @@ from drgs.reference import splatting as reference
 from drgs.splatting.projection import load_rows
 
 # Relative to the largest value of an array. The filter is a sum of squares and a logarithm: a few
-# roundings; pictures and gradients as in test_rendering.
+# roundings; images and gradients as in test_rendering.
 FILTER = {FLOAT64: 1e-14, FLOAT32: 2e-6}
 
 
-PICTURE = {FLOAT64: 1e-12, FLOAT32: 2e-5}
+IMAGE = {FLOAT64: 1e-12, FLOAT32: 2e-5}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -161,22 +161,22 @@ def test_the_nearest_of_two_cameras_decides():
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
 class SmoothCase(Case):
-    """A case whose Gaussians come with a filter; its picture is that of the widened ones."""
+    """A case whose Gaussians come with a filter; its image is that of the widened ones."""
 
     @property
     def smoothing(self) -> np.ndarray:
         return filter_of(self.count)
 
     @property
-    def picture(self) -> reference.Picture:
-        return _picture(self)
+    def rendered(self) -> reference.RenderedImage:
+        return _image(self)
 
-    def reference_picture(self, gaussians=None, threshold_width=0.0) -> reference.Picture:
+    def reference_image(self, gaussians=None, threshold_width=0.0) -> reference.RenderedImage:
         return reference.render(
             smoothed_reference(gaussians or self.gaussians, self.smoothing), self.camera,
             self.background, self.rendered_degree, self.antialiased, threshold_width,
@@ -193,22 +193,22 @@ class SmoothCase(Case):
 
 
 @cache
-def _picture(case):
-    return case.reference_picture(threshold_width=case.threshold_width)
+def _image(case):
+    return case.reference_image(threshold_width=case.threshold_width)
 
 
 @both_precisions
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_picture_is_the_references_of_the_widened_gaussians(precision, antialiased):
+def test_image_is_the_references_of_the_widened_gaussians(precision, antialiased):
     case = clear(SmoothCase("smooth", 37, 29, 1, antialiased=antialiased))
     _, frame = case.render(precision)
-    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
     unfiltered = reference.render(*case.scene, case.background, antialiased=antialiased)
-    assert np.abs(unfiltered.image - case.picture.image).max() > 0.1
+    assert np.abs(unfiltered.image - case.rendered.image).max() > 0.1
 
 
 @both_precisions
-def test_baked_gaussians_give_the_same_picture(precision):
+def test_baked_gaussians_give_the_same_image(precision):
     """Rounded to float32, as files hold them: by the kernels, and by the reference."""
     case = clear(SmoothCase("baked", 37, 29, 1))
     host = replace(as_numpy(case.gaussians), smoothing=case.smoothing.astype(np.float32))
@@ -216,13 +216,15 @@ def test_baked_gaussians_give_the_same_picture(precision):
     assert plain.smoothing is None and plain.log_scales.dtype == np.float32
     uploaded = plain.to(precision.TensorXf)
     _, frame = case.render(precision, uploaded)
-    tolerance = PICTURE[FLOAT32]
-    assert_pictures_agree(picture_of(frame, case), case.picture, tolerance)
+    tolerance = IMAGE[FLOAT32]
+    assert_images_agree(image_planes(frame, case), case.rendered, tolerance)
     by_reference = reference.Gaussians(
         **{name: getattr(plain, name).astype(np.float64) for name in PARAMETER_NAMES}
     )
     image = reference.render(by_reference, case.camera, case.background).image
-    assert np.abs(image - case.picture.image).max() <= tolerance * np.abs(case.picture.image).max()
+    assert (
+        np.abs(image - case.rendered.image).max() <= tolerance * np.abs(case.rendered.image).max()
+    )
 
 
 def test_baking_without_a_filter_changes_nothing():
@@ -271,8 +273,8 @@ def kernel_gradients(case, precision, cotangents):
 
 
 def outputs_of(case, gaussians) -> list[np.ndarray]:
-    picture = case.reference_picture(gaussians)
-    return [picture.image, picture.alpha, picture.depth]
+    rendered = case.reference_image(gaussians)
+    return [rendered.image, rendered.alpha, rendered.depth]
 
 
 @both_precisions

@@ -11,7 +11,7 @@ from drgs.config.schema import FitConfig
 from drgs.core import constants, memory
 from drgs.datasets import transforms
 from drgs.integrator import checks
-from drgs.io import pictures
+from drgs.io import images
 from drgs.reference import splatting
 
 REFERENCE = "drgs/reference/splatting.py"
@@ -67,7 +67,7 @@ def test_the_papers_symbols_have_names_in_the_code():
 def test_both_forms_of_the_projected_covariance_are_there():
     text = (REPOSITORY / "docs" / "how_it_works.md").read_text()
     assert r"\Sigma' = J W \Sigma W^T J^T = J W R S S^T R^T W^T J^T = M M^T" in text
-    assert "scenes/pictures/tiles.png" in text
+    assert "scenes/images/tiles.png" in text
 
 
 PATHS = sorted(
@@ -108,13 +108,13 @@ def test_the_limits_are_those_of_the_program():
     cap = FitConfig.model_fields["densify"].annotation.model_fields["max_gaussians"]
     (largest,) = (limit.le for limit in cap.metadata if hasattr(limit, "le"))
     stated = {
-        "a photograph": pictures.MAX_PIXELS,
-        "a rendered picture": memory.PICTURE_BYTES,
+        "a photograph": images.MAX_PIXELS,
+        "a rendered image": memory.IMAGE_BYTES,
         "samples of a pixel": checks.MAX_SAMPLES,
         "AOVs": constants.MAX_FEATURES,
         "Gaussians": largest,
         "frames of an orbit": render.MAX_FRAMES,
-        "an animated WebP": pictures.MAX_WEBP_SIDE,
+        "an animated WebP": images.MAX_WEBP_SIDE,
         "arrays": memory.MAX_LANES,
         "coordinates of cameras": int(transforms.MAX_COORDINATE),
     }

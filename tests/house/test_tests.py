@@ -14,7 +14,7 @@ MOST_LINES = 600
 
 OTHER_FOLDERS = {"support", "references", "commands", "scenes", "house", "examples"}
 """Beside those that are named like a package: ``support`` is what tests share, ``references`` are
-stored pictures, ``commands`` run the programs, ``scenes`` are the shipped ones, ``examples`` are
+stored images, ``commands`` run the programs, ``scenes`` are the shipped ones, ``examples`` are
 extensions that the documents show, ``house`` is about
 the repository itself."""
 

@@ -19,7 +19,7 @@ from PIL import Image
 from support.small_capture import blobs, make_dataset
 
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.pictures import write_png
+from drgs.io.images import write_png
 
 pytestmark = [
     pytest.mark.slow,
@@ -119,8 +119,8 @@ def test_the_script_renders_gaussians_and_a_mitsuba_scene(scripts, model, tmp_pa
     camera = ("--origin", "0", "-4", "1", "--size", "32", "24")
     run(scripts / "drgs", "render", model, *camera, "--out", "a", cwd=tmp_path)
     run(scripts / "drgs", "render", "scene.xml", "--out", "b", cwd=tmp_path)
-    for picture in ("a/camera.png", "b/scene.png"):
-        pixels = np.array(Image.open(tmp_path / picture))
+    for rendered in ("a/camera.png", "b/scene.png"):
+        pixels = np.array(Image.open(tmp_path / rendered))
         assert pixels.shape[:2] == (24, 32) and pixels.std() > 1
 
 

@@ -58,7 +58,7 @@ def test_what_is_cut_out_is_not(photographs):
         assert stages(CONFIG, with_alpha(many, lambda i, k=opaque: i == k or left_of(60))) == []
 
 
-def test_neither_are_small_pictures_and_the_papers_recipe(photographs):
+def test_neither_are_small_images_and_the_papers_recipe(photographs):
     assert stages(CONFIG, photographs_of(120, 99)) == []
     assert stages(changed(CONFIG, {"iterations": 1}), photographs) == []
     assert stages(changed(CONFIG, {"densify.strategy": "adc"}), photographs) == []

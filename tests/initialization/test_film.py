@@ -1,4 +1,4 @@
-"""Where points are in pictures, before anything is rendered: as the float64 reference has it."""
+"""Where points are in images, before anything is rendered: as the float64 reference has it."""
 
 from dataclasses import replace
 

@@ -1,10 +1,10 @@
-"""Colours of points, from pictures of bodies whose colours are known."""
+"""Colours of points, from images of bodies whose colours are known."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bodies import WHITE, box, colors_at, directions_to, pictures_of, sphere, together
+from support.bodies import WHITE, box, colors_at, directions_to, images_of, sphere, together
 
 from drgs.datasets.types import CameraMotion
 from drgs.initialization import point_colors
@@ -15,7 +15,7 @@ COUNT = 1000
 
 @pytest.fixture(scope="module")
 def ball():
-    return pictures_of(sphere(0.8), 16)
+    return images_of(sphere(0.8), 16)
 
 
 def on_the_ball(radius=0.8):
@@ -34,9 +34,9 @@ def test_points_have_the_colours_of_the_surface(ball):
 
 
 def test_what_is_behind_transparent_pixels_does_not_show(ball):
-    """Whatever it is: pictures over another background give the same colours."""
+    """Whatever it is: images over another background give the same colours."""
     points, spacing = on_the_ball()
-    black = pictures_of(sphere(0.8), 16, background=(0.0, 0.0, 0.0))
+    black = images_of(sphere(0.8), 16, background=(0.0, 0.0, 0.0))
     expected = colors_from_images(points, spacing, ball, WHITE)
     actual = colors_from_images(points, spacing, black, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(actual, expected, atol=1e-5)
@@ -49,7 +49,7 @@ def test_a_point_does_not_get_the_colour_of_what_hides_it():
         return np.where(points[:, :1] > 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
 
     wall = box((1.0, -0.6, -0.6), (1.1, 0.6, 0.6))
-    views = pictures_of(together(sphere(0.5), wall), 12, paint=paint)
+    views = images_of(together(sphere(0.5), wall), 12, paint=paint)
     points, spacing = on_the_ball(0.5)
     y, z = np.meshgrid(np.linspace(-0.58, 0.58, 40), np.linspace(-0.58, 0.58, 40))
     on_wall = np.concatenate(
@@ -61,7 +61,7 @@ def test_a_point_does_not_get_the_colour_of_what_hides_it():
     assert (colors[COUNT:, 0] > colors[COUNT:, 1]).mean() > 0.99
 
 
-def test_a_picture_that_shows_something_else_does_not_matter(ball):
+def test_a_image_that_shows_something_else_does_not_matter(ball):
     points, spacing = on_the_ball()
     wrong = replace(ball[0], image=np.zeros_like(ball[0].image), alpha=np.ones_like(ball[0].alpha))
     colors = colors_from_images(points, spacing, [wrong, *ball[1:], *ball[1:]], WHITE)
@@ -78,7 +78,7 @@ def test_pixels_that_a_mask_leaves_out_are_not_looked_at(ball):
     assert colors_from_images(points, spacing, masked, WHITE) is None
 
 
-def test_a_point_that_no_picture_sees_is_coloured_as_the_nearest_that_one_does(ball):
+def test_a_point_that_no_image_sees_is_coloured_as_the_nearest_that_one_does(ball):
     points, spacing = on_the_ball()
     aside = 30 * points[::50] + [0, 0, 0.1]
     both, wide = np.concatenate([points, aside]), np.append(spacing, spacing[::50])
@@ -89,7 +89,7 @@ def test_a_point_that_no_picture_sees_is_coloured_as_the_nearest_that_one_does(b
         np.testing.assert_array_equal(color, seen[nearest])
 
 
-def test_nothing_is_known_where_no_picture_shows_a_point(ball):
+def test_nothing_is_known_where_no_image_shows_a_point(ball):
     points, spacing = on_the_ball()
     assert colors_from_images(100 + points, spacing, ball, WHITE) is None
     assert colors_from_images(points, spacing, [], WHITE) is None

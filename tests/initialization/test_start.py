@@ -1,4 +1,4 @@
-"""Sizes of pictures, extents of scenes, and the Gaussians that a fit starts from."""
+"""Sizes of images, extents of scenes, and the Gaussians that a fit starts from."""
 
 import math
 from dataclasses import replace
@@ -62,7 +62,7 @@ def test_grey_images_become_rgb(photographs, pixels, expected):
     np.testing.assert_allclose(image, expected, rtol=1e-6)
 
 
-def test_image_size_scales_pictures_and_intrinsics_together(photographs):
+def test_image_size_scales_images_and_intrinsics_together(photographs):
     full, half = load(photographs), load(photographs, image_size=4)
     a, b = full.train[0], half.train[0]
     assert (b.width, b.height, b.image.shape) == (4, 3, (3, 4, 3))

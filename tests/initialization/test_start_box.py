@@ -56,19 +56,19 @@ def test_a_box_that_most_cameras_do_not_look_into_is_refused():
     message = refusal(views, half_extent=1.3)
     assert message == (
         "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at (around "
-        "(50, 0, 0), from 4.03 away), but only 1 of 4 have it in the middle of their pictures; set "
+        "(50, 0, 0), from 4.03 away), but only 1 of 4 have it in the middle of their images; set "
         "init.half_extent=null, and it follows from them"
     )
 
 
-def test_a_box_at_the_edge_of_the_pictures_is_refused():
+def test_a_box_at_the_edge_of_the_images_is_refused():
     views = views_from(AROUND, target=(0, 0, 1.6))
     assert "but only 0 of 4 have it in the middle of" in refusal(views, half_extent=0.4)
 
 
-def test_a_box_that_hardly_shows_in_the_pictures_is_refused():
+def test_a_box_that_hardly_shows_in_the_images_is_refused():
     views = views_from(AROUND, scale=100)
-    assert "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of a picture (the " in (
+    assert "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of a image (the " in (
         refusal(views, half_extent=1.3)
     )
 
@@ -92,7 +92,7 @@ def test_a_cloud_in_another_frame_of_reference_is_refused(cloud):
     assert message == (
         f"{cloud}: must hold what the cameras look at (around (30, 30, 30), from 4.03 away), in "
         "their frame of reference, but only 0 of 4 have any of its 50 points in the middle of "
-        "their pictures; give another init.point_cloud, or start from random points "
+        "their images; give another init.point_cloud, or start from random points "
         "(init.point_cloud=null, data.ignore_points=true)"
     )
 
@@ -121,7 +121,7 @@ def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
     assert note.endswith("not there: 1 of 1 point cloud (gone.ply); the fit starts without")
 
 
-def test_points_that_are_all_black_get_the_colours_of_the_pictures(tmp_path):
+def test_points_that_are_all_black_get_the_colours_of_the_images(tmp_path):
     """As of a pipeline that finds out none."""
     positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
@@ -134,7 +134,7 @@ def test_points_that_are_all_black_get_the_colours_of_the_pictures(tmp_path):
 
 # What else follows from the data
 @pytest.mark.parametrize(("mode", "background"), [("RGB", "black"), ("RGBA", "white")])
-def test_the_background_follows_from_the_pictures(photographs, mode, background):
+def test_the_background_follows_from_the_images(photographs, mode, background):
     from PIL import Image
 
     for file in sorted((photographs / "images").iterdir())[3:4]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bodies import DISTANCE, colors_at, dataset_of_pictures, opaque_at, pictures_of, sphere
+from support.bodies import DISTANCE, colors_at, dataset_of_images, images_of, opaque_at, sphere
 from support.datasets import load
 from support.photographs import write_points
 
@@ -20,7 +20,7 @@ def config(**init):
 
 @pytest.fixture(scope="module")
 def masks():
-    return dataset_of_pictures(pictures_of(sphere(0.8), 12))
+    return dataset_of_images(images_of(sphere(0.8), 12))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def refusal(dataset, **init):
     return str(error.value)
 
 
-def test_where_pictures_are_masks_a_fit_starts_on_their_hull(masks):
+def test_where_images_are_masks_a_fit_starts_on_their_hull(masks):
     for kind in ("auto", "masks"):
         start = start_of(config(start=kind), masks)
         assert start.description == f"{len(start.means)} points on the hull of 12 masks, coloured"
@@ -119,14 +119,14 @@ def test_masks_without_a_hull_are_said_and_left_aside(masks, opaque):
     nothing = with_alpha(masks, np.zeros_like)
     for kind in ("auto", "masks"):
         start = start_of(config(start=kind), nothing)
-        reason = "the masks of 12 pictures have no hull to start from"
+        reason = "the masks of 12 images have no hull to start from"
         assert start.description == f"300 random points in [-1.3, 1.3]^3 ({reason})"
 
 
 def test_masks_and_clouds_that_are_not_there_are_refused(masks, opaque):
     few = replace(opaque, train=(*masks.train[:2], *opaque.train[2:]))
     assert refusal(few, start="masks") == (
-        "init.start: masks needs nearly all training pictures to be transparent where there is "
+        "init.start: masks needs nearly all training images to be transparent where there is "
         "nothing, from cameras that stand still, but only 2 are; cut out what is to be fitted, or "
         "set init.start=auto"
     )

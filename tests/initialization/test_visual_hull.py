@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bodies import box, opaque_at, pictures_of, sphere, together
+from support.bodies import box, images_of, opaque_at, sphere, together
 
 from drgs.datasets.types import CameraMotion
 from drgs.initialization.start_box import Box
@@ -21,12 +21,12 @@ def carved(views, count=1500, seed=0, within=WHOLE):
 
 @pytest.fixture(scope="module")
 def ball():
-    return pictures_of(sphere(0.8), 16)
+    return images_of(sphere(0.8), 16)
 
 
 @pytest.fixture(scope="module")
 def brick():
-    return pictures_of(box((-0.5, -0.25, -0.75), (0.5, 0.25, 0.75)), 16)
+    return images_of(box((-0.5, -0.25, -0.75), (0.5, 0.25, 0.75)), 16)
 
 
 def test_points_of_a_ball_are_on_its_surface(ball):
@@ -55,7 +55,7 @@ def test_points_of_a_brick_are_on_its_faces(brick):
 
 
 @pytest.mark.parametrize("views", ["ball", "brick"])
-def test_no_picture_shows_a_point_empty(views, request):
+def test_no_image_shows_a_point_empty(views, request):
     """By the reference's projection, pixel by pixel."""
     views = request.getfixturevalue(views)
     points = carved(views)
@@ -68,7 +68,7 @@ def test_the_number_of_points_is_never_exceeded_and_nearly_reached(ball):
 
 
 def test_a_body_that_is_small_in_its_box_has_as_many_points():
-    views = pictures_of(sphere(0.05, (0.3, 0.2, -0.1)), 12, size=200, samples=1)
+    views = images_of(sphere(0.05, (0.3, 0.2, -0.1)), 12, size=200, samples=1)
     points = carved(views, 500)
     assert len(points) > 300
     assert np.linalg.norm(points - [0.3, 0.2, -0.1], axis=1).max() < 0.08
@@ -77,7 +77,7 @@ def test_a_body_that_is_small_in_its_box_has_as_many_points():
 def test_a_thin_pole_is_not_lost():
     """Its width is a fifth of a pixel and a fifteenth of a cube; beside it is a body."""
     pole = box((-0.004, 0.596, -1), (0.004, 0.604, 1))
-    views = pictures_of(together(pole, sphere(0.4)), 10, samples=7)
+    views = images_of(together(pole, sphere(0.4)), 10, samples=7)
     points = carved(views, 600)
     near = points[np.linalg.norm(points[:, :2] - [0, 0.6], axis=1) < 0.12]
     assert np.diff(np.sort([-1, *near[:, 2], 1])).max() < 0.25
@@ -110,7 +110,7 @@ def test_silhouettes_of_noise_take_little_memory(ball):
     assert peak < 60e6
 
 
-def test_large_pictures_are_looked_at_in_larger_pixels(ball):
+def test_large_images_are_looked_at_in_larger_pixels(ball):
     large = [replace(v, alpha=np.kron(v.alpha, np.ones((20, 20), np.float32))) for v in ball[:2]]
     for silhouette, view in zip(silhouettes_of(large), ball, strict=False):
         assert silhouette.scale == 3 and silhouette.solid.shape == (427, 427)
@@ -139,10 +139,10 @@ def test_a_camera_that_moves_is_left_out(ball):
     assert len(carved([moving, *ball[1:]], 300)) > 200
 
 
-def test_distorted_pictures_are_carved_as_they_are():
+def test_distorted_images_are_carved_as_they_are():
     lens = reference.OpenCV(k1=-0.3, k2=0.05, p1=0.01)
     body = sphere(0.5, (0.6, 0, 0))
-    views = pictures_of(body, 12, size=24, samples=1, lens=lens, focal=1.0)
+    views = images_of(body, 12, size=24, samples=1, lens=lens, focal=1.0)
     points = carved(views, 400)
     assert len(points) > 250
     off = np.linalg.norm(points - [0.6, 0, 0], axis=1) - 0.5
@@ -151,18 +151,18 @@ def test_distorted_pictures_are_carved_as_they_are():
 
 
 def test_masks_that_contradict_each_other_have_no_hull(ball):
-    elsewhere = pictures_of(sphere(0.1, (0, 0, 1.1)), 12)
+    elsewhere = images_of(sphere(0.1, (0, 0, 1.1)), 12)
     assert len(carved([*ball[::2], *elsewhere])) == 0
     assert len(carved([replace(view, alpha=0 * view.alpha) for view in ball])) == 0
 
 
-def test_what_few_pictures_show_is_not_part_of_the_hull(ball):
+def test_what_few_images_show_is_not_part_of_the_hull(ball):
     """Nothing there can be shown empty."""
     points = carved(ball, 300, within=Box(np.zeros(3), 2.5))
     assert np.linalg.norm(points, axis=1).max() < 1.1
 
 
-def test_alpha_is_a_mask_where_nearly_all_pictures_are_transparent_somewhere(ball):
+def test_alpha_is_a_mask_where_nearly_all_images_are_transparent_somewhere(ball):
     opaque = [replace(view, alpha=np.ones_like(view.alpha)) for view in ball]
     plain = [replace(view, alpha=None) for view in ball]
     for views, expected in (

@@ -1,7 +1,7 @@
-"""``splats`` as Mitsuba tests its differentiable integrators: small scenes, of each the picture and
+"""``splats`` as Mitsuba tests its differentiable integrators: small scenes, of each the image and
 its forward and backward derivatives.
 
-Pictures are compared with stored ones (``tests/references``), derivatives with finite differences
+Images are compared with stored ones (``tests/references``), derivatives with finite differences
 of ``mi.render``. Errors are measured as Mitsuba's ``test_ad_integrators.py`` does, and its
 thresholds are upper bounds of those here. Cut-offs are off where they are not what is tested, and
 orders do not change: steps that are documented as not differentiated do not occur. Light paths have
@@ -9,7 +9,7 @@ the same seed on both sides, so that a derivative is that of the same estimate.
 
     python tests/integrator/test_ad_integrators.py --write [NAME...]
 
-stores pictures anew, all or some.
+stores images anew, all or some.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-from support.ad_scenes import CONFIGS, PICTURES, Config, DefaultCutoffs, tensor
+from support.ad_scenes import CONFIGS, IMAGES, Config, DefaultCutoffs, tensor
 from support.openexr import read_exr
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -65,7 +65,7 @@ def initialized(kind: type[Config]) -> Iterator[Config]:
         config.params.update()
 
 
-def pictures(kind: type[Config], thetas: Sequence[float]) -> list[np.ndarray]:
+def renders(kind: type[Config], thetas: Sequence[float]) -> list[np.ndarray]:
     """(H, W, C) of each theta."""
     images = []
     with initialized(kind) as config:
@@ -77,24 +77,24 @@ def pictures(kind: type[Config], thetas: Sequence[float]) -> list[np.ndarray]:
 
 @contextmanager
 def attached(kind: type[Config]) -> Iterator[tuple[mi.Float, mi.TensorXf]]:
-    """Theta, and a picture that depends on it, whose derivative is that of :func:`pictures`."""
+    """Theta, and a image that depends on it, whose derivative is that of :func:`images`."""
     theta = mi.Float(0)
     dr.enable_grad(theta)
     with initialized(kind) as config:
         config.update(theta)
-        # Mitsuba wants another seed for the picture than for its derivative.
+        # Mitsuba wants another seed for the image than for its derivative.
         yield theta, mi.render(config.scene, config.params, seed=SEED + 1, seed_grad=SEED)
 
 
 def forward(kind: type[Config]) -> np.ndarray:
-    """Derivative of the picture, (H, W, C)."""
+    """Derivative of the image, (H, W, C)."""
     with attached(kind) as (theta, image):
         dr.set_grad(theta, 1.0)
         return np.array(dr.forward_to(image)).astype(np.float64)
 
 
 def backward(kind: type[Config], weights) -> float:
-    """Derivative of the weighted sum of the picture."""
+    """Derivative of the weighted sum of the image."""
     with attached(kind) as (theta, image):
         dr.backward(dr.sum(image * tensor(weights), axis=None))
         return dr.grad(theta)[0]
@@ -104,7 +104,7 @@ def backward(kind: type[Config], weights) -> float:
 def differences(kind: type[Config]) -> np.ndarray:
     """Central ones of fourth order, (H, W, C)."""
     h = kind.epsilon
-    a, b, c, d = pictures(kind, [-2 * h, -h, h, 2 * h])
+    a, b, c, d = renders(kind, [-2 * h, -h, h, 2 * h])
     return (8 * (c - b) - (d - a)) / (12 * h)
 
 
@@ -124,7 +124,7 @@ def relative(actual, expected, floor) -> np.ndarray:
     return np.abs(actual - expected) / np.maximum(np.abs(expected), floor)
 
 
-def errors_of_picture(actual, expected) -> tuple[float, float]:
+def errors_of_image(actual, expected) -> tuple[float, float]:
     """The mean, and the part of the pixels that differ by more than what storing changes.
 
     float16 rounds by 2^-11. Single precision is off by 1e-5, 5e-4 of Mitsuba's floor of 0.02.
@@ -151,27 +151,27 @@ def error_of_backward(kind, actual) -> float:
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", PICTURES)
-def test_pictures_are_those_that_are_stored(name):
+@pytest.mark.parametrize("name", IMAGES)
+def test_images_are_those_that_are_stored(name):
     """The second, which is as the first: nothing is left behind by one that it could show.
 
     Machines round differently, so that a light path or a splat's end may fall otherwise.
     """
-    first, actual = pictures(PICTURES[name], [0.0, 0.0])
+    first, actual = renders(IMAGES[name], [0.0, 0.0])
     np.testing.assert_allclose(actual, first, rtol=0, atol=1e-5)  # filters add in any order
     expected = read_reference(name)
     assert actual.shape == expected.shape
-    error_mean, differing = errors_of_picture(actual, expected)
+    error_mean, differing = errors_of_image(actual, expected)
     assert differing <= 0.01
     # Rounding to float16 is 2^-12 of a value at most, on the mean; pixels that differ may do so by
     # Mitsuba's maximum.
     assert error_mean <= 2**-12 + 0.5 * differing
 
 
-@pytest.mark.parametrize("name", PICTURES)
-def test_pictures_that_are_a_percent_brighter_are_others(name):
+@pytest.mark.parametrize("name", IMAGES)
+def test_images_that_are_a_percent_brighter_are_others(name):
     expected = read_reference(name)
-    _, differing = errors_of_picture(1.01 * expected, expected)
+    _, differing = errors_of_image(1.01 * expected, expected)
     assert differing > 0.01
 
 
@@ -202,7 +202,7 @@ def test_thresholds_are_below_mitsubas_and_tell_derivatives_that_are_a_percent_o
 
 
 # ----------------------------------------------------------------------------------------------
-# Stored pictures
+# Stored images
 # ----------------------------------------------------------------------------------------------
 
 
@@ -211,16 +211,16 @@ def read_reference(name: str) -> np.ndarray:
 
 
 def write_reference(name: str) -> None:
-    (image,) = pictures(PICTURES[name], [0.0])
+    (image,) = renders(IMAGES[name], [0.0])
     bitmap = mi.Bitmap(tensor(image))
     bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16)
     bitmap.write(str(REFERENCES / f"{name}.exr"))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Store pictures anew, by name, or all.")
-    parser.add_argument("--write", nargs="*", choices=PICTURES, metavar="NAME", required=True)
+    parser = argparse.ArgumentParser(description="Store images anew, by name, or all.")
+    parser.add_argument("--write", nargs="*", choices=IMAGES, metavar="NAME", required=True)
     mi.set_variant("llvm_ad_rgb")
     REFERENCES.mkdir(exist_ok=True)
-    for name in parser.parse_args().write or PICTURES:
+    for name in parser.parse_args().write or IMAGES:
         write_reference(name)

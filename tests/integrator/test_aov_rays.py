@@ -75,8 +75,8 @@ AOV = {"type": "aov", "aovs": "far:depth"}
     [(SENSORS["perspective"], False), *((view, True) for view in SENSORS.values())],
     ids=["splats alone", *SENSORS],
 )
-def test_aov_shows_the_picture_and_its_own_channels(view, surfaces):
-    """Channels: colour, alpha and AOVs of the nested picture, those AOVs again, and its own."""
+def test_aov_shows_the_image_and_its_own_channels(view, surfaces):
+    """Channels: colour, alpha and AOVs of the nested image, those AOVs again, and its own."""
     scene, shapes = Scene(view), {"wall": wall(view)} if surfaces else {}
     alone = image_of(load(scene, shapes=shapes, samples=3), seed=5)
     nested = load(scene, AOV, shapes=shapes, samples=3)
@@ -108,14 +108,14 @@ def test_any_filter_and_sampler_may_be_used(srgb_primitives, rfilter, samples, s
     np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=SAME)
 
 
-def test_one_sample_is_the_pixels_centre_in_the_picture_and_the_rays_place_in_the_rest():
+def test_one_sample_is_the_pixels_centre_in_the_image_and_the_rays_place_in_the_rest():
     scene = Scene()
     image = image_of(load(scene, AOV))
     assert np.array_equal(image[..., :6], image_of(load(scene)))
     assert np.abs(image[..., 6] - image[..., 4]).max() > 0.01
 
 
-def test_derivatives_of_the_picture_are_those_without_aov():
+def test_derivatives_of_the_image_are_those_without_aov():
     """With the same seed; aov hands on what is asked of the first channels."""
     scene = Scene()
     weights = scene.weights()
@@ -193,7 +193,7 @@ def test_rays_that_are_not_those_of_a_film_are_refused(case):
 
 
 def test_rays_of_another_sensor_are_refused():
-    """As what is not a picture may have as many rays as one."""
+    """As what is not a image may have as many rays as one."""
     from drgs.integrator.aov_rays import ImageRays
 
     first = mi.load_dict(VIEWS[1].sensor())

@@ -14,7 +14,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
 # As in test_splats: single precision, relative to the largest value of an array.
-PICTURE, GRADIENTS = 1e-5, 1e-4
+IMAGE, GRADIENTS = 1e-5, 1e-4
 
 STEP = 1e-7
 
@@ -43,11 +43,11 @@ def composited(gaussians, camera, columns) -> np.ndarray:
     splats = reference.project(gaussians, camera)
     planes = []
     for k in range(columns.shape[1]):
-        picture = reference.composite(
+        rendered = reference.composite(
             splats.means2d, splats.conics, splats.opacities, np.repeat(columns[:, k : k + 1], 3, 1),
             splats.depths, splats.visible, np.zeros(3), camera.width, camera.height,
         )  # fmt: skip
-        planes.append(picture.image[..., 0])
+        planes.append(rendered.image[..., 0])
     return np.stack(planes, axis=-1)
 
 
@@ -77,7 +77,7 @@ def channels_of(scene, gaussians=None, features=None) -> np.ndarray:
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
@@ -89,7 +89,7 @@ def test_normals_and_features_are_composited_as_numbers(view, srgb_primitives):
     loaded = with_features(scene)
     image = image_of(loaded)
     expected = channels_of(scene)
-    np.testing.assert_allclose(image[..., 4:], expected, atol=PICTURE * np.abs(expected).max())
+    np.testing.assert_allclose(image[..., 4:], expected, atol=IMAGE * np.abs(expected).max())
     names = ["n.X", "n.Y", "n.Z", "f.0", "f.1", "f.2", "f.3", "z.T"]
     assert loaded.integrator().aov_names() == names
     film = loaded.sensors()[0].film()
@@ -154,7 +154,7 @@ def test_a_row_whose_feature_is_not_finite_is_not_drawn():
     hidden[row] = -30
     gone = replace(scene.gaussians, logit_opacities=hidden)
     expected = composited(gone, scene.camera, features_of(scene))[scene.view.window]
-    np.testing.assert_allclose(image[..., 4:], expected, atol=PICTURE * np.abs(expected).max())
+    np.testing.assert_allclose(image[..., 4:], expected, atol=IMAGE * np.abs(expected).max())
 
 
 # ----------------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_forward_mode_is_the_transpose_of_the_gradients():
 
 
 def test_features_are_trained():
-    """Until they show what they are to show; the picture stays."""
+    """Until they show what they are to show; the image stays."""
     scene = clear(Scene())
     target = image_of(with_features(scene))[..., 7:11].astype(np.float32)
     zeros = mi.TensorXf(np.zeros((scene.count, 4), np.float32))

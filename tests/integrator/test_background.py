@@ -1,4 +1,4 @@
-"""Environments and pictures behind splats: against Mitsuba's ``path``, numpy, and differences."""
+"""Environments and images behind splats: against Mitsuba's ``path``, numpy, and differences."""
 
 import drjit as dr
 import mitsuba as mi
@@ -7,13 +7,13 @@ import pytest
 from support.backgrounds import (
     CLOSE,
     EMITTERS,
-    PICTURE,
+    IMAGE,
     VIEW,
     Camera,
     calibrated,
     integrator_of,
     load,
-    picture,
+    rendered,
     splats_alone,
     texels,
 )
@@ -114,7 +114,7 @@ def test_an_environment_is_seen_past_the_splats(camera, srgb_primitives, emitter
     settings = {"srgb_primitives": srgb_primitives, "background": [0.2, 0.4, 0.6]}
     image = image_of(load(sensor, integrator_of(gaussians, **settings), sky=EMITTERS[emitter]()))
     splats, behind = splats_alone(sensor, gaussians), PixelCenters.image(sensor, emitter)
-    np.testing.assert_allclose(image, over(splats, behind, srgb_primitives), atol=2 * PICTURE)
+    np.testing.assert_allclose(image, over(splats, behind, srgb_primitives), atol=2 * IMAGE)
     assert splats[..., 3].max() > 0.9 and splats[..., 3].min() < 0.1
     assert (image[..., 3] == 1).all()
 
@@ -126,7 +126,7 @@ def test_what_is_seen_past_the_splats_is_what_path_renders(emitter):
     far = {**tensors(scene.gaussians), "logit_opacities": mi.Float(np.full(40, -20, np.float32))}
     loaded = load(sensor, {"type": "splats", **far}, sky=EMITTERS[emitter]())
     actual = image_of(loaded, spp=9, seed=7)
-    np.testing.assert_allclose(actual, path_image(sensor, emitter, 9, seed=7), atol=PICTURE)
+    np.testing.assert_allclose(actual, path_image(sensor, emitter, 9, seed=7), atol=IMAGE)
     other = path_image(sensor, emitter, 9, seed=8)
     assert (np.abs(actual - other).max() > 0.1) == (emitter == "envmap")
 
@@ -141,7 +141,7 @@ def test_several_samples_are_each_before_their_own_part_of_the_environment(seed)
     behind = path_image(sensor, "envmap", 4, seed)
     free = on_black[..., 3] < 1e-6
     assert free.mean() > 0.05
-    np.testing.assert_allclose(actual[free][:, :3], behind[free][:, :3], atol=PICTURE)
+    np.testing.assert_allclose(actual[free][:, :3], behind[free][:, :3], atol=IMAGE)
     assert np.abs(actual - behind)[~free].max() > 0.2
     assert (actual[..., 3] == 1).all()
 
@@ -188,36 +188,36 @@ def test_without_an_environment_alpha_is_that_of_the_splats():
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
-def picture_of_film(width, height) -> np.ndarray:
+def image_of_film(width, height) -> np.ndarray:
     """Linear (height, width, 3), different in every pixel."""
     return texels(height, width, seed=5)
 
 
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
 @pytest.mark.parametrize("view", [VIEW, VIEWS[6], VIEWS[12], VIEWS[13]], ids=lambda v: v.name)
-def test_a_picture_is_stretched_over_the_film_upright(view, srgb_primitives):
+def test_a_image_is_stretched_over_the_film_upright(view, srgb_primitives):
     """A texel for each pixel of the whole film, of which a crop window shows a part."""
     camera = Camera(view)
-    values = picture_of_film(view.width, view.height)
+    values = image_of_film(view.width, view.height)
     gaussians = gaussians_before(camera)
-    settings = {"background": picture(values), "srgb_primitives": srgb_primitives}
+    settings = {"background": rendered(values), "srgb_primitives": srgb_primitives}
     image = image_of(load(camera.dictionary(), integrator_of(gaussians, **settings)))
     splats = splats_alone(camera.dictionary(), gaussians)
     expected = over(splats, values[view.window].astype(np.float64), srgb_primitives=False)
     if srgb_primitives:  # it is the last splat
         expected = to_linear(expected)
-    np.testing.assert_allclose(image[..., :3], expected[..., :3], atol=2 * PICTURE)
+    np.testing.assert_allclose(image[..., :3], expected[..., :3], atol=2 * IMAGE)
 
 
-def test_a_picture_of_another_size_is_interpolated():
+def test_a_image_of_another_size_is_interpolated():
     """Bilinearly, between the middles of texels, as numpy does it."""
     values = texels(4, 5, seed=6)
     sensor = Camera().dictionary()
-    background = picture(values, filter_type="bilinear", wrap_mode="clamp")
+    background = rendered(values, filter_type="bilinear", wrap_mode="clamp")
     nothing = {"logit_opacities": mi.Float(np.full(40, -20, np.float32))}
     integrator = integrator_of(Scene().gaussians, background=background) | nothing
     image = image_of(load(sensor, integrator))
@@ -228,13 +228,13 @@ def test_a_picture_of_another_size_is_interpolated():
     expected = np.stack(
         [[np.interp(y, range(4), column) for column in plane.T] for plane in along], axis=-1
     ).transpose(1, 0, 2)
-    np.testing.assert_allclose(image[..., :3], expected, atol=PICTURE)
+    np.testing.assert_allclose(image[..., :3], expected, atol=IMAGE)
 
 
-def test_an_environment_is_before_a_picture():
+def test_an_environment_is_before_a_image():
     """Both are given: the environment is seen, unless it is hidden."""
     sensor, gaussians = Camera().dictionary(), Scene().gaussians
-    settings = {"background": picture(texels())}
+    settings = {"background": rendered(texels())}
     sky = {"sky": EMITTERS["constant"]()}
     both = image_of(load(sensor, integrator_of(gaussians, **settings), **sky))
     alone = image_of(load(sensor, integrator_of(gaussians), **sky))

@@ -7,7 +7,7 @@ import pytest
 from support.backgrounds import (
     CLOSE,
     EMITTERS,
-    PICTURE,
+    IMAGE,
     VIEW,
     Camera,
     attached,
@@ -65,12 +65,12 @@ def test_an_environment_out_of_focus_is_the_mean_of_what_pinholes_in_the_apertur
         np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height
     )
     lens = effects.ThinLens(APERTURE["aperture_radius"], APERTURE["focus_distance"])
-    pictures = []
+    images = []
     for camera in effects.lens_cameras(plain, lens, 16):
         pinhole = calibrated(fx=focal, fy=focal, cx=camera.cx, cy=camera.cy).dictionary()
-        pictures.append(image_of(load(pinhole, hidden_splats(), sky=EMITTERS["envmap"]())))
-    np.testing.assert_allclose(image, np.mean(pictures, axis=0), atol=PICTURE)
-    assert np.abs(image - pictures[0]).max() > 0.3
+        images.append(image_of(load(pinhole, hidden_splats(), sky=EMITTERS["envmap"]())))
+    np.testing.assert_allclose(image, np.mean(images, axis=0), atol=IMAGE)
+    assert np.abs(image - images[0]).max() > 0.3
 
 
 def test_an_environment_out_of_focus_is_what_path_renders():
@@ -135,7 +135,7 @@ def moving(**changes) -> Camera:
 
 @pytest.mark.parametrize("times", [{}, {"shutter_open": 2.0, "shutter_close": 2.5}])
 def test_motion_blurs_the_environment_as_it_does_the_splats(times):
-    """The mean of pictures from where the camera was, whatever the clock says."""
+    """The mean of images from where the camera was, whatever the clock says."""
     gaussians = Scene().gaussians
     count = 3
     sensor = moving(shutter_samples=count, **times).dictionary()
@@ -146,7 +146,7 @@ def test_motion_blurs_the_environment_as_it_does_the_splats(times):
         alone = calibrated().dictionary(to_world=pose)
         still.append(image_of(load(alone, integrator_of(gaussians), sky=EMITTERS["envmap"]())))
     # Poses are interpolated in single precision on one side.
-    np.testing.assert_allclose(image, np.mean(still, axis=0), atol=10 * PICTURE)
+    np.testing.assert_allclose(image, np.mean(still, axis=0), atol=10 * IMAGE)
     assert np.abs(still[0] - still[-1]).max() > 0.2
 
 
@@ -167,4 +167,4 @@ def test_what_is_ignored_is_ignored_behind_the_splats_as_well(camera, ignored):
         )
         for c in (camera, calibrated())
     )
-    np.testing.assert_allclose(image, expected, atol=PICTURE)
+    np.testing.assert_allclose(image, expected, atol=IMAGE)

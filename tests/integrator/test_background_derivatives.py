@@ -13,7 +13,7 @@ from support.backgrounds import (
     attached,
     integrator_of,
     load,
-    picture,
+    rendered,
     splats_alone,
     texels,
 )
@@ -45,8 +45,8 @@ def scene_with(kind, srgb_primitives=True, camera=None, **settings):
     """A scene with a background of a kind, and the name of its parameter."""
     sensor, gaussians = (camera or Camera()).dictionary(), Scene().gaussians
     settings = {"srgb_primitives": srgb_primitives, **settings}
-    if kind == "picture":
-        settings["background"] = picture(texels(6, 8), filter_type="bilinear")
+    if kind == "image":
+        settings["background"] = rendered(texels(6, 8), filter_type="bilinear")
         return load(sensor, integrator_of(gaussians, **settings)), "integrator.background.data"
     loaded = load(sensor, integrator_of(gaussians, **settings), sky=EMITTERS[kind]())
     return loaded, "sky.radiance.value" if kind == "constant" else "sky.data"
@@ -67,7 +67,7 @@ def like(parameter, values):
     return flat if isinstance(parameter, mi.Float) else mi.TensorXf(flat, values.shape)
 
 
-KINDS = ["constant", "envmap", "picture"]
+KINDS = ["constant", "envmap", "image"]
 
 
 all_kinds = pytest.mark.parametrize("kind", KINDS)
@@ -76,7 +76,7 @@ all_kinds = pytest.mark.parametrize("kind", KINDS)
 @all_kinds
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
 def test_derivatives_of_the_radiance_are_differences(kind, srgb_primitives):
-    """Along random directions. In linear radiance the picture is linear in it: any step is exact
+    """Along random directions. In linear radiance the image is linear in it: any step is exact
     up to rounding; in display space a step of 1e-2 leaves its square.
     """
     loaded, key = scene_with(kind, srgb_primitives)
@@ -120,7 +120,7 @@ def floor() -> dict:
 FLOOR = "floor.bsdf.reflectance.value"
 
 
-TWICE = "two pictures", "two losses", "two losses of one graph"
+TWICE = "two images", "two losses", "two losses of one graph"
 """What a factor reaches the backdrop through, more than once."""
 
 
@@ -132,8 +132,8 @@ def factored(way, kind):
     else:
         sensor = Camera().dictionary()
     objects, settings = {}, {}
-    if kind == "picture":
-        settings["background"] = picture(texels(6, 8), filter_type="bilinear")
+    if kind == "image":
+        settings["background"] = rendered(texels(6, 8), filter_type="bilinear")
     else:
         objects["sky"] = EMITTERS[kind]()
     keys = [{"constant": "sky.radiance.value", "envmap": "sky.data"}.get(kind, BACKGROUND)]
@@ -166,8 +166,8 @@ def test_gradients_reach_what_the_radiance_was_computed_from(way, kind):
         for key, values in start.items():
             params[key] = like(params[key], values) * factor
         params.update()
-        pictures = [mi.render(loaded, params, **seeds) for _ in range(count)]
-        return [dr.sum(image * tensor(weights), axis=None) for image in pictures]
+        renders = [mi.render(loaded, params, **seeds) for _ in range(count)]
+        return [dr.sum(image * tensor(weights), axis=None) for image in renders]
 
     factor = mi.Float(1)
     dr.enable_grad(factor)
@@ -215,15 +215,15 @@ def test_derivatives_of_the_gaussians_know_what_is_behind_them(kind):
         hidden[key] = value
     hidden.update()
     behind = image_of(empty)[..., :3]
-    picture = reference.render(scene.gaussians, scene.camera, np.zeros(3), threshold_width=1e-4)
-    assert not picture.near_threshold.any()
-    coverage, of_colors = picture.alpha[..., None], weights[..., :3]
-    if kind == "picture":  # D(C + T b), and alpha
+    rendered = reference.render(scene.gaussians, scene.camera, np.zeros(3), threshold_width=1e-4)
+    assert not rendered.near_threshold.any()
+    coverage, of_colors = rendered.alpha[..., None], weights[..., :3]
+    if kind == "image":  # D(C + T b), and alpha
         display = to_display(behind)
-        slope = to_linear_derivative(picture.image + (1 - coverage) * display)
+        slope = to_linear_derivative(rendered.image + (1 - coverage) * display)
         d_alpha = weights[..., 3] - np.sum(of_colors * slope * display, axis=-1)
     else:  # A D(C / A) + T L, and alpha is 1
-        color = picture.image / np.where(coverage > 0, coverage, 1)
+        color = rendered.image / np.where(coverage > 0, coverage, 1)
         slope = to_linear_derivative(color)
         d_alpha = np.sum(of_colors * (to_linear(color) - color * slope - behind), axis=-1)
     expected = reference.render_gradients(
@@ -305,7 +305,7 @@ def test_derivatives_of_a_sensor_see_the_environment_move():
     assert dr.grad(turn)[0] != pytest.approx(difference, rel=0.03)
 
 
-def test_pictures_and_constant_radiance_are_the_same_bytes_in_two_runs():
+def test_images_and_constant_radiance_are_the_same_bytes_in_two_runs():
     """Derivatives of texels are added in any order: they, alone, may differ by rounding."""
     for kind in KINDS:
         loaded, key = scene_with(kind)

@@ -1,4 +1,4 @@
-"""Sensors of type ``batch``: pictures side by side, each as if its sensor were alone."""
+"""Sensors of type ``batch``: images side by side, each as if its sensor were alone."""
 
 import drjit as dr
 import mitsuba as mi
@@ -53,7 +53,7 @@ def parts(image) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("wall", [False, True], ids=["splats", "hybrid"])
 @pytest.mark.parametrize("pixel_format", ["rgba", "xyz"])
-def test_pictures_stand_side_by_side(wall, pixel_format):
+def test_images_stand_side_by_side(wall, pixel_format):
     settings = {"aovs": "z:depth", "srgb_primitives": True, "hide_emitters": not wall}
     image = image_of(load(batch(pixel_format=pixel_format), wall, **settings))
     for part, view in zip(parts(image), SENSORS, strict=True):
@@ -64,7 +64,7 @@ def test_pictures_stand_side_by_side(wall, pixel_format):
 
 
 def test_several_samples_are_those_of_the_whole_film():
-    """A box filter averages them; each picture's are a part of the film's. Half a percent
+    """A box filter averages them; each image's are a part of the film's. Half a percent
     of noise with 256 of them is a percent with 64."""
     center = image_of(load(batch()))
     sampled = image_of(load(batch(samples=64)))

@@ -130,7 +130,7 @@ def test_times_are_between_those_at_which_the_shutter_opens_and_closes():
     assert np.abs(film - (sample * sensor.size + sensor.corner)).max() < PIXELS
 
 
-# Its picture is a circle of a radius of 16 px.
+# Its image is a circle of a radius of 16 px.
 WIDE_FISHEYE = Calibrated(
     "wide fisheye", LENSES["plain fisheye"], FILM, f=(5.5, 5.5), c=(19.0, 14.0)
 )
@@ -250,7 +250,7 @@ def test_integrators_that_trace_rays_see_through_it_what_they_see_through_perspe
 @pytest.mark.parametrize(
     "sensor", [OPENCV, FISHEYE, BARREL, WIDE_FISHEYE, MOVING[3], MOVING[5]], **by_name
 )
-def test_a_path_traced_picture_shows_a_sphere_where_the_reference_sees_it(sensor):
+def test_a_path_traced_image_shows_a_sphere_where_the_reference_sees_it(sensor):
     """A luminous sphere, seen by pixels whose rays are nearer to its centre than its radius."""
     middle = sensor.corner + sensor.size / 2
     middle_time = middle[1] / sensor.view.height
@@ -286,7 +286,7 @@ def test_a_path_traced_picture_shows_a_sphere_where_the_reference_sees_it(sensor
     assert not image[outside].any()
 
 
-def test_a_camera_that_moves_blurs_a_path_traced_picture():
+def test_a_camera_that_moves_blurs_a_path_traced_image():
     """With a global shutter: a point is spread over the path that the reference says it takes."""
     sensor = replace(PINHOLE, view=FILM, close=pose([0.3, -1.0, 0.5], 40, (0.7, -0.7, 1.1)))
     center = (np.array(FILM.to_world) @ [0, 0, 4, 1])[:3]
@@ -313,14 +313,14 @@ def test_a_camera_that_moves_blurs_a_path_traced_picture():
 @pytest.mark.parametrize("sensor", [*STILL, BARREL], **by_name)
 def test_splats_are_seen_through_it_as_by_the_reference(sensor):
     camera = replace(sensor.camera, near=0.01)
-    gaussians, picture = clear_gaussians(
+    gaussians, rendered = clear_gaussians(
         sensor,
         lambda gaussians: effects.render(
             gaussians, camera, sensor.lens, threshold_width=NEAR_THRESHOLD
         ),
     )
     image = image_of(splats_scene(sensor, gaussians))
-    expected = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+    expected = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
     # As in test_rendering, float32; Mitsuba's numbers are float32 too.
     np.testing.assert_allclose(image, expected[sensor.view.window], rtol=0, atol=5e-5)
     assert image[..., 3].max() > 0.8

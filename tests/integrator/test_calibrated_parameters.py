@@ -146,7 +146,7 @@ def test_an_opencv_lens_without_coefficients_is_a_pinhole():
 
 
 @pytest.mark.parametrize("sensor", STILL, **by_name)
-def test_gradients_of_a_picture_reach_the_calibration(sensor):
+def test_gradients_of_a_image_reach_the_calibration(sensor):
     """Against central differences in single precision; some slopes are clamped."""
     gaussians = splats_before(FILM, 1, 40, 0)
     # Nothing is cut: nothing jumps.

@@ -15,7 +15,7 @@ import pytest
 from conftest import REPOSITORY
 from support.ellipsoids import (
     GRADIENTS,
-    PICTURE,
+    IMAGE,
     ROTATION,
     SCALE,
     TRANSLATION,
@@ -47,7 +47,7 @@ def variant():
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
@@ -74,7 +74,7 @@ def test_a_file_looks_the_same_through_a_shape(kind, degree, tmp_path):
 # With these approximations what is left is that volprim_rf_basic composites in the order in which a
 # ray enters the ellipsoids, passes over those entered within 1e-4 behind another, and does not draw
 # those that contain the camera: test_volprim.py measures each where it is alone. Of the mean
-# of this picture they make 0.025. A tenth less of all opacities makes 0.07, quaternions read
+# of this image they make 0.025. A tenth less of all opacities makes 0.07, quaternions read
 # otherwise 0.2, coefficients in another order 0.5.
 VOLPRIM = 0.04
 
@@ -91,7 +91,7 @@ def test_the_same_shapes_look_as_volprim_rf_basic_draws_them(kind):
     held = scene.held
     held["data"][:, 6:] /= np.linalg.norm(held["data"][:, 6:], axis=1, keepdims=True)
 
-    def picture(held, integrator, **settings):
+    def rendered(held, integrator, **settings):
         loaded = mi.load_dict(
             {
                 "type": "scene",
@@ -102,10 +102,10 @@ def test_the_same_shapes_look_as_volprim_rf_basic_draws_them(kind):
         )
         return image_of(loaded, spp=16)
 
-    expected = picture(held, "volprim_rf_basic", max_depth=256)
+    expected = rendered(held, "volprim_rf_basic", max_depth=256)
 
     def error(**changes):
-        actual = picture(held | changes, "splats", **AS_VOLPRIM)
+        actual = rendered(held | changes, "splats", **AS_VOLPRIM)
         return np.abs(actual - expected).mean() / expected.mean()
 
     assert error() < VOLPRIM
@@ -142,8 +142,8 @@ def test_a_model_looks_the_same_moved_by_the_integrator_a_shape_or_the_camera(
     ours = image_of(scene_with(moved, away))
     theirs = image_of(scene_with({names: transform()}, away, shape=shape))
     unturned = image_of(scene_with({}, away, shape=shape))
-    assert_images_agree(ours, unmoved, 3 * PICTURE)
-    assert_images_agree(theirs, unmoved, 3 * PICTURE)
+    assert_images_agree(ours, unmoved, 3 * IMAGE)
+    assert_images_agree(theirs, unmoved, 3 * IMAGE)
     assert np.abs(unturned - unmoved).max() > 0.02
 
 
@@ -164,7 +164,7 @@ def test_each_shape_may_have_a_to_world_of_its_own(tmp_path):
         for to_world in placed.values()
     ]
     expected = image_of(scene_with(tensors(joined(*parts)), view))
-    assert_images_agree(actual, expected, 3 * PICTURE)
+    assert_images_agree(actual, expected, 3 * IMAGE)
 
 
 def test_tensors_are_moved_as_a_file_is(tmp_path):
@@ -183,7 +183,7 @@ def test_tensors_are_moved_as_a_file_is(tmp_path):
 def test_gradients_of_turned_coefficients_are_those_of_the_unturned_before_a_turned_camera(
     tmp_path,
 ):
-    """The pictures are the same functions of the coefficients."""
+    """The images are the same functions of the coefficients."""
     scene = Scene(degree=3)
     path = write_model(tmp_path / "model.ply", scene.gaussians)
     shape = {"type": "ellipsoids", "filename": path}

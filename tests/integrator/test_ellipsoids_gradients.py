@@ -157,7 +157,7 @@ def test_backward_passes_give_the_same_bytes_and_add_nothing_atomically():
 
 
 def test_adam_reduces_the_loss():
-    """Every parameter starts somewhat off; the picture it had is the target."""
+    """Every parameter starts somewhat off; the image it had is the target."""
     scene = Held()
     loaded = scene.load()
     target = mi.TensorXf(image_of(loaded).astype(np.float32))

@@ -36,7 +36,7 @@ def variant():
 # ----------------------------------------------------------------------------------------------
 
 
-def picture_of(scene, **changes) -> np.ndarray:
+def rendered_of(scene, **changes) -> np.ndarray:
     """Of the scene's shape with some numbers changed: name = (row, column, value)."""
     return image_of(scene.load(shape=shape_of(changed(scene.held, **changes))))
 
@@ -54,10 +54,10 @@ SEEN = 3
 
 def test_an_opacity_of_one_is_the_largest_below_one():
     scene = Held()
-    largest = picture_of(scene, opacities=(SEEN, 0, 1 - 2.0**-24))
+    largest = rendered_of(scene, opacities=(SEEN, 0, 1 - 2.0**-24))
     for value in (1.0, 1.5, np.inf):
-        np.testing.assert_array_equal(picture_of(scene, opacities=(SEEN, 0, value)), largest)
-    assert np.abs(largest - picture_of(scene, opacities=(SEEN, 0, 0.9))).max() > 0.01
+        np.testing.assert_array_equal(rendered_of(scene, opacities=(SEEN, 0, value)), largest)
+    assert np.abs(largest - rendered_of(scene, opacities=(SEEN, 0, 0.9))).max() > 0.01
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_an_opacity_of_one_is_the_largest_below_one():
     ],
     ids=str,
 )
-def test_what_cannot_be_seen_leaves_the_picture_of_the_others(changes):
+def test_what_cannot_be_seen_leaves_the_image_of_the_others(changes):
     """With any least alpha."""
     scene = Held()
     others = {name: np.delete(values, SEEN, axis=0) for name, values in scene.held.items()}
@@ -98,7 +98,7 @@ def test_the_sign_of_a_standard_deviation_means_nothing():
 
 
 def test_a_to_world_that_mirrors_makes_the_mirror_image(tmp_path):
-    """Before a camera that is mirrored with it: of degree 0, the same picture."""
+    """Before a camera that is mirrored with it: of degree 0, the same image."""
     path = write_model(tmp_path / "model.ply", Scene(degree=0).gaussians)
     shape = {"type": "ellipsoids", "filename": path}
     mirror = mi.ScalarTransform4f().scale([-1, 1, 1])
@@ -111,7 +111,7 @@ def test_a_to_world_that_mirrors_makes_the_mirror_image(tmp_path):
 
 
 def test_the_derivative_at_an_opacity_of_one_is_that_of_the_inside():
-    """A splat behind all others, its peak beside the film: pictures are linear in its opacity."""
+    """A splat behind all others, its peak beside the film: images are linear in its opacity."""
     settings = {"alpha_cut": 0.0, "transmittance_stop": 0.0, "extent": 3.0}
     scene = Held(degree=0)
     camera = scene.camera

@@ -1,4 +1,4 @@
-"""Several shapes of ellipsoids, and the integrator's own Gaussians, in one picture."""
+"""Several shapes of ellipsoids, and the integrator's own Gaussians, in one image."""
 
 from __future__ import annotations
 

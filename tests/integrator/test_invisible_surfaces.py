@@ -1,4 +1,4 @@
-"""Surfaces that let all light pass change no picture, wherever they are."""
+"""Surfaces that let all light pass change no image, wherever they are."""
 
 from functools import cache
 
@@ -70,7 +70,7 @@ def placed(node) -> dict:
     return {k: v for k, v in node.items() if k != "z"} | {"to_world": to_world}
 
 
-def picture(objects, settings) -> np.ndarray:
+def rendered(objects, settings) -> np.ndarray:
     sensor = camera([0, 0, 4], [0, 0, 0], size=12)
     objects = {name: placed(node) for name, node in objects.items()}
     scene = scene_of(cloud(), **({"spp": 4, "max_depth": 4} | settings), sensor=sensor, **objects)
@@ -79,15 +79,15 @@ def picture(objects, settings) -> np.ndarray:
 
 @cache
 def without_panes(name) -> np.ndarray:
-    return picture(*SCENES[name])
+    return rendered(*SCENES[name])
 
 
 @pytest.mark.parametrize("z", [2.0, 0.05, -1.5], ids=["before", "amid", "behind"])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("pane", PANES)
-def test_what_is_invisible_changes_no_picture(pane, name, z):
+def test_what_is_invisible_changes_no_image(pane, name, z):
     objects, settings = SCENES[name]
-    found = picture(objects | {"pane": plane(z, PANES[pane])}, settings)
+    found = rendered(objects | {"pane": plane(z, PANES[pane])}, settings)
     expected = without_panes(name)
     np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
     assert expected.std() > 0.05

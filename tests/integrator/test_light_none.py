@@ -68,19 +68,19 @@ def load(tensors, objects, **settings):
 
 
 def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
-    """Of loading a scene, its picture, and derivatives with respect to the splats' colours."""
+    """Of loading a scene, its image, and derivatives with respect to the splats' colours."""
     dr.eval()  # what is still pending would be found here
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         scene = load(*arguments, **settings)
         params = mi.traverse(scene)
         dr.enable_grad(params["integrator.sh0"])
-        picture = mi.render(scene, params, seed=1, spp=1)
-        dr.backward(dr.mean(picture, axis=None))
+        rendered = mi.render(scene, params, seed=1, spp=1)
+        dr.backward(dr.mean(rendered, axis=None))
         gradient = np.array(dr.grad(params["integrator.sh0"]))
         assert gradient.any()
         dr.eval()
-        return drain_kernels(), [np.array(picture).tobytes(), gradient.tobytes()]
+        return drain_kernels(), [np.array(rendered).tobytes(), gradient.tobytes()]
 
 
 @pytest.mark.parametrize("objects", [dict, surfaces], ids=["splats alone", "splats and surfaces"])
@@ -91,8 +91,8 @@ def test_none_is_what_is_not_said(objects):
     assert len(plain[0]) > 30
     assert kernels_and_bytes(tensors, objects(), light="none") == plain
 
-    pictures = [image_of(load(tensors, surfaces(), light=light)) for light in ("rays", "none")]
-    assert np.abs(pictures[0] - pictures[1]).max() > 0.1
+    images = [image_of(load(tensors, surfaces(), light=light)) for light in ("rays", "none")]
+    assert np.abs(images[0] - images[1]).max() > 0.1
     assert kernels_and_bytes(tensors, objects()) == plain
     assert kernels_and_bytes(tensors, objects(), light="none") == plain
 
@@ -111,14 +111,14 @@ def test_without_surfaces_there_is_no_light_to_pass():
 def test_a_nested_integrator_forgets_the_light_of_the_one_it_was_nested_in_before():
     tensors, shared = gaussians(), mi.load_dict({"type": "splatpath"})
 
-    def picture(nested, **settings):
+    def rendered(nested, **settings):
         return image_of(load(tensors, surfaces(), nested=nested, **settings), seed=1)
 
-    dark = picture({"type": "splatpath"})
-    lit = picture(shared, light="rays")
+    dark = rendered({"type": "splatpath"})
+    lit = rendered(shared, light="rays")
     assert np.abs(lit - dark).max() > 0.1
-    np.testing.assert_array_equal(picture(shared, light="none"), dark)
-    np.testing.assert_array_equal(picture(shared, light="rays"), lit)
+    np.testing.assert_array_equal(rendered(shared, light="none"), dark)
+    np.testing.assert_array_equal(rendered(shared, light="rays"), lit)
 
 
 IMPORTS = """

@@ -1,4 +1,4 @@
-"""The readable twin of ``splats`` gives its pictures and gradients, to the last bit."""
+"""The readable twin of ``splats`` gives its images and gradients, to the last bit."""
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +24,7 @@ def ply(tmp_path_factory):
 
 
 @pytest.mark.parametrize("pixel_format", ["rgb", "rgba"])
-def test_pictures_and_gradients_are_those_of_splats_at_its_defaults(ply, pixel_format):
+def test_images_and_gradients_are_those_of_splats_at_its_defaults(ply, pixel_format):
     results = []
     for kind in ("splats", "splats_minimal"):
         sensor = VIEWS[1].sensor(pixel_format)

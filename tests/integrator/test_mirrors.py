@@ -50,14 +50,14 @@ def scene(light="probe", splats=None, probes="floor", **others):
     return scene_of(splats, light=light, spp=16, max_depth=4, **settings, **objects)
 
 
-def picture(*arguments, **others):
+def rendered(*arguments, **others):
     return np.array(mi.render(scene(*arguments, **others), seed=3), np.float64)
 
 
 def of_three(probes="floor", **others):
-    """Pictures without light, with probes, and with rays."""
-    own = picture(None, **others), picture(probes=probes, **others)
-    return *own, picture("rays", **others)
+    """Images without light, with probes, and with rays."""
+    own = rendered(None, **others), rendered(probes=probes, **others)
+    return *own, rendered("rays", **others)
 
 
 def test_a_mirror_shows_what_the_mirrored_camera_sees(monkeypatch):
@@ -150,7 +150,7 @@ def test_rough_mirrors_and_mirrors_in_mirrors_are_seen_from_the_mirrored_camera(
         assert metrics.psnr(none, rays) < 24
 
 
-def test_pictures_are_kept_until_something_changes(monkeypatch):
+def test_images_are_kept_until_something_changes(monkeypatch):
     counts, of = [], Mirrors.of
     monkeypatch.setattr(Mirrors, "of", lambda *values: counts.append(1) or of(*values))
     ball = {"type": "sphere", "radius": 0.3, "to_world": at(0.1, 0.9, 0)}

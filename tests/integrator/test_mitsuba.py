@@ -24,7 +24,7 @@ from support.calibrated_sensors import (
 from support.helpers import clear
 from support.lens_scenes import points_at
 from support.openexr import read_exr
-from support.splats_checks import GRADIENTS, PICTURE, write_gaussians
+from support.splats_checks import GRADIENTS, IMAGE, write_gaussians
 from support.splats_checks import XYZ as TO_XYZ
 from support.views import VIEWS, Scene, View, gradient, image_of, tensors
 
@@ -163,7 +163,7 @@ COLORS = {"luminance": TO_XYZ[1:2], "xyz": TO_XYZ, "rgb": np.eye(3)}
 @pytest.mark.parametrize("component_format", ["float16", "float32"])
 @pytest.mark.parametrize("alpha", [False, True], ids=["without alpha", "with alpha"])
 @pytest.mark.parametrize("colors", COLORS)
-def test_every_format_of_a_film_holds_the_same_picture(colors, alpha, component_format, tmp_path):
+def test_every_format_of_a_film_holds_the_same_image(colors, alpha, component_format, tmp_path):
     scene = clear(Scene(srgb_primitives=True))
     names = {"luminance": "luminance_alpha", "xyz": "xyza", "rgb": "rgba"}
     pixel_format = names[colors] if alpha else colors
@@ -172,9 +172,9 @@ def test_every_format_of_a_film_holds_the_same_picture(colors, alpha, component_
     expected = scene.image()
     expected = np.dstack([expected[..., :3] @ COLORS[colors].T, *([expected[..., 3]] * alpha)])
     # Mitsuba rounds the weights of luminance to four digits.
-    tolerance = 1e-3 if colors == "luminance" else PICTURE
+    tolerance = 1e-3 if colors == "luminance" else IMAGE
     np.testing.assert_allclose(image, expected, rtol=0, atol=tolerance * expected.max())
-    path = str(tmp_path / "picture.exr")
+    path = str(tmp_path / "image.exr")
     with openexr_threads():
         loaded.sensors()[0].film().write(path)
     bitmap = read_exr(path)
@@ -188,7 +188,7 @@ def test_every_format_of_a_film_holds_the_same_picture(colors, alpha, component_
 @pytest.mark.parametrize(
     "film", [{"samples": 3}, {"samples": 2, "rfilter": "gaussian"}], ids=["box", "gaussian"]
 )
-def test_develop_false_leaves_sampled_pictures_in_the_film(film):
+def test_develop_false_leaves_sampled_images_in_the_film(film):
     loaded = Scene(count=12).load(**film)
     assert dr.width(loaded.integrator().render(loaded, seed=2, develop=False)) == 0
     developed = np.array(loaded.sensors()[0].film().develop())
@@ -298,7 +298,7 @@ XML = """
 
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
-def test_xml_and_dictionary_give_the_same_picture(kind, tmp_path):
+def test_xml_and_dictionary_give_the_same_image(kind, tmp_path):
     scene, path = Scene(VIEW), tmp_path / "splats.ply"
     write_gaussians(path, scene.gaussians)
     sensor = VIEW.sensor(samples=4, sampler="stratified")

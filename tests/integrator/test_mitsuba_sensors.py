@@ -80,12 +80,12 @@ def test_points_on_the_rays_of_an_orthographic_sensor_are_seen_where_they_start(
 
 
 @pytest.mark.parametrize("factors", [(2.0, 2.0, 1.0), (2.0, 1.5, 1.0)])
-def test_an_orthographic_picture_is_that_of_the_reference(factors):
+def test_an_orthographic_image_is_that_of_the_reference(factors):
     view = View("", 53, 41, crop=WINDOW, to_world=scaled(VIEWS[1].to_world, *factors))
     sensor = Calibrated("orthographic", view=view)
     camera = own_camera(view)
     plain = replace(view, to_world=VIEWS[1].to_world)
-    gaussians, picture = clear_gaussians(
+    gaussians, rendered = clear_gaussians(
         sensor,
         lambda gaussians: effects.render(
             gaussians, camera, Orthographic(), threshold_width=NEAR_THRESHOLD
@@ -93,26 +93,26 @@ def test_an_orthographic_picture_is_that_of_the_reference(factors):
         view=plain,
     )
     image = image_of(splats_scene(own_sensor("orthographic", view), gaussians))
-    expected = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+    expected = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
     np.testing.assert_allclose(image, expected[view.window], rtol=0, atol=5e-5)
     assert image[..., 3].max() > 0.8
 
 
-def test_a_picture_through_a_thin_lens_is_that_of_the_reference():
+def test_a_image_through_a_thin_lens_is_that_of_the_reference():
     view = View("", 53, 41, crop=WINDOW)
     sensor = Calibrated("thin lens", view=view)
     camera, defocus = replace(view.camera, near=0.01), ThinLens(0.125, 3.0)
-    gaussians, picture = clear_gaussians(
+    gaussians, rendered = clear_gaussians(
         sensor,
         lambda gaussians: effects.render(
             gaussians, camera, defocus=defocus, threshold_width=NEAR_THRESHOLD
         ),
     )
     image = image_of(splats_scene(own_sensor("thinlens", view), gaussians))
-    expected = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+    expected = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
     np.testing.assert_allclose(image, expected[view.window], rtol=0, atol=5e-5)
     in_focus = effects.render(gaussians, camera)
-    assert np.abs(in_focus.image - picture.image)[view.window].max() > 0.05
+    assert np.abs(in_focus.image - rendered.image)[view.window].max() > 0.05
 
 
 def test_colours_along_rays_turn_with_a_rolling_shutter():

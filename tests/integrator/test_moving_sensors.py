@@ -47,7 +47,7 @@ SENSORS = [
 SAMPLES = 3
 
 
-def picture_by_reference(sensor, gaussians, threshold_width=1e-4) -> reference.Picture:
+def image_by_reference(sensor, gaussians, threshold_width=1e-4) -> reference.RenderedImage:
     """Of the whole film, on black."""
     camera = replace(sensor.camera, near=0.01)
     case = PluginCase(
@@ -55,7 +55,7 @@ def picture_by_reference(sensor, gaussians, threshold_width=1e-4) -> reference.P
         far_camera=replace(sensor.close_camera, near=0.01),
         samples=SAMPLES if sensor.shutter == "global" else 0,
     )  # fmt: skip
-    return case.reference_picture(gaussians, threshold_width)
+    return case.reference_image(gaussians, threshold_width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +71,12 @@ class PluginCase(MovingCase):
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{s.name}, {s.shutter}")
-def test_a_calibrated_sensors_picture_is_that_of_the_reference(variant, sensor):
-    gaussians, picture = clear_gaussians(
-        sensor, lambda gaussians: picture_by_reference(sensor, gaussians)
+def test_a_calibrated_sensors_image_is_that_of_the_reference(variant, sensor):
+    gaussians, rendered = clear_gaussians(
+        sensor, lambda gaussians: image_by_reference(sensor, gaussians)
     )
     scene = splats_scene(replace_samples(sensor), gaussians)
-    expected = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+    expected = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
     np.testing.assert_allclose(image_of(scene), expected[sensor.view.window], rtol=0, atol=5e-5)
     still = image_of(splats_scene(replace(sensor, close=None), gaussians))
     assert np.abs(still - expected[sensor.view.window]).max() > 0.02
@@ -90,7 +90,7 @@ def replace_samples(sensor) -> dict:
 def test_gradients_add_up_over_the_times(variant, sensor):
     """Of mi.render, in single precision, against differences of the float64 reference."""
     gaussians, _ = clear_gaussians(
-        sensor, lambda gaussians: picture_by_reference(sensor, gaussians, threshold_width=1e-3)
+        sensor, lambda gaussians: image_by_reference(sensor, gaussians, threshold_width=1e-3)
     )
     rows_of_window, columns = sensor.view.window
     shape = rows_of_window.stop - rows_of_window.start, columns.stop - columns.start, 4
@@ -100,8 +100,8 @@ def test_gradients_add_up_over_the_times(variant, sensor):
     step = 1e-6
 
     def loss(sign, direction) -> np.ndarray:
-        picture = picture_by_reference(sensor, moved(gaussians, direction, sign * step))
-        image = np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+        rendered = image_by_reference(sensor, moved(gaussians, direction, sign * step))
+        image = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
         return weights * image[sensor.view.window]
 
     for parameter, direction in directions(gaussians, seed=2).items():
@@ -114,7 +114,7 @@ def test_gradients_add_up_over_the_times(variant, sensor):
 def test_poses_that_kernels_share_change_no_byte(variant, monkeypatch):
     """Of more than :data:`PASSES_PER_KERNEL`, which are compiled in parts."""
     gaussians, _ = clear_gaussians(
-        SENSORS[0], lambda gaussians: picture_by_reference(SENSORS[0], gaussians)
+        SENSORS[0], lambda gaussians: image_by_reference(SENSORS[0], gaussians)
     )
     sensor = SENSORS[0].dictionary(shutter_samples=5)
     weights = np.random.default_rng(1).normal(0, 1, (21, 26, 4))
@@ -129,9 +129,7 @@ def test_poses_that_kernels_share_change_no_byte(variant, monkeypatch):
 
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
 def test_forward_derivatives_of_a_moving_camera_are_the_transpose(variant, sensor):
-    gaussians, _ = clear_gaussians(
-        sensor, lambda gaussians: picture_by_reference(sensor, gaussians)
-    )
+    gaussians, _ = clear_gaussians(sensor, lambda gaussians: image_by_reference(sensor, gaussians))
     scene = splats_scene(replace_samples(sensor), gaussians)
     weights = single(np.random.default_rng(1).normal(0, 1, image_of(scene).shape))
     gradients = gradients_of(scene, weights, PARAMETER_NAMES)

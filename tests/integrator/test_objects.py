@@ -218,7 +218,7 @@ def test_an_object_that_stands_twice_receives_both_derivatives():
 
 
 def test_gradient_descent_finds_where_an_object_stands():
-    """One of two, turned by 12 degrees and moved by a fifth of a unit, from one picture."""
+    """One of two, turned by 12 degrees and moved by a fifth of a unit, from one image."""
     scene = load(nested())
     true = {"axis_angle": [0.12, -0.15, 0.1], "position": [0.15, -0.1, 0.08]}
     middle = np.mean(MODELS["lego"].means, axis=0).tolist()

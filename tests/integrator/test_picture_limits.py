@@ -1,4 +1,4 @@
-"""Pictures that ask for more than there is are refused before anything is allocated or compiled."""
+"""Images that ask for more than there is are refused before anything is allocated or compiled."""
 
 import mitsuba as mi
 import numpy as np
@@ -47,7 +47,7 @@ def test_counts_of_samples_that_cannot_be_taken_are_refused(sampler, count):
     elif count:
         assert refusal(scene) == (
             f"splats: a pixel can have at most 4,096 samples, got {taken:,}; take the mean of "
-            "pictures with other seeds, or, for surfaces alone, set nested_spp"
+            "images with other seeds, or, for surfaces alone, set nested_spp"
         )
     else:
         assert np.isfinite(np.array(mi.render(scene))).all()
@@ -115,7 +115,7 @@ def test_samples_of_surfaces_that_cannot_be_held_or_counted_are_refused(
     )
     assert refusal(scene) == (
         f"splats: on a film of 37 x 23 px, nested_spp (or spp) must be at most "
-        f"{most // (37 * 23):,}, got 1,000,000,000; take the mean of pictures with other "
+        f"{most // (37 * 23):,}, got 1,000,000,000; take the mean of images with other "
         "seeds"
     )
     with pytest.raises(RuntimeError, match=f"nested_spp must be an integer from 0 to {MAX_INT}"):

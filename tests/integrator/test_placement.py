@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.ellipsoids import GRADIENTS, PICTURE, ROTATION, SCALE, TRANSLATION, assert_images_agree
+from support.ellipsoids import GRADIENTS, IMAGE, ROTATION, SCALE, TRANSLATION, assert_images_agree
 from support.helpers import assert_arrays_agree, clear, single
 from support.smoothing import smoothed_reference
 from support.views import Scene, gradient, gradients_of, image_of, tensors
@@ -62,21 +62,21 @@ def load(scene, model, matrix=MATRIX, **settings) -> mi.Scene:
     return mi.load_dict({"type": "scene", "integrator": settings, "sensor": scene.view.sensor()})
 
 
-def picture(scene, gaussians) -> np.ndarray:
+def rendered(scene, gaussians) -> np.ndarray:
     return scene.image(reference.render(gaussians, scene.camera, np.zeros(3), 3))
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
 def test_a_moved_object_looks_as_the_reference_draws_its_gaussians():
     scene, model = scene_and_object()
-    expected = picture(scene, moved_by(MATRIX, model))
+    expected = rendered(scene, moved_by(MATRIX, model))
     given = load(scene, model)
-    assert_images_agree(image_of(given), expected, 3 * PICTURE)
-    assert np.abs(expected - picture(scene, model)).max() > 0.1
+    assert_images_agree(image_of(given), expected, 3 * IMAGE)
+    assert np.abs(expected - rendered(scene, model)).max() > 0.1
     later = load(scene, model, matrix=None)
     params = mi.traverse(later)
     params[KEY] = mi.Transform4f(MATRIX)
@@ -107,7 +107,7 @@ def test_a_moved_object_looks_as_a_file_saved_moved(tmp_path):
 
     expected = image_of(file("moved.ply"))
     place = mi.ScalarTransform4f(MATRIX)
-    assert_images_agree(image_of(file("object.ply", to_world=place)), expected, 3 * PICTURE)
+    assert_images_agree(image_of(file("object.ply", to_world=place)), expected, 3 * IMAGE)
     unfiltered = image_of(file("moved.ply", ignore="smoothing"))
     assert np.abs(unfiltered - expected).max() > 0.02
 
@@ -196,7 +196,7 @@ def slopes() -> np.ndarray:
     for cell in np.ndindex(3, 4):
         step = np.zeros((4, 4))
         step[cell] = STEP
-        ends = [picture(scene, moved_by(MATRIX + s * step, model)) for s in (1, -1)]
+        ends = [rendered(scene, moved_by(MATRIX + s * step, model)) for s in (1, -1)]
         found[cell] = np.sum(scene.weights() * (ends[0] - ends[1])) / (2 * STEP)
     return found
 
@@ -210,7 +210,7 @@ def test_a_filter_that_grows_with_an_object_is_differentiated():
     def loss(matrix):
         k = Similarity.of(matrix, "it").scale
         return np.sum(
-            weights * picture(scene, smoothed_reference(moved_by(matrix, model), k * filters))
+            weights * rendered(scene, smoothed_reference(moved_by(matrix, model), k * filters))
         )
 
     smoothing = {"smoothing": mi.TensorXf(filters.astype(np.float32))}
@@ -248,7 +248,7 @@ def test_an_object_that_is_not_moved_has_the_same_derivatives():
     weights, world = scene.weights(), scene.gaussians
 
     def loss(matrix):
-        return np.sum(weights * picture(scene, moved_by(matrix, world)))
+        return np.sum(weights * rendered(scene, moved_by(matrix, world)))
 
     for cell in [(0, 1), (1, 3), (2, 2)]:
         step = np.zeros((4, 4))

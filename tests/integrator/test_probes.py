@@ -48,7 +48,7 @@ def test_a_mirror_ball_reflects_what_rays_show():
     rays = render(splats, spp=16, light_samples=0, **mirror_ball())
     probe = render(splats, light="probe", probes="ball", spp=16, **mirror_ball())
     none = render(splats, light="none", spp=16, **mirror_ball())
-    errors = [((picture - rays) ** 2).mean() for picture in (probe, none)]
+    errors = [((rendered - rays) ** 2).mean() for rendered in (probe, none)]
     assert errors[0] < 1e-3 < 0.02 < errors[1]
 
 

@@ -1,4 +1,4 @@
-"""From dataset views and Gaussians to Mitsuba objects that render the same picture."""
+"""From dataset views and Gaussians to Mitsuba objects that render the same image."""
 
 import math
 from dataclasses import fields, replace
@@ -155,16 +155,16 @@ def test_pixels_that_are_nearly_square_move_by_less_than_said():
 
 def expected_image(gaussians, view, near, antialiased):
     parameters = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
-    picture = reference.render(
+    rendered = reference.render(
         reference.Gaussians(**parameters), reference_camera(view, near), BACKGROUND,
         antialiased=antialiased, threshold_width=NEAR_THRESHOLD,
     )  # fmt: skip
-    assert not picture.near_threshold.any(), "choose another seed"
-    return picture.image
+    assert not rendered.near_threshold.any(), "choose another seed"
+    return rendered.image
 
 
 @pytest.mark.parametrize("antialiased, near", [(False, 0.01), (True, 0.25)])
-def test_a_scene_renders_the_views_picture_in_display_space(antialiased, near):
+def test_a_scene_renders_the_views_image_in_display_space(antialiased, near):
     view = make_view()
     gaussians = make_gaussians(view)
     model = ModelConfig(low_pass=0.3, antialiased=antialiased, near=near)
@@ -175,19 +175,19 @@ def test_a_scene_renders_the_views_picture_in_display_space(antialiased, near):
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
 
 
-def test_derivatives_are_possible_between_two_pictures_and_when_no_more_are_asked_for():
-    """A command that was interrupted leaves pictures that nobody takes."""
+def test_derivatives_are_possible_between_two_images_and_when_no_more_are_asked_for():
+    """A command that was interrupted leaves images that nobody takes."""
     view = make_view()
     scene = make_scene(make_gaussians(view), ModelConfig(**USUAL), BACKGROUND)
-    pictures = render_views(scene, [view] * 3)
-    next(pictures)
+    renders = render_views(scene, [view] * 3)
+    next(renders)
     x = mi.Float(2)
     dr.enable_grad(x)
     dr.backward(x * x)
     assert dr.grad(x) == 4
 
 
-def test_settings_of_the_model_change_the_picture():
+def test_settings_of_the_model_change_the_image():
     """Or the test above would show nothing."""
     view = make_view()
     gaussians = make_gaussians(view)

@@ -56,16 +56,16 @@ def transform_at(to_world, turn, shift):
     return mi.Transform4f(to_world) @ change.rotate([float(a) for a in AXIS], dr.rad2deg(turn))
 
 
-def rgba(picture) -> np.ndarray:
-    return np.concatenate([picture.image, picture.alpha[..., None]], axis=-1)
+def rgba(rendered) -> np.ndarray:
+    return np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A sensor, its parameters at the start, and the float64 picture (H, W, 4) at other ones."""
+    """A sensor, its parameters at the start, and the float64 image (H, W, 4) at other ones."""
 
     name: str
-    picture: Callable  # of a scene and values by name
+    rendered: Callable  # of a scene and values by name
     start: dict  # by name; turn and shift are of to_world, with _close of to_world_close
     view: View = VIEWS[1]
     sensor: dict = field(default_factory=dict)  # instead of a perspective one
@@ -87,10 +87,10 @@ class Case:
         return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
     def at(self, scene, name, step) -> np.ndarray:
-        return self.picture(scene, {**self.start, name: self.start[name] + step})
+        return self.rendered(scene, {**self.start, name: self.start[name] + step})
 
     def difference(self, scene, name) -> np.ndarray:
-        """Of the picture's window, (H, W, 4)."""
+        """Of the image's window, (H, W, 4)."""
         step = STEP * max(1.0, abs(self.start[name]))
         return (self.at(scene, name, step) - self.at(scene, name, -step)) / (2 * step)
 
@@ -113,8 +113,8 @@ def with_intrinsics(camera, values) -> reference.Camera:
     return replace(camera, **{name: values[name] for name in names if name in values})
 
 
-def perspective_picture(view):
-    def picture(scene, values):
+def perspective_image(view):
+    def rendered(scene, values):
         camera = camera_of(replace(view, fov=values.get("x_fov", view.fov)), values)
         size, offsets = (camera.width, camera.height), ("offset_x", "offset_y")
         if "offset_x" in values:
@@ -122,36 +122,36 @@ def perspective_picture(view):
             camera = replace(camera, cx=cx, cy=cy)
         return rgba(reference.render(scene.gaussians, camera, BACKGROUND))[view.window]
 
-    return picture
+    return rendered
 
 
-def lens_picture(kind, names):
-    def picture(scene, values):
+def lens_image(kind, names):
+    def rendered(scene, values):
         camera = with_intrinsics(camera_of(VIEWS[1], values), values)
         lens = kind(**{name: values[name] for name in names})
         return rgba(effects.render(scene.gaussians, camera, lens, BACKGROUND))
 
-    return picture
+    return rendered
 
 
-def thin_lens_picture(scene, values):
+def thin_lens_image(scene, values):
     camera = camera_of(replace(VIEWS[1], fov=values["x_fov"]), values)
     blur = effects.ThinLens(values["aperture_radius"], values["focus_distance"])
     return rgba(effects.render(scene.gaussians, camera, background=BACKGROUND, defocus=blur))
 
 
-def orthographic_picture(scene, values):
+def orthographic_image(scene, values):
     camera = camera_of(VIEWS[1], values)
     camera = replace(camera, fx=camera.width / 2, fy=camera.width / 2)
     return rgba(effects.render(scene.gaussians, camera, effects.Orthographic(), BACKGROUND))
 
 
-def blurred_picture(scene, values):
+def blurred_image(scene, values):
     cameras = [with_intrinsics(c(VIEWS[1], values), values) for c in (camera_of, closing)]
     return rgba(effects.render_motion_blur(scene.gaussians, *cameras, 2, BACKGROUND))
 
 
-def rolling_picture(scene, values):
+def rolling_image(scene, values):
     """By the kernels in double precision: the reference has a time for each row, not each splat."""
     opened, closed = (with_intrinsics(c(VIEWS[1], values), values) for c in (camera_of, closing))
     camera: Camera = device_camera(opened, FLOAT64)
@@ -180,49 +180,49 @@ def calibrated(**values):
 CASES = {
     case.name: case
     for case in (
-        Case("perspective", perspective_picture(VIEWS[1]), {**POSE, "x_fov": 50.0}),
+        Case("perspective", perspective_image(VIEWS[1]), {**POSE, "x_fov": 50.0}),
         Case(
             "off-centre crop window",
-            perspective_picture(VIEWS[13]),
+            perspective_image(VIEWS[13]),
             {**POSE, "x_fov": 50.0, "offset_x": 0.125, "offset_y": 0.0625},
             view=VIEWS[13],
         ),
         Case(
             "thin lens",
-            thin_lens_picture,
+            thin_lens_image,
             {**POSE, "x_fov": 50.0, "aperture_radius": 0.0625, "focus_distance": 2.0},
             sensor={
                 "type": "thinlens", "fov": 50.0, "aperture_radius": 0.0625, "focus_distance": 2.0
             },
         ),
-        Case("orthographic", orthographic_picture, POSE, sensor={"type": "orthographic"}),
+        Case("orthographic", orthographic_image, POSE, sensor={"type": "orthographic"}),
         Case(
             "calibrated",
-            lens_picture(effects.Pinhole, ()),
+            lens_image(effects.Pinhole, ()),
             {**POSE, **INTRINSICS},
             sensor=calibrated(**INTRINSICS),
         ),
         Case(
             "opencv",
-            lens_picture(effects.OpenCV, tuple(OPENCV)),
+            lens_image(effects.OpenCV, tuple(OPENCV)),
             {**POSE, **INTRINSICS, **OPENCV},
             sensor=calibrated(**INTRINSICS, lens="opencv", **OPENCV),
         ),
         Case(
             "fisheye",
-            lens_picture(effects.Fisheye, tuple(FISHEYE)),
+            lens_image(effects.Fisheye, tuple(FISHEYE)),
             {**POSE, **INTRINSICS, **FISHEYE},
             sensor=calibrated(**INTRINSICS, lens="fisheye", **FISHEYE),
         ),
         Case(
             "thin prism",
-            lens_picture(effects.ThinPrismFisheye, tuple(THIN_PRISM)),
+            lens_image(effects.ThinPrismFisheye, tuple(THIN_PRISM)),
             {**INTRINSICS, **THIN_PRISM},
             sensor=calibrated(**INTRINSICS, lens="thin_prism_fisheye", **THIN_PRISM),
         ),
         Case(
             "global shutter",
-            blurred_picture,
+            blurred_image,
             {**POSE, **CLOSE_POSE, **INTRINSICS},
             sensor=calibrated(
                 **INTRINSICS, to_world_close=lambda: mi.ScalarTransform4f(CLOSE), shutter_samples=2
@@ -230,7 +230,7 @@ CASES = {
         ),
         Case(
             "rolling shutter",
-            rolling_picture,
+            rolling_image,
             {**POSE, **CLOSE_POSE, **INTRINSICS},
             sensor=calibrated(
                 **INTRINSICS, to_world_close=lambda: mi.ScalarTransform4f(CLOSE), shutter="rolling"
@@ -247,11 +247,11 @@ every_parameter = pytest.mark.parametrize(
 
 @cache
 def clear_scene(name) -> Scene:
-    """Where single precision decides as double precision does: both pictures agree everywhere."""
+    """Where single precision decides as double precision does: both images agree everywhere."""
     case = CASES[name]
     for seed in range(40):
         scene = Scene(case.view, seed=seed)
-        expected = case.picture(scene, case.start)
+        expected = case.rendered(scene, case.start)
         if np.abs(image_of(case.load(scene)) - expected).max() < 1e-5:
             return scene
     raise AssertionError(f"{name}: no clear seed")
@@ -345,7 +345,7 @@ def test_forward_and_backward_derivatives_are_transposed(name):
 
 
 @all_cases
-def test_two_pictures_have_twice_the_derivatives_of_one(name):
+def test_two_images_have_twice_the_derivatives_of_one(name):
     """Of what the sensor's parameters were computed from, in two passes; sums of the same terms."""
     case, scene = CASES[name], clear_scene(name)
     weights = single(np.random.default_rng(3).normal(size=image_of(case.load(scene)).shape))
@@ -362,13 +362,13 @@ def test_derivatives_in_linear_radiance():
     """The conversion to what films expect comes after the background, the last splat."""
     case, scene = CASES["perspective"], clear_scene("perspective")
 
-    def picture(step):
+    def rendered(step):
         camera = camera_of(case.view, {"turn": step})
         premultiplied = reference.render(scene.gaussians, camera, np.zeros(3))
         whole = premultiplied.image + premultiplied.transmittance[..., None] * BACKGROUND
         return np.concatenate([to_linear(whole), premultiplied.alpha[..., None]], axis=-1)
 
-    expected = (picture(STEP) - picture(-STEP)) / (2 * STEP)
+    expected = (rendered(STEP) - rendered(-STEP)) / (2 * STEP)
     weights = weights_like(expected)
     loaded = case.load(scene, srgb_primitives=True)
     (actual,) = backward(loaded, weights, "turn")
@@ -380,9 +380,9 @@ def test_derivatives_of_depth_and_alpha_channels():
 
     def channels(step):
         camera = camera_of(case.view, {"shift": step})
-        picture = reference.render(scene.gaussians, camera, BACKGROUND)
+        rendered = reference.render(scene.gaussians, camera, BACKGROUND)
         return np.concatenate(
-            [rgba(picture), picture.depth[..., None], picture.alpha[..., None]], axis=-1
+            [rgba(rendered), rendered.depth[..., None], rendered.alpha[..., None]], axis=-1
         )
 
     expected = (channels(STEP) - channels(-STEP)) / (2 * STEP)
@@ -425,7 +425,7 @@ def test_several_samples_per_pixel_have_derivatives():
 
     loaded = case.load(scene, **endless)
     params, number = attach(loaded, "turn")
-    # Mitsuba wants other points for the derivatives than for the picture.
+    # Mitsuba wants other points for the derivatives than for the image.
     image = mi.render(loaded, params, spp=16, seed=1, seed_grad=5)
     dr.backward(dr.sum(image * tensor(weights), axis=None))
     expected = (value(step) - value(-step)) / (2 * step)

@@ -92,12 +92,12 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     if has_sky:
         mirror["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.0}}
     origins, directions = pixel_rays(mi.load_dict(mirror["sensor"]))
-    picture = along_rays(scene_of(splats, light_samples=0, **mirror), origins, directions)
+    rendered = along_rays(scene_of(splats, light_samples=0, **mirror), origins, directions)
     mirrored = gaussians(means * [1, 1, -1], 0.3, 0.7)
     mirrored = splatting.Gaussians(**{**vars(splats), "means": mirrored.means})
     seen = reference.pass_splats(mirrored, origins, directions, np.full(len(origins), np.inf))
     expected = radiance_of(seen, is_open=not has_sky)
-    np.testing.assert_allclose(picture, expected, atol=2e-4)
+    np.testing.assert_allclose(rendered, expected, atol=2e-4)
     assert expected.max() > 0.3
 
 
@@ -195,8 +195,8 @@ class Furnace:
             seen, mean = [*seen, 1 + of_lamp_there + bounced], 1 + of_lamp + bounced
         return seen
 
-    def pictures(self, max_depth, seeds) -> np.ndarray:
-        """Mean of the picture of each seed."""
+    def images(self, max_depth, seeds) -> np.ndarray:
+        """Mean of the image of each seed."""
         wall = {
             "type": "sphere",
             "flip_normals": True,
@@ -246,7 +246,7 @@ def test_bounces_in_a_furnace_of_fog_converge_to_its_radiance(furnace):
     """
     exact = np.array(furnace.radiances(50))
     exact = exact[np.array(DEPTHS) - 1]  # the last but one for -1: behind it, 0.4^49 is to come
-    found = np.array([furnace.pictures(depth, seeds=16) for depth in DEPTHS])
+    found = np.array([furnace.images(depth, seeds=16) for depth in DEPTHS])
     for radiance, expected in ((found, exact), (np.diff(found, axis=0), np.diff(exact))):
         error = radiance.std(axis=1, ddof=1) / np.sqrt(16)
         assert (np.abs(radiance.mean(axis=1) - expected) <= 4 * error + ROUNDING).all()
@@ -295,14 +295,14 @@ def test_glass_that_does_not_refract_changes_nothing():
         "sensor": camera([0, 0, 4], [0, 0, 0], size=16),
     }
     origins, directions = pixel_rays(mi.load_dict(slab["sensor"]))
-    picture = along_rays(scene_of(splats, light_samples=0, **slab), origins, directions)
+    rendered = along_rays(scene_of(splats, light_samples=0, **slab), origins, directions)
     seen = reference.pass_splats(splats, origins, directions, np.full(len(origins), np.inf))
-    np.testing.assert_allclose(picture, radiance_of(seen), atol=1e-3)
-    assert picture.max() > 0.3
+    np.testing.assert_allclose(rendered, radiance_of(seen), atol=1e-3)
+    assert rendered.max() > 0.3
 
 
 def test_materials_and_lamps_are_differentiated_among_splats():
-    """As central differences of pictures with many paths."""
+    """As central differences of images with many paths."""
     splats = gaussians([[0.3, 1.2, 0.5], [-0.8, 0.6, 0.4]], 0.4, 0.7, 0.8)
     objects = room()
     objects["sensor"] = camera([0, 2, 4], [0, 0.3, 0], size=8)

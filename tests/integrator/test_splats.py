@@ -1,4 +1,4 @@
-"""The ``splats`` integrator as a user of Mitsuba meets it: loading, variants, pictures, films."""
+"""The ``splats`` integrator as a user of Mitsuba meets it: loading, variants, images, films."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from support.helpers import clear
 from support.openexr import read_exr
 from support.splats_checks import (
     GRADIENTS,
-    PICTURE,
+    IMAGE,
     all_settings,
     assert_images_agree,
     both_color_spaces,
@@ -59,7 +59,7 @@ def scene_xml(view, integrator) -> str:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_a_file_and_tensors_give_the_same_picture(degree, tmp_path):
+def test_a_file_and_tensors_give_the_same_image(degree, tmp_path):
     scene = Scene(degree=degree)
     write_gaussians(tmp_path / "model.ply", scene.gaussians)
     settings = scene.settings | {"filename": str(tmp_path / "model.ply")}
@@ -243,7 +243,7 @@ print(max(errors[name] for name in ("image", *gradients)))
 """
 
 
-def test_picture_and_gradients_on_a_gpu(run_python):
+def test_image_and_gradients_on_a_gpu(run_python):
     result = run_python(CUDA)
     if "no CUDA" in result.stderr:
         pytest.skip("cuda_ad_rgb is not usable here")
@@ -252,25 +252,25 @@ def test_picture_and_gradients_on_a_gpu(run_python):
 
 
 # ----------------------------------------------------------------------------------------------
-# The picture
+# The image
 # ----------------------------------------------------------------------------------------------
 
 
 @all_views
 @both_color_spaces
-def test_picture_equals_the_reference_from_any_view(view, srgb_primitives):
-    """The picture of a crop window is compared with a part of the reference's whole picture."""
+def test_image_equals_the_reference_from_any_view(view, srgb_primitives):
+    """The image of a crop window is compared with a part of the reference's whole image."""
     scene = clear(Scene(view, srgb_primitives=srgb_primitives))
     assert_images_agree(fresh_image(scene), scene.image())
 
 
 @all_settings
-def test_picture_equals_the_reference_for_any_setting(scene):
+def test_image_equals_the_reference_for_any_setting(scene):
     scene = clear(scene)
     assert_images_agree(fresh_image(scene), scene.image())
 
 
-def test_every_setting_changes_the_picture():
+def test_every_setting_changes_the_image():
     """Or the comparison above would not show that it is heeded."""
     plain = Scene(degree=3)
     for changes in (
@@ -287,15 +287,15 @@ def test_every_setting_changes_the_picture():
 def test_pixels_near_a_threshold_are_all_that_may_differ():
     """Not a seed that avoids them: a few hundred splats on a larger film."""
     scene = Scene(View("large", 120, 90), count=300)
-    marked = scene.picture.near_threshold
+    marked = scene.rendered.near_threshold
     errors = np.abs(fresh_image(scene) - scene.image())
-    differs = (errors > PICTURE * np.abs(scene.image()).max()).any(axis=-1)
+    differs = (errors > IMAGE * np.abs(scene.image()).max()).any(axis=-1)
     assert marked.any() and not (differs & ~marked).any()
     assert differs.sum() <= max(1, 1e-4 * differs.size)
 
 
 @pytest.mark.parametrize("crop", [(13, 7, 29, 18), (40, 30, 13, 11), (0, 0, 5, 5)])
-def test_a_window_is_a_part_of_the_whole_picture(crop):
+def test_a_window_is_a_part_of_the_whole_image(crop):
     """Of splats so large that they reach into the window from far outside."""
     whole = Scene(View("whole", 53, 41))
     values = tensors(whole.gaussians)
@@ -374,7 +374,7 @@ def test_isolated_splats_look_as_volprim_rf_basic_draws_them():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_border_of_the_film_does_not_change_the_picture():
+def test_a_border_of_the_film_does_not_change_the_image():
     scene = Scene(VIEWS[-1])
     image = fresh_image(scene, rfilter="box", samples=1, sample_border=True)
     assert np.array_equal(image, fresh_image(scene, rfilter="box", samples=1))
@@ -391,19 +391,19 @@ def test_formats_of_the_film():
     assert np.allclose(luminance[..., 0], expected, rtol=1e-3)
 
 
-def test_the_film_holds_the_picture(tmp_path):
+def test_the_film_holds_the_image(tmp_path):
     scene = Scene()
     loaded = scene.load(component_format="float16")
     image = image_of(loaded)
     film = loaded.sensors()[0].film()
     assert np.array_equal(np.array(film.develop()), image.astype(np.float32))
     with openexr_threads():
-        film.write(str(tmp_path / "picture.exr"))
-    written = np.array(read_exr(tmp_path / "picture.exr")).astype(np.float64)
+        film.write(str(tmp_path / "image.exr"))
+    written = np.array(read_exr(tmp_path / "image.exr")).astype(np.float64)
     assert np.allclose(written, image, rtol=2**-11, atol=1e-6)
 
 
-def test_every_way_to_call_gives_the_same_picture():
+def test_every_way_to_call_gives_the_same_image():
     first, second = VIEWS[1], VIEWS[-1]
     scene = Scene(first)
     integrator = scene.settings | tensors(scene.gaussians)
@@ -437,7 +437,7 @@ def test_every_way_to_call_gives_the_same_picture():
         assert np.array_equal(np.array(image), two)
 
 
-def test_develop_false_leaves_the_picture_in_the_film():
+def test_develop_false_leaves_the_image_in_the_film():
     scene = Scene()
     loaded = scene.load()
     assert dr.width(loaded.integrator().render(loaded, develop=False)) == 0

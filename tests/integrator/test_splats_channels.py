@@ -36,7 +36,7 @@ def with_channels(scene, aovs="z:depth, a:alpha", sensor=None, **settings):
 
 def channels_of(scene, kinds) -> np.ndarray:
     """The window's channels besides colour, by the reference."""
-    planes = {"depth": scene.picture.depth, "alpha": scene.picture.alpha}
+    planes = {"depth": scene.rendered.depth, "alpha": scene.rendered.alpha}
     return np.stack([planes[kind] for kind in kinds], axis=-1)[scene.view.window]
 
 
@@ -126,8 +126,8 @@ def test_forward_mode_of_the_channels_equals_central_differences():
         values = dict(vars(scene.gaussians))
         for name, direction in directions.items():
             values[name] = values[name] + step * direction
-        picture = reference.render(reference.Gaussians(**values), scene.camera, np.zeros(3), 1)
-        return np.stack([picture.depth, picture.alpha], axis=-1)
+        rendered = reference.render(reference.Gaussians(**values), scene.camera, np.zeros(3), 1)
+        return np.stack([rendered.depth, rendered.alpha], axis=-1)
 
     expected = (at(STEP) - at(-STEP)) / (2 * STEP)
     assert_images_agree(tangent[..., 4:], expected, GRADIENTS)

@@ -60,7 +60,7 @@ print(digest.hexdigest())
 """
 
 
-def test_picture_and_gradients_have_the_same_bytes_in_every_process(run_python):
+def test_image_and_gradients_have_the_same_bytes_in_every_process(run_python):
     """Whatever the number of threads."""
     results = [run_python(DIGEST.format(threads=threads)) for threads in (1, 2, 3)]
     assert all(result.returncode == 0 for result in results), results[0].stderr
@@ -255,7 +255,7 @@ def test_a_changed_degree_is_rendered_again(renderings):
     ids=["rays", "unscented", "cuts"],
 )
 def test_approximations_are_parameters(approximations):
-    """The picture and its gradients are those of the pipeline that these approximations name."""
+    """The image and its gradients are those of the pipeline that these approximations name."""
     scene = Scene()
     integrator = mi.load_dict({"type": "splats", **tensors(scene.gaussians), **approximations})
     values = {k: float(v) if k == "low_pass" else v for k, v in approximations.items()}

@@ -176,10 +176,10 @@ ASIDE = View("aside", 31, 27, to_world=pose([0.3, -1.0, 0.5], 16, (0.6, -0.9, 0.
 def reference_gradients_from(view, scene, weights) -> dict[str, np.ndarray]:
     """Gradients for the Gaussians of ``scene``, seen from ``view``."""
     background = np.array(scene.background)
-    picture = reference.render(
+    rendered = reference.render(
         scene.gaussians, view.camera, background, threshold_width=NEAR_THRESHOLD
     )
-    assert not picture.near_threshold.any(), "choose another view"
+    assert not rendered.near_threshold.any(), "choose another view"
     return reference.render_gradients(
         scene.gaussians, view.camera, background, weights[..., :3], weights[..., 3]
     )
@@ -249,7 +249,7 @@ def test_last_holds_what_density_control_needs():
 
 
 def test_adam_reduces_the_loss():
-    """Every parameter starts somewhat off; the picture it had is the target."""
+    """Every parameter starts somewhat off; the image it had is the target."""
     scene = Scene(srgb_primitives=True)
     target = mi.TensorXf(fresh_image(scene).astype(np.float32))
     rng = np.random.default_rng(4)
@@ -272,7 +272,7 @@ def test_adam_reduces_the_loss():
 
 @pytest.mark.parametrize("count", [80, 20, 1], ids=["more", "fewer", "one"])
 def test_parameters_may_be_resized(count):
-    """The picture and the gradients are those of a scene that was loaded with the new ones."""
+    """The image and the gradients are those of a scene that was loaded with the new ones."""
     loaded = Scene().load()
     mi.render(loaded)
     resized = clear(Scene(count=count) if count >= 4 else Scene(count=4, seed=1))
@@ -311,11 +311,11 @@ def moved(scene, directions, step) -> np.ndarray:
             background = background + step * direction
         else:
             values[name] = values[name] + step * direction
-    picture = reference.render(
+    rendered = reference.render(
         reference.Gaussians(**values), scene.camera, np.zeros(3), scene.rendered_degree,
         scene.antialiased,
     )  # fmt: skip
-    return replace(scene, background=tuple(background)).image(picture)
+    return replace(scene, background=tuple(background)).image(rendered)
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_a_plan_names_what_asked_for_each_effect():
     defocused = plan_of(sensor_like(VIEWS[1], "thinlens", **BLURRED), sky=True, hide_emitters=True)
     assert "  depth of field: a thin lens (the sensor)\n" in defocused
     assert "  background: a constant colour (the integrator's background)\n" in defocused
-    picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))}
-    blurred = plan_of(sensor_like(VIEWS[1], **moving()), background=picture)
-    assert "  background: a picture (the integrator's background)\n" in blurred
+    rendered = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))}
+    blurred = plan_of(sensor_like(VIEWS[1], **moving()), background=rendered)
+    assert "  background: a image (the integrator's background)\n" in blurred
     assert "  motion: blurred (the sensor)\n" in blurred

@@ -237,7 +237,7 @@ def test_the_plan_of_sensors_regards_all_of_them():
         "  not simulated: lens (ignored), depth of field (ignored), motion (ignored), surfaces",
     ]
     plan = summary_of_sensors(rich_scene().state, cameras[:1], None, num_surfaces=2)
-    line = "  surfaces: a nested integrator's picture, between the splats (2 of the scene's shapes)"
+    line = "  surfaces: a nested integrator's image, between the splats (2 of the scene's shapes)"
     assert line in described(plan).splitlines()
     assert described(summary_of_sensors(ignoring.state, cameras[:1], None)).splitlines()[-1] == (
         "  not simulated: lens, depth of field, motion, surfaces"
@@ -393,7 +393,7 @@ def in_a_new_process(run_python, blocked=(), **changes) -> dict:
 
 
 def test_kernels_are_the_same_when_the_modules_of_effects_are_gone(run_python):
-    """Of a picture with its derivatives, and of a fit's iterations: hashes and operations."""
+    """Of a image with its derivatives, and of a fit's iterations: hashes and operations."""
     whole = in_a_new_process(run_python)
     reduced = in_a_new_process(run_python, blocked=MODULES)
     assert whole == reduced

@@ -1,4 +1,4 @@
-"""Derivatives of pictures with surfaces between splats; what runs, and when."""
+"""Derivatives of images with surfaces between splats; what runs, and when."""
 
 import gc
 import weakref
@@ -15,7 +15,7 @@ from support.views import (
     image_of,
     tensors,
 )
-from support.walls import GRADIENTS, PICTURE, SCENE, Wall, apart, blob, expected, load, rgba
+from support.walls import GRADIENTS, IMAGE, SCENE, Wall, apart, blob, expected, load, rgba
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
@@ -185,7 +185,7 @@ def test_gradients_are_the_same_to_the_last_bit():
 
 
 def counting():
-    """``path``, that counts its pictures."""
+    """``path``, that counts its images."""
 
     class Counting(mi.SamplingIntegrator):
         def __init__(self, props):
@@ -210,13 +210,13 @@ def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
     assert nested.count == 1
 
 
-@pytest.mark.parametrize("use", ["a picture", "a gradient", "a picture with gradients"])
+@pytest.mark.parametrize("use", ["a image", "a gradient", "a image with gradients"])
 @pytest.mark.parametrize("with_shapes", [False, True])
 def test_a_scene_is_freed_when_nobody_holds_it(use, with_shapes):
     """Though its integrator keeps what it saw of it."""
     loaded = load(SCENE, sky=True, shapes={"blob": blob([0, 0, 0])} if with_shapes else {})
     params = mi.traverse(loaded)
-    if use != "a picture":
+    if use != "a image":
         dr.enable_grad(params["integrator.means"], params[RADIANCE_KEY])
     image = mi.render(loaded, params)
     if use == "a gradient":
@@ -231,8 +231,8 @@ def test_samples_of_the_nested_integrator_are_not_those_of_the_splats():
     """Whatever the nested integrator writes into the sensor's sampler."""
     scene, weights = apart(SCENE), weights_of(SCENE)
     loaded = load(scene, nested_spp=16)
-    pictures = [image_of(loaded) for _ in range(2)]
-    np.testing.assert_array_equal(*pictures)
+    images = [image_of(loaded) for _ in range(2)]
+    np.testing.assert_array_equal(*images)
     gradients = [gradients_of(loaded, weights, ["means"])["means"] for _ in range(2)]
     np.testing.assert_array_equal(gradients[1], 2 * gradients[0])  # they are accumulated
     assert loaded.sensors()[0].sampler().sample_count() == 1
@@ -254,14 +254,14 @@ def test_a_nested_integrator_can_be_given():
     """``direct`` does not see a light by way of another surface."""
     scene = load(apart(SCENE), nested=mi.load_dict({"type": "direct"}))
     np.testing.assert_allclose(
-        image_of(scene), image_of(load(apart(SCENE))), rtol=0, atol=PICTURE * 2
+        image_of(scene), image_of(load(apart(SCENE))), rtol=0, atol=IMAGE * 2
     )
     assert "nested = " in str(scene.integrator())
 
 
 @pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
 def test_samples_of_the_nested_integrator_are_left_to_it(spp):
-    """Mitsuba's integrators leave their count with the sampler: the next picture is the same."""
+    """Mitsuba's integrators leave their count with the sampler: the next image is the same."""
     loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
     first = image_of(loaded, spp=spp, seed=3)
     assert loaded.sensors()[0].sampler().sample_count() == 1
@@ -269,7 +269,7 @@ def test_samples_of_the_nested_integrator_are_left_to_it(spp):
     np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
 
 
-def test_gradients_are_those_of_the_picture_whatever_the_nested_samples():
+def test_gradients_are_those_of_the_image_whatever_the_nested_samples():
     """Of splats at the centres of pixels, before a wall that covers the film and has no noise."""
     scene, weights = apart(SCENE), weights_of(SCENE)
     alone = gradients_of(load(scene), weights, ["means"])["means"]
@@ -288,7 +288,7 @@ def test_a_wall_that_has_moved_is_seen_where_it_is():
     np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, wall=Wall(z=2.9))))
 
 
-def test_a_picture_in_between_does_not_change_the_gradients():
+def test_a_image_in_between_does_not_change_the_gradients():
     scene, weights = apart(SCENE), weights_of(SCENE)
     loaded = load(scene)
     expected = gradients_of(loaded, weights, ["means"])["means"]
@@ -302,7 +302,7 @@ def test_a_picture_in_between_does_not_change_the_gradients():
 
 
 def test_gaussians_of_shapes_are_splats_and_no_surfaces():
-    """As if they were the integrator's own; they are left out of the nested picture."""
+    """As if they were the integrator's own; they are left out of the nested image."""
     scene = apart(SCENE)
     center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center
     one = {
@@ -316,5 +316,5 @@ def test_gaussians_of_shapes_are_splats_and_no_surfaces():
     together = {n: np.concatenate([v, [one[n]]]) for n, v in vars(scene.gaussians).items()}
     image = image_of(load(scene, shapes={"blob": blob(center)}))
     expected = image_of(load(scene, **tensors(reference.Gaussians(**together))))
-    np.testing.assert_allclose(image, expected, atol=PICTURE * expected.max())
+    np.testing.assert_allclose(image, expected, atol=IMAGE * expected.max())
     assert np.abs(image - image_of(load(scene))).max() > 0.1

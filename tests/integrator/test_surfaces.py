@@ -14,7 +14,7 @@ from support.views import (
     tensors,
 )
 from support.walls import (
-    PICTURE,
+    IMAGE,
     RADIANCE,
     SCENE,
     SKY,
@@ -39,7 +39,7 @@ def variant():
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
@@ -51,7 +51,7 @@ def test_a_wall_hides_what_is_behind_it_and_is_hidden_by_what_is_before(
 ):
     scene = apart(replace(scene, srgb_primitives=srgb_primitives))
     image = image_of(load(scene, sky=sky is not None))
-    np.testing.assert_allclose(image, rgba(scene, sky=sky), rtol=0, atol=PICTURE * image.max())
+    np.testing.assert_allclose(image, rgba(scene, sky=sky), rtol=0, atol=IMAGE * image.max())
 
 
 def covered_by(wall, camera, count=32) -> np.ndarray:
@@ -75,9 +75,9 @@ def test_a_wall_that_covers_a_part_of_the_film_ends_where_rays_say():
     image = image_of(load(scene, wall=wall, nested_spp=1024))
     share = covered_by(wall, scene.camera)[..., None]
     whole, without = rgba(scene, wall=wall), scene.image()
-    tolerance = np.full_like(image, PICTURE * image.max())
+    tolerance = np.full_like(image, IMAGE * image.max())
     # Rows of samples are a quarter of a pixel apart, so that a straight edge is found to an eighth;
-    # 1024 samples of the nested picture differ by 0.016 of what they show (3 sigma).
+    # 1024 samples of the nested image differ by 0.016 of what they show (3 sigma).
     edge = (share > 0) & (share < 1)
     assert 50 < edge.sum() < 150
     assert 50 < (share == 1).sum() < 500
@@ -85,7 +85,7 @@ def test_a_wall_that_covers_a_part_of_the_film_ends_where_rays_say():
     assert np.all(np.abs(image - share * whole - (1 - share) * without) <= tolerance)
 
 
-def test_without_splats_the_picture_is_the_nested_one():
+def test_without_splats_the_image_is_the_nested_one():
     """With an environment that is seen past the edges of the wall, and a mirror that shows it."""
     scene = apart(SCENE)
     empty = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
@@ -136,10 +136,10 @@ def test_films_of_other_formats_show_the_same(pixel_format):
     )
     if pixel_format.endswith("a"):
         colors = np.concatenate([colors, rgb[..., 3:]], axis=-1)
-    np.testing.assert_allclose(image, colors, rtol=0, atol=PICTURE * image.max())
+    np.testing.assert_allclose(image, colors, rtol=0, atol=IMAGE * image.max())
 
 
-def test_the_film_holds_the_picture_when_it_is_not_developed():
+def test_the_film_holds_the_image_when_it_is_not_developed():
     scene = load(apart(SCENE), sky=True)
     image = image_of(scene)
     nothing = scene.integrator().render(scene, develop=False)
@@ -151,14 +151,14 @@ def test_depth_alpha_and_normal_are_those_of_both():
     scene = apart(SCENE)
     image = image_of(load(scene, aovs="z:depth, a:alpha, n:normal"))
     planes = expected(scene)
-    np.testing.assert_allclose(image[..., :4], rgba(scene), rtol=0, atol=PICTURE * 2)
-    np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=PICTURE * 4)
-    np.testing.assert_allclose(image[..., 5], planes["alpha"], rtol=0, atol=PICTURE)
+    np.testing.assert_allclose(image[..., :4], rgba(scene), rtol=0, atol=IMAGE * 2)
+    np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=IMAGE * 4)
+    np.testing.assert_allclose(image[..., 5], planes["alpha"], rtol=0, atol=IMAGE)
     # The normals of splats are 0 where they are all transparent, and the wall's is added.
     bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
     normals = image_of(load(scene, aovs="n:normal", **bare))[..., 4:]
     normal = scene.camera.rotation.T @ WALL.axes()[2]
-    np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=PICTURE)
+    np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=IMAGE)
 
 
 def test_depth_of_surfaces_is_that_of_mitsubas_own_positions():
@@ -173,8 +173,8 @@ def test_depth_of_surfaces_is_that_of_mitsubas_own_positions():
     z = (seen - scene.camera.center) @ scene.camera.rotation[2]
     *_, depth, alpha, nothing = np.moveaxis(image_of(loaded), -1, 0)
     np.testing.assert_allclose(depth, z, rtol=0, atol=2e-3)  # 0.02 a pixel
-    np.testing.assert_allclose(alpha, 1, atol=PICTURE)
-    np.testing.assert_allclose(nothing, 0, atol=PICTURE)
+    np.testing.assert_allclose(alpha, 1, atol=IMAGE)
+    np.testing.assert_allclose(nothing, 0, atol=IMAGE)
     # Divided by alpha, it is a mean of what is there: between the nearest splat and the wall.
     *_, depth, alpha, _ = np.moveaxis(
         image_of(load(scene, wall=wall, aovs="z:depth, a:alpha, f:feature_x", **feature(scene))),
@@ -195,7 +195,7 @@ def test_one_sample_that_is_anywhere_in_its_pixel_sees_surfaces(rfilter):
     bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
     sensor = scene.view.sensor(rfilter=rfilter)
     image = image_of(load(scene, sensor, wall=Wall(tilt=(0, 0)), aovs="z:depth", **bare))
-    np.testing.assert_allclose(image[..., 4], WALL.z, rtol=PICTURE)
+    np.testing.assert_allclose(image[..., 4], WALL.z, rtol=IMAGE)
     np.testing.assert_allclose(
         image[..., :3], np.broadcast_to(to_display(RADIANCE), (23, 37, 3)), rtol=1e-4
     )
@@ -220,7 +220,7 @@ def test_surfaces_nearer_than_the_near_plane_are_not_seen():
     scene = apart(replace(SCENE, near=0.5))
     shapes = {"close": Wall(z=0.4, tilt=(0, 0)).shape(scene.camera)}
     image = image_of(load(scene, shapes=shapes, aovs="z:depth"))
-    np.testing.assert_allclose(image[..., 4], expected(scene)["depth"], rtol=0, atol=PICTURE * 4)
+    np.testing.assert_allclose(image[..., 4], expected(scene)["depth"], rtol=0, atol=IMAGE * 4)
 
 
 def test_surfaces_beyond_the_far_clip_are_not_seen():
@@ -268,8 +268,8 @@ def test_splats_are_seen_between_a_window_and_what_stands_behind_it(srgb_primiti
     # Paths pass a window with its opacity: 5 standard errors of the part of the wall's light.
     noise = 5 * 0.5 / np.sqrt(1024) * (to_display if not srgb_primitives else np.asarray)(RADIANCE)
     difference = np.abs(image[..., :3] - planes["color"])
-    assert (difference <= noise + PICTURE).all() and difference.mean() < noise.mean() / 5
-    np.testing.assert_allclose(image[..., 3], planes["alpha"], rtol=0, atol=PICTURE)
+    assert (difference <= noise + IMAGE).all() and difference.mean() < noise.mean() / 5
+    np.testing.assert_allclose(image[..., 3], planes["alpha"], rtol=0, atol=IMAGE)
     # Mitsuba moves the rays that go on from a surface by 1e-4, along its normal.
     np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=8e-4)
 
@@ -286,7 +286,7 @@ def test_edges_are_the_same_at_the_border_of_a_crop_window():
     settings = {"wall": wall, "aovs": "z:depth,t:alpha"}
     whole = image_of(load(scene, **settings))[y : y + height, x : x + width]
     part = image_of(load(scene, sensor=cropped, **settings))
-    np.testing.assert_allclose(part[..., 3:], whole[..., 3:], rtol=0, atol=PICTURE)
+    np.testing.assert_allclose(part[..., 3:], whole[..., 3:], rtol=0, atol=IMAGE)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -324,7 +324,7 @@ def test_instances_are_surfaces(with_shapes):
     def results(shapes, prefix):
         settings = {"nested": mi.load_dict({"type": "prb", "max_depth": 2}), "aovs": "z:depth"}
         loaded = load(scene, wall=None, shapes=shapes | others, **settings)
-        pictures = [image_of(loaded)]
+        images = [image_of(loaded)]
         params = mi.traverse(loaded)
         key = f"{prefix}.bsdf.reflectance.value"
         dr.enable_grad(params[key])
@@ -333,7 +333,7 @@ def test_instances_are_surfaces(with_shapes):
         key = f"{prefix}.to_world"
         params[key] = mi.Transform4f(mi.traverse(mi.load_dict(pane(2.9, diffuse)))["to_world"])
         params.update()
-        return *pictures, gradients, image_of(loaded)
+        return *images, gradients, image_of(loaded)
 
     found = results(repeated(pane(2.3, diffuse)), "group.shape")
     known = results({"floor": pane(2.3, diffuse)}, "floor")

@@ -1,4 +1,4 @@
-"""Pictures of one integrator from several threads of a program."""
+"""Images of one integrator from several threads of a program."""
 
 import threading
 import time
@@ -46,8 +46,8 @@ def scene_of(view, **objects):
 
 
 @pytest.mark.parametrize("shared", [True, False], ids=["one scene", "two scenes"])
-def test_two_threads_get_the_pictures_that_one_gets(shared):
-    """From sensors in turn, so that no frame is that of the picture before."""
+def test_two_threads_get_the_images_that_one_gets(shared):
+    """From sensors in turn, so that no frame is that of the image before."""
     first = scene_of(VIEWS[1])
     scenes = [first, first if shared else scene_of(VIEWS[3])]
     expected = [[image_of(scenes[k], sensor=2 * k + s) for s in (0, 1)] for k in (0, 1)]
@@ -56,12 +56,12 @@ def test_two_threads_get_the_pictures_that_one_gets(shared):
         turns = [n % 2 for n in range(10)]
         return [(s, image_of(scenes[number], sensor=2 * number + s)) for s in turns]
 
-    for number, pictures in enumerate(in_two_threads(work)):
-        for sensor, picture in pictures:
-            np.testing.assert_array_equal(picture, expected[number][sensor])
+    for number, images in enumerate(in_two_threads(work)):
+        for sensor, rendered in images:
+            np.testing.assert_array_equal(rendered, expected[number][sensor])
 
 
-def test_one_integrator_makes_one_picture_at_a_time():
+def test_one_integrator_makes_one_image_at_a_time():
     """Its frames, its film and the nested integrator's recordings are not those of two."""
     active, most = [], []
 

@@ -2,7 +2,7 @@
 
 The two do not compute the same. drgs projects a Gaussian with the affine approximation at its mean
 (EWA) and adds a low-pass; volprim takes the Gaussian's peak along each pixel's ray. How far this
-sets the pictures apart is derived here, and nothing else may.
+sets the images apart is derived here, and nothing else may.
 
 **Opacity.** In camera axes let u = (x/z, y/z) be the slope of a pixel's ray, u0 that of the mean,
 d = u - u0, z the mean's depth, S the covariance, and A(u) = [I | -u], the 2x3 projection along the
@@ -87,12 +87,12 @@ all_scenes = pytest.mark.parametrize("splats", SCENES.values(), ids=SCENES.keys(
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
 def difference_of(gaussians, view) -> np.ndarray:
-    """volprim's picture, the low-pass undone, less drgs's: (H, W, 3)."""
+    """volprim's image, the low-pass undone, less drgs's: (H, W, 3)."""
     axes = axes_of(widened(gaussians, view.camera))
     return volprim_image(gaussians, view, *axes) - drgs_image(gaussians, view)
 

@@ -69,7 +69,7 @@ def a_thousandth_brighter(gaussians, camera):
 
 
 def in_another_order(gaussians, camera):
-    """The first splat in the second's place in depth, the picture of each unchanged."""
+    """The first splat in the second's place in depth, the image of each unchanged."""
     factors = np.array([4.0, 1.0])
     means = camera.center + (gaussians.means - camera.center) * factors[:, None]
     scales = gaussians.log_scales + np.log(factors)[:, None]

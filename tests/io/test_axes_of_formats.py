@@ -38,7 +38,7 @@ def asymmetric_scene() -> Gaussians:
     )
 
 
-def picture(gaussians: Gaussians, rotation: np.ndarray) -> np.ndarray:
+def rendered(gaussians: Gaussians, rotation: np.ndarray) -> np.ndarray:
     """By the float64 reference, from a camera turned about the origin."""
     pose = pose_around(0.7, 0.4)
     pose[:3] = rotation @ pose[:3]
@@ -59,18 +59,18 @@ def test_a_scene_looks_the_same_in_the_axes_of_the_file(tmp_path, each):
     scene.save(tmp_path / f"a{each.value.suffix}")
     if not each.value.has_harmonics:
         scene = replace(scene, shN=scene.shN[:, :0])
-    expected = picture(scene, np.eye(3))
+    expected = rendered(scene, np.eye(3))
     _, arrays, _ = read_gaussians(tmp_path / f"a{each.value.suffix}")
     rotation = Z_TO_Y if each.value.up == "y" else np.eye(3)
-    found = picture(Gaussians(**arrays), rotation)
+    found = rendered(Gaussians(**arrays), rotation)
     # Rounding errors are uniform: of a third of their largest square; the squares of the 15
     # harmonics add up to 15 / (4 pi). Three times that, and what float32 leaves.
     limit = 3 * ROUNDING[each.name] * np.sqrt(15 / (4 * np.pi) / 3) + 1e-5
     assert difference(found, expected) <= limit
-    again = picture(Gaussians.load(tmp_path / f"a{each.value.suffix}"), np.eye(3))
+    again = rendered(Gaussians.load(tmp_path / f"a{each.value.suffix}"), np.eye(3))
     assert difference(again, expected) <= limit
-    assert difference(picture(scene, Z_TO_Y), expected) > 0.1  # what no turn would be
+    assert difference(rendered(scene, Z_TO_Y), expected) > 0.1  # what no turn would be
     if each.value.up == "y":
         unturned = Gaussians(**{**arrays, "shN": scene.shN})
         np.testing.assert_allclose(arrays["means"], scene.means @ Z_TO_Y.T, atol=1e-3)  # same rows
-        assert difference(picture(unturned, rotation), expected) > limit  # harmonics as before
+        assert difference(rendered(unturned, rotation), expected) > limit  # harmonics as before

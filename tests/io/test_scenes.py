@@ -7,7 +7,7 @@ import pytest
 
 from drgs.capture.path_tracing import load_scene
 from drgs.core.errors import UserError
-from drgs.io.pictures import write_exr
+from drgs.io.images import write_exr
 from drgs.io.scenes import load_scene_file, openexr_threads
 
 

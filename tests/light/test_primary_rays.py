@@ -1,10 +1,10 @@
-"""What primary rays pass of splats, against pictures that others make of them.
+"""What primary rays pass of splats, against images that others make of them.
 
-A camera's rays meet Gaussians as pictures of the projection ``exact`` show them, whose order and
+A camera's rays meet Gaussians as images of the projection ``exact`` show them, whose order and
 colours are those along a pixel's ray. Two things differ by definition, and are configured away:
 
-- The low-pass of a film. Rays have none, so that pictures are made without.
-- What is near. Pictures show Gaussians whose mean is beyond the near plane, rays those whose peak
+- The low-pass of a film. Rays have none, so that images are made without.
+- What is near. Images show Gaussians whose mean is beyond the near plane, rays those whose peak
   is before them. Here, both are the same ones.
 
 Mitsuba's ``volprim_rf_basic`` takes the peak along a ray as well. It clamps alpha at 0.9999, cuts
@@ -51,7 +51,7 @@ from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import load_rows
 
 AS_RAYS = {"projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0}
-"""The approximations of a picture that shows what rays pass."""
+"""The approximations of a image that shows what rays pass."""
 
 MOST_ON_A_RAY = 64
 """Splats that a pixel may put in order, at most; fewer are on any ray of these scenes."""
@@ -99,7 +99,7 @@ def pass_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
 
 
 # ----------------------------------------------------------------------------------------------
-# Exact pictures
+# Exact images
 # ----------------------------------------------------------------------------------------------
 
 
@@ -121,14 +121,14 @@ class Problem:
 
     def planes_of_reference(self, marked) -> tuple[np.ndarray, np.ndarray]:
         """Transmittance and colour (H, W, 4), and the pixels (H, W) of no close decision."""
-        picture = reference_rays.render(
+        rendered = reference_rays.render(
             self.gaussians,
             self.camera,
             model=reference_rays.ImageModel(**AS_RAYS),
             threshold_width=marked,
         )
-        planes = np.concatenate([picture.transmittance[..., None], picture.image], axis=-1)
-        return planes, ~picture.near_threshold
+        planes = np.concatenate([rendered.transmittance[..., None], rendered.image], axis=-1)
+        return planes, ~rendered.near_threshold
 
 
 some_views = pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[10]], ids=lambda v: v.name)
@@ -136,10 +136,10 @@ some_views = pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[10]], id
 
 @both_precisions
 @some_views
-def test_primary_rays_pass_what_an_exact_picture_shows(precision, view):
-    """Of the reference of pictures, which projects; rays do not. And so does the reference of rays.
+def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
+    """Of the reference of images, which projects; rays do not. And so does the reference of rays.
 
-    Within what pictures by the kernels are.
+    Within what images by the kernels are.
     """
     problem = Problem.of(view)
     expected, kept = problem.planes_of_reference(MARKED[precision])
@@ -150,7 +150,7 @@ def test_primary_rays_pass_what_an_exact_picture_shows(precision, view):
         passed = reference_light.pass_splats(problem.gaussians, *rays, far)
         planes = np.column_stack([passed.transmittances, passed.colors])
         actual["reference of rays"] = planes.reshape(expected.shape)
-        # Many on a ray; and the picture with a window puts all of them in order.
+        # Many on a ray; and the image with a window puts all of them in order.
         assert 20 < passed.counts.max() < MOST_ON_A_RAY
     assert kept.mean() > 0.9 and expected[..., 0].min() < 0.01 and expected[..., 1:].max() > 0.9
     assert_arrays_agree(
@@ -161,7 +161,7 @@ def test_primary_rays_pass_what_an_exact_picture_shows(precision, view):
 
 
 @some_views
-def test_a_picture_of_the_plugin_shows_what_the_sensors_rays_pass(view):
+def test_a_image_of_the_plugin_shows_what_the_sensors_rays_pass(view):
     """Both against the reference."""
     problem = Problem.of(view)
     expected, kept = problem.planes_of_reference(MARKED[FLOAT32])
@@ -175,11 +175,11 @@ def test_a_picture_of_the_plugin_shows_what_the_sensors_rays_pass(view):
     image = image_of(
         mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view.sensor()})
     )
-    picture = np.concatenate([1 - image[..., 3:], image[..., :3]], axis=-1)
+    rendered = np.concatenate([1 - image[..., 3:], image[..., :3]], axis=-1)
     passed = pass_all(problem.gaussians, rays_of_sensor(view), FLOAT32, view)
     assert_arrays_agree(
-        {"picture": picture[kept], "rays": passed[kept]},
-        dict.fromkeys(("picture", "rays"), expected[kept]),
+        {"image": rendered[kept], "rays": passed[kept]},
+        dict.fromkeys(("image", "rays"), expected[kept]),
         PLANES[FLOAT32],
     )
 
@@ -191,7 +191,7 @@ def test_a_picture_of_the_plugin_shows_what_the_sensors_rays_pass(view):
 
 @pytest.mark.parametrize("splats", SCENES.values(), ids=SCENES.keys())
 def test_primary_rays_pass_what_volprim_shows(splats):
-    """Within rounding, as the picture of ``splats`` is but for what is derived there."""
+    """Within rounding, as the image of ``splats`` is but for what is derived there."""
     gaussians, view = splats.gaussians, splats.view
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     expected = volprim_image(gaussians, view, np.exp(gaussians.log_scales), quats[:, [1, 2, 3, 0]])

@@ -1,4 +1,4 @@
-"""Structure from motion: cameras as pictures were taken with, or why there are none."""
+"""Structure from motion: cameras as images were taken with, or why there are none."""
 
 import signal
 import sys
@@ -36,7 +36,7 @@ def placed(tmp_path_factory):
     return folder, found, poses, watched
 
 
-def test_cameras_are_those_that_pictures_were_taken_with(placed):
+def test_cameras_are_those_that_images_were_taken_with(placed):
     """Up to a similarity. Features are found to a tenth of a pixel: an angle of 3e-4."""
     folder, found, poses, _ = placed
     assert found.names == tuple(NAMES) and found.missing == ()
@@ -74,7 +74,7 @@ def test_nothing_but_the_model_is_left_behind(placed):
     assert files == {*sfm.MODEL_FILES, ".drgs-poses.json"}
 
 
-def test_pictures_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
+def test_images_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
     pytest.importorskip("pycolmap")
     for k in range(3):
         Image.new("RGB", (64, 48), (40 * k, 20, 90)).save(tmp_path / f"{k}.png")
@@ -176,7 +176,7 @@ def search(tmp_path, monkeypatch):
         Image.new("RGB", (8, 8)).save(tmp_path / f"{k}.png")
 
     def found(content, replace=False, act=lambda temporary: None):
-        def run(function, search, pictures, folder, names, temporary, **_):
+        def run(function, search, images, folder, names, temporary, **_):
             act(temporary)
             (temporary / "model").mkdir()
             for name in sfm.MODEL_FILES:
@@ -344,9 +344,9 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
     for name in ("2.png", "10.png", "1.JPG", "b/3.png", "notes.txt"):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(tmp_path / "images" / name, format="PNG")
-    pictures, names = photographs_in(tmp_path)
-    assert pictures == tmp_path / "images" and names == ["1.JPG", "2.png", "10.png", "b/3.png"]
-    (tmp_path / "images" / "10.png").write_bytes(b"not a picture")
+    images, names = photographs_in(tmp_path)
+    assert images == tmp_path / "images" and names == ["1.JPG", "2.png", "10.png", "b/3.png"]
+    (tmp_path / "images" / "10.png").write_bytes(b"not a image")
     with pytest.raises(UserError, match=r"10\.png: cannot read the image"):
         photographs_in(tmp_path)
 

@@ -1,4 +1,4 @@
-"""Defocus, moving cameras, smoothing and pictures through lenses against samples and limits."""
+"""Defocus, moving cameras, smoothing and images through lenses against samples and limits."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from drgs.reference.effects import Fisheye, Orthographic, Pinhole, ThinLens
 from drgs.reference.splatting import Camera
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
-def assert_pictures_agree(actual, expected, tolerance) -> None:
+def assert_images_agree(actual, expected, tolerance) -> None:
     for name in ("image", "alpha", "depth", "transmittance"):
         np.testing.assert_allclose(
             getattr(actual, name), getattr(expected, name), rtol=0, atol=tolerance, err_msg=name
@@ -35,18 +35,18 @@ def assert_pictures_agree(actual, expected, tolerance) -> None:
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [None, 1])
-def test_picture_behind_a_pinhole_is_the_reference_picture(antialiased, degree):
+def test_image_behind_a_pinhole_is_the_reference_image(antialiased, degree):
     gaussians, camera = small_scene()
     expected = reference.render(gaussians, camera, BACKGROUND, degree, antialiased)
     actual = effects.render(
         gaussians, camera, background=BACKGROUND, antialiased=antialiased, degree=degree
     )
     # J by differences: 1e-13 of itself. Measured: 3e-14.
-    assert_pictures_agree(actual, expected, 1e-10)
+    assert_images_agree(actual, expected, 1e-10)
     np.testing.assert_array_equal(actual.near_threshold, expected.near_threshold)
 
 
-def test_orthographic_picture_is_a_pinhole_picture_from_afar():
+def test_orthographic_image_is_a_pinhole_image_from_afar():
     """From 1e6 times as far with a lens 1e6 times as long, all rays are parallel to 1e-6."""
     gaussians, camera = small_scene()
     camera = replace(camera, fx=9.0, fy=8.0, near=1.0)
@@ -89,7 +89,7 @@ def test_a_fisheye_composites_by_distance():
     gaussians = replace(
         gaussians_at(points, 0.3), sh0=np.random.default_rng(0).normal(0, 1, (3, 1, 3))
     )
-    picture = effects.render(gaussians, camera, Fisheye())
+    rendered = effects.render(gaussians, camera, Fisheye())
     splats = effects.project(gaussians, camera, Fisheye())
     order = np.argsort(np.linalg.norm(points, axis=1))
     assert list(order) != list(np.argsort(points[:, 2]))
@@ -102,7 +102,7 @@ def test_a_fisheye_composites_by_distance():
         assert alpha > 0.01
         image += transmittance * alpha * colors[n]
         transmittance *= 1 - alpha
-    np.testing.assert_allclose(picture.image[row, column], image, rtol=1e-10)
+    np.testing.assert_allclose(rendered.image[row, column], image, rtol=1e-10)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -111,13 +111,13 @@ def test_a_fisheye_composites_by_distance():
 
 
 def test_blur_radius_is_half_the_spread_of_the_aperture():
-    """The point's pictures from the two ends of the aperture are two radii apart."""
+    """The point's images from the two ends of the aperture are two radii apart."""
     camera, defocus = camera_at_origin(), ThinLens(0.2, 3.0)
     for depth in (0.5, 2.0, 3.0, 40.0):
         point = np.array([0.4, -0.3, depth])
         film = []
         for shift in ([-0.2, 0, 0], [0.2, 0, 0], [0, -0.2, 0], [0, 0.2, 0]):
-            # A shifted pinhole, whose picture is moved so that the plane z = 3 stays.
+            # A shifted pinhole, whose image is moved so that the plane z = 3 stays.
             moved = (point - shift)[:2] / depth + np.array(shift[:2]) / 3.0
             film.append(np.array([230, 190]) * moved)
         expected = [abs(film[1] - film[0])[0] / 2, abs(film[3] - film[2])[1] / 2]
@@ -180,14 +180,14 @@ def test_the_plane_in_focus_is_the_same_from_the_whole_aperture():
     scales = np.column_stack([rng.uniform(0.1, 0.4, (9, 2)), np.full(9, 1e-9)])
     gaussians = replace(gaussians_at(means, scales), quats=quats)
     image, alpha = effects.render_lens_samples(gaussians, camera, ThinLens(0.3, 2.0), 7, BACKGROUND)
-    picture = reference.render(gaussians, camera, BACKGROUND)
+    rendered = reference.render(gaussians, camera, BACKGROUND)
     # The scale of 1e-9 along z, times slopes and f.
-    np.testing.assert_allclose(image, picture.image, atol=1e-9)
-    np.testing.assert_allclose(alpha, picture.alpha, atol=1e-9)
+    np.testing.assert_allclose(image, rendered.image, atol=1e-9)
+    np.testing.assert_allclose(alpha, rendered.alpha, atol=1e-9)
 
 
 @pytest.mark.parametrize("aperture_radius", [0.05, 0.1, 0.2])
-def test_defocused_picture_is_the_mean_of_many_pinholes(aperture_radius):
+def test_defocused_image_is_the_mean_of_many_pinholes(aperture_radius):
     """One splat of variance v = 4.3 px^2, spread over a disc of radius R = 1, 2 or 4 px.
 
     Splat and disc convolved have the peak opacity (1 - exp(-x)) / x, x = R^2 / (2 v); the
@@ -198,18 +198,18 @@ def test_defocused_picture_is_the_mean_of_many_pinholes(aperture_radius):
     gaussians = gaussians_at([0.025, -0.025, 2.0], 0.1)  # at the centre of pixel [15, 16]
     defocus = ThinLens(aperture_radius, 1.0)
     image, alpha = effects.render_lens_samples(gaussians, camera, defocus, 400, BACKGROUND)
-    picture = effects.render(gaussians, camera, background=BACKGROUND, defocus=defocus)
+    rendered = effects.render(gaussians, camera, background=BACKGROUND, defocus=defocus)
     x = (40 * aperture_radius * 0.5) ** 2 / 2 / 4.3
     peak, disc_peak = 0.5 / (1 + x / 2), 0.5 * (1 - math.exp(-x)) / x
     # The mean is off the axis, and J with it, by 0.01. Measured: 3e-5.
-    assert picture.alpha[15, 16] == pytest.approx(peak, abs=1e-4)
+    assert rendered.alpha[15, 16] == pytest.approx(peak, abs=1e-4)
     # 400 points of the disc, and J differs between them by the aperture's angle squared, 0.01.
     assert alpha[15, 16] == pytest.approx(disc_peak, abs=1e-3)
 
     # Elsewhere an alpha below the cut is zero in one of the two.
     tolerance = peak - disc_peak + reference.ALPHA_CUT
-    np.testing.assert_allclose(picture.alpha, alpha, atol=tolerance)
-    np.testing.assert_allclose(picture.image, image, atol=tolerance)
+    np.testing.assert_allclose(rendered.alpha, alpha, atol=tolerance)
+    np.testing.assert_allclose(rendered.image, image, atol=tolerance)
     assert 0.5 - alpha[15, 16] > 5 * tolerance
 
 
@@ -289,28 +289,28 @@ def moving_cameras() -> tuple[Camera, Camera]:
 
 
 @pytest.mark.parametrize("lens", [Pinhole(), FISHEYE], ids=str)
-def test_a_still_camera_takes_the_plain_picture(lens):
+def test_a_still_camera_takes_the_plain_image(lens):
     gaussians, camera = small_scene()
     plain = effects.render(gaussians, camera, lens, BACKGROUND)
     blurred = effects.render_motion_blur(gaussians, camera, camera, 3, BACKGROUND, lens)
     rolled = effects.render_rolling_shutter(gaussians, camera, camera, BACKGROUND, lens)
     # The quaternion of R R^T is the identity's to rounding.
-    assert_pictures_agree(blurred, plain, 1e-12)
-    assert_pictures_agree(rolled, plain, 1e-12)
+    assert_images_agree(blurred, plain, 1e-12)
+    assert_images_agree(rolled, plain, 1e-12)
 
 
-def test_motion_blur_is_the_mean_of_pictures_on_the_way():
+def test_motion_blur_is_the_mean_of_images_on_the_way():
     gaussians, _ = small_scene()
     open, close = moving_cameras()
-    pictures = [
+    images = [
         reference.render(gaussians, effects.camera_at(open, close, t), BACKGROUND)
         for t in (1 / 6, 3 / 6, 5 / 6)
     ]
     blurred = effects.render_motion_blur(gaussians, open, close, 3, BACKGROUND)
     for name in ("image", "alpha", "depth", "transmittance"):
-        expected = sum(getattr(picture, name) for picture in pictures) / 3
+        expected = sum(getattr(rendered, name) for rendered in images) / 3
         np.testing.assert_allclose(getattr(blurred, name), expected, atol=1e-10)
-    assert np.abs(blurred.image - pictures[1].image).max() > 0.01
+    assert np.abs(blurred.image - images[1].image).max() > 0.01
 
 
 def test_a_pixel_is_marked_if_it_is_near_a_threshold_at_any_time():
@@ -331,8 +331,8 @@ def test_motion_blur_widens_by_the_variance_of_the_path():
     gaussians = gaussians_at([0.25, 0.0, 2.0], [0.1, 0.1, 1e-6], opacity=0.985)
     length = 40 * 0.5 / 2
     blurred, in_focus = (
-        picture.alpha
-        for picture in (
+        rendered.alpha
+        for rendered in (
             effects.render_motion_blur(gaussians, open, close, 50),
             reference.render(gaussians, replace(open, center=np.array([0.25, 0, 0]))),
         )
@@ -351,16 +351,16 @@ def test_motion_blur_widens_by_the_variance_of_the_path():
     np.testing.assert_allclose(variance - focus_variance, length**2 / 12, rtol=1e-3)
 
 
-def test_rows_of_a_rolling_shutter_are_rows_of_pictures_in_time():
+def test_rows_of_a_rolling_shutter_are_rows_of_images_in_time():
     gaussians, _ = small_scene()
     open, close = moving_cameras()
     rolled = effects.render_rolling_shutter(gaussians, open, close, BACKGROUND)
     for row in (0, 7, 19):
         camera = effects.camera_at(open, close, (row + 0.5) / 20)
-        picture = reference.render(gaussians, camera, BACKGROUND)
-        for field in fields(picture):
+        rendered = reference.render(gaussians, camera, BACKGROUND)
+        for field in fields(rendered):
             np.testing.assert_allclose(
-                getattr(rolled, field.name)[row], getattr(picture, field.name)[row], atol=1e-10
+                getattr(rolled, field.name)[row], getattr(rendered, field.name)[row], atol=1e-10
             )
 
 

@@ -1,4 +1,4 @@
-"""The float64 reference against gsplat's picture and gradients."""
+"""The float64 reference against gsplat's image and gradients."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from drgs.reference import splatting as reference
 
 
-def test_picture_agrees_with_gsplat(gsplat):
+def test_image_agrees_with_gsplat(gsplat):
     gaussians, camera, expected, _ = gsplat
-    picture = reference.render(gaussians, camera, np.ones(3))
-    errors = np.abs(picture.image - expected)
+    rendered = reference.render(gaussians, camera, np.ones(3))
+    errors = np.abs(rendered.image - expected)
     # Single precision: positions of 200 px carry 1e-5 px; measured 6.7e-7 on average.
     assert errors.mean() <= 2e-6
     # That is 5e-5 relative in an alpha near the cut, which then flips; measured 4 pixels, at

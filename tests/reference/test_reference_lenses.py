@@ -237,7 +237,7 @@ def test_some_random_lenses_turn_and_some_do_not():
     assert min(radii) < 5 and max(radii) > 5
 
 
-def test_points_that_would_fold_back_into_the_picture_are_not_seen():
+def test_points_that_would_fold_back_into_the_image_are_not_seen():
     camera, lens = camera_at_origin(), OpenCV(k1=-0.3)
     limit = math.sqrt(1 / 0.9)
     folded = np.array([[1.8, 0, 1.0], [2 * limit, 0, 2.0]])

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support.reference_loops import (
     UNCUT,
-    assert_pictures_agree,
+    assert_images_agree,
     camera_gaussian,
-    naive_picture,
+    naive_image,
     only,
     pixel_rays,
     rotated_splats,
@@ -84,10 +84,10 @@ def test_pixel_order_of_two_discs_changes_where_their_planes_cross(projection):
     alphas = [rays.render(only(gaussians, [n]), camera, model=model).alpha for n in (0, 1)]
     red = np.where(first_in_front, 1.0, 1 - alphas[1]) * alphas[0]
     green = np.where(first_in_front, 1 - alphas[0], 1.0) * alphas[1]
-    picture = rays.render(gaussians, camera, model=model)
+    rendered = rays.render(gaussians, camera, model=model)
     # alpha is 1 - T, rounded at the size of 1.
-    np.testing.assert_allclose(picture.image[..., 0], red, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(picture.image[..., 1], green, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(rendered.image[..., 0], red, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(rendered.image[..., 1], green, rtol=0, atol=1e-14)
     by_center = rays.render(gaussians, camera, model=replace(model, order="center"))
     np.testing.assert_allclose(by_center.image[..., 0], alphas[0], rtol=0, atol=1e-14)
 
@@ -124,11 +124,11 @@ def test_entry_order_puts_a_large_splat_before_a_small_nearer_one():
     for order, color in orders.items():
         # Enters at 2 - 0.3 = 1.7 and 3 - 1.8 = 1.2.
         model = ImageModel("exact", order, extent=3.0, low_pass=0.0)
-        picture = rays.render(gaussians, camera, model=model)
-        np.testing.assert_allclose(picture.image[4, 4], color, rtol=0, atol=1e-15)
+        rendered = rays.render(gaussians, camera, model=model)
+        np.testing.assert_allclose(rendered.image[4, 4], color, rtol=0, atol=1e-15)
         # The depths are of the peaks, whatever the order is by.
         expected = color[0] * 2 + color[1] * 3
-        np.testing.assert_allclose(picture.depth[4, 4], expected, rtol=1e-14)
+        np.testing.assert_allclose(rendered.depth[4, 4], expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize("step", [0.0, 0.3])
@@ -139,10 +139,10 @@ def test_a_ray_passes_over_what_it_enters_within_a_step(step, stop):
     model = ImageModel(
         "exact", "entry", stop=stop, transmittance_stop=0.2, extent=2.0, step=step, low_pass=0.0
     )
-    picture = rays.render(gaussians, camera, BACKGROUND, model)
-    assert_pictures_agree(picture, naive_picture(gaussians, camera, model), atol=1e-12)
+    rendered = rays.render(gaussians, camera, BACKGROUND, model)
+    assert_images_agree(rendered, naive_image(gaussians, camera, model), atol=1e-12)
     plain = replace(model, stop="before", step=0.0)
-    same = np.array_equal(rays.render(gaussians, camera, BACKGROUND, plain).image, picture.image)
+    same = np.array_equal(rays.render(gaussians, camera, BACKGROUND, plain).image, rendered.image)
     assert same == (step == 0 and stop == "before")
 
 
@@ -150,8 +150,8 @@ def test_splat_around_the_camera_does_not_exist_in_entry_order():
     gaussians, camera = scene_of([[0, 0, 1.0]], np.log(0.4)), straight_camera()
     for extent, exists in [(2.4, True), (2.6, False)]:
         model = ImageModel("exact", "entry", extent=extent, low_pass=0.0)
-        picture = rays.render(gaussians, camera, model=model)
-        assert picture.alpha[4, 4] == (0.5 if exists else 0.0)
+        rendered = rays.render(gaussians, camera, model=model)
+        assert rendered.alpha[4, 4] == (0.5 if exists else 0.0)
         assert (
             rays.render(gaussians, camera, model=replace(model, order="pixel")).alpha[4, 4] == 0.5
         )
@@ -187,9 +187,9 @@ def test_ties_are_composited_by_index():
         ImageModel("exact", "pixel"),
         ImageModel("exact", "entry", extent=3.0),
     ):
-        picture = rays.render(gaussians, straight_camera(), model=model)
+        rendered = rays.render(gaussians, straight_camera(), model=model)
         # The middle of the film is the middle of a pixel: G = 1.
-        np.testing.assert_allclose(picture.image[4, 4], [0.5, 0.25, 0.125], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(rendered.image[4, 4], [0.5, 0.25, 0.125], rtol=0, atol=1e-15)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -206,10 +206,10 @@ def test_pixels_near_the_extent_are_marked():
     gaussians, camera = scene_of([[0, 0, 1.0]], np.log(0.1)), straight_camera(focal=10.0)
     for relative, marked in ON_BOTH_SIDES:
         model = ImageModel(extent=math.sqrt(1 / (1 + relative)), low_pass=0.0)
-        picture = rays.render(gaussians, camera, model=model)
-        assert picture.near_threshold[4, 5] == marked, relative
-        assert (picture.alpha[4, 5] > 0) == (relative < 0)
-        assert not picture.near_threshold[4, 4]
+        rendered = rays.render(gaussians, camera, model=model)
+        assert rendered.near_threshold[4, 5] == marked, relative
+        assert (rendered.alpha[4, 5] > 0) == (relative < 0)
+        assert not rendered.near_threshold[4, 4]
 
 
 def test_pixels_where_splats_may_change_order_are_marked():
@@ -238,9 +238,9 @@ def test_splats_behind_the_stop_mark_nothing():
             np.log(0.1),
             opacity=np.array([0.9999, 0.9999, reference.ALPHA_MAX]),
         )
-        picture = rays.render(gaussians, straight_camera(), model=ImageModel("exact", "pixel"))
-        assert picture.transmittance[4, 4] == 1 - reference.ALPHA_MAX
-        assert picture.near_threshold[4, 4] == marked, third
+        rendered = rays.render(gaussians, straight_camera(), model=ImageModel("exact", "pixel"))
+        assert rendered.transmittance[4, 4] == 1 - reference.ALPHA_MAX
+        assert rendered.near_threshold[4, 4] == marked, third
 
 
 def test_pixels_whose_ray_enters_a_splat_near_the_camera_are_marked():
@@ -248,13 +248,13 @@ def test_pixels_whose_ray_enters_a_splat_near_the_camera_are_marked():
     for relative, marked in ON_BOTH_SIDES:
         gaussians = scene_of([[0, 0, 1.0]], np.log(0.5 * (1 + relative)))
         model = ImageModel("exact", "entry", extent=2.0, low_pass=0.0)
-        picture = rays.render(gaussians, camera, model=model)
-        assert picture.near_threshold[4, 4] == marked, relative
-        assert (picture.alpha[4, 4] > 0) == (relative < 0)
+        rendered = rays.render(gaussians, camera, model=model)
+        assert rendered.near_threshold[4, 4] == marked, relative
+        assert (rendered.alpha[4, 4] > 0) == (relative < 0)
 
 
 def test_nothing_is_near_a_decision_that_is_not_taken():
     """An alpha that underflows to 0 is not near a cut of 0, nor T = 0 near a stop of 0."""
     gaussians = replace(scene_of([[0, 0, 1]], np.log(1e-3)), logit_opacities=[2.0])
-    picture = rays.render(gaussians, straight_camera(), model=replace(UNCUT, low_pass=0.0))
-    assert picture.alpha[0, 0] == 0 and not picture.near_threshold.any()
+    rendered = rays.render(gaussians, straight_camera(), model=replace(UNCUT, low_pass=0.0))
+    assert rendered.alpha[0, 0] == 0 and not rendered.near_threshold.any()

@@ -39,7 +39,7 @@ def test_exact_response_is_the_largest_density_along_the_ray(low_pass):
     directions = pixel_rays(camera)
     visible = 0
     for n in range(len(gaussians.means)):
-        picture = rays.render(only(gaussians, [n]), camera, model=model)
+        rendered = rays.render(only(gaussians, [n]), camera, model=model)
         mean, factor = camera_gaussian(gaussians, camera, n)
         widening = low_pass * mean[2] ** 2 / camera.fx**2 * np.diag([1, 1, 0])
         precision = np.linalg.inv(factor @ factor.T + widening)
@@ -57,13 +57,13 @@ def test_exact_response_is_the_largest_density_along_the_ray(low_pass):
             found = minimize_scalar(
                 rho_sq, bounds=(grid[best - 1], grid[best + 1]), options={"xatol": 1e-12}
             )
-            response = picture.alpha[row, column] / 0.5
+            response = rendered.alpha[row, column] / 0.5
             # rho^2, of at most 1e4 here where the response is not zero, to 1e-16 times its
             # condition of 1e3; alpha is 1 - T, rounded at the size of 1.
             np.testing.assert_allclose(response, math.exp(-found.fun / 2), rtol=0, atol=1e-11)
             if response > 1e-3:
                 visible += 1
-                peak = picture.depth[row, column] / picture.alpha[row, column]
+                peak = rendered.depth[row, column] / rendered.alpha[row, column]
                 # The minimiser is known to sqrt(1e-16) deviations along the ray, which are at
                 # most a few times the depth; the depth carries 1e-16 / 1e-3 beside it.
                 np.testing.assert_allclose(peak, found.x, rtol=1e-6)
@@ -90,10 +90,10 @@ def test_exact_disc_without_thickness_is_where_the_ray_meets_its_plane():
         model = replace(UNCUT, projection="exact", order="pixel", low_pass=0.0)
         with warnings.catch_warnings(), np.errstate(divide="raise", over="raise", invalid="raise"):
             warnings.simplefilter("error")
-            picture = rays.render(gaussians, camera, model=model)
+            rendered = rays.render(gaussians, camera, model=model)
         # alpha is 1 - T, rounded at the size of 1; the rest is rounding of numbers of that size.
-        np.testing.assert_allclose(picture.alpha, 0.5 * response, rtol=0, atol=1e-14)
-        np.testing.assert_allclose(picture.depth, 0.5 * response * t, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(rendered.alpha, 0.5 * response, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(rendered.depth, 0.5 * response * t, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_exact_tends_to_ewa_as_splats_shrink(slope, sizes, order):
     """rho^2 = rho_ewa^2 / D with D = 1 - 2 kappa . e + O(angle^2), and kappa = O(angle).
 
     kappa, the covariance of depth with the place on the film, vanishes for a round splat on the
-    axis. The picture stays 2 px wide while the splat's angle shrinks: a long lens.
+    axis. The image stays 2 px wide while the splat's angle shrinks: a long lens.
     """
 
     def error(angle):

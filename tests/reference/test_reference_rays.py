@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from support.reference_loops import (
     UNCUT,
-    assert_pictures_agree,
+    assert_images_agree,
     naive_basis,
     naive_color,
-    naive_picture,
+    naive_image,
     naive_splat,
     only,
     scene_of,
@@ -49,7 +49,7 @@ def joined(first, second) -> Gaussians:
 
 
 # ----------------------------------------------------------------------------------------------
-# The whole picture
+# The whole image
 # ----------------------------------------------------------------------------------------------
 
 
@@ -61,12 +61,12 @@ def test_default_model_is_the_reference(antialiased, sh_degree):
     # Wide enough that the scene, which keeps 5e-4 clear of thresholds, has marked pixels.
     width = 0.01
     expected = reference.render(gaussians, camera, BACKGROUND, sh_degree, antialiased, width)
-    picture = rays.render(gaussians, camera, BACKGROUND, model, threshold_width=width)
+    rendered = rays.render(gaussians, camera, BACKGROUND, model, threshold_width=width)
     # Rounding only: C is inverted in another order of operations. Measured 1e-15.
-    assert_pictures_agree(picture, expected, atol=1e-13)
-    np.testing.assert_array_equal(picture.alpha, 1 - picture.transmittance)
+    assert_images_agree(rendered, expected, atol=1e-13)
+    np.testing.assert_array_equal(rendered.alpha, 1 - rendered.transmittance)
     assert expected.near_threshold.any() and not expected.near_threshold.all()
-    np.testing.assert_array_equal(picture.near_threshold, expected.near_threshold)
+    np.testing.assert_array_equal(rendered.near_threshold, expected.near_threshold)
 
 
 @pytest.mark.parametrize(
@@ -84,14 +84,14 @@ def test_default_model_is_the_reference(antialiased, sh_degree):
     ],
     ids=lambda m: f"{m.projection}-{m.order}-{m.sh_direction}-{m.low_pass}-{m.antialiased}",
 )
-def test_picture_equals_a_loop_over_pixels(model):
+def test_image_equals_a_loop_over_pixels(model):
     gaussians, camera = small_scene()
-    expected = naive_picture(gaussians, camera, model)
-    picture = rays.render(gaussians, camera, BACKGROUND, model)
-    assert_pictures_agree(picture, expected, LOOP_ROUNDING)
-    # The choice is seen: another model's picture is not this one.
+    expected = naive_image(gaussians, camera, model)
+    rendered = rays.render(gaussians, camera, BACKGROUND, model)
+    assert_images_agree(rendered, expected, LOOP_ROUNDING)
+    # The choice is seen: another model's image is not this one.
     assert (
-        np.abs(picture.image - reference.render(gaussians, camera, BACKGROUND).image).max() > 0.01
+        np.abs(rendered.image - reference.render(gaussians, camera, BACKGROUND).image).max() > 0.01
     )
 
 
@@ -116,9 +116,9 @@ def test_each_choice_changes_what_it_says(projection, change):
     gaussians, camera = small_scene()
     uncut = replace(UNCUT, projection=projection)
     model = replace(uncut, **change)
-    picture = rays.render(gaussians, camera, BACKGROUND, model)
-    assert_pictures_agree(picture, naive_picture(gaussians, camera, model), LOOP_ROUNDING)
-    difference = np.abs(picture.image - rays.render(gaussians, camera, BACKGROUND, uncut).image)
+    rendered = rays.render(gaussians, camera, BACKGROUND, model)
+    assert_images_agree(rendered, naive_image(gaussians, camera, model), LOOP_ROUNDING)
+    difference = np.abs(rendered.image - rays.render(gaussians, camera, BACKGROUND, uncut).image)
     assert (difference.max() > 1e-3) == bool(change)
 
 
@@ -127,7 +127,7 @@ def test_without_decisions_every_splat_counts(projection):
     """C = sum_i c_i alpha_i prod_{j < i} (1 - alpha_j), over all splats at all pixels."""
     gaussians, camera = small_scene()
     model = replace(UNCUT, projection=projection)
-    picture = rays.render(gaussians, camera, BACKGROUND, model)
+    rendered = rays.render(gaussians, camera, BACKGROUND, model)
     depths = (gaussians.means - camera.center) @ camera.rotation[2]
     order = [n for n in np.argsort(depths) if depths[n] >= camera.near]
     assert len(order) == 11
@@ -139,7 +139,7 @@ def test_without_decisions_every_splat_counts(projection):
         alphas = np.array([hit[0] if hit else 0.0 for hit in hits])
         weights = [alphas[i] * np.prod(1 - alphas[:i]) for i in range(len(order))]
         expected = weights @ colors + np.prod(1 - alphas) * BACKGROUND
-        np.testing.assert_allclose(picture.image[row, column], expected, atol=LOOP_ROUNDING)
+        np.testing.assert_allclose(rendered.image[row, column], expected, atol=LOOP_ROUNDING)
 
 
 def test_opaque_splat_without_a_clamp_leaves_nothing():
@@ -158,14 +158,14 @@ def test_color_of_a_pixel_is_that_in_its_rays_direction(degree):
     gaussians, camera = small_scene()
     gaussians = replace(only(gaussians, [5]), shN=only(gaussians, [5]).shN * 4)
     model = replace(UNCUT, sh_direction="pixel", sh_degree=degree)
-    picture = rays.render(gaussians, camera, model=model)
+    rendered = rays.render(gaussians, camera, model=model)
     colors = np.zeros((20, 24, 3))
     for row, column in np.ndindex(20, 24):
         position = (column + 0.5, row + 0.5)
         basis = naive_basis(gaussians, camera, model, position)
         colors[row, column] = naive_color(gaussians, 0, basis)
     np.testing.assert_allclose(
-        picture.image, picture.alpha[..., None] * colors, rtol=0, atol=1e-14
+        rendered.image, rendered.alpha[..., None] * colors, rtol=0, atol=1e-14
     )  # rounding
     if degree == 3:
         assert (colors == 0).any() and (colors > 0).any()
@@ -204,13 +204,13 @@ def test_region_is_the_crop_of_the_whole(model):
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.projection)
-def test_picture_does_not_depend_on_how_it_is_divided(model, monkeypatch):
+def test_image_does_not_depend_on_how_it_is_divided(model, monkeypatch):
     gaussians, camera = small_scene()
     expected = rays.render(gaussians, camera, BACKGROUND, model)
     monkeypatch.setattr(rays, "MAX_PAIRS", 7)
     divided = rays.render(gaussians, camera, BACKGROUND, model)
     # Products of other batches of rows may be rounded differently.
-    assert_pictures_agree(divided, expected, atol=1e-14)
+    assert_images_agree(divided, expected, atol=1e-14)
     np.testing.assert_array_equal(divided.near_threshold, expected.near_threshold)
 
 
@@ -223,7 +223,7 @@ def test_shifted_positions_are_a_shifted_principal_point(model):
     moved = replace(camera, cx=camera.cx - shift[0], cy=camera.cy - shift[1])
     shifted = rays.render(gaussians, camera, BACKGROUND, model, positions=positions)
     expected = rays.render(gaussians, moved, BACKGROUND, model)
-    assert_pictures_agree(shifted, expected, atol=1e-12)  # rounding of positions of 20 px
+    assert_images_agree(shifted, expected, atol=1e-12)  # rounding of positions of 20 px
     unmoved = rays.render(gaussians, camera, BACKGROUND, model)
     assert np.abs(unmoved.image - shifted.image).max() > 0.1
 
@@ -250,10 +250,10 @@ def test_culled_and_degenerate_gaussians_raise_no_warning_and_change_nothing(pro
     model = ImageModel(projection, "pixel", low_pass=low_pass)
     with warnings.catch_warnings(), np.errstate(divide="raise", over="raise", invalid="raise"):
         warnings.simplefilter("error")
-        picture = rays.render(joined(gaussians, strange), camera, BACKGROUND, model)
+        rendered = rays.render(joined(gaussians, strange), camera, BACKGROUND, model)
     alone = rays.render(gaussians, camera, BACKGROUND, model)
     # Batched matrix products may round differently in batches of another size.
-    assert_pictures_agree(picture, alone, atol=1e-13)
+    assert_images_agree(rendered, alone, atol=1e-13)
 
 
 def test_point_without_extent_is_the_low_pass():
@@ -262,16 +262,16 @@ def test_point_without_extent_is_the_low_pass():
     squares = (np.arange(9) - 4.0) ** 2
     expected = 0.5 * np.exp(-(squares[:, None] + squares) / 0.6)
     for projection in ("ewa", "unscented", "exact"):
-        picture = rays.render(gaussians, camera, model=replace(UNCUT, projection=projection))
-        np.testing.assert_allclose(picture.alpha, expected, rtol=0, atol=1e-15)
+        rendered = rays.render(gaussians, camera, model=replace(UNCUT, projection=projection))
+        np.testing.assert_allclose(rendered.alpha, expected, rtol=0, atol=1e-15)
 
 
 def test_no_gaussians_show_the_background():
     camera = small_camera()
     empty = only(small_scene()[0], [])
     for model in MODELS:
-        picture = rays.render(empty, camera, BACKGROUND, model)
-        np.testing.assert_array_equal(picture.image, np.broadcast_to(BACKGROUND, (20, 24, 3)))
+        rendered = rays.render(empty, camera, BACKGROUND, model)
+        np.testing.assert_array_equal(rendered.image, np.broadcast_to(BACKGROUND, (20, 24, 3)))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The float64 reference against central differences, a per-pixel loop, and gsplat's picture."""
+"""The float64 reference against central differences, a per-pixel loop, and gsplat's image."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def small_scene_gradients(antialiased: bool, sh_degree: int) -> tuple[dict, dict
     gaussians, camera = small_scene()
 
     def outputs(background, **fields):
-        picture = reference.render(Gaussians(**fields), camera, background, sh_degree, antialiased)
-        return picture.image, picture.alpha, picture.depth
+        rendered = reference.render(Gaussians(**fields), camera, background, sh_degree, antialiased)
+        return rendered.image, rendered.alpha, rendered.depth
 
     weights = cotangents()
     parameters = {name: getattr(gaussians, name) for name in PARAMETERS}
@@ -73,10 +73,10 @@ def small_scene_gradients(antialiased: bool, sh_degree: int) -> tuple[dict, dict
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_small_scene_keeps_clear_of_thresholds(antialiased):
     gaussians, camera = small_scene()
-    picture = reference.render(
+    rendered = reference.render(
         gaussians, camera, antialiased=antialiased, threshold_width=CLEARANCE
     )
-    assert not picture.near_threshold.any()
+    assert not rendered.near_threshold.any()
 
 
 def test_small_scene_enters_every_branch():
@@ -96,10 +96,10 @@ def test_small_scene_enters_every_branch():
         fields = {name: getattr(gaussians, name)[kept] for name in PARAMETERS}
         return reference.render(Gaussians(**fields), camera)
 
-    picture = reference.render(gaussians, camera)
-    assert not np.array_equal(without(9).image, picture.image)
+    rendered = reference.render(gaussians, camera)
+    assert not np.array_equal(without(9).image, rendered.image)
     for antialiased in (False, True):
-        brute = brute_force_picture(gaussians, camera, BACKGROUND, 3, antialiased)
+        brute = brute_force_image(gaussians, camera, BACKGROUND, 3, antialiased)
         assert brute["num_stopped"] >= 3 and brute["num_clamped"] >= 3
 
 
@@ -170,8 +170,8 @@ def test_composite_gradients_agree_with_central_differences():
         a, b, c = abc.T
         conics = np.moveaxis(np.array([[a, b], [b, c]]), -1, 0)
         # A perturbed depth keeps its place: no two are within STEP of each other.
-        picture = reference.composite(conics=conics, visible=visible, **rest, **size)
-        return picture.image, picture.alpha, picture.depth
+        rendered = reference.composite(conics=conics, visible=visible, **rest, **size)
+        return rendered.image, rendered.alpha, rendered.depth
 
     parameters = {"abc": abc(splats["conics"]), **splats}
     del parameters["conics"]
@@ -186,12 +186,12 @@ def test_composite_gradients_agree_with_central_differences():
 
 
 # ----------------------------------------------------------------------------------------------
-# The picture
+# The image
 # ----------------------------------------------------------------------------------------------
 
 
-def brute_force_picture(gaussians, camera, background, sh_degree, antialiased) -> dict:
-    """The picture by scalar loops over pixels and Gaussians: no boxes, factors or order arrays."""
+def brute_force_image(gaussians, camera, background, sh_degree, antialiased) -> dict:
+    """The image by scalar loops over pixels and Gaussians: no boxes, factors or order arrays."""
     splats = []
     for n in range(len(gaussians.means)):
         x, y, z = camera.rotation @ (gaussians.means[n] - camera.center)
@@ -255,17 +255,17 @@ def brute_force_picture(gaussians, camera, background, sh_degree, antialiased) -
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("sh_degree", [0, 3])
-def test_picture_equals_a_loop_over_pixels(antialiased, sh_degree):
+def test_image_equals_a_loop_over_pixels(antialiased, sh_degree):
     gaussians, camera = small_scene()
-    expected = brute_force_picture(gaussians, camera, BACKGROUND, sh_degree, antialiased)
-    picture = reference.render(gaussians, camera, BACKGROUND, sh_degree, antialiased)
+    expected = brute_force_image(gaussians, camera, BACKGROUND, sh_degree, antialiased)
+    rendered = reference.render(gaussians, camera, BACKGROUND, sh_degree, antialiased)
     # Both are float64; the loop's determinants and inverses lose a digit or two.
     for name in ("image", "alpha", "depth"):
-        np.testing.assert_allclose(getattr(picture, name), expected[name], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(picture.alpha, 1 - picture.transmittance)
+        np.testing.assert_allclose(getattr(rendered, name), expected[name], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(rendered.alpha, 1 - rendered.transmittance)
 
 
-def one_splat(opacities, offset=(0.0, 0.0), depths=None) -> reference.Picture:
+def one_splat(opacities, offset=(0.0, 0.0), depths=None) -> reference.RenderedImage:
     """White splats of 1 px^2, stacked on the centre of the middle pixel of a 9 x 9 film."""
     n = len(opacities)
     return reference.composite(
@@ -282,25 +282,25 @@ def one_splat(opacities, offset=(0.0, 0.0), depths=None) -> reference.Picture:
 
 
 def test_one_splat_is_its_gaussian_where_it_reaches_the_cut():
-    picture = one_splat([0.5])
-    assert picture.alpha[4, 4] == 0.5
-    assert picture.alpha[4, 6] == pytest.approx(0.5 * math.exp(-2), abs=1e-15)
-    assert picture.alpha[4, 7] == pytest.approx(0.5 * math.exp(-4.5), abs=1e-15)  # 1.4 / 255
-    assert picture.alpha[4, 8] == 0.0  # 0.5 exp(-8) is below 1 / 255
+    rendered = one_splat([0.5])
+    assert rendered.alpha[4, 4] == 0.5
+    assert rendered.alpha[4, 6] == pytest.approx(0.5 * math.exp(-2), abs=1e-15)
+    assert rendered.alpha[4, 7] == pytest.approx(0.5 * math.exp(-4.5), abs=1e-15)  # 1.4 / 255
+    assert rendered.alpha[4, 8] == 0.0  # 0.5 exp(-8) is below 1 / 255
     # z = 1; alpha is 1 - T, rounded at the size of 1.
-    np.testing.assert_allclose(picture.depth, picture.alpha, rtol=0, atol=2e-16)
+    np.testing.assert_allclose(rendered.depth, rendered.alpha, rtol=0, atol=2e-16)
 
 
 def test_splats_are_composited_by_depth_and_ties_by_index():
-    picture = one_splat([0.25, 0.5, 0.125], depths=[2.0, 1.0, 2.0])
+    rendered = one_splat([0.25, 0.5, 0.125], depths=[2.0, 1.0, 2.0])
     weights = [0.5, 0.5 * 0.25, 0.5 * 0.75 * 0.125]
-    assert picture.depth[4, 4] == weights[0] + 2 * weights[1] + 2 * weights[2]
+    assert rendered.depth[4, 4] == weights[0] + 2 * weights[1] + 2 * weights[2]
     colors = np.eye(3)
-    picture = reference.composite(
+    rendered = reference.composite(
         np.full((3, 2), 0.5), np.tile(np.eye(2), (3, 1, 1)), np.array([0.25, 0.5, 0.125]), colors,
         np.array([2.0, 1.0, 2.0]), np.ones(3, dtype=bool), np.zeros(3), 1, 1,
     )  # fmt: skip
-    np.testing.assert_array_equal(picture.image[0, 0], [weights[1], weights[0], weights[2]])
+    np.testing.assert_array_equal(rendered.image[0, 0], [weights[1], weights[0], weights[2]])
 
 
 def test_a_hundred_ties_are_composited_by_index():
@@ -309,21 +309,21 @@ def test_a_hundred_ties_are_composited_by_index():
     depths = np.tile([2.0, 1.0], 50)
     order = [*range(1, 100, 2), *range(0, 100, 2)]
     transmittances = np.cumprod([1.0, *(1 - opacities[order])])[:-1]
-    picture = reference.composite(
+    rendered = reference.composite(
         np.full((100, 2), 0.5), np.tile(np.eye(2), (100, 1, 1)), opacities,
         np.arange(100.0)[:, None] * np.ones(3), depths, np.ones(100, dtype=bool), np.zeros(3), 1, 1,
     )  # fmt: skip
     expected = np.sum(transmittances * opacities[order] * order)
-    np.testing.assert_allclose(picture.image[0, 0], expected, rtol=1e-13)
+    np.testing.assert_allclose(rendered.image[0, 0], expected, rtol=1e-13)
 
 
 def test_second_clamped_splat_stops_the_pixel_as_in_single_precision():
     one = np.float32(1)
     behind = one * (one - np.float32(0.99)) * (one - np.float32(0.99))
     assert behind < np.float32(1e-4) and 0.01 * 0.01 >= 1e-4
-    picture = one_splat([0.999, 0.999])
-    assert picture.transmittance[4, 4] == 1 - float(np.float32(0.99))
-    assert not picture.near_threshold[4, 4]
+    rendered = one_splat([0.999, 0.999])
+    assert rendered.transmittance[4, 4] == 1 - float(np.float32(0.99))
+    assert not rendered.near_threshold[4, 4]
 
 
 @pytest.mark.parametrize("threshold", [1 / 255, 0.99])
@@ -331,12 +331,12 @@ def test_pixels_near_an_alpha_threshold_are_marked(threshold):
     # At 1/255 the splat's centre is half a pixel away: the opacity itself is above the cut.
     shift, gain = ((0.5, 0.0), math.exp(0.125)) if threshold < 0.5 else ((0.0, 0.0), 1.0)
     for relative, marked in [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]:
-        picture = one_splat([threshold * (1 + relative) * gain], shift)
-        assert picture.near_threshold[4, 4] == marked, relative
+        rendered = one_splat([threshold * (1 + relative) * gain], shift)
+        assert rendered.near_threshold[4, 4] == marked, relative
 
 
 def test_pixels_near_the_stop_are_marked():
     for relative, marked in [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]:
-        picture = one_splat([0.95, 0.95, 1 - 1e-4 * (1 + relative) / 0.05**2])
-        assert picture.near_threshold[4, 4] == marked, relative
-        assert (picture.transmittance[4, 4] < 2e-4) == (relative > 0)
+        rendered = one_splat([0.95, 0.95, 1 - 1e-4 * (1 + relative) / 0.05**2])
+        assert rendered.near_threshold[4, 4] == marked, relative
+        assert (rendered.transmittance[4, 4] < 2e-4) == (relative > 0)

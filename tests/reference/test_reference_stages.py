@@ -149,12 +149,12 @@ def test_culled_and_degenerate_gaussians_raise_no_warning_and_change_nothing(ant
     )
     with warnings.catch_warnings(), np.errstate(divide="raise", over="raise", invalid="raise"):
         warnings.simplefilter("error")
-        picture = reference.render(both, camera, BACKGROUND, antialiased=antialiased)
+        rendered = reference.render(both, camera, BACKGROUND, antialiased=antialiased)
         gradients = reference.render_gradients(
             both, camera, BACKGROUND, **cotangents(), antialiased=antialiased
         )
     alone = reference.render(gaussians, camera, BACKGROUND, antialiased=antialiased)
-    np.testing.assert_array_equal(picture.image, alone.image)
+    np.testing.assert_array_equal(rendered.image, alone.image)
     alone = reference.render_gradients(
         gaussians, camera, BACKGROUND, **cotangents(), antialiased=antialiased
     )
@@ -170,8 +170,8 @@ def test_no_gaussians_show_the_background():
         np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 1, 3)),
         np.zeros((0, 15, 3)),
     )  # fmt: skip
-    picture = reference.render(empty, camera, BACKGROUND)
-    np.testing.assert_array_equal(picture.image, np.broadcast_to(BACKGROUND, (20, 24, 3)))
+    rendered = reference.render(empty, camera, BACKGROUND)
+    np.testing.assert_array_equal(rendered.image, np.broadcast_to(BACKGROUND, (20, 24, 3)))
     gradients = reference.render_gradients(empty, camera, BACKGROUND, **cotangents())
     assert gradients["shN"].shape == (0, 15, 3)
     np.testing.assert_allclose(

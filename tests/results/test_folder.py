@@ -16,7 +16,7 @@ from drgs.results.folder import (
     remove_run,
 )
 
-PICTURES = image_names("test", ["r_0", "r_1"])
+IMAGES = image_names("test", ["r_0", "r_1"])
 
 
 @pytest.fixture
@@ -28,8 +28,8 @@ def config(tmp_path):
 def finished(tmp_path, config):
     """The folder of a run that has written something."""
     folder = tmp_path / "out"
-    claim_output_folder(folder, config, PICTURES)
-    for name in ("point_cloud.ply", *PICTURES):
+    claim_output_folder(folder, config, IMAGES)
+    for name in ("point_cloud.ply", *IMAGES):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("result")
     return folder
@@ -58,7 +58,7 @@ def test_a_folder_without_results_is_taken(tmp_path, config, present):
 def test_a_run_of_the_same_configuration_may_go_on_in_its_folder(finished, config):
     before = contents(finished)
     same = FitConfig(data=config.data, output={"history_every": 3})
-    claim_output_folder(finished, same, PICTURES)
+    claim_output_folder(finished, same, IMAGES)
     after = contents(finished)
     assert load_run_config(finished) == same
     assert {**after, "config.yml": None} == {**before, "config.yml": None}
@@ -76,7 +76,7 @@ def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_
 
 
 def test_what_a_killed_run_was_writing_is_removed_and_nothing_else(finished, config):
-    kept = {".DS_Store", ".notes.tmp.txt", "point_cloud.ply", *PICTURES}
+    kept = {".DS_Store", ".notes.tmp.txt", "point_cloud.ply", *IMAGES}
     for name in (".checkpoint.4711.tmp.npz", "renders/.r_1.4711.tmp.png", *kept):
         (finished / name).write_text("half")
     claim_output_folder(finished, config)
@@ -169,7 +169,7 @@ def test_a_folder_in_the_place_of_a_result_is_not_removed(finished):
             (finished / ".drgs-fit.json").unlink()
         (finished / "curves.png").mkdir(exist_ok=True)
         before = contents(finished)
-        assert "got curves.png" in refusal(remove_run, finished, PICTURES)
+        assert "got curves.png" in refusal(remove_run, finished, IMAGES)
         assert contents(finished) == before
 
 

@@ -25,7 +25,7 @@ def test_values_are_clamped_before_they_are_compared():
     assert psnr(-target, 0 * target) == np.inf
 
 
-def test_single_precision_pictures_are_compared_in_double():
+def test_single_precision_images_are_compared_in_double():
     x, y = images()
     assert psnr(x.astype(np.float32), y) == pytest.approx(psnr(x, y), rel=1e-6)
 
@@ -37,20 +37,20 @@ def test_nan_is_not_hidden():
     assert np.isnan(ssim(x, y))
 
 
-def test_ssim_is_one_for_equal_pictures_only():
+def test_ssim_is_one_for_equal_images_only():
     x, y = images()
     assert ssim(x, x) == pytest.approx(1, abs=1e-14)
     assert ssim(x, y) < 0.5
     assert ssim(x, y) == pytest.approx(ssim(y, x), rel=1e-14)
 
 
-def test_ssim_of_flat_pictures_is_the_luminance_term():
+def test_ssim_of_flat_images_is_the_luminance_term():
     # Windows wholly inside: no variance, so S = (2ab + C1) / (a^2 + b^2 + C1).
     x, y = np.full((40, 40, 3), 0.3), np.full((40, 40, 3), 0.6)
     weights = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
     weights /= weights.sum()
     covered = np.array([weights[max(0, 5 - i) : 5 + 40 - i].sum() for i in range(40)])
-    mass = np.outer(covered, covered)  # of the window inside the picture
+    mass = np.outer(covered, covered)  # of the window inside the image
     a, b = 0.3 * mass, 0.6 * mass
     var_a, var_b, cov = 0.09 * mass - a * a, 0.36 * mass - b * b, 0.18 * mass - a * b
     expected = ((2 * a * b + 1e-4) * (2 * cov + 9e-4)) / (
@@ -107,7 +107,7 @@ def test_what_a_mask_leaves_out_does_not_matter():
 
 
 def test_ssim_of_a_mask_is_the_mean_of_the_map_over_the_pixels_that_count():
-    """Of masked pictures, by a window in two dimensions at each pixel."""
+    """Of masked images, by a window in two dimensions at each pixel."""
     x, y = images(2, (14, 13, 3))
     mask = np.ones((14, 13))
     mask[2:6, 4:9] = 0

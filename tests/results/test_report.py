@@ -93,9 +93,7 @@ def out(tmp_path_factory, dataset, scene, images):
     folder = tmp_path_factory.mktemp("results") / "blobs"
     folder.mkdir()
     render = partial(render_views, scene)
-    scores = report.write_pictures(
-        folder, dataset, render, with_renders=False, with_comparisons=True
-    )
+    scores = report.write_images(folder, dataset, render, with_renders=False, with_comparisons=True)
     fitted = report.Fitted(scene, blobs(), render, Shown(blobs(), Approximations()))
     report.write_results(folder, dataset, fitted, scores, history(changes=CHANGES), metrics())
     return folder
@@ -117,11 +115,11 @@ def test_everything_is_written_and_nothing_temporary(out):
 
 
 # ----------------------------------------------------------------------------------------------
-# Pictures
+# Images
 # ----------------------------------------------------------------------------------------------
 
 
-def test_one_picture_is_held_at_a_time(tmp_path, dataset):
+def test_one_image_is_held_at_a_time(tmp_path, dataset):
     """Each is written and scored before the next one is rendered; renders only if asked for."""
     rendered = []
 
@@ -132,7 +130,7 @@ def test_one_picture_is_held_at_a_time(tmp_path, dataset):
             rendered.append(np.full((HEIGHT, WIDTH, 3), 0.1 * index, np.float32))
             yield rendered[-1]
 
-    scores = report.write_pictures(
+    scores = report.write_images(
         tmp_path, dataset, render, with_renders=True, with_comparisons=True
     )
     for score, image, view in zip(scores, rendered, dataset.test, strict=True):
@@ -176,7 +174,7 @@ def test_the_orbit_has_the_shape_of_the_photographs_and_shows_the_scene(out, dat
     (expected,) = render_views(scene, [camera])
     animation.seek(17)
     difference = np.asarray(animation.convert("RGB")) / 255 - expected
-    assert np.abs(difference).mean() < 0.05  # lossy, of small colourful pictures
+    assert np.abs(difference).mean() < 0.05  # lossy, of small colourful images
 
 
 def test_curves_are_drawn(out):
@@ -225,7 +223,7 @@ def test_the_time_of_curves_is_that_of_those_tried_out(monkeypatch):
     monkeypatch.setattr(report, "_seconds_of_curve", seconds)
     panels = curves.panels_of(history(12))
     once = sum(1.0 if panel.scale == "log" else 0.5 for panel in panels)
-    themes = 3  # two in the page, one in the picture of all
+    themes = 3  # two in the page, one in the image of all
     assert report.seconds_of_curves() == pytest.approx(themes * once)
     monkeypatch.undo()
     assert report.seconds_of_curves() > 0
@@ -302,7 +300,7 @@ class Page(HTMLParser):
         self.text.append(data)
 
     def images(self):
-        """(bytes) of every embedded picture."""
+        """(bytes) of every embedded image."""
         for reference in self.references:
             if reference.startswith("data:image"):
                 kind, data = re.fullmatch(r"data:(image/\w+);base64,(.*)", reference).groups()
@@ -325,13 +323,13 @@ def test_the_page_refers_to_nothing_outside(page):
     assert set(page.tags).isdisjoint({"script", "iframe", "object", "embed"})
 
 
-def test_pictures_and_curves_lie_one_below_the_other_on_a_phone(page):
+def test_images_and_curves_lie_one_below_the_other_on_a_phone(page):
     phone = re.search(r"@media \(max-width: 560px\) \{(.*?\}\s*)\}", page.source, re.DOTALL)[1]
     assert ".three, .curves { grid-template-columns: minmax(0, 1fr); }" in phone
     text = " ".join(" ".join(page.text).split())
-    assert text.count("Fitted Reference Difference") == 3  # each below its own picture
+    assert text.count("Fitted Reference Difference") == 3  # each below its own image
     assert page.source.count('<div class="curves"><picture>') == 1
-    assert page.tags.count("picture") == 6
+    assert page.tags.count("image") == 6
 
 
 def test_the_orbit_can_be_paused_and_honours_reduced_motion(page):
@@ -339,16 +337,16 @@ def test_the_orbit_can_be_paused_and_honours_reduced_motion(page):
     assert '<label for="orbit">' in page.source
     still, moving = (re.search(rf'class="{c}"[^>]*src="(.*?)"', page.source)[1] for c in KINDS)
     frames = []
-    for picture in (still, moving):
-        with Image.open(io.BytesIO(base64.b64decode(picture.partition(",")[2]))) as image:
+    for rendered in (still, moving):
+        with Image.open(io.BytesIO(base64.b64decode(rendered.partition(",")[2]))) as image:
             frames.append((image.n_frames, np.asarray(image.convert("RGB")) / 255))
     assert [count for count, _ in frames] == [1, report.ORBIT_FRAMES]
-    assert np.abs(frames[0][1] - frames[1][1]).mean() < 0.05  # lossy, of small colourful pictures
+    assert np.abs(frames[0][1] - frames[1][1]).mean() < 0.05  # lossy, of small colourful images
     reduced = page.source.partition("prefers-reduced-motion: reduce")[2].partition("\n}\n")[0]
     assert ".orbit .moving, .orbit .pause" in reduced.partition("display: none")[0]
 
 
-def test_pictures_of_a_renderer_are_no_photographs(tmp_path, dataset, images, out, page):
+def test_images_of_a_renderer_are_no_photographs(tmp_path, dataset, images, out, page):
     path, taken = tmp_path / "report.html", replace(dataset, rendered=False)
     orbit = (out / "orbit.webp").read_bytes()
     report.write_report(path, "a", taken, *scored(images, taken), history(2), metrics(), orbit)
@@ -358,7 +356,7 @@ def test_pictures_of_a_renderer_are_no_photographs(tmp_path, dataset, images, ou
     assert "Photograph" not in rendered and "Reference" not in photographed
 
 
-def test_the_pages_pictures_are_whole(page, out, tmp_path):
+def test_the_pages_images_are_whole(page, out, tmp_path):
     sizes = []
     for index, (kind, data) in enumerate(page.images()):
         path = tmp_path / str(index)
@@ -427,7 +425,7 @@ def test_text_from_outside_is_escaped(tmp_path, dataset, images, out):
     assert "<b>r_0" in "".join(page.text)
 
 
-def test_a_picture_that_equals_its_photograph_is_infinitely_good(tmp_path, dataset, out):
+def test_a_image_that_equals_its_photograph_is_infinitely_good(tmp_path, dataset, out):
     equal = replace(dataset, test=dataset.test[:1])
     report.write_report(
         tmp_path / "report.html",

@@ -45,11 +45,11 @@ CAMERA = "Array.from(viewer.app.root.findByName('camera').getWorldTransform().da
 """To the page's axes, by columns."""
 
 ALIKE = 42.0
-"""dB, at least: the browser's picture against ours. Measured 45.9: what is left are whole numbers,
+"""dB, at least: the browser's image against ours. Measured 45.9: what is left are whole numbers,
 8 bits of opacities and of what is blended, steps of 1/32 of harmonics and of 8 % of scales."""
 
 OTHERWISE = 34.0
-"""dB, at most: against our picture with something left out. Measured 24 to 32."""
+"""dB, at most: against our image with something left out. Measured 24 to 32."""
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def shown_camera(page, initial_view):
     return pinhole("shown", pose, WIDTH, HEIGHT, FIELD_OF_VIEW)
 
 
-def assert_shown_as_fitted(picture, camera, gaussians) -> None:
+def assert_shown_as_fitted(rendered, camera, gaussians) -> None:
     """With harmonics, low-pass and compensation."""
     flat = replace(gaussians, shN=0 * gaussians.shN)
     left_out = {
@@ -126,9 +126,9 @@ def assert_shown_as_fitted(picture, camera, gaussians) -> None:
         "low-pass": ours(camera, gaussians, low_pass=0.0),
         "compensation": ours(camera, gaussians, antialiased=False),
     }
-    assert decibels(picture, ours(camera, gaussians)) >= ALIKE
+    assert decibels(rendered, ours(camera, gaussians)) >= ALIKE
     for name, image in left_out.items():
-        assert decibels(picture, image) <= OTHERWISE, name
+        assert decibels(rendered, image) <= OTHERWISE, name
 
 
 def test_it_opens_from_disk_without_a_request_or_an_error(page, path):
@@ -143,11 +143,11 @@ def test_the_first_view_is_that_of_the_training_camera(page, gaussians, initial_
     np.testing.assert_allclose(
         camera.camera_to_world, initial_view.camera.camera_to_world, atol=1e-5 * RADIUS
     )
-    assert_shown_as_fitted(page.picture(), initial_view.camera, gaussians)
+    assert_shown_as_fitted(page.rendered(), initial_view.camera, gaussians)
 
 
 def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, initial_view):
-    before, first = shown_camera(page, initial_view), page.picture()
+    before, first = shown_camera(page, initial_view), page.rendered()
     page.drag((30, 90), (210, 90))
     settle(page)
     after = shown_camera(page, initial_view)
@@ -159,8 +159,8 @@ def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, ini
     cosine = level[0] @ level[1] / np.prod(np.linalg.norm(level, axis=1))
     assert 15 < np.degrees(np.arccos(cosine)) < 90
     assert abs(after.camera_to_world[:3, 0] @ UP) < 1e-3  # upright
-    assert decibels(first, page.picture()) < OTHERWISE
-    assert_shown_as_fitted(page.picture(), after, gaussians)
+    assert decibels(first, page.rendered()) < OTHERWISE
+    assert_shown_as_fitted(page.rendered(), after, gaussians)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -174,11 +174,11 @@ def test_with_its_controls_it_fits_the_window_and_turns(path, size):
         edges = np.array(page.evaluate(BUTTONS))
         assert len(edges) >= 7  # play, orbit, fly, settings, keys, about, full screen
         assert edges.min() >= 0 and (edges[:, 2:] <= [width, height]).all()
-        before, middle = page.picture(), (width // 2, height // 2)
+        before, middle = page.rendered(), (width // 2, height // 2)
         page.drag(middle, (middle[0] + 80, middle[1] + 20))
         settle(page)
         shown = np.s_[height // 3 : height // 2, width // 4 : 3 * width // 4]
-        assert decibels(page.picture()[shown], before[shown]) < OTHERWISE
+        assert decibels(page.rendered()[shown], before[shown]) < OTHERWISE
         assert page.troubles() == []
         own, *others = page.requests()
         assert own == path.as_uri() and all(a.startswith(("blob:", "data:")) for a in others)

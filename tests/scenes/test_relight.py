@@ -62,7 +62,7 @@ def found_by(relight, output, name) -> dict[str, list[float]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["objects", "mirror"])
-def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys, name):
+def test_what_the_image_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys, name):
     """In 40 steps, from a start that is half as far away."""
     start = from_half_way(relight, monkeypatch, name)
     monkeypatch.setattr(relight, "BALL", [0.9, 0.2, 0.45])  # beside the knot
@@ -76,8 +76,8 @@ def test_what_the_picture_was_made_of_is_found(relight, monkeypatch, tmp_path, c
     for key in start:
         assert at_end[key] < at_start[key] / 3, key
     assert (tmp_path / "parameters.md").read_text() in output
-    for picture in ("target", "start", "end", "difference"):
-        assert iio.imread(tmp_path / f"{picture}.png").shape == (40, 40, 3)
+    for rendered in ("target", "start", "end", "difference"):
+        assert iio.imread(tmp_path / f"{rendered}.png").shape == (40, 40, 3)
     with Image.open(tmp_path / "relight.webp") as animation:
         assert animation.n_frames == 14 and animation.size == (80, 40)
     assert (tmp_path / "loss.png").exists() and (tmp_path / "relight.gif").exists()

@@ -27,7 +27,7 @@ def files_of_the_checkout():
 def photographs_in(folder):
     """In the place of what a script computes."""
     folder.mkdir(parents=True)
-    (folder / "target.png").write_text("a picture")
+    (folder / "target.png").write_text("a image")
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_every_script_is_tried():
     assert found == set(SCRIPTS)
 
 
-def test_pictures_of_shapes_go_where_the_command_is_run(script):
+def test_images_of_shapes_go_where_the_command_is_run(script):
     assert script("compare_shapes") == {"out/shapes.png"}
 
 
@@ -70,7 +70,7 @@ def test_the_knot_goes_where_the_command_is_run(script):
     assert script("knot") == {"out/knot.ply"}
 
 
-def test_the_picture_of_tiles_goes_where_the_command_is_run(script):
+def test_the_image_of_tiles_goes_where_the_command_is_run(script):
     assert script("draw_tiles") == {"out/tiles.png"}
 
 

@@ -15,8 +15,8 @@ from support.helpers import (
     Case,
     Cotangents,
     both_precisions,
+    image_planes,
     kernel_gradients,
-    picture_of,
     render,
     single,
 )
@@ -54,7 +54,7 @@ def joined(*parts) -> reference.Gaussians:
 
 def case_of(gaussians) -> Case:
     degree = gaussians.sh_degree
-    # The reference's background is behind every picture: the loss sees transmittance too.
+    # The reference's background is behind every image: the loss sees transmittance too.
     return Case("clamp", 17, 13, degree, recipe=lambda *_: (gaussians, CAMERA))
 
 
@@ -75,13 +75,13 @@ def slope(gaussians, cotangents, name, index, step=1e-6) -> float:
     def loss(sign):
         values = getattr(gaussians, name).copy()
         values[index] += sign * step
-        picture = reference.render(
+        rendered = reference.render(
             replace(gaussians, **{name: values}), CAMERA, case_of(gaussians).background
         )
         return (
-            np.sum(cotangents.d_image * picture.image)
-            + np.sum(cotangents.d_alpha * picture.alpha)
-            + np.sum(cotangents.d_depth * picture.depth)
+            np.sum(cotangents.d_image * rendered.image)
+            + np.sum(cotangents.d_alpha * rendered.alpha)
+            + np.sum(cotangents.d_depth * rendered.depth)
         )
 
     return (loss(1) - loss(-1)) / (2 * step)
@@ -154,10 +154,10 @@ def test_exponents_far_below_underflow_are_zero_not_garbage(precision):
     """A needle along x: a few pixels off it the exponent is below -1000, where exp2 underflows."""
     gaussians = splat(log_scales=np.log([[2.0, 1e-4, 1e-4]]), quats=[[1.0, 0, 0, 0]])
     case = case_of(gaussians)
-    picture = picture_of(render(case, precision)[1], case)
+    rendered = image_planes(render(case, precision)[1], case)
     rows_of_the_needle = np.abs(np.arange(13) + 0.5 - CAMERA.cy) < 3
-    assert (picture["alpha"][rows_of_the_needle] > 0).any()
-    assert (picture["transmittance"][~rows_of_the_needle] == 1).all()
+    assert (rendered["alpha"][rows_of_the_needle] > 0).any()
+    assert (rendered["transmittance"][~rows_of_the_needle] == 1).all()
     assert not gradients_of(gaussians, precision, at_pixel(8, 0))["means"].any()
 
 

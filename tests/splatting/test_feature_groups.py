@@ -1,4 +1,4 @@
-"""Many features, composited in groups, against as many pictures of few."""
+"""Many features, composited in groups, against as many images of few."""
 
 import drjit as dr
 import numpy as np

@@ -1,4 +1,4 @@
-"""Hard inputs stay finite and as accurate as float32 can be: a picture and gradients for each.
+"""Hard inputs stay finite and as accurate as float32 can be: a image and gradients for each.
 
 Every family is rendered and differentiated in float64 and in float32 and compared with the
 float64 reference (whose analytic gradients are compared with central differences in
@@ -21,8 +21,8 @@ import pytest
 from support.hard_cases import FAMILIES, allowed, cotangents_of, errors_over_bounds, expected
 from support.helpers import (
     both_precisions,
+    image_planes,
     kernel_gradients,
-    picture_of,
     render,
 )
 
@@ -37,20 +37,22 @@ all_families = pytest.mark.parametrize("name", FAMILIES)
 
 
 # ----------------------------------------------------------------------------------------------
-# Picture and gradients of every family
+# Image and gradients of every family
 # ----------------------------------------------------------------------------------------------
 
 
 @both_precisions
 @all_families
-def test_picture_and_gradients_are_within_the_bound(precision, name):
+def test_image_and_gradients_are_within_the_bound(precision, name):
     case = FAMILIES[name]
-    picture_bounds, gradient_bounds = allowed(name)
-    picture, gradients = expected(name)
-    marked = case.picture.near_threshold
+    image_bounds, gradient_bounds = allowed(name)
+    rendered, gradients = expected(name)
+    marked = case.rendered.near_threshold
     assert marked.sum() <= max(2, 0.01 * marked.size)
     _, frame = render(case, precision)
-    ratios = errors_over_bounds(picture_of(frame, case), picture, picture_bounds, precision, marked)
+    ratios = errors_over_bounds(
+        image_planes(frame, case), rendered, image_bounds, precision, marked
+    )
     actual = kernel_gradients(case, precision, cotangents_of(name))
     ratios |= errors_over_bounds(actual, gradients, gradient_bounds, precision)
     assert max(ratios.values()) <= 1, ratios
@@ -77,11 +79,11 @@ def test_textbook_formulas_exceed_the_bound_where_the_stable_ones_do_not():
     conics = conics / (a * c - b * b)[:, None, None]
     splats2d = reference.project(case.gaussians, case.camera)
     colors = reference.sh_colors(case.gaussians, case.camera, case.degree)
-    picture = reference.composite(
+    rendered = reference.composite(
         splats2d.means2d, conics, splats2d.opacities, colors, splats2d.depths, splats2d.visible,
         case.background, case.width, case.height,
     )  # fmt: skip
-    error = np.abs(picture.image - case.picture.image)
+    error = np.abs(rendered.image - case.rendered.image)
     assert (error > allowed(case.name)[0]["image"]).mean() > 0.05
 
 
@@ -116,14 +118,14 @@ def test_reference_gradient_is_the_slope_of_the_reference(name):
         return {key: getattr(gaussians, key) + sign * step * d for key, d in direction.items()}
 
     def loss(fields):
-        picture = reference.render(
+        rendered = reference.render(
             reference.Gaussians(**fields), camera, case.background, case.rendered_degree,
             case.antialiased,
         )  # fmt: skip
         pairs = [
-            (cotangents.d_image, picture.image),
-            (cotangents.d_alpha, picture.alpha),
-            (cotangents.d_depth, picture.depth),
+            (cotangents.d_image, rendered.image),
+            (cotangents.d_alpha, rendered.alpha),
+            (cotangents.d_depth, rendered.depth),
         ]
         return np.concatenate([np.ravel(weights * values) for weights, values in pairs])
 

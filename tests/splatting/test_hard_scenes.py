@@ -9,15 +9,15 @@ from support.helpers import (
     FLOAT32,
     Case,
     Cotangents,
-    assert_pictures_agree,
+    assert_images_agree,
     bitwise,
     both_precisions,
     clear,
     device_camera,
     device_gaussians,
     frame_adjoint,
+    image_planes,
     kernel_gradients,
-    picture_of,
     plane_cotangents,
     reference_gaussians,
     reference_gradients,
@@ -46,15 +46,15 @@ ORDINARY = [
 
 @pytest.mark.parametrize("case", ORDINARY, ids=lambda case: case.name)
 def test_ten_thousand_ordinary_gaussians_in_float32(case):
-    """Pictures within 2e-5 of the reference, gradients within 1e-4, cosines above 0.99999.
+    """Images within 2e-5 of the reference, gradients within 1e-4, cosines above 0.99999.
 
     A mean at 400 px carries 3 roundings of 2.4e-5 px or less, of either sign, and alpha changes by
     at most 1.1 per px: some 1e-5 in a pixel that a dozen splats share. Measured 1.9e-5 and 1.9e-5.
     Pixels near a threshold may flip, at most 1e-4 of them.
     """
     cotangents = Cotangents.random(case)
-    picture = picture_of(render(case, FLOAT32)[1], case)
-    assert_pictures_agree(picture, case.picture, 2e-5)
+    rendered = image_planes(render(case, FLOAT32)[1], case)
+    assert_images_agree(rendered, case.rendered, 2e-5)
     actual = kernel_gradients(case, FLOAT32, cotangents)
     for name, wanted in reference_gradients(case, cotangents).items():
         error = np.abs(actual[name] - wanted).max()
@@ -97,7 +97,7 @@ def planes_and_gradients(gaussians, case, precision):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 def test_a_number_that_is_not_finite_reaches_no_other_row(precision, antialiased, value, name):
-    """The row is dropped: the picture and all other gradients are, bit by bit, those without it."""
+    """The row is dropped: the image and all other gradients are, bit by bit, those without it."""
     case = clear(replace(NOT_FINITE, antialiased=antialiased))
     row = most_important_row(case)
     spoiled = {key: getattr(case.gaussians, key).copy() for key in PARAMETER_NAMES}
@@ -133,15 +133,15 @@ def most_important_row(case) -> int:
     ],
 )
 def test_infinities_that_mean_something_are_drawn_as_that(precision, name, value):
-    """The limit of large numbers: the picture is that of -1e4 (or 1e4), to the last bit."""
+    """The limit of large numbers: the image is that of -1e4 (or 1e4), to the last bit."""
     case = clear(NOT_FINITE)
     row = most_important_row(case)
-    pictures = []
+    images = []
     for number in (value, np.sign(value) * 1e4):
         fields = {key: getattr(case.gaussians, key).copy() for key in PARAMETER_NAMES}
         fields[name].reshape(len(fields[name]), -1)[row, :] = number
-        pictures.append(planes_and_gradients(reference.Gaussians(**fields), case, precision)[0])
-    assert bitwise(pictures[0]) == bitwise(pictures[1])
+        images.append(planes_and_gradients(reference.Gaussians(**fields), case, precision)[0])
+    assert bitwise(images[0]) == bitwise(images[1])
     without = {key: np.delete(array, row, 0) for key, array in vars(case.gaussians).items()}
     dropped = planes_and_gradients(reference.Gaussians(**without), case, precision)[0]
-    assert bitwise(pictures[0]) != bitwise(dropped)
+    assert bitwise(images[0]) != bitwise(dropped)

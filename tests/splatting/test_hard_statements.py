@@ -23,8 +23,8 @@ from support.helpers import (
     both_precisions,
     device_camera,
     device_gaussians,
+    image_planes,
     kernel_gradients,
-    picture_of,
     reference_gradients,
     render,
     rows,
@@ -74,8 +74,8 @@ def test_a_quaternion_of_norm_zero_is_the_identity_and_has_no_gradient(precision
 def test_an_empty_view_is_the_background_and_has_no_gradient(precision):
     case = FAMILIES["no visible Gaussian"]
     _, frame = render(case, precision)
-    picture = picture_of(frame, case)
-    assert (picture["transmittance"] == 1).all() and not picture["depth"].any()
+    rendered = image_planes(frame, case)
+    assert (rendered["transmittance"] == 1).all() and not rendered["depth"].any()
     gradients = kernel_gradients(case, precision, cotangents_of(case.name))
     del gradients["background"]
     assert not any(value.any() for value in gradients.values())
@@ -98,17 +98,17 @@ def test_a_million_gaussians_in_one_pixel(precision):
     nearest = reference.Gaussians(*(value[first] for value in vars(gaussians).values()))
     case = Case("a million", 20, 18, 0, count=count, recipe=lambda *_: (gaussians, camera))
     small = replace(case, name="3,000 of a million", recipe=lambda *_: (nearest, camera))
-    assert not small.picture.near_threshold.any()
-    assert 0.9e-4 < small.picture.transmittance.min() < 1.1e-4
+    assert not small.rendered.near_threshold.any()
+    assert 0.9e-4 < small.rendered.transmittance.min() < 1.1e-4
     cotangents = Cotangents.random(small)
-    actual_picture = picture_of(render(case, precision)[1], case)
+    actual_image = image_planes(render(case, precision)[1], case)
     actual = kernel_gradients(case, precision, cotangents)
     wanted = reference_gradients(small, cotangents)
     # sqrt(2,130 layers) roundings, with lambda = 6, of sums that cancel: 1e-16 and 2e-5.
     tolerance = {FLOAT64: 1e-11, FLOAT32: 5e-5}[precision]
     for plane in PLANES:
-        values = getattr(small.picture, plane)
-        assert np.abs(actual_picture[plane] - values).max() <= tolerance * np.abs(values).max()
+        values = getattr(small.rendered, plane)
+        assert np.abs(actual_image[plane] - values).max() <= tolerance * np.abs(values).max()
     rest = np.delete(np.arange(count), first)
     for key in ("means", "log_scales", "logit_opacities", "sh0"):
         assert not actual[key][rest].any(), key
@@ -124,7 +124,7 @@ def test_a_million_gaussians_in_one_pixel(precision):
 def test_crop_windows_are_parts_of_the_whole(precision, name):
     """Each piece, drawn by itself, is within the bound of the whole."""
     case = FAMILIES[name]
-    bounds, wanted = allowed(name)[0]["image"], case.picture.image
+    bounds, wanted = allowed(name)[0]["image"], case.rendered.image
     gaussians = device_gaussians(case.gaussians, precision)
     whole = device_camera(case.camera, precision)
     for x, y, width, height in [(0, 0, 17, 29), (17, 0, 20, 11), (17, 11, 20, 18)]:
@@ -141,7 +141,7 @@ def test_crop_windows_are_parts_of_the_whole(precision, name):
         planes = [rows(plane).reshape(height, width) for plane in frame.planes()]
         image = np.stack(planes[1:4], axis=-1) + planes[0][..., None] * case.background
         part = np.s_[y : y + height, x : x + width]
-        marked = case.picture.near_threshold[part]
+        marked = case.rendered.near_threshold[part]
         ratios = errors_over_bounds(
             {"image": image}, {"image": wanted[part]}, {"image": bounds[part]}, precision, marked
         )

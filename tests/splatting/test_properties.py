@@ -57,7 +57,7 @@ def variant():
 
 def assert_equal(actual, expected) -> None:
     """To the last bit, but for the signs of zeros; all is finite."""
-    for of in ("picture", "gradients"):
+    for of in ("image", "gradients"):
         for name, values in getattr(expected, of).items():
             assert np.isfinite(values).all(), name
             np.testing.assert_array_equal(getattr(actual, of)[name], values, name)
@@ -154,7 +154,7 @@ def test_points_and_camera_may_be_scaled_by_powers_of_two(precision, case, expon
 def scaled_result(result, factor) -> Result:
     """What becomes of a result when the unit of length is divided by ``factor``."""
     return Result(
-        picture=result.picture | {"depth": factor * result.picture["depth"]},
+        rendered=result.rendered | {"depth": factor * result.rendered["depth"]},
         gradients=result.gradients | {"means": result.gradients["means"] / factor},
     )
 

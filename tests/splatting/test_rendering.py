@@ -1,4 +1,4 @@
-"""The whole chain against the float64 reference and gsplat: picture, gradients, tangents, bytes."""
+"""The whole chain against the float64 reference and gsplat: image, gradients, tangents, bytes."""
 
 from dataclasses import replace
 
@@ -12,14 +12,14 @@ from support.helpers import (
     Case,
     Cotangents,
     assert_arrays_agree,
-    assert_pictures_agree,
+    assert_images_agree,
     both_precisions,
     clear,
     device_camera,
     device_gaussians,
     frame_adjoint,
+    image_planes,
     kernel_gradients,
-    picture_of,
     plane_cotangents,
     reference_gradients,
     render,
@@ -51,36 +51,36 @@ from drgs.splatting.projection import plain_opacity
 # <= 1.1 per px, so by 1e-5, and a pixel by a few such errors of either sign: measured 4e-6.
 # Gradients: the same errors, and those of S / (1 - a), 1e-7 / 0.01 = 1e-5 of the largest term;
 # then rows that cancel (a quaternion's gradient is small beside its terms). Measured 1e-5.
-PICTURE = {FLOAT64: 1e-12, FLOAT32: 2e-5}
+IMAGE = {FLOAT64: 1e-12, FLOAT32: 2e-5}
 
 
 all_cases = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 
 
 # ----------------------------------------------------------------------------------------------
-# Picture
+# Image
 # ----------------------------------------------------------------------------------------------
 
 
 @both_precisions
 @all_cases
-def test_picture_equals_the_reference(precision, case):
+def test_image_equals_the_reference(precision, case):
     """No pixel is near a threshold, so none is left out."""
     case = clear(case)
     _, frame = render(case, precision)
-    assert not case.picture.near_threshold.any()
-    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    assert not case.rendered.near_threshold.any()
+    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
 
 
 @both_precisions
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_larger_pictures_differ_only_at_marked_pixels(precision, seed, antialiased):
+def test_larger_images_differ_only_at_marked_pixels(precision, seed, antialiased):
     """Scenes as they come: a few of the 10,800 pixels are near a threshold, at most one flips."""
     case = Case("large", 120, 90, 1, count=600, antialiased=antialiased, seed=seed)
-    assert case.picture.near_threshold.any()
+    assert case.rendered.near_threshold.any()
     _, frame = render(case, precision)
-    assert_pictures_agree(picture_of(frame, case), case.picture, PICTURE[precision])
+    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
 
 
 def test_stacked_scenes_stop_pixels_and_clamp_alphas():
@@ -138,10 +138,10 @@ def test_gradients_scaled_by_one_percent_are_noticed(precision, field, first, en
 
 
 @both_precisions
-def test_gradients_of_a_larger_picture(precision):
+def test_gradients_of_a_larger_image(precision):
     """The cotangent is zero at marked pixels, in both computations."""
     case = Case("large", 120, 90, 1, count=600, seed=1)
-    marked = case.picture.near_threshold
+    marked = case.rendered.near_threshold
     assert 0 < marked.sum() <= 50
     cotangents = Cotangents.random(case)
     actual = kernel_gradients(case, precision, cotangents)
@@ -174,21 +174,21 @@ def test_features_are_composited_in_the_order_that_was_asked_for(precision, feat
     pipeline = rendering.Pipeline(3, plain_opacity, features)
     gaussians, frame = render(case, precision, pipeline)
     cotangents = Cotangents.random(case)
-    picture = {
+    rendered = {
         rendering.color_features: list(
-            np.moveaxis(case.picture.image, -1, 0)
-            - case.background[:, None, None] * case.picture.transmittance
+            np.moveaxis(case.rendered.image, -1, 0)
+            - case.background[:, None, None] * case.rendered.transmittance
         ),
-        rendering.depth_feature: [case.picture.depth],
+        rendering.depth_feature: [case.rendered.depth],
     }
     weights = {
         rendering.color_features: list(np.moveaxis(cotangents.d_image, -1, 0)),
         rendering.depth_feature: [cotangents.d_depth],
     }
-    expected = [case.picture.transmittance] + [p for f in features for p in picture[f]]
+    expected = [case.rendered.transmittance] + [p for f in features for p in rendered[f]]
     actual = [rows(plane).reshape(case.height, case.width) for plane in frame.planes()]
     assert len(actual) == len(expected)
-    assert_arrays_agree(dict(enumerate(actual)), dict(enumerate(expected)), PICTURE[precision])
+    assert_arrays_agree(dict(enumerate(actual)), dict(enumerate(expected)), IMAGE[precision])
 
     gradients = frame_adjoint(
         gaussians,
@@ -247,9 +247,9 @@ def test_without_a_visible_splat_there_is_only_the_background(precision):
     hidden = replace(case.gaussians, logit_opacities=np.full(5, -8.0))
     gaussians = device_gaussians(hidden, precision)
     frame = rendering.render(gaussians, device_camera(case.camera, precision), case.pipeline)
-    picture = picture_of(frame, case)
-    np.testing.assert_array_equal(picture["image"], np.broadcast_to(case.background, (13, 20, 3)))
-    assert not picture["depth"].any() and not picture["alpha"].any()
+    rendered = image_planes(frame, case)
+    np.testing.assert_array_equal(rendered["image"], np.broadcast_to(case.background, (13, 20, 3)))
+    assert not rendered["depth"].any() and not rendered["alpha"].any()
     gradients = frame_adjoint(
         gaussians, frame, *plane_cotangents(case, Cotangents.random(case), precision)
     )
@@ -320,7 +320,7 @@ def test_camera_tangents_of_two_frames_equal_differences_of_the_reference(case):
 
 @pytest.mark.parametrize("sh_direction", ["mean", "pixel"])
 @both_precisions
-def test_weighted_sums_are_what_a_gaussian_adds_to_the_picture_times_the_plane(
+def test_weighted_sums_are_what_a_gaussian_adds_to_the_image_times_the_plane(
     precision, sh_direction
 ):
     """The reference composites each Gaussian alone in white, among the others in black.
@@ -333,15 +333,15 @@ def test_weighted_sums_are_what_a_gaussian_adds_to_the_picture_times_the_plane(
     plane = np.random.default_rng(3).uniform(0, 1, (case.height, case.width))
     expected = []
     for white in np.eye(12):
-        picture = reference.composite(
+        rendered = reference.composite(
             splats.means2d, splats.conics, splats.opacities, np.repeat(white[:, None], 3, axis=1),
             splats.depths, splats.visible, np.zeros(3), case.width, case.height,
             cuts=splats.cuts,
         )  # fmt: skip
-        expected.append(np.sum(picture.image[..., 0] * plane))
+        expected.append(np.sum(rendered.image[..., 0] * plane))
     approximations = Approximations(sh_direction=sh_direction)
     pipeline = pipeline_of(approximations, case.rendered_degree)
     _, frame = render(case, precision, pipeline)
     got = np.array(rendering.weighted_sums(frame, precision.array(plane)), np.float64)
     assert np.max(expected) > 1
-    np.testing.assert_allclose(got, expected, atol=PICTURE[precision] * np.max(expected))
+    np.testing.assert_allclose(got, expected, atol=IMAGE[precision] * np.max(expected))

@@ -1,4 +1,4 @@
-"""The whole chain against gsplat's pictures and gradients."""
+"""The whole chain against gsplat's images and gradients."""
 
 from dataclasses import replace
 
@@ -40,12 +40,12 @@ def gsplat_frame(scene, precision):
 
 @pytest.fixture(scope="module")
 def gsplat_marked(gsplat):
-    """The reference's picture, with marks."""
+    """The reference's image, with marks."""
     return reference.render(*gsplat[:2], np.ones(3), threshold_width=NEAR_THRESHOLD)
 
 
 @both_precisions
-def test_picture_agrees_with_gsplat(precision, gsplat, gsplat_marked):
+def test_image_agrees_with_gsplat(precision, gsplat, gsplat_marked):
     _, _, image = gsplat_frame(gsplat, precision)
     errors = np.abs(image - gsplat[2])
     # gsplat's positions of 200 px carry 1e-5 px: measured 7e-7 on average, and 4 flipped pixels.

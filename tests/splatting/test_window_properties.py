@@ -26,7 +26,7 @@ from support.random_scenes import (
     cases,
     changed,
     examples,
-    picture_of,
+    image_planes,
     point_at,
     random_weights,
     result_of,
@@ -74,9 +74,9 @@ def plugin_scenes(draw) -> Scene:
 
 
 def rendered(case, precision, gaussians) -> dict[str, np.ndarray]:
-    """The picture of other Gaussians than the case's."""
+    """The image of other Gaussians than the case's."""
     gaussians = uploaded(gaussians, precision)
-    return picture_of(
+    return image_planes(
         rendering.render(gaussians, device_camera(case.camera, precision), case.pipeline)
     )
 
@@ -116,30 +116,30 @@ def window_of(camera, piece, precision):
 @both_precisions
 @examples
 @given(cases(), sizes, sizes)
-def test_windows_together_are_the_whole_picture(precision, case, x, y):
-    """And their gradients add up to those of the whole picture."""
+def test_windows_together_are_the_whole_image(precision, case, x, y):
+    """And their gradients add up to those of the whole image."""
     assume_decided(case)
     undecided = undecided_pixels(case)
     weights = random_weights(case) * ~undecided
     expected = result_of(case, precision, weights)
-    picture = {name: np.full_like(values, np.nan) for name, values in expected.picture.items()}
+    rendered = {name: np.full_like(values, np.nan) for name, values in expected.rendered.items()}
     gradients = {name: np.zeros_like(values) for name, values in expected.gradients.items()}
     for piece in pieces(case.width, case.height, x, y):
         x0, y0, width, height = piece
         window = slice(y0, y0 + height), slice(x0, x0 + width)
         camera = window_of(case.camera, piece, precision)
         part = result_of(case, precision, [w[window] for w in weights], camera=camera)
-        for name, values in part.picture.items():
-            picture[name][window] = values
+        for name, values in part.rendered.items():
+            rendered[name][window] = values
         for name, values in part.gradients.items():
             gradients[name] = gradients[name] + values
-    actual = Result(picture, gradients)
+    actual = Result(rendered, gradients)
     assert_agree(actual, expected, case.gaussians.quats, undecided, CROPPED * ROUNDOFF[precision])
 
 
 @examples
 @given(plugin_scenes(), sizes, sizes)
-def test_windows_of_a_mitsuba_film_together_are_the_whole_picture(scene, x, y):
+def test_windows_of_a_mitsuba_film_together_are_the_whole_image(scene, x, y):
     undecided = undecided_pixels(scene)
     loaded = scene.load()
     whole, image = image_of(loaded), np.full((scene.view.height, scene.view.width, 4), np.nan)
@@ -176,7 +176,7 @@ def test_white_minus_black_is_the_transmittance_and_alpha_the_rest(scene):
 @both_precisions
 @examples
 @given(cases(), seeds)
-def test_pictures_are_linear_in_the_features_and_weights_add_up_to_alpha(precision, case, seed):
+def test_images_are_linear_in_the_features_and_weights_add_up_to_alpha(precision, case, seed):
     rng = np.random.default_rng(seed)
     a, b = rng.normal(0, 1, (2, case.count))
     s, t = rng.normal(0, 1, 2)

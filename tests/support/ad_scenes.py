@@ -55,14 +55,14 @@ def splats(gaussians, **settings) -> dict:
 class Config:
     """A scene, one of its parameters, and how that depends on a number theta, 0 at the start."""
 
-    picture: str  # name of the stored one
+    rendered: str  # name of the stored one
     key: str
     along: Any = 1.0  # derivative of the parameter in theta, broadcast to its shape
     row: int | None = None  # the only one that changes, where it is a tensor; None: all
     epsilon = 0.01  # step of theta
     spp = 1
 
-    # Mitsuba's are 0.05, 0.5 and 0.05. Pictures are single: rounding of 1e-6 over a step of 0.01 is
+    # Mitsuba's are 0.05, 0.5 and 0.05. Images are single: rounding of 1e-6 over a step of 0.01 is
     # 1e-4 of derivatives around 1, and averages out in sums. In linear radiance the maximum is that
     # of pixels within a step of the kink of the conversion, where slopes differ by 1.8 %, half of
     # which is missed. Measured: mean 1.1e-4, maximum 9.8e-3, of sums 4.6e-5.
@@ -110,7 +110,7 @@ class Config:
 
     def initialize(self) -> None:
         """Load the scene, if no other config has, and note where the parameter starts."""
-        self.scene = scene_of(self.picture)
+        self.scene = scene_of(self.rendered)
         self.params = mi.traverse(self.scene)
         self.initial_state = type(self.params[self.key])(self.params[self.key])
 
@@ -139,7 +139,7 @@ class Config:
 class Means(Config):
     """All move to the right."""
 
-    picture = "splats"
+    rendered = "splats"
     key = "integrator.means"
     along = (1.0, 0.0, 0.0)
 
@@ -185,7 +185,7 @@ class DefaultCutoffs(Means):
     so that larger steps are as good. Measured: mean 0.018, maximum 0.22, of the sum 0.005.
     """
 
-    picture = "default_cutoffs"
+    rendered = "default_cutoffs"
     epsilon = 0.1
     error_mean_threshold, error_max_threshold = 0.03, 0.5
     error_mean_threshold_bwd = 0.02
@@ -201,7 +201,7 @@ class DefaultCutoffs(Means):
 
 
 class DisplaySpace(Means):
-    picture = "display_space"
+    rendered = "display_space"
 
     def integrator(self):
         return super().integrator() | {"srgb_primitives": False}
@@ -210,7 +210,7 @@ class DisplaySpace(Means):
 class Feature(Config):
     """Behind it the channels of depth, alpha and normals."""
 
-    picture = "aovs"
+    rendered = "aovs"
     key = "integrator.feature_mark"
 
     def integrator(self):
@@ -233,7 +233,7 @@ class NormalOfRotations(Feature):
 class AntialiasedScale(Config):
     """Of splats that are smaller than a pixel."""
 
-    picture = "antialiased"
+    rendered = "antialiased"
     key = "integrator.log_scales"
 
     def gaussians(self):
@@ -247,7 +247,7 @@ class AntialiasedScale(Config):
 class UnscentedMeans(Means):
     """Of which each pixel sees the colour in its own direction."""
 
-    picture = "unscented"
+    rendered = "unscented"
 
     def integrator(self):
         return super().integrator() | {"projection": "unscented", "sh_direction": "pixel"}
@@ -256,7 +256,7 @@ class UnscentedMeans(Means):
 class ExactMeans(Means):
     """Far behind each other, so that at no pixel the order of their peaks changes."""
 
-    picture = "exact"
+    rendered = "exact"
 
     def gaussians(self):
         return gaussians(count=10, farthest=-7.0)
@@ -280,7 +280,7 @@ class ExactRotation(ExactMeans):
 class Sampled(Means):
     """At four points of each pixel, which a filter adds to several."""
 
-    picture = "sampled"
+    rendered = "sampled"
     spp = 4
 
     def film(self):
@@ -303,7 +303,7 @@ class FieldOfView(Means):
 
 
 class ThinLens(Config):
-    picture = "thin_lens"
+    rendered = "thin_lens"
     key = "sensor.to_world"
     along = OBLIQUE
 
@@ -317,7 +317,7 @@ class Aperture(ThinLens):
 
 
 class Orthographic(Config):
-    picture = "orthographic"
+    rendered = "orthographic"
     key = "sensor.to_world"
     along = OBLIQUE
 
@@ -329,7 +329,7 @@ class Orthographic(Config):
 
 
 class Calibrated(Config):
-    picture = "calibrated"
+    rendered = "calibrated"
     key = "sensor.to_world"
     along = OBLIQUE
 
@@ -346,7 +346,7 @@ class Distortion(Calibrated):
 class CropWindow(Means):
     """Left of the middle of a film that is twice as large."""
 
-    picture = "crop_window"
+    rendered = "crop_window"
 
     def film(self):
         whole = {"width": 2 * WIDTH, "height": 2 * HEIGHT}
@@ -363,7 +363,7 @@ class CropWindowFieldOfView(CropWindow):
 class Batch(Means):
     """From the right and from the left."""
 
-    picture = "batch"
+    rendered = "batch"
 
     def sensor(self):
         film = self.film() | {"width": WIDTH // 2}
@@ -391,7 +391,7 @@ def emitter(position, radiance) -> dict:
 class Hybrid(Means):
     """Before, beside and behind a diffuse ball that is lit from the left."""
 
-    picture = "hybrid"
+    rendered = "hybrid"
     hide_emitters = False
 
     def gaussians(self):
@@ -438,7 +438,7 @@ class AreaLightRadiance(Hybrid):
 
 
 class PointLightIntensity(Hybrid):
-    picture = "point_light"
+    rendered = "point_light"
     key = "light.intensity.value"
     along = 1.0
 
@@ -450,7 +450,7 @@ class PointLightIntensity(Hybrid):
 class BeforeConstantEmitter(Hybrid):
     """It lights the ball, and is seen behind all."""
 
-    picture = "constant_emitter"
+    rendered = "constant_emitter"
 
     def light(self):
         return {"type": "constant", "radiance": {"type": "rgb", "value": [0.4, 0.6, 0.9]}}
@@ -467,7 +467,7 @@ class HiddenEmitters(AreaLightRadiance):
     Not before the ball: what Mitsuba 3.9 sees through a hidden lamp is not lit by it.
     """
 
-    picture = "hidden_emitters"
+    rendered = "hidden_emitters"
     hide_emitters = True
 
     def light(self):
@@ -483,7 +483,7 @@ class HiddenEmitters(AreaLightRadiance):
 class ShapeData(Config):
     """Centres, scales and quaternions."""
 
-    picture = "shapes"
+    rendered = "shapes"
     key = "shape.data"
     along = np.tile([1, 0, 0, 0.1, 0.1, 0.1, 0.3, -0.5, 0.8, 0.4], 24)
 
@@ -521,11 +521,11 @@ def _kinds(kind: type) -> list[type[Config]]:
 CONFIGS = _kinds(Config)
 
 
-PICTURES = {config.picture: config for config in reversed(CONFIGS)}
+IMAGES = {config.rendered: config for config in reversed(CONFIGS)}
 """A config of each, with which it is rendered."""
 
 
 @cache
-def scene_of(picture: str) -> mi.Scene:
+def scene_of(rendered: str) -> mi.Scene:
     """One for all configs that show it: Mitsuba compiles light paths anew for each scene."""
-    return mi.load_dict(PICTURES[picture]().scene_dict())
+    return mi.load_dict(IMAGES[rendered]().scene_dict())

@@ -1,4 +1,4 @@
-"""Scenes for each approximation, and what its pictures and derivatives are checked against."""
+"""Scenes for each approximation, and what its images and derivatives are checked against."""
 
 import math
 from dataclasses import dataclass, replace
@@ -120,8 +120,8 @@ class Problem:
     def pipeline(self) -> rendering.Pipeline:
         return pipeline_of(self.approximations, SCENES[self.scene][3])
 
-    def picture(self, threshold_width) -> reference.Picture:
-        return _picture(self, threshold_width)
+    def rendered(self, threshold_width) -> reference.RenderedImage:
+        return _image(self, threshold_width)
 
     def reference_planes(self, gaussians) -> np.ndarray:
         """(H, W, 4): transmittance and colour."""
@@ -149,7 +149,7 @@ class Problem:
         """(H, W, 4), zero at pixels that a small step may take across a decision."""
         camera = self.inputs[1]
         weights = np.random.default_rng(seed).normal(size=(camera.height, camera.width, 4))
-        return single(weights * ~self.picture(marked).near_threshold[..., None])
+        return single(weights * ~self.rendered(marked).near_threshold[..., None])
 
     def kernel_gradients(self, precision, weights) -> dict[str, np.ndarray]:
         gaussians, frame = self.render(precision)
@@ -167,14 +167,14 @@ def _inputs(scene):
 
 
 @cache
-def _picture(problem, threshold_width):
+def _image(problem, threshold_width):
     return reference_rays.render(
         *problem.inputs, (0, 0, 0), problem.model, threshold_width=threshold_width
     )
 
 
-def _planes(picture) -> np.ndarray:
-    return np.concatenate([picture.transmittance[..., None], picture.image], axis=-1)
+def _planes(rendered) -> np.ndarray:
+    return np.concatenate([rendered.transmittance[..., None], rendered.image], axis=-1)
 
 
 def direction(problem, name, seed) -> reference.Gaussians:
@@ -275,9 +275,9 @@ def check_sums_of_products_are_exact_to_twice_the_precision():
     assert abs(float(high[0]) + float(low[0]) - expected) < 200 * 2.0**-48 * np.abs(a * b).max()
 
 
-def check_twins_are_composited_in_one_order_by_picture_and_derivative():
-    """Every splat is there twice, in two colours, at equal depths. Pictures are linear in the
-    colours that are not clamped: their derivatives, times them, give the picture again. (The window
+def check_twins_are_composited_in_one_order_by_image_and_derivative():
+    """Every splat is there twice, in two colours, at equal depths. Images are linear in the
+    colours that are not clamped: their derivatives, times them, give the image again. (The window
     is odd: a comparison that swaps twins does it again at every insertion.)
     """
     gaussians, camera = close_scene(3, 20, 12, 0, 10)
@@ -290,8 +290,8 @@ def check_twins_are_composited_in_one_order_by_picture_and_derivative():
     black = device_gaussians(reference.Gaussians(**{**twins, "sh0": 0 * twins["sh0"]}), FLOAT64)
     without = rendering.render(black, device_camera(camera, FLOAT64), pipeline)
     gradients = frame_adjoint(device, frame, [precise(w) for w in weights], precise(0 * weights[0]))
-    pictures = [np.array([rows(p) for p in f.planes()[1:]]) for f in (frame, without)]
-    linear = np.sum(weights * (pictures[0] - pictures[1]))
+    images = [np.array([rows(p) for p in f.planes()[1:]]) for f in (frame, without)]
+    linear = np.sum(weights * (images[0] - images[1]))
     from_gradients = np.sum(twins["sh0"] * np.array(gradients.parameters.sh0))
     assert from_gradients == pytest.approx(linear, rel=1e-12)
 

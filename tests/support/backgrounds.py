@@ -1,4 +1,4 @@
-"""Environments and pictures behind splats."""
+"""Environments and images behind splats."""
 
 from dataclasses import dataclass, field
 from functools import cache
@@ -14,7 +14,7 @@ from support.views import VIEWS, View, image_of, tensors
 
 # Single precision, of values up to 2: as in test_splats; the conversion to display space multiplies
 # errors of dark pixels by up to 13.
-PICTURE = 2e-5
+IMAGE = 2e-5
 
 
 VIEW = VIEWS[1]
@@ -92,7 +92,7 @@ def splats_alone(sensor, gaussians, **settings) -> np.ndarray:
     return image_of(load(sensor, integrator_of(gaussians, **settings)))
 
 
-def picture(values, **changes) -> dict:
+def rendered(values, **changes) -> dict:
     return {
         "type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "filter_type": "nearest",
         **changes,

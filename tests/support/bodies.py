@@ -1,4 +1,4 @@
-"""Analytic bodies, and pictures of them with alpha: rays through every pixel, in float64."""
+"""Analytic bodies, and images of them with alpha: rays through every pixel, in float64."""
 
 import numpy as np
 
@@ -53,7 +53,7 @@ def directions_to(count):
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
 
 
-def picture_of(
+def image_of(
     body, name, center, size=64, samples=2, lens=None, background=WHITE, focal=1.4, paint=colors_at
 ):
     """A view towards the origin; lens: of the reference, as well; samples: of a pixel, squared."""
@@ -88,15 +88,15 @@ def picture_of(
     )  # fmt: skip
 
 
-def pictures_of(body, count=20, **options):
+def images_of(body, count=20, **options):
     """Views from all around."""
     return tuple(
-        picture_of(body, f"v{number}", DISTANCE * direction, **options)
+        image_of(body, f"v{number}", DISTANCE * direction, **options)
         for number, direction in enumerate(directions_to(count))
     )
 
 
-def dataset_of_pictures(views, half_extent=1.3, background=WHITE, **fields):
+def dataset_of_images(views, half_extent=1.3, background=WHITE, **fields):
     """All of them to train on."""
     return Dataset(tuple(views), (), "test", background, half_extent, "", **fields)
 
@@ -105,9 +105,9 @@ PINHOLE = reference.Pinhole()
 
 
 def opaque_at(view, points, lens=PINHOLE):
-    """(N,) bool: whether the picture shows something at the places of points (N, 3), world.
+    """(N,) bool: whether the image shows something at the places of points (N, 3), world.
 
-    Projected by the reference. True where the picture does not show them.
+    Projected by the reference. True where the image does not show them.
     """
     fields = view.fx, view.fy, view.cx, view.cy, view.width, view.height
     camera = Camera(view.camera_to_world[:3, :3].T, view.center, *fields, 0.2)

@@ -1,7 +1,7 @@
 """Chromium without a window, by the DevTools protocol: pages, a mouse, and what went wrong.
 
 It listens to a pipe (``--remote-debugging-pipe``): messages are JSON, each ended by a zero byte, on
-file descriptors 3 and 4 of the browser. Pictures are made by software, as test machines have no
+file descriptors 3 and 4 of the browser. Images are made by software, as test machines have no
 graphics card.
 """
 
@@ -149,7 +149,7 @@ class Page:
             assert time.monotonic() < end, f"{expression} is not true; {self.troubles()}"
             time.sleep(0.05)
 
-    def picture(self) -> np.ndarray:
+    def rendered(self) -> np.ndarray:
         """(height, width, 3) display space, 0 to 1."""
         data = self.call("Page.captureScreenshot", format="png")["data"]
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
@@ -205,7 +205,7 @@ class Page:
 
 @contextmanager
 def a_page(width: int, height: int) -> Iterator[Page]:
-    """Of a browser of its own, whose pictures are made by software."""
+    """Of a browser of its own, whose images are made by software."""
     with Browser(*SOFTWARE_WEBGL) as browser:
         yield Page(browser, width, height)
 

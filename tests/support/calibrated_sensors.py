@@ -138,12 +138,12 @@ def splats_scene(sensor, gaussians, **settings) -> mi.Scene:
 
 
 def clear_gaussians(sensor, render, view=None):
-    """Gaussians before the view, and their picture, which no threshold is near to."""
+    """Gaussians before the view, and their image, which no threshold is near to."""
     for seed in range(100):
         gaussians = splats_before(view or sensor.view, 1, 40, seed)
-        picture = render(gaussians)
-        if not picture.near_threshold[sensor.view.window].any():
-            return gaussians, picture
+        rendered = render(gaussians)
+        if not rendered.near_threshold[sensor.view.window].any():
+            return gaussians, rendered
     raise AssertionError(f"{sensor.name}: no clear seed among 100")
 
 

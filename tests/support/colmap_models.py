@@ -109,7 +109,7 @@ SIZE = 640, 480  # of some_model's cameras
 NAMES = ("a.jpg", "b.jpg", "cam/1.png", "cam/2.png")
 
 
-def write_pictures(folder, names=NAMES, size=SIZE, **options):
+def write_images(folder, names=NAMES, size=SIZE, **options):
     """Of a colour for each."""
     for number, name in enumerate(names):
         path = folder / name
@@ -121,5 +121,5 @@ def write_dataset(folder, models=("PINHOLE",), below="sparse/0", write=write_bin
     """Images are in the file in another order than by name."""
     model = some_model(np.random.default_rng(1), NAMES[::-1], models)
     write(folder / below, model)
-    write_pictures(folder / "images")
+    write_images(folder / "images")
     return model

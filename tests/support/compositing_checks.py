@@ -73,12 +73,12 @@ class FlatScene:
 
     def reference_planes(self) -> dict[str, np.ndarray]:
         """transmittance (H, W) and features (H, W, C)."""
-        pictures = [
+        renders = [
             reference.composite(**self.reference_arguments(g)) for g in range(self.num_groups)
         ]
-        images = np.concatenate([picture.image for picture in pictures], axis=-1)
+        images = np.concatenate([rendered.image for rendered in renders], axis=-1)
         return {
-            "transmittance": pictures[0].transmittance,
+            "transmittance": renders[0].transmittance,
             "features": images[..., : self.features.shape[1]],
         }
 
@@ -106,8 +106,8 @@ class FlatScene:
         return total
 
     def near_threshold(self) -> np.ndarray:
-        picture = reference.composite(**self.reference_arguments(), threshold_width=NEAR_THRESHOLD)
-        return picture.near_threshold
+        rendered = reference.composite(**self.reference_arguments(), threshold_width=NEAR_THRESHOLD)
+        return rendered.near_threshold
 
     def num_stopped(self) -> int:
         """Pixels that are finished before the last splat that reaches them."""

@@ -38,13 +38,13 @@ EXP2 = 4.0
 class Noise:
     """Root mean square change of each result under one rounding everywhere."""
 
-    picture: dict[str, np.ndarray]
+    rendered: dict[str, np.ndarray]
     gradients: dict[str, np.ndarray]
 
 
 def noise(case: Case, cotangents: Cotangents, samples: int = SAMPLES) -> Noise:
-    """The noise of a case's picture and gradients, arrays in the shapes of the results."""
-    pictures, gradients = [], []
+    """The noise of a case's image and gradients, arrays in the shapes of the results."""
+    images, gradients = [], []
     base = _results(case.gaussians, case.camera, case, cotangents)
     splats = reference.project(case.gaussians, case.camera, case.antialiased)
     order = reference._depth_order(splats.depths, splats.visible)
@@ -55,21 +55,21 @@ def noise(case: Case, cotangents: Cotangents, samples: int = SAMPLES) -> Noise:
             *(rounded(rng, getattr(cotangents, name)) for name in vars(cotangents))
         )
         with _rounded_stages(rng, order):
-            picture, gradient = _results(gaussians, camera, case, weights)
-        pictures.append(picture)
+            rendered, gradient = _results(gaussians, camera, case, weights)
+        images.append(rendered)
         gradients.append(gradient)
-    return Noise(_rms(pictures, base[0]), _rms(gradients, base[1]))
+    return Noise(_rms(images, base[0]), _rms(gradients, base[1]))
 
 
 def _results(gaussians, camera, case, cotangents) -> tuple[dict, dict]:
-    picture = reference.render(
+    rendered = reference.render(
         gaussians, camera, case.background, case.rendered_degree, case.antialiased
     )
     gradients = reference.render_gradients(
         gaussians, camera, case.background, cotangents.d_image, cotangents.d_alpha,
         cotangents.d_depth, case.rendered_degree, case.antialiased,
     )  # fmt: skip
-    planes = {n: getattr(picture, n) for n in ("image", "alpha", "depth", "transmittance")}
+    planes = {n: getattr(rendered, n) for n in ("image", "alpha", "depth", "transmittance")}
     return planes, gradients
 
 

@@ -1,4 +1,4 @@
-"""Pictures of the corner of a room with noise on its walls, and where they were taken."""
+"""Images of the corner of a room with noise on its walls, and where they were taken."""
 
 import numpy as np
 from PIL import Image
@@ -19,12 +19,12 @@ def walls(seed=0, side=512):
     return np.clip(0.5 + 0.2 * noise, 0, 1)
 
 
-def picture_of(textures, pose):
+def image_of(textures, pose):
     """(H, W, 3) uint8 of a pinhole camera; pose: (4, 4) camera to world, OpenGL axes."""
     width, height = SIZE
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([x, -y, np.full_like(x, -FOCAL)], axis=-1) @ pose[:3, :3].T
-    center, picture = pose[:3, 3], np.zeros((height, width, 3))
+    center, rendered = pose[:3, 3], np.zeros((height, width, 3))
     distances = np.stack([-center[k] / np.minimum(rays[..., k], -1e-9) for k in range(3)])
     nearest = distances.argmin(axis=0)
     for k in range(3):
@@ -33,8 +33,8 @@ def picture_of(textures, pose):
         for channel in range(3):
             texture = textures[k, :, :, channel]
             seen = map_coordinates(texture, np.moveaxis(place, -1, 0), order=1, mode="wrap")
-            picture[..., channel] = np.where(nearest == k, seen, picture[..., channel])
-    return np.round(255 * picture).astype(np.uint8)
+            rendered[..., channel] = np.where(nearest == k, seen, rendered[..., channel])
+    return np.round(255 * rendered).astype(np.uint8)
 
 
 def poses(count):
@@ -50,10 +50,10 @@ def poses(count):
 
 
 def write_photographs(folder, names, **options):
-    """A picture of each name; their poses."""
+    """A image of each name; their poses."""
     folder.mkdir(parents=True, exist_ok=True)
     textures = walls()
     found = poses(len(names))
     for name, pose in zip(names, found, strict=True):
-        Image.fromarray(picture_of(textures, pose)).save(folder / name, **options)
+        Image.fromarray(image_of(textures, pose)).save(folder / name, **options)
     return found

@@ -26,8 +26,7 @@ def check_against_differences(case, kernel_gradients, tolerance) -> dict[str, np
     gradients, found = kernel_gradients(case, FLOAT64, cotangents), {}
     for parameter, direction in directions(case.gaussians, seed=3).items():
         forward, backward = (
-            case.reference_picture(moved(case.gaussians, direction, sign * STEP))
-            for sign in (1, -1)
+            case.reference_image(moved(case.gaussians, direction, sign * STEP)) for sign in (1, -1)
         )
         expected = sum(
             np.sum(getattr(cotangents, f"d_{n}") * (getattr(forward, n) - getattr(backward, n)))
@@ -41,7 +40,7 @@ def check_against_differences(case, kernel_gradients, tolerance) -> dict[str, np
 def check_transpose(case, precision, gaussians, frames, kernel_gradients, tolerance) -> None:
     """The adjoint is the transpose of the tangent: <w, J v> = <J^T w, v>.
 
-    frames: the case's picture is their mean; kernel_gradients: as above; tolerance: relative, of
+    frames: the case's image is their mean; kernel_gradients: as above; tolerance: relative, of
     sums of thousands of terms, each as accurate as the arrays are.
     """
     cotangents = Cotangents.random(case, seed=4)

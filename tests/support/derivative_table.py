@@ -1,6 +1,6 @@
 """Derivatives with respect to all kinds of parameters, by all routes, and the table of them.
 
-Scenes are continuous in the parameter: no silhouette or edge of a shadow moves in the picture.
+Scenes are continuous in the parameter: no silhouette or edge of a shadow moves in the image.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def load(case: Case, route: str) -> mi.Scene:
 
 
 class Derivative:
-    """That of a picture's weighted mean with respect to theta, by a route."""
+    """That of a image's weighted mean with respect to theta, by a route."""
 
     def __init__(self, case: Case, route: str) -> None:
         self.case, self.scene = case, load(case, route)

@@ -17,7 +17,7 @@ from support.views import Scene, gradient, tensors
 
 # As in test_splats: single precision, relative to the largest value of an array. Scales and
 # opacities are converted with a relative error of 1e-7 each.
-PICTURE, GRADIENTS = 1e-5, 1e-4
+IMAGE, GRADIENTS = 1e-5, 1e-4
 
 
 HELD = ("data", "opacities", "sh_coeffs")
@@ -129,7 +129,7 @@ def assert_held_agree(actual, expected):
     assert_arrays_agree(apart(actual), apart(expected), GRADIENTS)
 
 
-def assert_images_agree(actual, expected, tolerance=PICTURE):
+def assert_images_agree(actual, expected, tolerance=IMAGE):
     assert_arrays_agree({"image": actual}, {"image": expected}, tolerance)
 
 

@@ -58,7 +58,7 @@ def assert_fit_refused(*arguments: object, folder: Path, message: str) -> None:
     assert_refused(fit.main, *arguments, folder=folder, message=message)
 
 
-def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report that takes no time: an empty page."""
 
     def write_page(out: Path, *_: object) -> None:

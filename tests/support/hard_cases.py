@@ -1,4 +1,4 @@
-"""Families of hard inputs, and how far rounding may take their pictures and gradients."""
+"""Families of hard inputs, and how far rounding may take their images and gradients."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -456,10 +456,10 @@ def cotangents_of(name) -> Cotangents:
 
 @cache
 def expected(name) -> tuple[dict, dict]:
-    """Picture and gradients by the reference."""
+    """Image and gradients by the reference."""
     case = FAMILIES[name]
-    picture = {plane: getattr(case.picture, plane) for plane in PLANES}
-    return picture, reference_gradients(case, cotangents_of(name))
+    rendered = {plane: getattr(case.rendered, plane) for plane in PLANES}
+    return rendered, reference_gradients(case, cotangents_of(name))
 
 
 @cache
@@ -471,8 +471,8 @@ def allowed(name) -> tuple[dict, dict]:
     def bounds(noises, values):
         return {key: bound_of(case, noises[key], value) for key, value in values.items()}
 
-    pictures, gradients = expected(name)
-    return bounds(found.picture, pictures), bounds(found.gradients, gradients)
+    images, gradients = expected(name)
+    return bounds(found.rendered, images), bounds(found.gradients, gradients)
 
 
 def bound_of(case, noise, values) -> np.ndarray:

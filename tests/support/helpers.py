@@ -194,9 +194,9 @@ class Case:
         return self.degree if self.sh_degree is None else self.sh_degree
 
     @property
-    def picture(self) -> reference.Picture:
+    def rendered(self) -> reference.RenderedImage:
         """By the reference; marked pixels are those within ``threshold_width``."""
-        return _picture(self)
+        return _image(self)
 
     @property
     def pipeline(self) -> rendering.Pipeline:
@@ -214,7 +214,7 @@ def _scene(case):
 
 
 @cache
-def _picture(case):
+def _image(case):
     return reference.render(
         case.gaussians, case.camera, case.background, case.rendered_degree, case.antialiased,
         threshold_width=case.threshold_width,
@@ -225,11 +225,11 @@ def _picture(case):
 def clear(case):
     """The case with the first seed that leaves no pixel near a threshold: nothing may differ.
 
-    case: a :class:`Case`, or another dataclass with a ``seed`` and a ``picture``.
+    case: a :class:`Case`, or another dataclass with a ``seed`` and a ``rendered``.
     """
     for seed in range(case.seed, case.seed + 200):
         candidate = replace(case, seed=seed)
-        if not candidate.picture.near_threshold.any():
+        if not candidate.rendered.near_threshold.any():
             return candidate
     raise AssertionError(f"{case}: no clear seed among 200")
 
@@ -287,8 +287,8 @@ def as_images(planes, camera) -> dict[str, np.ndarray]:
     }
 
 
-def picture_of(frame, case) -> dict[str, np.ndarray]:
-    """What ``reference.Picture`` holds, from a frame with colour and depth."""
+def image_planes(frame, case) -> dict[str, np.ndarray]:
+    """What ``reference.RenderedImage`` holds, from a frame with colour and depth."""
     images = as_images(frame.planes(), case.camera)
     transmittance = images["transmittance"]
     return {
@@ -301,7 +301,7 @@ def picture_of(frame, case) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Cotangents:
-    """Derivatives of a loss with respect to the picture."""
+    """Derivatives of a loss with respect to the image."""
 
     d_image: np.ndarray  # (H, W, 3)
     d_alpha: np.ndarray  # (H, W)
@@ -312,7 +312,7 @@ class Cotangents:
         """Normal weights; zero at the pixels that the reference marks."""
         rng = np.random.default_rng(seed)
         shape = case.height, case.width
-        kept = ~case.picture.near_threshold
+        kept = ~case.rendered.near_threshold
         image, alpha, depth = (rng.normal(0, 1, s) for s in ((*shape, 3), shape, shape))
         return Cotangents(
             single(image) * kept[..., None], single(alpha) * kept, single(depth) * kept
@@ -383,17 +383,17 @@ def assert_arrays_agree(actual, expected, tolerance) -> None:
     assert not lines, "\n".join(lines)
 
 
-def assert_pictures_agree(actual, picture: reference.Picture, tolerance) -> None:
+def assert_images_agree(actual, rendered: reference.RenderedImage, tolerance) -> None:
     """Compare planes, leaving out only marked pixels that do differ, at most 1e-4 of all (or 1)."""
-    differs = np.zeros(picture.near_threshold.shape, dtype=bool)
+    differs = np.zeros(rendered.near_threshold.shape, dtype=bool)
     expected = {
-        name: getattr(picture, name) for name in ("image", "alpha", "depth", "transmittance")
+        name: getattr(rendered, name) for name in ("image", "alpha", "depth", "transmittance")
     }
     for name, values in expected.items():
         errors = np.abs(actual[name] - values)
         bad = ~(errors <= tolerance * np.abs(values).max())
         differs |= bad.any(axis=-1) if bad.ndim == 3 else bad
-    flipped = differs & picture.near_threshold
+    flipped = differs & rendered.near_threshold
     assert flipped.sum() <= max(1, 1e-4 * flipped.size), f"{flipped.sum()} pixels flipped"
     assert_arrays_agree(
         {n: np.where(_like(flipped, v), v, actual[n]) for n, v in expected.items()},

@@ -36,7 +36,7 @@ take long to compile, the others, which are these without some terms, tell no mo
 # float64: the reference's J, by differences, is off by 1e-13 of itself. Measured 4e-13.
 #
 # float32: as in test_rendering, and a few roundings more on the way to the film.
-PICTURE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
+IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 
 
 def case_of(name, **others) -> LensCase:

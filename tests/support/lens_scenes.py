@@ -130,10 +130,10 @@ class LensCase(Case):
         return _scene(self)
 
     @property
-    def picture(self) -> reference.Picture:
-        return _picture(self)
+    def rendered(self) -> reference.RenderedImage:
+        return _image(self)
 
-    def reference_picture(self, gaussians=None, threshold_width=0.0) -> reference.Picture:
+    def reference_image(self, gaussians=None, threshold_width=0.0) -> reference.RenderedImage:
         """Of other Gaussians."""
         return effects.render(
             gaussians or self.gaussians, self.camera, self.lens, self.background, self.antialiased,
@@ -164,8 +164,8 @@ def _scene(case):
 
 
 @cache
-def _picture(case):
-    return case.reference_picture(threshold_width=case.threshold_width)
+def _image(case):
+    return case.reference_image(threshold_width=case.threshold_width)
 
 
 def camera_behind(case, rng) -> reference.Camera:

@@ -66,8 +66,8 @@ FAR_AWAY = gaussians([[0, 0, 1e4]])
 
 
 def mean_and_error(render, rounds):
-    pictures = np.stack([np.array(render(seed)) for seed in range(rounds)])
-    return pictures.mean(0), pictures.std(0, ddof=1) / np.sqrt(rounds)
+    images = np.stack([np.array(render(seed)) for seed in range(rounds)])
+    return images.mean(0), images.std(0, ddof=1) / np.sqrt(rounds)
 
 
 def pixel_rays(sensor):

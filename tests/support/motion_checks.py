@@ -56,13 +56,13 @@ class MovingCase(LensCase):
         return effects.camera_at(self.camera, self.close_camera, time)
 
     @property
-    def picture(self) -> reference.Picture:
-        return _picture(self)
+    def rendered(self) -> reference.RenderedImage:
+        return _image(self)
 
-    def reference_picture(self, gaussians=None, threshold_width=0.0) -> reference.Picture:
+    def reference_image(self, gaussians=None, threshold_width=0.0) -> reference.RenderedImage:
         gaussians = gaussians or self.gaussians
         if self.samples:
-            return effects._mean_picture(
+            return effects._mean_image(
                 [
                     effects.render(
                         gaussians, self.camera_at((k + 0.5) / self.samples), self.lens,
@@ -71,7 +71,7 @@ class MovingCase(LensCase):
                     for k in range(self.samples)
                 ]
             )  # fmt: skip
-        return rolling_picture(self, gaussians, threshold_width)
+        return rolling_image(self, gaussians, threshold_width)
 
     def device_camera(self, precision) -> Camera:
         camera = super().device_camera(precision)
@@ -92,8 +92,8 @@ class MovingCase(LensCase):
 
 
 @cache
-def _picture(case):
-    return case.reference_picture(threshold_width=case.threshold_width)
+def _image(case):
+    return case.reference_image(threshold_width=case.threshold_width)
 
 
 def time_of(case, mean) -> float:
@@ -113,7 +113,7 @@ def _time_of(case, mean) -> float:
     return 1.0 if behind(1) >= 0 else brentq(behind, 0, 1, xtol=1e-15, rtol=1e-14)
 
 
-def rolling_picture(case, gaussians, threshold_width) -> reference.Picture:
+def rolling_image(case, gaussians, threshold_width) -> reference.RenderedImage:
     """Each splat as a whole at the time of its mean."""
     single_rows = [
         reference.Gaussians(**{n: getattr(gaussians, n)[k : k + 1] for n in PARAMETER_NAMES})

@@ -17,7 +17,7 @@ from support.helpers import (
     Case,
     as_images,
     assert_arrays_agree,
-    assert_pictures_agree,
+    assert_images_agree,
     device_camera,
     device_gaussians,
     frame_adjoint,
@@ -92,12 +92,12 @@ def undecided_pixels(scene) -> np.ndarray:
     That is 1.6e-4 px in float32, and ln(alpha) changes by at most 6.1 per px: see NEAR_THRESHOLD.
     Rejects a scene in which these are more than 5% of the pixels.
     """
-    picture = reference.render(
+    rendered = reference.render(
         scene.gaussians, scene.camera, np.zeros(3), scene.rendered_degree, scene.antialiased,
         threshold_width=1e-3,
     )  # fmt: skip
-    assume(picture.near_threshold.mean() <= 0.05)
-    return picture.near_threshold
+    assume(rendered.near_threshold.mean() <= 0.05)
+    return rendered.near_threshold
 
 
 def changed(gaussians, **rules) -> reference.Gaussians:
@@ -126,9 +126,9 @@ def point_at(camera, film, z) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Result:
-    """A picture on black, and the gradients of sum(weights * planes)."""
+    """A image on black, and the gradients of sum(weights * planes)."""
 
-    picture: dict  # what reference.Picture holds
+    rendered: dict  # what reference.Image holds
     gradients: dict  # of the six parameters and means2d; visible
 
 
@@ -158,7 +158,7 @@ def result_of(case, precision, weights, gaussians=None, camera=None) -> Result:
     d_transmittance, *d_features = [stored(plane, precision) for plane in weights]
     gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
     return Result(
-        picture=picture_of(frame),
+        rendered=image_planes(frame),
         gradients={
             **{name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES},
             "means2d": np.stack([rows(column) for column in gradients.means2d], axis=-1),
@@ -167,8 +167,8 @@ def result_of(case, precision, weights, gaussians=None, camera=None) -> Result:
     )
 
 
-def picture_of(frame) -> dict[str, np.ndarray]:
-    """The planes, under the names of ``reference.Picture``."""
+def image_planes(frame) -> dict[str, np.ndarray]:
+    """The planes, under the names of ``reference.RenderedImage``."""
     images = as_images(frame.planes(), frame.camera)
     return {
         "image": images["color"],
@@ -179,7 +179,7 @@ def picture_of(frame) -> dict[str, np.ndarray]:
 
 
 def assert_agree(actual, expected, quats, undecided, px) -> None:
-    """That no splat was displaced by more than ``px``, as far as pictures and gradients tell.
+    """That no splat was displaced by more than ``px``, as far as images and gradients tell.
 
     quats: (N, 4); undecided: (H, W), pixels at which decisions may flip, of which one at most may.
 
@@ -187,8 +187,8 @@ def assert_agree(actual, expected, quats, undecided, px) -> None:
     transmittance. Its derivative of at most 1.1 per px changes by 1 / 0.3 = 3.3 per px^2, three
     times as much relative to it; another 1.1 comes from each of T, S and 1 / (1 - alpha): 6 per px.
     """
-    picture = reference.Picture(**expected.picture, near_threshold=undecided)
-    assert_pictures_agree(actual.picture, picture, 1.1 * px)
+    rendered = reference.RenderedImage(**expected.rendered, near_threshold=undecided)
+    assert_images_agree(actual.rendered, rendered, 1.1 * px)
     assert_arrays_agree(*(_with_shapes(r.gradients, quats) for r in (actual, expected)), 6 * px)
 
 

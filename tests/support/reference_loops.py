@@ -1,4 +1,4 @@
-"""The picture of each approximation by scalar loops and textbook formulas."""
+"""The image of each approximation by scalar loops and textbook formulas."""
 
 from __future__ import annotations
 
@@ -144,9 +144,9 @@ def naive_color(gaussians, n, basis) -> np.ndarray:
     return np.maximum(basis @ coefficients + 0.5, 0)
 
 
-def naive_picture(gaussians, camera, model) -> dict[str, np.ndarray]:
+def naive_image(gaussians, camera, model) -> dict[str, np.ndarray]:
     shape = camera.height, camera.width
-    picture = {
+    rendered = {
         "image": np.zeros((*shape, 3)),
         "depth": np.zeros(shape),
         "transmittance": np.ones(shape),
@@ -171,18 +171,18 @@ def naive_picture(gaussians, camera, model) -> dict[str, np.ndarray]:
             if (behind if model.stop == "before" else transmittance) < model.transmittance_stop:
                 break
             color = naive_color(gaussians, n, bases[n])
-            picture["image"][row, column] += transmittance * alpha * color
-            picture["depth"][row, column] += transmittance * alpha * depth
+            rendered["image"][row, column] += transmittance * alpha * color
+            rendered["depth"][row, column] += transmittance * alpha * depth
             transmittance *= 1 - alpha
-        picture["image"][row, column] += transmittance * BACKGROUND
-        picture["transmittance"][row, column] = transmittance
-    return picture
+        rendered["image"][row, column] += transmittance * BACKGROUND
+        rendered["transmittance"][row, column] = transmittance
+    return rendered
 
 
-def assert_pictures_agree(picture, expected, atol) -> None:
+def assert_images_agree(rendered, expected, atol) -> None:
     for name in ("image", "depth", "transmittance"):
         wanted = expected[name] if isinstance(expected, dict) else getattr(expected, name)
-        np.testing.assert_allclose(getattr(picture, name), wanted, rtol=0, atol=atol, err_msg=name)
+        np.testing.assert_allclose(getattr(rendered, name), wanted, rtol=0, atol=atol, err_msg=name)
 
 
 def straight_camera(size=9, focal=20.0, near=0.01) -> Camera:

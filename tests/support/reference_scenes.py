@@ -70,7 +70,7 @@ BACKGROUND = np.array([0.9, 0.4, 0.2])
 
 
 def cotangents() -> dict[str, np.ndarray]:
-    """One random weight for each number of the picture."""
+    """One random weight for each number of the image."""
     rng = np.random.default_rng(5)
     return {
         "d_image": rng.normal(0, 1, (20, 24, 3)),

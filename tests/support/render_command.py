@@ -9,7 +9,7 @@ from support.small_capture import (
     FOCUS,
     HEIGHT,
     WIDTH,
-    assert_pictures_agree,
+    assert_images_agree,
     blobs,
     photograph,
 )
@@ -18,7 +18,7 @@ WHITE = (1.0, 1.0, 1.0)
 BLACK = (0.0, 0.0, 0.0)
 
 
-def picture(path):
+def rendered(path):
     return iio.imread(path) / 255
 
 
@@ -26,14 +26,14 @@ def run(*arguments):
     render.main([str(argument) for argument in arguments])
 
 
-# A picture of 8 bits is within half a level of what was rendered; the renderer is within 1e-4.
+# A image of 8 bits is within half a level of what was rendered; the renderer is within 1e-4.
 EIGHT_BITS = 0.5 / 255 + 1e-4
 
 
 def assert_shows(path, camera, background):
-    """The file is the picture that the reference makes of the blobs."""
+    """The file is the image that the reference makes of the blobs."""
     expected = photograph(blobs(), camera, background)
-    assert_pictures_agree(picture(path), np.clip(expected.image, 0, 1), expected, EIGHT_BITS)
+    assert_images_agree(rendered(path), np.clip(expected.image, 0, 1), expected, EIGHT_BITS)
     return np.clip(expected.image, 0, 1)
 
 

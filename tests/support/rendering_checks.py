@@ -153,11 +153,15 @@ def camera_differences(case) -> np.ndarray:
             for sign in (1, -1):
                 value = np.array(getattr(case.camera, name))
                 value[index] += sign * step
-                picture = reference.render(
+                rendered = reference.render(
                     case.gaussians, replace(case.camera, **{name: value}), np.zeros(3),
                     case.rendered_degree, case.antialiased,
                 )  # fmt: skip
-                images = [picture.transmittance, *np.moveaxis(picture.image, -1, 0), picture.depth]
+                images = [
+                    rendered.transmittance,
+                    *np.moveaxis(rendered.image, -1, 0),
+                    rendered.depth,
+                ]
                 planes.append(np.reshape(images, (5, -1)))
             found.append((planes[0] - planes[1]) / (2 * step))
     return np.array(found)

@@ -50,7 +50,7 @@ def view(name: str, pose: np.ndarray, image: np.ndarray) -> View:
     return View(name, pose, focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, image=image)
 
 
-def photograph(gaussians: Gaussians, camera, background) -> reference.Picture:
+def photograph(gaussians: Gaussians, camera, background) -> reference.RenderedImage:
     """By the reference, as a View or a Viewpoint sees it; 0.2: the configuration's near plane."""
     pose = camera.camera_to_world
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
@@ -64,9 +64,9 @@ def photograph(gaussians: Gaussians, camera, background) -> reference.Picture:
     )
 
 
-def assert_pictures_agree(image, expected, picture: reference.Picture, tolerance) -> None:
+def assert_images_agree(image, expected, rendered: reference.RenderedImage, tolerance) -> None:
     """Compare (H, W, 3), leaving out pixels where float32 may decide otherwise than float64."""
-    kept = ~picture.near_threshold
+    kept = ~rendered.near_threshold
     assert image.shape == expected.shape
     assert kept.mean() > 0.95
     errors = np.abs(image - expected)[kept]

@@ -38,7 +38,9 @@ def reference_camera(view: View, near=0.2) -> reference.Camera:
     return reference.Camera(view.camera_to_world[:3, :3].T, view.center, *lens, near)
 
 
-def photograph(gaussians: reference.Gaussians, view: View, background=WHITE) -> reference.Picture:
+def photograph(
+    gaussians: reference.Gaussians, view: View, background=WHITE
+) -> reference.RenderedImage:
     """Pixels near a threshold, where float32 may decide otherwise, are marked."""
     return reference.render(
         gaussians, reference_camera(view), np.array(background), threshold_width=NEAR_THRESHOLD
@@ -58,11 +60,11 @@ def true_dataset(background=WHITE) -> Dataset:
     blobs = double(true_blobs())
 
     def seen(view: View) -> View:
-        picture = photograph(blobs, view, background)
-        opaque = picture.alpha > 0.1
-        depth = np.where(opaque, picture.depth / np.where(opaque, picture.alpha, 1), 0)
-        pictures = {"image": np.clip(picture.image, 0, 1), "alpha": picture.alpha, "depth": depth}
-        return replace(view, **{k: v.astype(np.float32) for k, v in pictures.items()})
+        rendered = photograph(blobs, view, background)
+        opaque = rendered.alpha > 0.1
+        depth = np.where(opaque, rendered.depth / np.where(opaque, rendered.alpha, 1), 0)
+        renders = {"image": np.clip(rendered.image, 0, 1), "alpha": rendered.alpha, "depth": depth}
+        return replace(view, **{k: v.astype(np.float32) for k, v in renders.items()})
 
     return replace(
         dataset,

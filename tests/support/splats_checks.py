@@ -20,7 +20,7 @@ from support.views import (
 # Relative to the largest value of an array, in single precision: test_rendering derives 2e-5 and
 # 2e-4 for films up to twice this size. Converting to linear radiance multiplies relative errors by
 # at most 2.4. Measured 1e-6 and 1e-5.
-PICTURE = 1e-5
+IMAGE = 1e-5
 
 
 GRADIENTS = 1e-4
@@ -65,7 +65,7 @@ both_color_spaces = pytest.mark.parametrize(
 )
 
 
-def assert_images_agree(actual, expected, tolerance=PICTURE):
+def assert_images_agree(actual, expected, tolerance=IMAGE):
     assert_arrays_agree({"image": actual}, {"image": expected}, tolerance)
 
 

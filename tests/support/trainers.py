@@ -8,7 +8,7 @@ from drgs.initialization.start import gaussians_from_points
 
 
 def small_view(name, angle):
-    """A 20x16 picture of random colours, from a circle of radius 3 in the plane z = 0."""
+    """A 20x16 image of random colours, from a circle of radius 3 in the plane z = 0."""
     center = 3 * np.array([np.cos(angle), np.sin(angle), 0.0])
     pose = np.eye(4)
     forward = -center / 3
@@ -21,7 +21,7 @@ def small_view(name, angle):
 
 def small_dataset():
     views = tuple(small_view(f"v{i}", angle) for i, angle in enumerate((0.0, 1.0, 2.0, 4.0)))
-    return Dataset(views, views[:1], "test", (1.0, 1.0, 1.0), 1.0, "four random pictures")
+    return Dataset(views, views[:1], "test", (1.0, 1.0, 1.0), 1.0, "four random images")
 
 
 def make_trainer(**changes):

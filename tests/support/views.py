@@ -136,7 +136,7 @@ def splats_before(view: View, degree: int, count: int, seed: int) -> reference.G
 
     The first four: behind the camera, at a depth of 0.15, too transparent to be seen, large.
     With a margin of 10% of the window they stay inside the slopes that no Jacobian clamps, so
-    that the picture of a window is part of the whole picture.
+    that the image of a window is part of the whole image.
     """
     rng = np.random.default_rng(seed)
     camera = view.camera
@@ -242,29 +242,29 @@ class Scene:
         return self.degree if self.sh_degree is None else self.sh_degree
 
     @property
-    def picture(self) -> reference.Picture:
+    def rendered(self) -> reference.RenderedImage:
         """The whole film by the reference, on black."""
-        return _picture(self)
+        return _image(self)
 
-    def image(self, picture=None) -> np.ndarray:
+    def image(self, rendered=None) -> np.ndarray:
         """The developed RGBA image (H, W, 4) of the window: linear radiance if so set."""
-        picture = picture or self.picture
+        rendered = rendered or self.rendered
         decode = to_linear if self.srgb_primitives else np.asarray
-        color = decode(picture.image + picture.transmittance[..., None] * self.background)
-        return np.concatenate([color, picture.alpha[..., None]], axis=-1)[self.view.window]
+        color = decode(rendered.image + rendered.transmittance[..., None] * self.background)
+        return np.concatenate([color, rendered.alpha[..., None]], axis=-1)[self.view.window]
 
     def gradients(self, weights) -> dict[str, np.ndarray]:
         """Gradients of sum(weights * image()), weights (H, W, 4), by the reference.
 
-        With P the premultiplied picture, D the decoding and B the background, the image is
+        With P the premultiplied image, D the decoding and B the background, the image is
         D(P + T B), and alpha is 1 - T.
         """
         d_window = np.zeros((self.view.height, self.view.width, 4))
         d_window[self.view.window] = weights
         d_image, d_alpha = d_window[..., :3], d_window[..., 3]
-        background, transmittance = np.array(self.background), self.picture.transmittance
+        background, transmittance = np.array(self.background), self.rendered.transmittance
         if self.srgb_primitives:
-            whole = self.picture.image + transmittance[..., None] * background
+            whole = self.rendered.image + transmittance[..., None] * background
             d_image = d_image * to_linear_derivative(whole)
         d_background = np.einsum("hw,hwc->c", transmittance, d_image)
         d_alpha = d_alpha - d_image @ background
@@ -287,7 +287,7 @@ def _gaussians(view, degree, count, seed):
 
 
 @cache
-def _picture(scene):
+def _image(scene):
     return reference.render(
         scene.gaussians, scene.camera, np.zeros(3), scene.rendered_degree, scene.antialiased,
         threshold_width=NEAR_THRESHOLD,

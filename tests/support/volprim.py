@@ -309,7 +309,7 @@ def _colors_along(gaussians, rays) -> np.ndarray:
 
 
 def bound(gaussians, camera, covariance, excess=0.0) -> np.ndarray:
-    """(H, W, 3): how far the pictures may be apart.
+    """(H, W, 3): how far the images may be apart.
 
     covariance: (N, 3, 3) world, volprim's. excess: drgs's variances on the film are larger than
     the projections of ``covariance`` by at most this factor, less 1.
@@ -335,9 +335,9 @@ def bound(gaussians, camera, covariance, excess=0.0) -> np.ndarray:
 
 
 def propagated(on_film, d_alpha, d_colors) -> np.ndarray:
-    """(H, W, 3): what errors of alphas (N, H, W) and colours (N, H, W, 3) make of a picture.
+    """(H, W, 3): what errors of alphas (N, H, W) and colours (N, H, W, 3) make of a image.
 
-    A picture is linear in each alpha, with the slope T (color - the picture behind), which is at
+    A image is linear in each alpha, with the slope T (color - the image behind), which is at
     most the largest color; and the weight of a color is at most its alpha.
     """
     colors = np.maximum(on_film.color_by_mean, on_film.color_by_ray) + d_colors

@@ -14,7 +14,7 @@ from support.views import VIEWS, Scene, decode, tensors
 
 # As in test_splats: single precision, relative to the largest value of an array. Conversions to
 # display space multiply errors of dark pixels by up to 13.
-PICTURE, GRADIENTS = 2e-5, 1e-4
+IMAGE, GRADIENTS = 2e-5, 1e-4
 
 
 RADIANCE = np.array([0.25, 0.5, 1.5])
@@ -104,16 +104,16 @@ def expected(
     layers = [
         (w.depth(camera), np.broadcast_to(c, (camera.height, camera.width))) for w, c, _ in walls
     ]
-    picture = render_with_surfaces(gaussians or scene.gaussians, camera, layers)
-    T = picture.transmittance[..., None]
+    rendered = render_with_surfaces(gaussians or scene.gaussians, camera, layers)
+    T = rendered.transmittance[..., None]
     if not scene.srgb_primitives:
-        color = picture.color + T * (scene.background if sky is None else to_display(sky))
+        color = rendered.color + T * (scene.background if sky is None else to_display(sky))
     elif sky is None:
-        color = decode(picture.color + T * scene.background, picture.coverage + T[..., 0])
+        color = decode(rendered.color + T * scene.background, rendered.coverage + T[..., 0])
     else:
-        color = decode(picture.color, picture.coverage) + T * sky
-    depth, light, shares, rest = picture.depth, 0, 0, 1.0
-    for (z, alpha), before, (_, _, radiance) in zip(layers, picture.before, walls, strict=True):
+        color = decode(rendered.color, rendered.coverage) + T * sky
+    depth, light, shares, rest = rendered.depth, 0, 0, 1.0
+    for (z, alpha), before, (_, _, radiance) in zip(layers, rendered.before, walls, strict=True):
         share, rest = rest * alpha * before, rest * (1 - alpha)
         light, shares = light + share[..., None] * radiance, shares + share
         depth = depth + share * z

@@ -128,7 +128,7 @@ def test_a_configuration_that_cannot_shrink_is_planned():
     assert [(s.until, s.factor) for s in result.config.coarse] == [(1, 4)]
 
 
-def test_small_pictures_do_not_become_smaller():
+def test_small_images_do_not_become_smaller():
     assert planned(100, side=50).chosen.strategy is plan.STRATEGIES[0]
 
 

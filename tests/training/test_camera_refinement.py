@@ -123,10 +123,10 @@ def test_unmoved_cameras_give_the_plain_loss():
 
 
 def loss_in_numpy(gaussians, view, image) -> float:
-    """Of the reference's picture and a photograph; float64."""
-    picture = reference.render(gaussians, fits.reference_camera(view), np.ones(3))
-    shown = np.clip(picture.image, 0, 1)
-    return 0.8 * np.abs(picture.image - image).mean() + 0.2 * (1 - ssim(shown, image))
+    """Of the reference's image and a photograph; float64."""
+    rendered = reference.render(gaussians, fits.reference_camera(view), np.ones(3))
+    shown = np.clip(rendered.image, 0, 1)
+    return 0.8 * np.abs(rendered.image - image).mean() + 0.2 * (1 - ssim(shown, image))
 
 
 @pytest.mark.parametrize("index", [1, 4])
@@ -140,8 +140,8 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
     trainer.iteration = 1
     effect, view = effect_of(trainer), trainer.views[index]
     photo, row = fits.plain_dataset().train[index], row_of(numbers, index)
-    picture = fits.photograph(fits.double(start), moved(photo, **row))
-    assert not picture.near_threshold.any() and picture.image.max() <= 1
+    rendered = fits.photograph(fits.double(start), moved(photo, **row))
+    assert not rendered.near_threshold.any() and rendered.image.max() <= 1
     effect.before(trainer.fit_state(), view)
     leaves = effect.parameters.leaves(view.index)
     trainer.params.update(trainer.optimizer)
@@ -318,7 +318,7 @@ def test_a_focal_length_and_a_principal_point_that_are_off_are_found():
     np.testing.assert_allclose(found.camera_to_world, disturbed.camera_to_world, atol=1e-6)
 
 
-def test_refined_cameras_make_better_pictures():
+def test_refined_cameras_make_better_images():
     """Of disturbed cameras: of the blobs as the held-out cameras, which are right, see them."""
     rng = np.random.default_rng(6)
     dataset = fits.with_views(
@@ -379,9 +379,9 @@ def test_other_views_are_measured_through_the_lens_that_was_found():
         np.testing.assert_array_equal(view.camera_to_world, other.camera_to_world)
         for name in ("fx", "fy", "cx", "cy"):
             assert getattr(view, name) == pytest.approx(getattr(other, name), rel=1e-7)
-    pictures = trainer.images(dataset.test)
-    for picture, other in zip(pictures, render_views(trainer.scene, expected), strict=True):
-        np.testing.assert_allclose(picture, other, atol=1e-5)
+    renders = trainer.images(dataset.test)
+    for rendered, other in zip(renders, render_views(trainer.scene, expected), strict=True):
+        np.testing.assert_allclose(rendered, other, atol=1e-5)
 
 
 def test_without_rates_of_the_lens_other_views_are_as_they_were():

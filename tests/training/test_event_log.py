@@ -11,7 +11,7 @@ from support.fit_command import (
     assert_fit_refused,
     assert_fits,
     stop_after,
-    without_pictures,
+    without_images,
     write_project,
 )
 
@@ -33,8 +33,8 @@ needs_tensorboardx = pytest.mark.skipif(
 
 
 @pytest.fixture(autouse=True)
-def no_pictures(monkeypatch):
-    without_pictures(monkeypatch)
+def no_images(monkeypatch):
+    without_images(monkeypatch)
 
 
 def checksum(data):
@@ -107,7 +107,7 @@ def test_the_curves_are_those_of_the_history_and_the_splats_those_of_a_fit_witho
 def test_a_resumed_fit_is_one_curve_and_another_fit_takes_its_place(tmp_path, monkeypatch):
     config, out = write_project(tmp_path), tmp_path / "out"
     with monkeypatch.context() as patch:
-        without_pictures(patch)
+        without_images(patch)
         stop_after(patch, 5)  # behind the checkpoint of 4
         assert run_in_process(fit.main, config, "--out", out, "--tensorboard").returncode == 130
     steps = [step for step, _ in events_of(out)[1]["loss"]]

@@ -110,11 +110,11 @@ def test_a_folder_is_fitted_as_the_command_does(folder):
     assert given.data == config.data and given.iterations == 4500
 
 
-def test_pictures_of_what_was_fitted(folder):
+def test_images_of_what_was_fitted(folder):
     result = drgs.train(CONFIG)
     (view,) = drgs.load_dataset("data").test
-    (picture,) = result.trainer.images((view,))
-    assert picture.shape == view.image.shape
+    (rendered,) = result.trainer.images((view,))
+    assert rendered.shape == view.image.shape
 
 
 @pytest.mark.parametrize(

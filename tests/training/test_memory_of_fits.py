@@ -215,7 +215,7 @@ def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available)
         room(config_of(10_000, fewer * 5 // 4), dataset)
 
 
-def test_smaller_pictures_are_advised_where_they_help(available):
+def test_smaller_images_are_advised_where_they_help(available):
     config, dataset = config_of(10_000, 10_000), dataset_of(5376, 3024, 4)
     available(3 * GB)
     with pytest.raises(UserError, match=r"set data\.image_size=") as error:

@@ -42,10 +42,10 @@ def photographed() -> Dataset:
             view.camera_to_world[:3, :3].T, view.center, view.fx, view.fy, view.cx, view.cy,
             view.width, view.height, 0.2,
         )  # fmt: skip
-        picture = reference.render(blobs, camera, np.ones(3))
-        alpha = picture.alpha.astype(np.float32)
-        depth = np.where(alpha > 0.99, picture.depth, 0).astype(np.float32)
-        return replace(view, image=picture.image.astype(np.float32), alpha=alpha, depth=depth)
+        rendered = reference.render(blobs, camera, np.ones(3))
+        alpha = rendered.alpha.astype(np.float32)
+        depth = np.where(alpha > 0.99, rendered.depth, 0).astype(np.float32)
+        return replace(view, image=rendered.image.astype(np.float32), alpha=alpha, depth=depth)
 
     noise = capture.make_dataset(train=10, test=3)
     return replace(noise, train=tuple(map(seen, noise.train)), test=tuple(map(seen, noise.test)))

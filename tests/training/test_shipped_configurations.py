@@ -119,8 +119,8 @@ def psnr_of(tmp_path_factory):
         key = kind, config.model_dump_json()
         if key not in fitted:
             trainer = train(config, dataset).trainer
-            pictures = trainer.images(dataset.test)
-            pairs = zip(pictures, dataset.test, strict=True)
+            renders = trainer.images(dataset.test)
+            pairs = zip(renders, dataset.test, strict=True)
             fitted[key] = mean_quality((p, view.image, view.mask) for p, view in pairs).psnr
         return fitted[key]
 

@@ -90,9 +90,9 @@ def test_a_fit_renders_with_the_filter_that_it_found():
     )
     widened = smoothed_reference(by_reference, expected_filter(start.means, dataset.train))
     (camera,) = reference_cameras([photo])
-    picture = reference.render(widened, camera, np.ones(3), 1)
+    rendered = reference.render(widened, camera, np.ones(3), 1)
     # A mean of 2304 numbers in single precision; without the filter it is another.
-    assert loss == pytest.approx(np.abs(picture.image - photo.image).mean(), rel=1e-5)
+    assert loss == pytest.approx(np.abs(rendered.image - photo.image).mean(), rel=1e-5)
     unfiltered = reference.render(by_reference, camera, np.ones(3), 1)
     assert np.abs(unfiltered.image - photo.image).mean() != pytest.approx(loss, rel=1e-4)
 

@@ -69,7 +69,7 @@ def masked_dataset(spoiled=True, masks=True):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
-def test_the_loss_is_that_of_the_masked_pictures(weight):
+def test_the_loss_is_that_of_the_masked_images(weight):
     trainer = fits.make_trainer(masked_dataset(), loss__dssim_weight=weight)
     for index in (0, 3):
         view, photo = trainer.views[index], masked_dataset().train[index]
@@ -124,8 +124,8 @@ def test_the_psnr_of_an_iteration_is_that_of_the_pixels_that_count():
     for iteration in range(1, 4):
         index = view_of(iteration, len(trainer.views), trainer.config.seed)
         trainer.params.update(trainer.optimizer)
-        picture = mi.render(trainer.scene, sensor=trainer.views[index].sensor)
-        difference = np.array(dr.detach(picture)) - masked_dataset().train[index].image
+        rendered = mi.render(trainer.scene, sensor=trainer.views[index].sensor)
+        difference = np.array(dr.detach(rendered)) - masked_dataset().train[index].image
         expected = -10 * np.log10(np.mean(difference[mask_of(index) > 0] ** 2))
         assert trainer.step().psnr == pytest.approx(expected, abs=1e-4)
         views.add(index)
@@ -228,11 +228,11 @@ def test_the_penalty_is_that_of_the_integrators_depth_and_alpha():
 
 
 def clear_view(dataset):
-    """A training view none of whose pixels is near a threshold, its number, and its picture."""
+    """A training view none of whose pixels is near a threshold, its number, and its image."""
     blobs = fits.double(fits.disturbed_blobs())
     for index, photo in enumerate(dataset.train):
-        picture = fits.photograph(blobs, photo)
-        if not picture.near_threshold.any():
+        rendered = fits.photograph(blobs, photo)
+        if not rendered.near_threshold.any():
             return index, photo
     raise AssertionError("no clear view")
 
@@ -250,8 +250,8 @@ def test_the_penaltys_gradient_is_a_difference_of_the_reference():
     start, step = fits.double(fits.disturbed_blobs()), 1e-6
 
     def value(gaussians) -> float:
-        picture = reference.render(gaussians, fits.reference_camera(photo))
-        return penalty_in_numpy(picture.depth, picture.alpha, photo, dataset.extent)
+        rendered = reference.render(gaussians, fits.reference_camera(photo))
+        return penalty_in_numpy(rendered.depth, rendered.alpha, photo, dataset.extent)
 
     rng = np.random.default_rng(2)
     for name in PARAMETER_NAMES:
@@ -364,9 +364,9 @@ def test_depth_supervision_puts_blobs_at_their_depths():
         trainer = fits.make_trainer(dataset, loss__depth_weight=weight, optimizer__means_lr=2e-3)
         gaussians = fits.double(fits.steps(trainer, 40).gaussians())
         photo = fits.true_dataset().train[0]
-        picture = fits.photograph(gaussians, photo)
-        known = (photo.depth > 0) & (picture.alpha > 0.1)
-        depth = picture.depth[known] / picture.alpha[known]
+        rendered = fits.photograph(gaussians, photo)
+        known = (photo.depth > 0) & (rendered.alpha > 0.1)
+        depth = rendered.depth[known] / rendered.alpha[known]
         errors[weight] = np.abs(depth - photo.depth[known]).mean()
     assert errors[2.0] < 0.5 * errors[0.0], errors
 
@@ -449,8 +449,8 @@ def target_of(view) -> np.ndarray:
     return np.array(view.target.image)
 
 
-def test_the_target_is_the_transparent_picture_over_the_color():
-    """The picture was composited over the dataset's background; its colours are unknown here."""
+def test_the_target_is_the_transparent_image_over_the_color():
+    """The image was composited over the dataset's background; its colours are unknown here."""
     trainer, dataset = random_trainer(), transparent_dataset()
     (effect,) = trainer.effects
     blobs = fits.double(fits.true_blobs())
@@ -500,7 +500,7 @@ def test_opaque_photographs_are_refused():
 
 
 def test_what_masks_leave_out_stays_black_over_any_color():
-    """SSIM's windows that reach into it see the same black in both pictures."""
+    """SSIM's windows that reach into it see the same black in both images."""
     dataset = transparent_dataset()
     views = [replace(view, mask=mask_of(index)) for index, view in enumerate(dataset.train)]
     trainer = random_trainer(replace(dataset, train=tuple(views)))

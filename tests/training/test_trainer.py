@@ -217,7 +217,7 @@ def test_other_models_learn_as_well(model):
     """Degree 0 has no shN parameter at all; antialiasing changes the opacities' gradient."""
     trainer = make_trainer(model=model)
     losses = [trainer.step().loss for _ in range(40)]
-    # The pictures are noise: what can be learnt is their mean.
+    # The images are noise: what can be learnt is their mean.
     assert np.mean(losses[-8:]) < 0.95 * np.mean(losses[:8])
     assert trainer.gaussians().sh_degree == model["sh_degree"]
 

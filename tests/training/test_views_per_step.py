@@ -138,7 +138,7 @@ def test_a_change_that_falls_into_a_step_comes_behind_it():
     assert changes == [8, 12, 20]  # of iterations 6, 12, 18 and 20
 
 
-def test_pictures_change_their_size_with_the_first_step_behind_a_stage():
+def test_images_change_their_size_with_the_first_step_behind_a_stage():
     trainer = make_trainer(4, coarse=[{"until": 6, "factor": 2}])
     widths, begun = [], []
     for _ in range(4):

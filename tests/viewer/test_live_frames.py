@@ -1,4 +1,4 @@
-"""Pictures that somebody asks for: what they show, and with which approximations."""
+"""Images that somebody asks for: what they show, and with which approximations."""
 
 from dataclasses import replace
 
@@ -36,16 +36,16 @@ def scene():
     return LiveScene(blobs(), ModelConfig(), WHITE)
 
 
-def reference_picture(**approximations):
+def reference_image(**approximations):
     scene = make_scene(blobs(), ModelConfig(**approximations), WHITE)
-    (picture,) = render_views(scene, [EYE.viewpoint(48, 32)])
-    return picture
+    (rendered,) = render_views(scene, [EYE.viewpoint(48, 32)])
+    return rendered
 
 
 def test_colors_are_those_of_the_usual_rendering_in_eight_bits(scene):
     frame = scene.frame(REQUEST)
     assert frame.pixels.dtype == np.uint8 and frame.seconds > 0
-    assert np.array_equal(frame.pixels, np.round(255 * reference_picture()))
+    assert np.array_equal(frame.pixels, np.round(255 * reference_image()))
 
 
 @pytest.mark.parametrize("others", [{"projection": "exact"}, {"order": "pixel"}, {"low_pass": 0.0}])
@@ -53,12 +53,12 @@ def test_approximations_are_switched_and_switched_back(scene, others):
     first = scene.frame(REQUEST).pixels
     values = {**vars(scene.approximations), **others}
     switched = scene.frame(replace(REQUEST, approximations=Approximations(**values))).pixels
-    assert np.array_equal(switched, np.round(255 * reference_picture(**others)))
+    assert np.array_equal(switched, np.round(255 * reference_image(**others)))
     assert not np.array_equal(switched, first)
     assert np.array_equal(scene.frame(REQUEST).pixels, first)
 
 
-def test_smaller_pictures_show_the_same(scene):
+def test_smaller_images_show_the_same(scene):
     small = scene.frame(REQUEST.smaller(2)).pixels
     assert small.shape == (16, 24, 3)
     means = scene.frame(REQUEST).pixels.reshape(16, 2, 24, 2, 3).mean(axis=(1, 3))
@@ -86,9 +86,9 @@ def test_normals_point_to_the_camera(scene):
     assert (normals @ EYE.camera_to_world[:3, 2]).max() < 0.5
 
 
-def test_the_error_is_the_difference_from_the_most_accurate_picture(scene):
+def test_the_error_is_the_difference_from_the_most_accurate_image(scene):
     best = {"projection": "exact", **MOST_ACCURATE}
-    shown, accurate = reference_picture(), reference_picture(**best)
+    shown, accurate = reference_image(), reference_image(**best)
     frame = scene.frame(replace(REQUEST, shows="error"))
     expected = np.round(255 * np.clip(0.5 + 5 * (shown - accurate), 0, 1))
     assert np.abs(frame.pixels - expected).max() <= 1  # halves are rounded in single precision

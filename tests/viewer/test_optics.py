@@ -1,4 +1,4 @@
-"""Lenses to look through: where things come to the picture, and how sharp they are."""
+"""Lenses to look through: where things come to the image, and how sharp they are."""
 
 import math
 
@@ -55,13 +55,13 @@ def viewpoint(focal=FOCAL, lens=None):
     ],
     ids=["pinhole", "opencv", "fisheye"],
 )
-def test_pictures_are_those_of_the_same_camera_in_a_dataset(lens, numbers, view):
+def test_images_are_those_of_the_same_camera_in_a_dataset(lens, numbers, view):
     scene = make_scene(blobs(), ModelConfig(**USUAL), BACKGROUND)
     (expected,) = render_views(scene, [view])
-    picture = np.clip(seen(blobs(), lens, **numbers), 0, 1)
+    rendered = np.clip(seen(blobs(), lens, **numbers), 0, 1)
     assert np.ptp(expected) > 0.3
     # The focal length goes through an angle in degrees, in single precision: 1e-6 of it.
-    assert np.abs(picture - expected).max() < 1e-4
+    assert np.abs(rendered - expected).max() < 1e-4
 
 
 def speck(x, y, z):
@@ -77,9 +77,9 @@ def speck(x, y, z):
     )
 
 
-def place(picture):
+def place(rendered):
     """Of what differs from the background: its middle (px), and its largest difference."""
-    difference = np.abs(picture[:, :, :3] - BACKGROUND).sum(axis=2)
+    difference = np.abs(rendered[:, :, :3] - BACKGROUND).sum(axis=2)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     return (
         (difference * x).sum() / difference.sum(),
@@ -97,7 +97,7 @@ def test_parallel_rays_show_a_thing_where_the_pinhole_does_at_the_distance_of_th
 
 
 def test_a_closed_aperture_is_a_pinhole(capfd):
-    """Of which Mitsuba says nothing, once a picture."""
+    """Of which Mitsuba says nothing, once a image."""
     dot = speck(0.8, -0.5, 2 * RADIUS)
     assert np.array_equal(seen(dot, "thin lens", aperture=0.0), seen(dot))
     assert "aperture" not in "".join(capfd.readouterr())

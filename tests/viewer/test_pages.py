@@ -122,7 +122,7 @@ def test_every_control_is_in_the_request(page):
     assert asked(page).approximations.extent == 3.5  # has no control
 
 
-def test_times_are_compared_with_those_of_the_same_picture_as_fitted(page):
+def test_times_are_compared_with_those_of_the_same_image_as_fitted(page):
     page._texts[7] = SimpleNamespace(content="")
     switched = Approximations(order="pixel")
     frames = [
@@ -183,7 +183,7 @@ def test_a_page_from_elsewhere_cannot_connect(server):
         connect(place, subprotocols=[protocol], origin="https://elsewhere.org")
 
 
-def test_nothing_is_said_of_pictures_for_a_browser_that_was_closed():
+def test_nothing_is_said_of_images_for_a_browser_that_was_closed():
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         with serving("127.0.0.1", None, ("", "")) as server:

@@ -1,4 +1,4 @@
-"""The pages of ``fit --view`` and ``view`` in a headless browser: pictures come and follow."""
+"""The pages of ``fit --view`` and ``view`` in a headless browser: images come and follow."""
 
 import argparse
 import json
@@ -66,25 +66,25 @@ def needs():
     pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
 
 
-def shown(picture: np.ndarray) -> np.ndarray:
+def shown(rendered: np.ndarray) -> np.ndarray:
     """(H, W, 3) float: below the browser's warning, beside and above the controls."""
-    height, width, _ = picture.shape
-    return picture[height // 5 : 3 * height // 5, : width // 2].astype(float)
+    height, width, _ = rendered.shape
+    return rendered[height // 5 : 3 * height // 5, : width // 2].astype(float)
 
 
 def seen(page) -> np.ndarray:
     """The same of what the page shows, 0 to 255."""
-    return shown(255 * page.picture())
+    return shown(255 * page.rendered())
 
 
-def wait_for_a_picture(page) -> np.ndarray:
+def wait_for_a_image(page) -> np.ndarray:
     """Splats on white, once the page has ceased to fade in."""
 
     def is_there() -> bool:
-        picture = 255 * page.picture()
-        return picture[-20:, :20].min() > 250 and np.ptp(shown(picture)) > 100
+        rendered = 255 * page.rendered()
+        return rendered[-20:, :20].min() > 250 and np.ptp(shown(rendered)) > 100
 
-    browsers.wait_until(is_there, "a picture")
+    browsers.wait_until(is_there, "a image")
     return seen(page)
 
 
@@ -101,11 +101,11 @@ def expected_view(run: Path, width: int, height: int) -> np.ndarray:
     args = argparse.Namespace(what=run, up=None)
     model = load_model(run)
     (camera,) = view.cameras_of(args, model)
-    # As wide as high, at least: on a phone the window is narrower than the camera's picture.
+    # As wide as high, at least: on a phone the window is narrower than the camera's image.
     focal = 0.5 * min(width, height) / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     size = {"cx": width / 2, "cy": height / 2, "width": width, "height": height}
-    (picture,) = render_views(model.scene(), [replace(camera, fx=focal, fy=focal, **size)])
-    return 255 * picture
+    (rendered,) = render_views(model.scene(), [replace(camera, fx=focal, fy=focal, **size)])
+    return 255 * rendered
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -116,18 +116,16 @@ def test_gaussians_are_seen_as_they_are_and_turn_under_the_mouse(fit, size, tmp_
         browsers.a_page(width, height) as page,
     ):
         page.open(address)
-        wait_for_a_picture(page)
+        wait_for_a_image(page)
         page.wait_for("/\\d+ ms for \\d+×\\d+/.test(document.body.innerText)")
         expected = shown(expected_view(fit, width, height))
         # JPEG at a quality of 92 is within one or two of 255, half a pixel more at edges.
         browsers.wait_until(
-            lambda: np.abs(seen(page) - expected).mean() < 3, lambda: "the expected picture"
+            lambda: np.abs(seen(page) - expected).mean() < 3, lambda: "the expected image"
         )
         before, middle = seen(page), (0.3 * width, 0.3 * height)
         page.drag(middle, (middle[0] + 60, middle[1] - 20))
-        browsers.wait_until(
-            lambda: np.abs(seen(page) - before).mean() > 6, lambda: "another picture"
-        )
+        browsers.wait_until(lambda: np.abs(seen(page) - before).mean() > 6, lambda: "another image")
         assert_clean(page, address)
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
@@ -145,13 +143,11 @@ def test_a_fit_is_seen_paused_and_ended(tmp_path):
 
         page.open(address)
         page.wait_for(f"document.body.innerText.includes(' of {ENDLESS:,} iterations')")
-        browsers.wait_until(lambda: np.ptp(seen(page)) > 40, "a picture")
+        browsers.wait_until(lambda: np.ptp(seen(page)) > 40, "a image")
         time.sleep(FADE_SECONDS)
         before = seen(page)
         page.drag((400, 500), (460, 470))
-        browsers.wait_until(
-            lambda: np.abs(seen(page) - before).mean() > 3, lambda: "another picture"
-        )
+        browsers.wait_until(lambda: np.abs(seen(page) - before).mean() > 3, lambda: "another image")
         first = iteration()
         browsers.wait_until(lambda: iteration() > first, "progress")
         page.click("Pause")
@@ -160,7 +156,7 @@ def test_a_fit_is_seen_paused_and_ended(tmp_path):
         held, still = iteration(), seen(page)
         page.drag((400, 500), (340, 530))
         browsers.wait_until(
-            lambda: np.abs(seen(page) - still).mean() > 3, lambda: "a picture in the pause"
+            lambda: np.abs(seen(page) - still).mean() > 3, lambda: "a image in the pause"
         )
         assert iteration() == held
         page.click("Go on")

@@ -1,4 +1,4 @@
-"""Whose picture comes next, and how large: by a clock that the tests turn."""
+"""Whose image comes next, and how large: by a clock that the tests turn."""
 
 from types import SimpleNamespace
 
@@ -66,7 +66,7 @@ def served(them, stage):
     return them.serve(lambda: stage)
 
 
-def test_a_moving_camera_gets_small_pictures_and_a_still_one_the_whole(clock):
+def test_a_moving_camera_gets_small_images_and_a_still_one_the_whole(clock):
     stage, left, them = make(clock)
     assert not served(them, stage)
     left.put(1, REQUEST)
@@ -79,7 +79,7 @@ def test_a_moving_camera_gets_small_pictures_and_a_still_one_the_whole(clock):
     assert not served(them, stage)  # nothing has changed
 
 
-def test_pictures_of_a_moving_camera_keep_to_their_time(clock):
+def test_images_of_a_moving_camera_keep_to_their_time(clock):
     """At 1 microsecond a pixel the whole takes 0.48 s: a third of either side is in time."""
     stage, left, them = make(clock, 1e-6)
     for _ in range(8):
@@ -95,7 +95,7 @@ def test_pictures_of_a_moving_camera_keep_to_their_time(clock):
     assert [width for _, width, _ in stage.shown][-2:] == [400, 800]
 
 
-def test_a_still_camera_gets_larger_pictures_step_by_step_until_it_moves(clock):
+def test_a_still_camera_gets_larger_images_step_by_step_until_it_moves(clock):
     stage, left, them = make(clock, 3e-6)
     for _ in range(6):
         left.put(1, REQUEST)
@@ -125,7 +125,7 @@ def test_what_changes_by_itself_is_rendered_again_after_a_while(clock):
     served(them, stage)
     clock.now += STILL_SECONDS
     served(them, stage)
-    clock.now += 4.7  # of a picture that took 0.48 s
+    clock.now += 4.7  # of a image that took 0.48 s
     assert not served(them, stage)
     clock.now += 0.2
     assert served(them, stage)

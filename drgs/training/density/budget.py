@@ -5,7 +5,7 @@ there is room for some more. Those are split that see most of the errors that ar
 
     s_i = sum over pixels of w_i(p) |C(p) - C*(p)|
 
-with the weights w of compositing, from every tenth view or so: the derivative of the picture
+with the weights w of compositing, from every tenth view or so: the derivative of the image
 composited with the errors as cotangent, which the kernels of the adjoint compute anyway. What is
 split are the longest axes of those Gaussians, into two halves. What has become transparent is
 removed, and there are no opacity resets.
@@ -134,7 +134,7 @@ class GrowthToNumber(DensityStrategy):
     def _uncapped_goal(self, iteration: int) -> int:
         """N_0 + (N - N_0) sqrt(u) / r^(2 - u), where u rises from 0 at ``start`` to 1 at ``stop``.
 
-        r: what the pictures' sizes are divided by: coarse pictures need fewer (DashGaussian, Chen
+        r: what the images' sizes are divided by: coarse images need fewer (DashGaussian, Chen
         et al. 2025). 1 at ``stop``: no change comes after it.
         """
         start, stop = self.config.start, self.config.stop_seen_from(iteration)

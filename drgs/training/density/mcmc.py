@@ -3,7 +3,7 @@
 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): the Gaussians are
 samples of a distribution that the photographs define, and Adam's steps with noise are a walk
 through it. Nothing is cloned or split by a threshold. Gaussians that have become transparent are
-moved to where opaque ones are, such that the picture changes as little as possible.
+moved to where opaque ones are, such that the image changes as little as possible.
 """
 
 from __future__ import annotations

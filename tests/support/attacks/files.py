@@ -394,9 +394,9 @@ def _zip_bomb(path: Path) -> None:
 
 
 def _in_format(kind: str, mode: str, path: Path) -> None:
-    picture = Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
-    picture = picture.convert("L") if mode in "IF" else picture
-    picture.convert(mode).save(path, kind)
+    rendered = Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    rendered = rendered.convert("L") if mode in "IF" else rendered
+    rendered.convert(mode).save(path, kind)
 
 
 def _animated(path: Path) -> None:
@@ -405,10 +405,10 @@ def _animated(path: Path) -> None:
 
 
 def _rotated(orientation: int, path: Path) -> None:
-    picture = Image.open(path).convert("RGB").transpose(Image.Transpose.ROTATE_90)
+    rendered = Image.open(path).convert("RGB").transpose(Image.Transpose.ROTATE_90)
     exif = Image.Exif()
     exif[0x0112] = orientation
-    picture.save(path, "JPEG", exif=exif)
+    rendered.save(path, "JPEG", exif=exif)
 
 
 def _png_bomb(path: Path) -> None:
@@ -465,7 +465,7 @@ FORMATS = {
 
 
 def special_attacks() -> Iterator[Attack]:
-    """Bombs and pictures of every kind."""
+    """Bombs and images of every kind."""
     for file, kinds in SPECIAL.items():
         for name, change in kinds.items():
             # A background may have so many pixels, which Mitsuba keeps as floats.

@@ -38,7 +38,7 @@ OPTIONS = {
         "--fov": ("--fov", "50"),
         "--size": ("--size", "8", "6"),
         "--background": ("--background", "black"),
-        "--background picture": ("--background", "sky.png"),
+        "--background image": ("--background", "sky.png"),
         "--ignore": ("--ignore", "motion"),
         "--scene": ("--scene", "photos.yml"),
         "--data": ("--data", "lego"),
@@ -195,7 +195,7 @@ NAMES = {
     "backslash": "a\\b",
     "dots": "...",
 }
-"""What folders, pictures and configurations may be called."""
+"""What folders, images and configurations may be called."""
 
 
 def _moved(old: str, new: str, folder: Path) -> None:
@@ -203,7 +203,7 @@ def _moved(old: str, new: str, folder: Path) -> None:
         (folder / old).rename(folder / new)
 
 
-def _renamed_picture(stem: str, folder: Path) -> None:
+def _renamed_image(stem: str, folder: Path) -> None:
     """A test view of another name, in the folder and in the file that names it."""
     path = folder / "lego" / "transforms_test.json"
     if len(os.fsencode(f"{stem}.png")) <= 255:
@@ -249,10 +249,10 @@ def name_attacks() -> Iterator[Attack]:
                 **more,
             )
             yield Attack(
-                f"name/picture/{kind}",
+                f"name/image/{kind}",
                 "fit",
                 ("fit.yml", "--out", "out"),
-                partial(_renamed_picture, name),
+                partial(_renamed_image, name),
                 **more,
             )
             yield Attack(
@@ -269,7 +269,7 @@ def name_attacks() -> Iterator[Attack]:
 # ----------------------------------------------------------------------------------------------
 
 
-def _tiny_pictures(folder: Path) -> None:
+def _tiny_images(folder: Path) -> None:
     """Of one pixel."""
     for path in (folder / "lego").glob("*/*.png"):
         iio.imwrite(path, np.full((1, 1, 4), 200, np.uint8))
@@ -280,10 +280,10 @@ def drawn_attacks() -> Iterator[Attack]:
     words = ("fit.yml", "--out", "out")
     changes = {
         "as it is": (words, lambda folder: None),
-        "markup": (words, partial(_renamed_picture, NAMES["markup"])),
-        "not UTF-8": (words, partial(_renamed_picture, NAMES["not UTF-8"])),
+        "markup": (words, partial(_renamed_image, NAMES["markup"])),
+        "not UTF-8": (words, partial(_renamed_image, NAMES["not UTF-8"])),
         "newline": (("fit.yml", "--out", NAMES["newline"]), lambda folder: None),
-        "one pixel": (words, _tiny_pictures),
+        "one pixel": (words, _tiny_images),
         "photographs": (("photos.yml", "--out", "out"), lambda folder: None),
         "one iteration": ((*words, "--set", "iterations=1"), lambda folder: None),
     }

@@ -160,7 +160,7 @@ OBJECTS = {
         "</scene>",
         '<emitter type="envmap"><string name="filename" value="nowhere.exr"/></emitter></scene>',
     ),
-    "a sky that is no picture": lambda scene: scene.replace(
+    "a sky that is no image": lambda scene: scene.replace(
         "</scene>",
         '<emitter type="envmap"><string name="filename" value="fit.yml"/></emitter></scene>',
     ),

@@ -197,7 +197,7 @@ WORDS = {
     "photographs": "photos",
     "finished fit": "run",
     "stopped fit": "stopped",
-    "picture": "sky.png",
+    "image": "sky.png",
     "configuration": "fit.yml",
     "splats": "gaussians.ply",
     "scene": "splats.xml",

@@ -73,7 +73,7 @@ BALL = """<scene version="3.0.0">
 """
 
 CAPTURE = ("--views", "2", "--test-views", "1", "--spp", "1", "--points", "9", "--max-depth", "2")
-"""A capture of the least there is; the picture's size is given beside it."""
+"""A capture of the least there is; the image's size is given beside it."""
 
 
 def pose(angle: float) -> list[list[float]]:
@@ -83,7 +83,7 @@ def pose(angle: float) -> list[list[float]]:
 
 
 def noise(seed: int, channels: int) -> np.ndarray:
-    """A picture of random bytes."""
+    """A image of random bytes."""
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, channels), np.uint8)
 
 
@@ -225,7 +225,7 @@ class _CtrlCAtCheckpoint(Fault):
 
 
 def capture_size(size: int) -> tuple[str, ...]:
-    """The option for square pictures."""
+    """The option for square images."""
     return ("--size", str(size), str(size))
 
 

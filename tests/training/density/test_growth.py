@@ -209,7 +209,7 @@ def test_a_fit_grows_along_the_curve_and_is_resumed_to_the_same_bytes(variant):
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
 
 
-def test_the_number_is_reached_where_pictures_are_coarse_until_the_end_of_growth():
+def test_the_number_is_reached_where_images_are_coarse_until_the_end_of_growth():
     coarse = [CoarseStage(until=1000, factor=2)]
     config = DensifyConfig(start=100, stop=1000, every=100, budget={"gaussians": 90})
     growth = GrowthToNumber(config, coarse, first=50)
@@ -219,7 +219,7 @@ def test_the_number_is_reached_where_pictures_are_coarse_until_the_end_of_growth
     ]
 
 
-def test_coarse_pictures_have_fewer_gaussians_and_the_means_rate_waits_for_their_end(variant):
+def test_coarse_images_have_fewer_gaussians_and_the_means_rate_waits_for_their_end(variant):
     coarse = [{"until": 9, "factor": 4}, {"until": 17, "factor": 2}]
     trainer, counts, rates = make_trainer(densify=GROWING, coarse=coarse), [], []
     for _ in range(50):
@@ -236,7 +236,7 @@ def test_coarse_pictures_have_fewer_gaussians_and_the_means_rate_waits_for_their
     assert rates[17:] == pytest.approx([first * 100 ** (-k / 33) for k in range(1, 34)])
 
 
-def test_the_number_follows_from_the_pictures_where_it_is_not_given(variant):
+def test_the_number_follows_from_the_images_where_it_is_not_given(variant):
     trainer = make_trainer(densify={"strategy": "budget"})
     assert trainer.config.densify.budget.gaussians == round(250 * math.sqrt(20 * 16))
 

@@ -92,21 +92,21 @@ def test_transparent_gaussians_become_copies_of_opaque_ones():
         np.testing.assert_array_equal(moment[: len(untouched)], former[untouched])
 
 
-def test_the_picture_before_and_after_is_nearly_the_same():
+def test_the_image_before_and_after_is_nearly_the_same():
     # Seen from far away, whatever the direction: a splat and its copies.
     camera = reference.Camera(np.eye(3), np.array([0.0, 0, -4]), 40.0, 40.0, 12.0, 12.0, 24, 24)
     optimizer = make([0.3, 0.3], [DEAD, 0.8], tensor_type=TensorXf64, seed=3)
 
-    def picture():
+    def rendered():
         arrays = values(optimizer)
         gaussians = reference.Gaussians(**arrays | {"means": 0.1 * arrays["means"]})
         return reference.render(gaussians, camera, np.ones(3)).image
 
-    before = picture()
+    before = rendered()
     assert act(optimizer, growth=0.0).relocated == 1
     # As much light in all along lines through the centre; the profile itself is not Gaussian.
     assert np.abs(before - 1).max() > 0.3
-    assert np.abs(picture() - before).max() < 0.06 * np.abs(before - 1).max()
+    assert np.abs(rendered() - before).max() < 0.06 * np.abs(before - 1).max()
 
 
 def test_copies_are_spread_over_what_they_are_copies_of():

@@ -15,7 +15,7 @@ from support.small_capture import make_dataset, write_dataset
 from drgs.core.errors import UserError
 from drgs.datasets.fingerprint import fingerprint_of
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.pictures import write_png
+from drgs.io.images import write_png
 
 SETTINGS = (
     "iterations=8",
@@ -106,7 +106,7 @@ def test_views_are_compared_with_those_of_the_first_process(
         check()
 
 
-def test_pictures_of_other_files_are_refused(tmp_path):
+def test_images_of_other_files_are_refused(tmp_path):
     """Of a background that is another one; then of a model, with the same background."""
     here, there, out = (tmp_path / name for name in ("first", "second", "out"))
     knot = Gaussians.load(together.REPOSITORY / "scenes" / "shapes" / "knot.ply")

@@ -158,7 +158,7 @@ def unused_content(path: Path) -> list[str]:
             found.append(f"with the colour profile {profile}, which is not applied")
         # The other images of an MPO are smaller ones, or for bright displays.
         if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
-            found.append("with several pictures each, of which the first is used")
+            found.append("with several images each, of which the first is used")
         return found
 
 
@@ -212,7 +212,7 @@ def read_pixels(path: Path) -> np.ndarray:
     with _opened(path) as image:
         _check(path, image)  # before memory is allocated for it
         needed = image.width * image.height * PIXEL_BYTES
-        require_memory(path, needed, f"a picture of {image.width} x {image.height} px")
+        require_memory(path, needed, f"a image of {image.width} x {image.height} px")
         # Pillow turns TIFFs, and no others.
         turn, decoded = _orientation(image) if image.format == "TIFF" else 1, image
         if image.mode not in ("RGBA", "LA") and _has_alpha(image):
