@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from support.small_fits import plain_dataset
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.accuracy.exact import ewa_with_depth
 from drgs.accuracy.pipeline import pipeline_of
@@ -124,7 +124,7 @@ def test_the_plugin_and_a_configuration_have_it_by_name():
     found = mi.load_dict({"type": "splats", "falloff": "compact", **tensors})
     found = found.state.approximations
     assert found == Approximations(falloff="compact")
-    assert ModelConfig(falloff="compact", **USUAL).approximations == found
+    assert ModelConfig(falloff="compact", **VIEWER_RENDERING).approximations == found
     with pytest.raises(ValueError, match=r"falloff\n.*must be one of gaussian, compact "):
         ModelConfig(falloff="compcat")
 

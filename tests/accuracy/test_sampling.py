@@ -27,8 +27,8 @@ from support.helpers import (
     single,
 )
 from support.views import VIEWS, Scene, image_of, tensors
-from support.walls import Wall
-from support.walls import load as load_wall
+from support.wall_scenes import Wall
+from support.wall_scenes import load as load_wall
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES

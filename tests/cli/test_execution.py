@@ -10,7 +10,7 @@ import pytest
 from support.fit_command import write_scene
 from support.folders import visible
 from support.small_capture import blobs
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs import fit, render
 from drgs.cli.execution import executing
@@ -150,7 +150,7 @@ def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     write_scene(
         folder,
-        model={"sh_degree": 1, "sh_increase_every": 2, **USUAL},
+        model={"sh_degree": 1, "sh_increase_every": 2, **VIEWER_RENDERING},
         densify={
             "start": 1,
             "stop": 4,

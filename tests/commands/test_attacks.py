@@ -8,10 +8,10 @@ thousands, in a process of their own. A failure names the attacks; to repeat one
 
 import mitsuba as mi
 import pytest
+from support.attacks.attack_folder import AttackFolder
 from support.attacks.catalogue import FAMILIES, KNOWN_FAILURES, attacks, some
 from support.attacks.server import Server
 from support.attacks.trial import trial
-from support.attacks.workshop import Workshop
 
 QUICK = {
     "schema": 120,
@@ -46,9 +46,9 @@ SLOW = {
 
 
 @pytest.fixture(scope="module")
-def workshop(tmp_path_factory):
+def attack_folder(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
-    return Workshop(tmp_path_factory.mktemp("attacks"))
+    return AttackFolder(tmp_path_factory.mktemp("attacks"))
 
 
 def check(found):
@@ -62,15 +62,15 @@ def check(found):
 
 
 @pytest.mark.parametrize("family", QUICK)
-def test_attacks_end_in_results_or_in_one_line(workshop, family):
-    found = [a for a in attacks(family, workshop) if not a.risky and not a.is_long]
+def test_attacks_end_in_results_or_in_one_line(attack_folder, family):
+    found = [a for a in attacks(family, attack_folder) if not a.risky and not a.is_long]
     chosen = some(found, QUICK[family])
-    check({attack.name: trial(attack, workshop) for attack in chosen})
+    check({attack.name: trial(attack, attack_folder) for attack in chosen})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
-def test_many_attacks_end_in_results_or_in_one_line(workshop, tmp_path, family):
+def test_many_attacks_end_in_results_or_in_one_line(attack_folder, tmp_path, family):
     with Server(tmp_path) as server:
-        chosen = some(attacks(family, workshop), SLOW[family], seed=1)
+        chosen = some(attacks(family, attack_folder), SLOW[family], seed=1)
         check({attack.name: server.trial(attack.name, attack.seconds) for attack in chosen})

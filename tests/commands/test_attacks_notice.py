@@ -8,17 +8,17 @@ import warnings
 import numpy as np
 import pytest
 from support.attacks.attack import Attack
+from support.attacks.attack_folder import AttackFolder, contents
 from support.attacks.observer import Fault
 from support.attacks.trial import trial
-from support.attacks.workshop import Workshop, contents
 
 from drgs.core.files import atomic_path
 
 
 @pytest.fixture(scope="module")
-def workshop(tmp_path_factory):
+def attack_folder(tmp_path_factory):
     """Without what the commands themselves would write, which takes seconds."""
-    return Workshop(tmp_path_factory.mktemp("attacks"), with_results=False)
+    return AttackFolder(tmp_path_factory.mktemp("attacks"), with_results=False)
 
 
 def refuse(*lines):
@@ -88,26 +88,26 @@ BREACHES = {
 
 
 @pytest.mark.parametrize(("command", "message"), BREACHES.values(), ids=BREACHES)
-def test_what_no_command_may_do_is_noticed(workshop, monkeypatch, command, message):
+def test_what_no_command_may_do_is_noticed(attack_folder, monkeypatch, command, message):
     monkeypatch.setattr("drgs.render.main", lambda words: command())
     seconds = 0.5 if command is wait else 20
-    wrong = trial(Attack("x", "render", (), encoding="ascii", seconds=seconds), workshop)
+    wrong = trial(Attack("x", "render", (), encoding="ascii", seconds=seconds), attack_folder)
     assert any(message in line for line in wrong), wrong
-    assert trial(Attack("x", "capture", ("--help",)), workshop) == []
+    assert trial(Attack("x", "capture", ("--help",)), attack_folder) == []
 
 
 @pytest.mark.parametrize(
     ("message", "wrong"),
     [("error: a.yml: no", []), ("error: no", ["does not name a.yml: error: no"])],
 )
-def test_a_refusal_names_the_file(workshop, monkeypatch, message, wrong):
+def test_a_refusal_names_the_file(attack_folder, monkeypatch, message, wrong):
     monkeypatch.setattr("drgs.render.main", lambda words: refuse(message))
-    assert trial(Attack("x", "render", (), named="a.yml"), workshop) == wrong
+    assert trial(Attack("x", "render", (), named="a.yml"), attack_folder) == wrong
 
 
-def test_what_must_be_refused_and_is_not_is_noticed(workshop, monkeypatch):
+def test_what_must_be_refused_and_is_not_is_noticed(attack_folder, monkeypatch):
     monkeypatch.setattr("drgs.render.main", lambda words: None)
-    assert trial(Attack("x", "render", (), must_refuse=True), workshop) == ["was not refused"]
+    assert trial(Attack("x", "render", (), must_refuse=True), attack_folder) == ["was not refused"]
 
 
 def work(words):
@@ -125,25 +125,27 @@ def forgetful_work(words):
 
 
 @pytest.mark.parametrize(("command", "is_right"), [(work, True), (forgetful_work, False)])
-def test_work_that_does_not_survive_a_kill_is_noticed(workshop, monkeypatch, command, is_right):
+def test_work_that_does_not_survive_a_kill_is_noticed(
+    attack_folder, monkeypatch, command, is_right
+):
     monkeypatch.setattr("drgs.render.main", command)
     found = []
     for at in range(14):
         words = (command.__name__,)
         fault = Fault("kill", at)
         attack = Attack("x", "render", words, fault=fault, again=words, results=("a", "b"))
-        found += trial(attack, workshop)
+        found += trial(attack, attack_folder)
     stale = [line for line in found if ".tmp" not in line]
     assert (stale == []) is is_right, found
 
 
-def test_the_workshop_is_put_back(workshop):
-    before = contents(workshop.folder)
-    (workshop.folder / "sky.png").unlink()
-    (workshop.folder / "mine" / "notes.txt").write_text("changed")
-    (workshop.folder / "photos").rename(workshop.folder / "images")
-    (workshop.folder / "new").mkdir()
-    os.mkfifo(workshop.folder / "new" / "pipe")
-    assert contents(workshop.folder) != before
-    workshop.put_back()
-    assert contents(workshop.folder) == before
+def test_the_workshop_is_put_back(attack_folder):
+    before = contents(attack_folder.folder)
+    (attack_folder.folder / "sky.png").unlink()
+    (attack_folder.folder / "mine" / "notes.txt").write_text("changed")
+    (attack_folder.folder / "photos").rename(attack_folder.folder / "images")
+    (attack_folder.folder / "new").mkdir()
+    os.mkfifo(attack_folder.folder / "new" / "pipe")
+    assert contents(attack_folder.folder) != before
+    attack_folder.put_back()
+    assert contents(attack_folder.folder) == before

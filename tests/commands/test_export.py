@@ -25,7 +25,7 @@ from drgs.io.formats import read_gaussians, readable_formats
 from drgs.results.refined_cameras import write_views
 
 OTHERWISE = {"antialiased": True, "low_pass": 0.1}
-USUAL = {"antialiased": False, "low_pass": 0.3}
+VIEWER_RENDERING = {"antialiased": False, "low_pass": 0.3}
 
 
 def run(*arguments):
@@ -46,7 +46,7 @@ def fit(tmp_path):
     folder.mkdir()
     (folder / "config.yml").write_text("")
     replace(gaussians_within_ranges(20), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
-    viewers = replace(gaussians_within_ranges(30), rendered_with=USUAL)
+    viewers = replace(gaussians_within_ranges(30), rendered_with=VIEWER_RENDERING)
     viewers.save(folder / "point_cloud_viewers.ply")
     write_views(folder / "views.json", make_dataset(6, 1))
     return folder

@@ -16,7 +16,7 @@ import yaml
 from conftest import REPOSITORY
 from support.commands import run_in_process
 from support.folders import visible
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.cli.execution import executing
 from drgs.config.load import dump_config, load_config
@@ -99,7 +99,7 @@ def configuration(dataset):
     values = {
         "data": {"path": str(dataset), "background": "white"},
         "init": {"num_points": 300, "half_extent": 1.0},
-        "model": {"sh_degree": 1, "sh_increase_every": 100, **USUAL},
+        "model": {"sh_degree": 1, "sh_increase_every": 100, **VIEWER_RENDERING},
         "densify": {
             "strategy": "adc",
             "adc": {"clone_scale": 0.03, "reset_every": 150, "white_background_reset": 80},

@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from support import children
+from support import child_functions
 
 from drgs.core.child_process import ChildEndedError, DeferredInterrupts, run_in_child
 from drgs.core.errors import UserError
@@ -48,24 +48,24 @@ def ends(process):
 
 def test_a_child_reports_and_returns():
     reports = []
-    assert call(children.add, 2, 3, watch=lambda *given: reports.append(given)) == 5
+    assert call(child_functions.add, 2, 3, watch=lambda *given: reports.append(given)) == 5
     assert reports == [("given", 2, 3)]
 
 
 def test_what_a_user_can_repair_is_raised_here():
     with pytest.raises(UserError, match=r"^a\.jpg: cannot be read$"):
-        call(children.refuse)
+        call(child_functions.refuse)
 
 
 def test_a_defect_keeps_its_traceback():
     with pytest.raises(RuntimeError, match=r"(?s)status 1:\nTraceback.*ZeroDivisionError: by not"):
-        call(children.fail)
+        call(child_functions.fail)
 
 
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGABRT", "SIGSEGV"])
 def test_a_signal_that_ended_the_child_is_named(name):
     with pytest.raises(ChildEndedError, match=rf"^{name}: Check failed: out of luck$"):
-        call(children.crash, signal.Signals[name])
+        call(child_functions.crash, signal.Signals[name])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -78,7 +78,7 @@ def test_an_interrupt_ends_the_child(number):
         os.kill(os.getpid(), number)
 
     with pytest.raises(KeyboardInterrupt):
-        call(children.wait, watch=watch)
+        call(child_functions.wait, watch=watch)
     assert not is_running(*processes)
     assert terminated == ([True] if number == signal.SIGTERM else [])
 
@@ -86,11 +86,11 @@ def test_an_interrupt_ends_the_child(number):
 def test_a_child_ends_with_a_parent_that_is_killed():
     program = (
         f"import sys; sys.path[:] = {sys.path!r}\n"
-        "from support import children\n"
+        "from support import child_functions\n"
         "from drgs.core.child_process import DeferredInterrupts, run_in_child\n"
         "with DeferredInterrupts() as interrupts:\n"
         "    show = lambda process: print(process, flush=True)\n"
-        "    run_in_child(children.wait, watch=show, interrupts=interrupts)\n"
+        "    run_in_child(child_functions.wait, watch=show, interrupts=interrupts)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as parent:
         child = int(parent.stdout.readline())

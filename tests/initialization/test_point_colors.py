@@ -4,7 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bodies import WHITE, box, colors_at, directions_to, images_of, sphere, together
+from support.analytic_shapes import (
+    WHITE,
+    box,
+    colors_at,
+    directions_to,
+    images_of,
+    sphere,
+    together,
+)
 
 from drgs.datasets.types import CameraMotion
 from drgs.initialization import point_colors

@@ -4,7 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bodies import DISTANCE, colors_at, dataset_of_images, images_of, opaque_at, sphere
+from support.analytic_shapes import (
+    DISTANCE,
+    colors_at,
+    dataset_of_images,
+    images_of,
+    opaque_at,
+    sphere,
+)
 from support.datasets import load
 from support.photographs import write_points
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.bodies import box, images_of, opaque_at, sphere, together
+from support.analytic_shapes import box, images_of, opaque_at, sphere, together
 
 from drgs.datasets.types import CameraMotion
 from drgs.initialization.start_box import Box

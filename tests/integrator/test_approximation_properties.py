@@ -6,7 +6,7 @@ import annotated_types
 import mitsuba as mi
 import pytest
 from conftest import REPOSITORY
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.config.load import load_config
@@ -41,7 +41,7 @@ def test_the_page_of_splats_documents_what_is_declared(name):
 def test_the_configuration_has_what_is_declared(name):
     field, declared = ModelConfig.model_fields[name], DECLARED[name]
     assert field.description.startswith(declared.description)
-    assert ModelConfig(**USUAL).approximations == Approximations()
+    assert ModelConfig(**VIEWER_RENDERING).approximations == Approximations()
     limits = declared.limits.finite if declared.limits else {}
     assert field.metadata == [getattr(annotated_types, k.title())(v) for k, v in limits.items()]
 
@@ -55,10 +55,10 @@ def test_every_annotation_is_read():
 
 def test_a_default_that_is_not_rounded_is_the_default():
     """A configuration writes 0.99 for the float32 next to it."""
-    written = ModelConfig(alpha_max=0.99, alpha_cut=1 / 255, extent=None, **USUAL)
+    written = ModelConfig(alpha_max=0.99, alpha_cut=1 / 255, extent=None, **VIEWER_RENDERING)
     assert written.approximations == Approximations()
     assert written.approximations.others_than_default == {}
-    chosen = ModelConfig(alpha_max=0.98, extent=3.0, **USUAL).approximations
+    chosen = ModelConfig(alpha_max=0.98, extent=3.0, **VIEWER_RENDERING).approximations
     assert chosen.others_than_default == {"alpha_max": 0.98, "extent": 3.0}
 
 

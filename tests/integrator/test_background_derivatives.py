@@ -19,7 +19,7 @@ from support.backgrounds import (
 )
 from support.helpers import single
 from support.views import VIEWS, Scene, image_of, to_linear, to_linear_derivative
-from support.walls import to_display
+from support.wall_scenes import to_display
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.arrays import from_host

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.views import VIEWS, Scene, tensors
-from support.walls import WALL
+from support.wall_scenes import WALL
 
 import drgs
 from drgs.core.constants import MAX_FEATURES, MAX_INT

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.helpers import NEAR_THRESHOLD, assert_arrays_agree
 from support.sensors import camera_of, numbers, points_on_rays
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 from support.views import View as Perspective
 from support.views import image_of, pose, splats_before
 
@@ -178,7 +178,7 @@ def test_a_scene_renders_the_views_image_in_display_space(antialiased, near):
 def test_derivatives_are_possible_between_two_images_and_when_no_more_are_asked_for():
     """A command that was interrupted leaves images that nobody takes."""
     view = make_view()
-    scene = make_scene(make_gaussians(view), ModelConfig(**USUAL), BACKGROUND)
+    scene = make_scene(make_gaussians(view), ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     renders = render_views(scene, [view] * 3)
     next(renders)
     x = mi.Float(2)
@@ -203,7 +203,7 @@ def test_a_scene_takes_gaussians_from_host_or_device():
     gaussians = make_gaussians(view)
     sensor = make_sensors([view])[0]
     images = [
-        image_of(make_scene(g, ModelConfig(**USUAL), BACKGROUND), sensor=sensor)
+        image_of(make_scene(g, ModelConfig(**VIEWER_RENDERING), BACKGROUND), sensor=sensor)
         for g in (gaussians, gaussians.to(mi.TensorXf))
     ]
     assert np.array_equal(*images)
@@ -216,7 +216,7 @@ def test_a_scene_may_hold_few_gaussians(count):
     rows = slice(3, 3 + count)
     many = make_gaussians(view)
     few = Gaussians(**{name: getattr(many, name)[rows] for name in PARAMETER_NAMES})
-    scene = make_scene(few, ModelConfig(near=0.01, **USUAL), BACKGROUND)
+    scene = make_scene(few, ModelConfig(near=0.01, **VIEWER_RENDERING), BACKGROUND)
     image = image_of(scene, sensor=make_sensors([view])[0])
     expected = expected_image(few, view, 0.01, False)
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
@@ -224,7 +224,7 @@ def test_a_scene_may_hold_few_gaussians(count):
 
 def test_a_scenes_parameters_are_copies_under_the_integrators_name():
     gaussians = make_gaussians(make_view()).to(mi.TensorXf)
-    scene = make_scene(gaussians, ModelConfig(**USUAL), BACKGROUND)
+    scene = make_scene(gaussians, ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     params = mi.traverse(scene)
     before = np.array(gaussians.means)
     params["integrator.means"] = dr.zeros(mi.TensorXf, gaussians.means.shape)
@@ -234,7 +234,7 @@ def test_a_scenes_parameters_are_copies_under_the_integrators_name():
 
 def test_sensors_of_views_render_without_a_warning(capfd):
     view = make_view()
-    scene = make_scene(make_gaussians(view), ModelConfig(**USUAL), BACKGROUND)
+    scene = make_scene(make_gaussians(view), ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     mi.render(scene, sensor=make_sensors([view])[0])
     assert "splats" not in "".join(capfd.readouterr())
 
@@ -258,9 +258,9 @@ def test_approximations_reach_the_integrator():
     gaussians = bench_gaussians(5)
     scene = make_scene(gaussians, ModelConfig(**values), (1.0, 1.0, 1.0))
     assert scene.integrator().state.approximations == Approximations(**values)
-    scene = make_scene(gaussians, ModelConfig(**USUAL), (1.0, 1.0, 1.0))
+    scene = make_scene(gaussians, ModelConfig(**VIEWER_RENDERING), (1.0, 1.0, 1.0))
     assert scene.integrator().state.approximations == Approximations()
-    default = {name: getattr(ModelConfig(**USUAL), name) for name in values}
+    default = {name: getattr(ModelConfig(**VIEWER_RENDERING), name) for name in values}
     default["extent"] = math.inf
     for name, value in vars(Approximations()).items():
         assert default[name] == (pytest.approx(value) if isinstance(value, float) else value), name

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import TESTS
 from support import small_fits as fits
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 from support.views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -48,7 +48,7 @@ def variant():
 def config_of(**changes):
     """The default of everything but of filters; ``__`` is written for the dot."""
     values = {key.replace("__", "."): value for key, value in changes.items()}
-    return changed(FitConfig(data={"path": "."}, model=USUAL), values)
+    return changed(FitConfig(data={"path": "."}, model=VIEWER_RENDERING), values)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -423,7 +423,7 @@ from dataclasses import replace
 from drgs.training.effects.base import training_effects
 from drgs.training.summary import summary_of_fit
 from support import small_capture as capture
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 from drgs.config.changes import changed
 from drgs.config.schema import FitConfig
 

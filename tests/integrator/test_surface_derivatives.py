@@ -15,7 +15,7 @@ from support.views import (
     image_of,
     tensors,
 )
-from support.walls import GRADIENTS, IMAGE, SCENE, Wall, apart, blob, expected, load, rgba
+from support.wall_scenes import GRADIENTS, IMAGE, SCENE, Wall, apart, blob, expected, load, rgba
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError

@@ -13,7 +13,7 @@ from support.views import (
     image_of,
     tensors,
 )
-from support.walls import (
+from support.wall_scenes import (
     IMAGE,
     RADIANCE,
     SCENE,

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from support.colmap_models import write_dataset
-from support.corner import FOCAL, SIZE, write_photographs
 from support.datasets import load
+from support.textured_corner import FOCAL, SIZE, write_photographs
 
 from drgs.core.child_process import ChildEndedError
 from drgs.core.errors import UserError, UserNote

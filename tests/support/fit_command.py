@@ -10,7 +10,7 @@ from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
 from support.commands import Outcome, assert_ends_well, assert_refused, run_in_process
 from support.small_capture import make_dataset, write_dataset
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 ITERATIONS = 8
 
@@ -18,7 +18,7 @@ SMALL = {"data": {"path": "data"}, "init": {"num_points": 40, "half_extent": 0.5
 """Sections that all scenes have here."""
 
 VALUES = {
-    "model": {"sh_degree": 1, "sh_increase_every": 3, **USUAL},
+    "model": {"sh_degree": 1, "sh_increase_every": 3, **VIEWER_RENDERING},
     "densify": {
         "start": 1,
         "stop": 7,

@@ -20,7 +20,7 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.trainer import Trainer
 from support import small_capture as capture
 from support.helpers import NEAR_THRESHOLD
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -97,7 +97,7 @@ def config_of(**changes) -> FitConfig:
     """Of a fit whose population stays; changes: by names such as ``model.smoothing``."""
     config = FitConfig(
         data={"path": "."},
-        model={"sh_degree": 1, "sh_increase_every": 1, **USUAL},
+        model={"sh_degree": 1, "sh_increase_every": 1, **VIEWER_RENDERING},
         densify={
             "start": 1_000_000,
             "stop": 1_000_001,

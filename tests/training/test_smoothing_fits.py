@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import small_capture as capture
 from support.smoothing import smoothed_reference
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.config.schema import FitConfig
@@ -36,7 +36,12 @@ def make_trainer(coarse=(), **changes):
     config = FitConfig.model_validate(
         {
             "data": {"path": "."},
-            "model": {"smoothing": True, "sh_degree": 1, "sh_increase_every": 1, **USUAL},
+            "model": {
+                "smoothing": True,
+                "sh_degree": 1,
+                "sh_increase_every": 1,
+                **VIEWER_RENDERING,
+            },
             "densify": GROWING,
             "iterations": 60,
             "coarse": list(coarse),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support import small_fits as fits
 from support.small_capture import decibels
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.config.changes import changed
 from drgs.config.schema import ModelConfig
@@ -34,7 +34,7 @@ def ended_fit(iterations=20, **changes):
 
 
 def shown_by_viewers(gaussians, dataset):
-    scene = make_scene(gaussians, ModelConfig(near=0.2, **USUAL), dataset.background)
+    scene = make_scene(gaussians, ModelConfig(near=0.2, **VIEWER_RENDERING), dataset.background)
     pairs = zip(render_views(scene, dataset.test), dataset.test, strict=True)
     return np.mean([decibels(image, view.image) for image, view in pairs])
 

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import RADIUS, blobs, pose_around
-from support.usual_rule import USUAL
+from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
@@ -28,7 +28,7 @@ def variant():
 
 
 def seen(gaussians, lens="pinhole", **numbers):
-    scene = LiveScene(gaussians, ModelConfig(**USUAL), BACKGROUND)
+    scene = LiveScene(gaussians, ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     return scene.image(FrameRequest(EYE, WIDTH, HEIGHT, lens, numbers))[0]
 
 
@@ -56,7 +56,7 @@ def viewpoint(focal=FOCAL, lens=None):
     ids=["pinhole", "opencv", "fisheye"],
 )
 def test_images_are_those_of_the_same_camera_in_a_dataset(lens, numbers, view):
-    scene = make_scene(blobs(), ModelConfig(**USUAL), BACKGROUND)
+    scene = make_scene(blobs(), ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     (expected,) = render_views(scene, [view])
     rendered = np.clip(seen(blobs(), lens, **numbers), 0, 1)
     assert np.ptp(expected) > 0.3

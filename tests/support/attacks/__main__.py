@@ -11,21 +11,21 @@ from tempfile import TemporaryDirectory
 import mitsuba as mi
 
 import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+from support.attacks.attack_folder import AttackFolder
 from support.attacks.catalogue import FAMILIES, attacks
 from support.attacks.server import Server
-from support.attacks.workshop import Workshop
 
 
 def main(patterns: list[str]) -> None:
     """Run the attacks whose names match one of the patterns; none: count them."""
     mi.set_variant("llvm_ad_rgb")
     with TemporaryDirectory(prefix="attacks-") as base, Server(Path(base)) as server:
-        workshop = Workshop(Path(base) / "here")
+        attack_folder = AttackFolder(Path(base) / "here")
         for family in FAMILIES:
             if not patterns:
-                print(f"{family}: {len(attacks(family, workshop))}")
+                print(f"{family}: {len(attacks(family, attack_folder))}")
             elif any(pattern.partition("/")[0] == family for pattern in patterns):
-                for attack in attacks(family, workshop):
+                for attack in attacks(family, attack_folder):
                     if any(attack.name == p or fnmatch(attack.name, p) for p in patterns):
                         started = time.perf_counter()
                         wrong = server.trial(attack.name, attack.seconds)

@@ -15,7 +15,7 @@ def _nothing(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class Attack:
-    """A command line in the workshop's folder, after its files were changed.
+    """A command line in the attack folder's folder, after its files were changed.
 
     A refusal is expected to be one line with status 2 that changes no file; a success, status 0,
     changes nothing outside the folder ``out``.
@@ -25,7 +25,7 @@ class Attack:
     command: str  # fit, render or capture
     words: tuple[str, ...]  # of the command line
     change: Callable[[Path], None] = _nothing  # of the files, before; takes the folder
-    out: str = "out"  # folder, within the workshop's, that belongs to the command
+    out: str = "out"  # folder, within the attack folder's, that belongs to the command
     theirs: tuple[str, ...] = ()  # paths, in ``out`` as well, that are the user's
     named: str = ""  # part of every refusal's message
     encoding: str = "utf-8"  # of the standard output

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from support.attacks.attack import Attack
+from support.attacks.attack_folder import AttackFolder
 from support.attacks.faults import fault_attacks, size_attacks
 from support.attacks.files import damage_attacks, other_file_attacks, special_attacks
 from support.attacks.options import (
@@ -17,25 +18,24 @@ from support.attacks.options import (
 )
 from support.attacks.scenes import object_attacks, property_attacks
 from support.attacks.values import option_attacks, schema_attacks
-from support.attacks.workshop import Workshop
 
 DAMAGED = 40
 """Of each kind, for each file."""
 
-FAMILIES: dict[str, Callable[[Workshop], Iterable[Attack]]] = {
-    "schema": lambda workshop: schema_attacks(),
-    "option": lambda workshop: option_attacks(),
-    "instead": lambda workshop: other_file_attacks(),
-    "damaged": lambda workshop: damage_attacks(DAMAGED),
-    "special": lambda workshop: special_attacks(),
-    "together": lambda workshop: combination_attacks(),
-    "folder": lambda workshop: folder_attacks(),
-    "name": lambda workshop: name_attacks(),
+FAMILIES: dict[str, Callable[[AttackFolder], Iterable[Attack]]] = {
+    "schema": lambda attack_folder: schema_attacks(),
+    "option": lambda attack_folder: option_attacks(),
+    "instead": lambda attack_folder: other_file_attacks(),
+    "damaged": lambda attack_folder: damage_attacks(DAMAGED),
+    "special": lambda attack_folder: special_attacks(),
+    "together": lambda attack_folder: combination_attacks(),
+    "folder": lambda attack_folder: folder_attacks(),
+    "name": lambda attack_folder: name_attacks(),
     "fault": fault_attacks,
-    "size": lambda workshop: size_attacks(),
-    "drawn": lambda workshop: drawn_attacks(),
-    "property": lambda workshop: property_attacks(),
-    "object": lambda workshop: object_attacks(),
+    "size": lambda attack_folder: size_attacks(),
+    "drawn": lambda attack_folder: drawn_attacks(),
+    "property": lambda attack_folder: property_attacks(),
+    "object": lambda attack_folder: object_attacks(),
 }
 """By the first part of an attack's name."""
 
@@ -47,9 +47,9 @@ KNOWN_FAILURES: dict[str, str] = {
 of them does so no more."""
 
 
-def attacks(family: str, workshop: Workshop) -> list[Attack]:
+def attacks(family: str, attack_folder: AttackFolder) -> list[Attack]:
     """All of a family."""
-    found = list(FAMILIES[family](workshop))
+    found = list(FAMILIES[family](attack_folder))
     names = [attack.name for attack in found]
     assert len(set(names)) == len(names), family
     return found
@@ -61,6 +61,6 @@ def some(found: list[Attack], count: int, seed: int = 0) -> list[Attack]:
     return [found[index] for index in sorted(chosen)]
 
 
-def find(name: str, workshop: Workshop) -> Attack:
+def find(name: str, attack_folder: AttackFolder) -> Attack:
     """The attack of that name."""
-    return next(a for a in attacks(name.partition("/")[0], workshop) if a.name == name)
+    return next(a for a in attacks(name.partition("/")[0], attack_folder) if a.name == name)

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from support.attacks.attack import Attack
+from support.attacks.attack_folder import CAPTURE, AttackFolder, capture_size, standing_in
 from support.attacks.observer import KINDS, SMALL_FILES, Fault
 from support.attacks.trial import run
-from support.attacks.workshop import CAPTURE, Workshop, capture_size, standing_in
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ WORKS = {
 """By name. What a fit draws takes seconds, and is sketched."""
 
 
-def count_changes(work: Work, workshop: Workshop) -> int:
+def count_changes(work: Work, attack_folder: AttackFolder) -> int:
     """How often the command changes a file, when nothing happens."""
     attack = Attack("rehearsal", work.command, work.words)
-    with standing_in(workshop.folder):
+    with standing_in(attack_folder.folder):
         outcome = run(attack, work.words)
-    workshop.put_back()
+    attack_folder.put_back()
     assert outcome.status == 0, outcome.err
     return len(outcome.changes.inside)
 
@@ -88,10 +88,10 @@ def size_attacks() -> Iterator[Attack]:
             )
 
 
-def fault_attacks(workshop: Workshop) -> Iterator[Attack]:
+def fault_attacks(attack_folder: AttackFolder) -> Iterator[Attack]:
     """Each kind of fault at each change of a file by each of the works."""
     for name, work in WORKS.items():
-        for at in range(count_changes(work, workshop)):
+        for at in range(count_changes(work, attack_folder)):
             for kind in KINDS:
                 yield Attack(
                     f"fault/{name}/{kind} at {at}",

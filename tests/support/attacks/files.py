@@ -17,8 +17,8 @@ import yaml
 from PIL import Image
 
 from support.attacks.attack import Attack
+from support.attacks.attack_folder import CAPTURE, HEIGHT, WIDTH, capture_size
 from support.attacks.mutations import mutate_bytes, mutate_chunks, mutate_header, mutate_tree
-from support.attacks.workshop import CAPTURE, HEIGHT, WIDTH, capture_size
 
 RENDER = ("--origin", "3", "0", "1", "--size", "8", "6", "--out", "out")
 

@@ -46,13 +46,13 @@ class Killed(BaseException):
 
 @dataclass(frozen=True)
 class Fault:
-    """Strikes at change number ``at`` of the workshop's files, counted from 0."""
+    """Strikes at change number ``at`` of the attack folder's files, counted from 0."""
 
     kind: str  # one of KINDS, or SMALL_FILES
     at: int
 
     def strike(self, number: int, event: str, path: str) -> None:
-        """Called before each change; path: within the workshop."""
+        """Called before each change; path: within the attack folder."""
         if number < self.at or self.kind == SMALL_FILES:
             return
         if self.kind == "kill":
@@ -69,7 +69,7 @@ class Fault:
 class Changes:
     """What a trial did to files, in its order."""
 
-    folder: Path  # of the workshop
+    folder: Path  # of the attack folder
     fault: Fault | None = None
     inside: list[tuple[str, str]] = field(default_factory=list)  # (event, path in the folder)
     outside: list[str] = field(default_factory=list)  # paths

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from support.attacks.attack import Attack
-from support.attacks.workshop import CAPTURE, SETTINGS, capture_size
+from support.attacks.attack_folder import CAPTURE, SETTINGS, capture_size
 
 OPTIONS = {
     "fit": {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drgs.config.approximations import DECLARED
 from support.attacks.attack import Attack
-from support.attacks.workshop import SPLATS
+from support.attacks.attack_folder import SPLATS
 
 WORDS = ("render", ("splats.xml", "--out", "out"))
 
@@ -197,7 +197,7 @@ OBJECTS = {
         '<lookat origin="4', '<scale x="5"/><lookat origin="4'
     ),
 }
-"""By name, a scene made of the workshop's."""
+"""By name, a scene made of the attack folder's."""
 
 
 def _sensor(scene: str) -> str:

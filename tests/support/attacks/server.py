@@ -18,7 +18,7 @@ GRACE = 40.0
 class Server:
     """Runs attacks by name; a context manager.
 
-    base: a folder, for the workshops.
+    base: a folder, for the attack folders.
     """
 
     def __init__(self, base: Path) -> None:
@@ -77,22 +77,22 @@ def serve(base: Path) -> None:
     import mitsuba as mi
 
     import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+    from support.attacks.attack_folder import AttackFolder
     from support.attacks.catalogue import attacks
     from support.attacks.trial import trial
-    from support.attacks.workshop import Workshop
 
     # Libraries and commands print to what is the standard output.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
-    workshop, families = Workshop(base), {}
+    attack_folder, families = AttackFolder(base), {}
     for line in sys.stdin:
         name = json.loads(line)
         family = name.partition("/")[0]
         if family not in families:
-            families[family] = {attack.name: attack for attack in attacks(family, workshop)}
-        print(json.dumps(trial(families[family][name], workshop)), file=answers, flush=True)
+            families[family] = {attack.name: attack for attack in attacks(family, attack_folder)}
+        print(json.dumps(trial(families[family][name], attack_folder)), file=answers, flush=True)
 
 
 if __name__ == "__main__":

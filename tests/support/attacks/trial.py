@@ -19,8 +19,8 @@ from pathlib import Path
 
 from drgs.__main__ import COMMANDS
 from support.attacks.attack import Attack
+from support.attacks.attack_folder import AttackFolder, contents, sketched_results, standing_in
 from support.attacks.observer import Changes, Killed, observed
-from support.attacks.workshop import Workshop, contents, sketched_results, standing_in
 
 KILLED = 137
 INTERRUPTED = 130
@@ -31,7 +31,7 @@ PIPE_BYTES = 1 << 20
 CACHES = re.compile(
     r"/(\.drjit|\.cache|__pycache__|\.nv|\.config/matplotlib)(/|$)|^/dev/(null|tty)$|^/proc/self/"
 )
-"""Paths outside the workshop that may be written: of libraries, and of these trials."""
+"""Paths outside the attack folder that may be written: of libraries, and of these trials."""
 
 TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
 
@@ -66,19 +66,19 @@ class Outcome:
     changes: Changes = field(default_factory=lambda: Changes(Path()))
 
 
-def trial(attack: Attack, workshop: Workshop) -> list[str]:
-    """Run an attack and put the workshop back; what is wrong, in a line each."""
+def trial(attack: Attack, attack_folder: AttackFolder) -> list[str]:
+    """Run an attack and put the attack folder back; what is wrong, in a line each."""
     try:
-        with standing_in(workshop.folder):
-            attack.change(workshop.folder)
-            before = contents(workshop.folder)
+        with standing_in(attack_folder.folder):
+            attack.change(attack_folder.folder)
+            before = contents(attack_folder.folder)
             outcome = run(attack, attack.words)
-            wrong = [*faults_of(attack, outcome), *damage(attack, outcome, before, workshop)]
+            wrong = [*faults_of(attack, outcome), *damage(attack, outcome, before, attack_folder)]
             if attack.again and outcome.status != 0:
-                wrong += recovery(attack, workshop)
+                wrong += recovery(attack, attack_folder)
         return wrong
     finally:
-        workshop.put_back()
+        attack_folder.put_back()
 
 
 def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outcome:
@@ -157,10 +157,10 @@ def _wrong_refusal(attack: Attack, err: str) -> list[str]:
 
 
 def damage(
-    attack: Attack, outcome: Outcome, before: dict[str, str], workshop: Workshop
+    attack: Attack, outcome: Outcome, before: dict[str, str], attack_folder: AttackFolder
 ) -> list[str]:
     """What is wrong with the files that it left."""
-    after, wrong = contents(workshop.folder), []
+    after, wrong = contents(attack_folder.folder), []
     own = os.path.normpath(attack.out) if "\0" not in attack.out else ""
 
     def is_own(path: str) -> bool:
@@ -187,14 +187,14 @@ def _cannot_tidy(attack: Attack) -> bool:
     return attack.fault is not None and attack.fault.kind in ("kill", "denied")
 
 
-def recovery(attack: Attack, workshop: Workshop) -> list[str]:
+def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
     """What is wrong after the command was run again, as its user would."""
     outcome = run(attack, attack.again, with_fault=False)
     if outcome.status != 0:
         return [f"again: ended with {outcome.status}: {_last_lines(outcome.err)}"]
-    found = contents(workshop.folder / attack.out)
+    found = contents(attack_folder.folder / attack.out)
     wrong = [f"again: left {path}" for path in found if TEMPORARY.search(path)]
-    expected = undisturbed(attack, workshop)
+    expected = undisturbed(attack, attack_folder)
     wrong += [f"again: {n} is missing" for n in expected.keys() - found.keys()]
     wrong += [f"again: {n} is too much" for n in found.keys() - expected.keys()]
     return wrong + [
@@ -207,15 +207,15 @@ def recovery(attack: Attack, workshop: Workshop) -> list[str]:
 _undisturbed: dict[tuple, dict[str, str]] = {}
 
 
-def undisturbed(attack: Attack, workshop: Workshop) -> dict[str, str]:
-    """What the command leaves in its folder when nothing happens; puts the workshop back."""
-    key = str(workshop.folder), attack.command, attack.words
+def undisturbed(attack: Attack, attack_folder: AttackFolder) -> dict[str, str]:
+    """What the command leaves in its folder when nothing happens; puts the attack folder back."""
+    key = str(attack_folder.folder), attack.command, attack.words
     if key not in _undisturbed:
-        workshop.put_back()
-        attack.change(workshop.folder)
+        attack_folder.put_back()
+        attack.change(attack_folder.folder)
         outcome = run(attack, attack.words, with_fault=False)
         assert outcome.status == 0, outcome.err
-        _undisturbed[key] = contents(workshop.folder / attack.out)
+        _undisturbed[key] = contents(attack_folder.folder / attack.out)
     return _undisturbed[key]
 
 

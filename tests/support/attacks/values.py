@@ -10,7 +10,7 @@ from drgs.__main__ import COMMANDS
 from drgs.cli.commands import CommandParser
 from drgs.config.load import known_keys
 from support.attacks.attack import Attack
-from support.attacks.workshop import CAPTURE, capture_size
+from support.attacks.attack_folder import CAPTURE, capture_size
 
 NUMBERS = {
     "nan": ".nan",

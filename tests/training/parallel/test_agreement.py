@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import together
+from support import parallel_processes
 from support.datasets import edit, load
 from support.small_capture import make_dataset, write_dataset
 
@@ -59,7 +59,7 @@ def copies(tmp_path):
 def fitted(copies, out, size=2):
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     words = ["-m", "drgs.fit", copies[0], "--out", out, *settings]
-    return together.run(size, words, cwd=copies[0], on_second=f"cd {copies[1]}")
+    return parallel_processes.run(size, words, cwd=copies[0], on_second=f"cd {copies[1]}")
 
 
 def test_another_photograph_of_one_process_is_refused(copies, tmp_path):
@@ -109,7 +109,7 @@ def test_views_are_compared_with_those_of_the_first_process(
 def test_images_of_other_files_are_refused(tmp_path):
     """Of a background that is another one; then of a model, with the same background."""
     here, there, out = (tmp_path / name for name in ("first", "second", "out"))
-    knot = Gaussians.load(together.REPOSITORY / "scenes" / "shapes" / "knot.ply")
+    knot = Gaussians.load(parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply")
     for folder, shade in ((here, 0), (there, 9)):
         folder.mkdir()
         knot.save(folder / "model.ply")
@@ -118,7 +118,7 @@ def test_images_of_other_files_are_refused(tmp_path):
 
     def rendered():
         command = ["-m", "drgs.render", *words]
-        status, _, errors = together.run(2, command, cwd=here, on_second=f"cd {there}")
+        status, _, errors = parallel_processes.run(2, command, cwd=here, on_second=f"cd {there}")
         return status, errors
 
     status, errors = rendered()

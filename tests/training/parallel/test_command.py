@@ -11,7 +11,7 @@ import sys
 import time
 
 import pytest
-from support import together
+from support import parallel_processes
 
 CONFIG = """
 data: {{path: {data}, image_size: 50}}
@@ -30,7 +30,7 @@ def config(tmp_path):
 
     def write(iterations=60, views=4):
         path = tmp_path / "fit.yml"
-        data = together.REPOSITORY / "scenes" / "lego"
+        data = parallel_processes.REPOSITORY / "scenes" / "lego"
         path.write_text(CONFIG.format(data=data, iterations=iterations, views=views))
         return path
 
@@ -51,24 +51,26 @@ def result(folder):
 def assert_all_end(word):
     """The launcher may have ended a moment before its processes."""
     end = time.monotonic() + 10
-    while together.ranks_of(str(word)):
+    while parallel_processes.ranks_of(str(word)):
         assert time.monotonic() < end
         time.sleep(0.05)
 
 
 def test_a_fit_that_is_shared_is_the_same(config, tmp_path):
     path = config()
-    status, output, errors = together.run(2, command(path, "--out", tmp_path / "two"))
+    status, output, errors = parallel_processes.run(2, command(path, "--out", tmp_path / "two"))
     assert status == 0, errors
     assert output.count("written: ") == 1 and "Traceback" not in errors
-    assert together.run(1, command(path, "--out", tmp_path / "one"))[0] == 0
+    assert parallel_processes.run(1, command(path, "--out", tmp_path / "one"))[0] == 0
     assert result(tmp_path / "two") == result(tmp_path / "one")
     metrics = json.loads((tmp_path / "two" / "metrics.json").read_text())
     assert metrics["config"]["optimizer"]["views_per_step"] == 4
 
 
 def test_too_many_processes_are_refused_once(config, tmp_path):
-    status, _, errors = together.run(3, command(config(views=2), "--out", tmp_path / "out"))
+    status, _, errors = parallel_processes.run(
+        3, command(config(views=2), "--out", tmp_path / "out")
+    )
     assert status == 2
     assert errors.count("error: ") == 1
     assert "optimizer.views_per_step must be at least the number of processes (3)" in errors
@@ -87,13 +89,15 @@ def test_too_many_processes_are_refused_once(config, tmp_path):
     ],
 )
 def test_what_cannot_be_shared_or_done_is_refused_once(config, tmp_path, words, message):
-    status, _, errors = together.run(2, command(config(), "--out", tmp_path / "out", *words))
+    status, _, errors = parallel_processes.run(
+        2, command(config(), "--out", tmp_path / "out", *words)
+    )
     assert (status, errors.count("error: ")) == (2, 1), errors
     assert message in errors
 
 
 def test_a_wrong_command_line_is_refused_once(tmp_path):
-    status, _, errors = together.run(2, command("nothing.yml", "--out", tmp_path / "out"))
+    status, _, errors = parallel_processes.run(2, command("nothing.yml", "--out", tmp_path / "out"))
     assert status == 2 and errors.count("error: ") == 1
 
 
@@ -112,9 +116,9 @@ def test_a_process_that_fails_alone_is_heard_once_and_ends_all(
     config, tmp_path, on_second, message
 ):
     if on_second is MISSING:
-        on_second = together.failing_import(tmp_path, "mpi4py", MISSING)
+        on_second = parallel_processes.failing_import(tmp_path, "mpi4py", MISSING)
     words, start = command(config(), "--out", tmp_path / "out"), time.monotonic()
-    status, _, errors = together.run(2, words, on_second=on_second)
+    status, _, errors = parallel_processes.run(2, words, on_second=on_second)
     assert (status, errors.count("error: ")) == (2, 1), errors
     assert message in errors and "Traceback" not in errors and "Fatal" not in errors
     assert time.monotonic() - start < 60  # 4 to 8 s; without an end, for ever
@@ -123,33 +127,33 @@ def test_a_process_that_fails_alone_is_heard_once_and_ends_all(
 
 
 def test_an_unexpected_error_of_one_process_is_traced_once_and_ends_all(config, tmp_path):
-    failing = together.failing_import(
+    failing = parallel_processes.failing_import(
         tmp_path, "drgs.training.parallel.exchange", "RuntimeError('a bug')"
     )
     words = command(config(), "--out", tmp_path / "out")
-    status, _, errors = together.run(2, words, on_second=failing)
+    status, _, errors = parallel_processes.run(2, words, on_second=failing)
     assert status == 1, errors
     assert errors.startswith("process 1: Traceback") and errors.count("Traceback") == 1
     assert errors.endswith("RuntimeError: a bug\n")
 
 
 def test_a_command_of_one_process_is_refused_once(tmp_path):
-    model = together.REPOSITORY / "scenes" / "shapes" / "knot.ply"
+    model = parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply"
     words = ["-m", "drgs.export", model, "--out", tmp_path / "a.spz"]
-    status, _, errors = together.run(2, words)
+    status, _, errors = parallel_processes.run(2, words)
     assert (status, errors.count("error: ")) == (2, 1), errors
     assert "mpiexec: processes can share fit and render" in errors
     assert not (tmp_path / "a.spz").exists()
-    assert together.run(1, words)[0] == 0 and (tmp_path / "a.spz").exists()
+    assert parallel_processes.run(1, words)[0] == 0 and (tmp_path / "a.spz").exists()
 
 
 @pytest.mark.slow
 def test_ctrl_c_while_everybody_is_busy_with_something_else_ends_all(config, tmp_path):
     """In a rehearsal: nothing is to be saved, and nobody is left behind."""
     path, out = config(iterations=100_000), tmp_path / "out"
-    process = together.start(2, command(path, "--out", out, "--budget", "1h"))
+    process = parallel_processes.start(2, command(path, "--out", out, "--budget", "1h"))
     end = time.monotonic() + 60
-    while len(together.ranks_of(str(out))) < 2:
+    while len(parallel_processes.ranks_of(str(out))) < 2:
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.05)
     time.sleep(2.5)
@@ -162,7 +166,7 @@ def test_ctrl_c_while_everybody_is_busy_with_something_else_ends_all(config, tmp
 
 def started(path, out, size=2):
     """A fit that has saved a checkpoint and goes on."""
-    process = together.start(size, command(path, "--out", out))
+    process = parallel_processes.start(size, command(path, "--out", out))
     end = time.monotonic() + 60
     while not (out / "checkpoint.npz").exists():
         assert process.poll() is None and time.monotonic() < end
@@ -177,8 +181,8 @@ def test_ctrl_c_saves_and_another_number_goes_on(config, tmp_path):
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130 and "stopped; continue with" in output
-    assert together.run(3, command("--resume", tmp_path / "out"))[0] == 0
-    assert together.run(1, command(path, "--out", tmp_path / "whole"))[0] == 0
+    assert parallel_processes.run(3, command("--resume", tmp_path / "out"))[0] == 0
+    assert parallel_processes.run(1, command(path, "--out", tmp_path / "whole"))[0] == 0
     assert result(tmp_path / "out") == result(tmp_path / "whole")
 
 
@@ -189,13 +193,13 @@ def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
     out, rng = tmp_path / "out", random.Random(seed)
     process = started(config(iterations=800), out, 3)
     time.sleep(2 * rng.random())
-    ranks = together.ranks_of(str(out))
+    ranks = parallel_processes.ranks_of(str(out))
     assert len(ranks) == 3
     os.kill(rng.choice(ranks), signal.SIGKILL)
     process.communicate(timeout=30)
     assert process.returncode != 0
     assert_all_end(out)
-    assert together.run(2, command("--resume", out))[0] == 0
+    assert parallel_processes.run(2, command("--resume", out))[0] == 0
     assert (out / "metrics.json").exists()
 
 
@@ -217,11 +221,17 @@ def test_a_full_disk_ends_all_and_others_go_on(config, tmp_path):
         pytest.skip("only root can mount a small disk")
     path, disk, kept = config(iterations=800), tmp_path / "disk", tmp_path / "kept"
     disk.mkdir()
-    words = [together.mpiexec(), "-n", "2", sys.executable, *command(path, "--out", disk / "out")]
+    words = [
+        parallel_processes.mpiexec(),
+        "-n",
+        "2",
+        sys.executable,
+        *command(path, "--out", disk / "out"),
+    ]
     done = subprocess.run(
         ["unshare", "--mount", "sh", "-c", ON_A_SMALL_DISK, "-", disk, kept, *words],
-        cwd=together.REPOSITORY,
-        env=together.environment(),
+        cwd=parallel_processes.REPOSITORY,
+        env=parallel_processes.environment(),
         capture_output=True,
         text=True,
         timeout=120,
@@ -230,4 +240,4 @@ def test_a_full_disk_ends_all_and_others_go_on(config, tmp_path):
         pytest.skip("no small disk can be mounted")
     assert done.returncode == 2
     assert done.stderr.count("error: ") == 1 and "No space left" in done.stderr
-    assert together.run(3, command("--resume", kept / "out"))[0] == 0
+    assert parallel_processes.run(3, command("--resume", kept / "out"))[0] == 0

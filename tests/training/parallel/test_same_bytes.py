@@ -2,8 +2,8 @@
 
 import mitsuba as mi
 import pytest
+from support import parallel_processes
 from support import small_fits as fits
-from support import together
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -17,11 +17,11 @@ def settings(views_per_step=4, **changes):
 
 
 def assert_the_same(changes, sizes, steps=8, data="plain"):
-    dataset = together.DATASETS[data]()
+    dataset = parallel_processes.DATASETS[data]()
     alone = fits.Trainer(fits.config_of(**changes), dataset, fits.disturbed_blobs())
-    expected = together.found_by(alone, steps)
+    expected = parallel_processes.found_by(alone, steps)
     for size in sizes:
-        state, reports = together.fitted(size, steps, changes, data)
+        state, reports = parallel_processes.fitted(size, steps, changes, data)
         assert reports == expected[1], size
         assert state == expected[0], size
 
@@ -98,9 +98,9 @@ def test_late_steps_of_more_views():
 
 def test_all_processes_say_which_number_is_none():
     alone = fits.make_trainer(fits.plain_dataset(), optimizer__views_per_step=4)
-    expected = together.spoiled(alone, 17)
+    expected = parallel_processes.spoiled(alone, 17)
     assert "in row 17" in expected
-    assert together.said_of(3, 17) == expected
+    assert parallel_processes.state_text(3, 17) == expected
 
 
 REFINED = {

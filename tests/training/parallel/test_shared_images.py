@@ -1,18 +1,20 @@
 """``mpiexec -n K python -m drgs.render``: the same files."""
 
-from support import together
+from support import parallel_processes
 
-MODEL = together.REPOSITORY / "scenes" / "shapes" / "knot.ply"
+MODEL = parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply"
 
 
 def rendered(size, out, *words):
     command = ["-m", "drgs.render", MODEL, "--orbit", 5, "--size", 30, 20, "--out", out, *words]
-    return together.run(size, command)
+    return parallel_processes.run(size, command)
 
 
 def test_a_scene_of_mitsuba_is_refused(tmp_path):
-    scene = together.REPOSITORY / "scenes" / "hybrid.xml"
-    status, _, errors = together.run(2, ["-m", "drgs.render", scene, "--out", tmp_path / "a.png"])
+    scene = parallel_processes.REPOSITORY / "scenes" / "hybrid.xml"
+    status, _, errors = parallel_processes.run(
+        2, ["-m", "drgs.render", scene, "--out", tmp_path / "a.png"]
+    )
     assert status == 2 and errors.count("error: ") == 1
     assert "a scene of Mitsuba is rendered by one process" in errors
 

@@ -172,7 +172,7 @@ def sketched_results() -> Iterator[None]:
         yield
 
 
-class Workshop:
+class AttackFolder:
     """See this module. ``folder`` is where attacks happen."""
 
     def __init__(self, base: Path, with_results: bool = True) -> None:

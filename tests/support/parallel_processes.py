@@ -1,6 +1,6 @@
 """Several processes that do something together: started by ``mpiexec``, as users start them.
 
-``python -m support.together`` is a program that each of them runs.
+``python -m support.parallel_processes`` is a program that each of them runs.
 """
 
 from __future__ import annotations
@@ -127,15 +127,15 @@ DATASETS = {"plain": _plain, "transparent": _transparent, "blurred": _blurred}
 def fitted(size: int, steps: int, changes: Mapping[str, Any], data: str = "plain") -> list:
     """What :func:`found_by` gives of a small fit on so many processes; data: of DATASETS."""
     task = json.dumps({"steps": steps, "changes": dict(changes), "data": data})
-    status, output, errors = run(size, ["-m", "support.together", task])
+    status, output, errors = run(size, ["-m", "support.parallel_processes", task])
     assert status == 0, errors
     return json.loads(output)
 
 
-def said_of(size: int, row: int) -> str:
+def state_text(size: int, row: int) -> str:
     """What :func:`spoiled` gives on so many processes."""
     task = json.dumps({"spoiled": row, "changes": {"optimizer.views_per_step": 4}, "data": "plain"})
-    status, output, errors = run(size, ["-m", "support.together", task])
+    status, output, errors = run(size, ["-m", "support.parallel_processes", task])
     assert status == 0, errors
     return json.loads(output)
 

@@ -1,4 +1,4 @@
-"""Analytic bodies, and images of them with alpha: rays through every pixel, in float64."""
+"""Analytic shapes, and images of them with alpha: rays through every pixel, in float64."""
 
 import numpy as np
 
@@ -35,9 +35,9 @@ def box(low, high):
     return hit
 
 
-def together(*bodies):
+def together(*shapes):
     """Whichever is met first."""
-    return lambda origin, directions: np.min([b(origin, directions) for b in bodies], axis=0)
+    return lambda origin, directions: np.min([b(origin, directions) for b in shapes], axis=0)
 
 
 def colors_at(points):
@@ -54,7 +54,7 @@ def directions_to(count):
 
 
 def image_of(
-    body, name, center, size=64, samples=2, lens=None, background=WHITE, focal=1.4, paint=colors_at
+    shape, name, center, size=64, samples=2, lens=None, background=WHITE, focal=1.4, paint=colors_at
 ):
     """A view towards the origin; lens: of the reference, as well; samples: of a pixel, squared."""
     pose = look_at(center, (0, 0, 0))
@@ -67,7 +67,7 @@ def image_of(
     rays = np.column_stack([slopes, np.ones(len(slopes))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays @ pose[:3, :3].T
-    distance = body(np.asarray(center, float), rays)
+    distance = shape(np.asarray(center, float), rays)
     met = np.isfinite(distance)
     colors = np.zeros((len(rays), 3))
     colors[met] = paint(np.asarray(center) + distance[met, None] * rays[met])
@@ -88,10 +88,10 @@ def image_of(
     )  # fmt: skip
 
 
-def images_of(body, count=20, **options):
+def images_of(shape, count=20, **options):
     """Views from all around."""
     return tuple(
-        image_of(body, f"v{number}", DISTANCE * direction, **options)
+        image_of(shape, f"v{number}", DISTANCE * direction, **options)
         for number, direction in enumerate(directions_to(count))
     )
 
