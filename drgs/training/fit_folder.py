@@ -162,7 +162,7 @@ class FitFolder:
         if for_viewers is not None:
             other = for_viewers.gaussians
             other.save(out / GAUSSIANS_FOR_VIEWERS)
-            images = zip(for_viewers.renders(dataset.test), dataset.test, strict=True)
+            images = zip(for_viewers.images(dataset.test), dataset.test, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             metrics["viewers"] = _split_metrics(quality, split)
         if output.report:

@@ -310,17 +310,17 @@ def test_photographs_may_lie_beside_the_model(tmp_path):
 )
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_models_and_photographs_are_found_where_programs_put_them(
-    tmp_path, place, model, renders, write
+    tmp_path, place, model, images, write
 ):
     there = some(NAMES)
     write(tmp_path / model, there)
-    write_images(tmp_path / renders)
+    write_images(tmp_path / images)
     if place in ("workspace", "undistorted"):  # beside the model of the photographs as taken
         write(tmp_path / "sparse" / "0", some_model(np.random.default_rng(2), NAMES))
     dataset, notes = load_noting(tmp_path)
     view = dataset.test[0]
     np.testing.assert_allclose(view.camera_to_world, there.images[0][2], atol=1e-14)
-    assert view.files["image"] == tmp_path / renders / "a.jpg" and notes == []
+    assert view.files["image"] == tmp_path / images / "a.jpg" and notes == []
 
 
 def test_a_model_with_its_photographs_is_preferred_to_an_undistorted_one(tmp_path):

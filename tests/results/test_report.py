@@ -329,7 +329,7 @@ def test_images_and_curves_lie_one_below_the_other_on_a_phone(page):
     text = " ".join(" ".join(page.text).split())
     assert text.count("Fitted Reference Difference") == 3  # each below its own image
     assert page.source.count('<div class="curves"><picture>') == 1
-    assert page.tags.count("image") == 6
+    assert page.tags.count("picture") == 6
 
 
 def test_the_orbit_can_be_paused_and_honours_reduced_motion(page):

@@ -57,7 +57,7 @@ def variant():
 
 def assert_equal(actual, expected) -> None:
     """To the last bit, but for the signs of zeros; all is finite."""
-    for of in ("image", "gradients"):
+    for of in ("rendered", "gradients"):
         for name, values in getattr(expected, of).items():
             assert np.isfinite(values).all(), name
             np.testing.assert_array_equal(getattr(actual, of)[name], values, name)

@@ -54,7 +54,7 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
     # What the fit itself has found is shown as before.
     for image, again in zip(before, trainer.images(dataset.test), strict=True):
         np.testing.assert_array_equal(image, again)
-    pairs = zip(found.renders(dataset.test), dataset.test, strict=True)
+    pairs = zip(found.images(dataset.test), dataset.test, strict=True)
     assert np.mean([decibels(image, view.image) for image, view in pairs]) == pytest.approx(
         tuned, abs=1e-6
     )
