@@ -24,7 +24,7 @@ from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.orbits import up_of
-from drgs.effects.smoothing import baked
+from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import turned_towards
 from drgs.io.formats import file_formats, format_for
@@ -113,7 +113,7 @@ def _page(source: ExportSource) -> bytes:
         initial_view = InitialView.from_views(cameras, gaussians)
     else:
         initial_view = InitialView.from_gaussians(gaussians, Z_UP)
-    shown = Shown(gaussians, Approximations.of(gaussians.rendered_with or {}))
+    shown = Shown(gaussians, Approximations.from_values(gaussians.rendered_with or {}))
     return viewer_page(title, shown, initial_view, background)
 
 
@@ -213,8 +213,8 @@ def run(args: argparse.Namespace) -> None:
     if out.resolve() == source.path.resolve():
         raise UserError(f"--out {out}: is what is exported; choose another name")
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
-    up = _up(args, source, target)
-    gaussians = _selected(source, args)
+    up = _up_direction(args, source, target)
+    gaussians = _select(source, args)
     if up is not None:
         gaussians = turned_towards(gaussians, up, target.up)
     if args.order == "morton":
@@ -252,7 +252,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
     gaussians = Gaussians.load(path)
     said = said_by(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in said.items() if value != DECLARED[name].default}
-    shown = frozenset() if honoured is None else honoured(Approximations.of(said))
+    shown = frozenset() if honoured is None else honoured(Approximations.from_values(said))
     if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
         beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
         note = (
@@ -260,7 +260,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
             "show it otherwise" + (f"; export {beside} instead" if beside.is_file() else "")
         )
         warnings.warn(UserNote(note), stacklevel=2)
-    gaussians = baked(replace(gaussians, rendered_with=others or None))
+    gaussians = bake_smoothing(replace(gaussians, rendered_with=others or None))
     return ExportSource(gaussians, path, what if what.is_dir() else None)
 
 
@@ -324,7 +324,7 @@ def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.nda
     return replace(gaussians, **arrays, features=features)
 
 
-def _selected(source: ExportSource, args: argparse.Namespace) -> Gaussians[np.ndarray]:
+def _select(source: ExportSource, args: argparse.Namespace) -> Gaussians[np.ndarray]:
     found = kept_by(source.gaussians, args.crop, args.min_opacity, args.max_size)
     if not found:
         return source.gaussians
@@ -336,7 +336,9 @@ def _selected(source: ExportSource, args: argparse.Namespace) -> Gaussians[np.nd
     return take(source.gaussians, kept)
 
 
-def _up(args: argparse.Namespace, source: ExportSource, target: ExportTarget) -> np.ndarray | None:
+def _up_direction(
+    args: argparse.Namespace, source: ExportSource, target: ExportTarget
+) -> np.ndarray | None:
     """Return the direction (3,) that is up, and print it; None: the model is not to be turned."""
     words = args.up
     if words is None and not target.has_axes:

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 
 from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
 from drgs.cli.ending import INTERRUPTED_STATUS
-from drgs.cli.execution import add_execution_arguments, executing
+from drgs.cli.execution import add_execution_arguments, execution_settings
 from drgs.config.extensions import describe_extensions
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
-from drgs.core.environment import required
+from drgs.core.environment import require_module
 from drgs.core.errors import UserError
 from drgs.core.processes import process_number, start_mpi
 from drgs.datasets.folders import config_for
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> None:
     started = time.perf_counter() - LOADING_SECONDS
     comm = communicator(args)
     budget = None if args.budget is None else Budget(args.budget, started + args.budget)
-    with executing(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
+    with execution_settings(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
         session = FitSession(
             None, variant=args.variant, budget=budget, check_ranges=check_ranges, comm=comm
         )
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> None:
             return
         server = blocks.enter_context(page_server(args))
         if args.tensorboard:
-            required("tensorboardX", "tensorboard", "--tensorboard")
+            require_module("tensorboardX", "tensorboard", "--tensorboard")
         session.config, out = read_inputs(args)
         session.folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
         session.uses_terminal = True
@@ -184,7 +184,7 @@ def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer 
             if getattr(args, f"view_{name}") is not None:
                 raise UserError(f"--view-{name}: needs --view")
         return nullcontext()
-    required("viser", "viewer", "--view")
+    require_module("viser", "viewer", "--view")
     from drgs.viewer.server import ADDRESS, serving
 
     options = ("--view-address", "--view-port")

@@ -179,7 +179,7 @@ def rasterization(
     color = NamedFeature("colors") if sh_degree is None else color_features
     features = () if render_mode in ("D", "ED") else (color,)
     features += () if render_mode == "RGB" else (depth_feature,)
-    pipeline = replace(pipeline_of(selected, sh_degree or 0, features), rows=activated)
+    pipeline = replace(pipeline_of(selected, sh_degree or 0, features), rows=use_activated)
     is_camera_attached = any(dr.grad_enabled(inputs[name]) for name in ("viewmats", "Ks"))
     film = _Film(int(width), int(height), float(near_plane), sh_degree, is_camera_attached)
     detached = dr.detach(inputs)
@@ -290,7 +290,7 @@ def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
         _require(is_regular, f"viewmats[{index}]", expected, viewmat.tolist())
 
 
-def activated(rows: GaussianRows) -> GaussianRows:
+def use_activated(rows: GaussianRows) -> GaussianRows:
     """Take scales and opacities of Gaussians as they are, from their features."""
     assert rows.features is not None, "see _View._gaussians"
     t = types_of(type(rows.logit_opacities))
@@ -330,10 +330,10 @@ def _images(
         alphas.append(alpha)
     dr.eval(images, alphas)
     shape = (len(views), views[0].film.height, views[0].film.width)
-    return _stacked(images, shape), _stacked(alphas, shape)
+    return _stack_cameras(images, shape), _stack_cameras(alphas, shape)
 
 
-def _stacked(parts: list[Float], shape: tuple[int, ...]) -> TensorXf:
+def _stack_cameras(parts: list[Float], shape: tuple[int, ...]) -> TensorXf:
     """Return one flat array per camera as a tensor of this shape and one axis more."""
     flat = parts[0] if len(parts) == 1 else dr.concat(parts)
     return types_of(type(flat)).TensorXf(flat, (*shape, dr.width(flat) // math.prod(shape)))
@@ -503,7 +503,7 @@ def _meta(views: list[_View]) -> dict[str, Any]:
     dr.eval(columns)
     film, num = views[0].film, views[0].gaussians.num_gaussians
     meta: dict[str, Any] = {
-        name: _stacked(flat, (len(views), num)) for name, flat in columns.items()
+        name: _stack_cameras(flat, (len(views), num)) for name, flat in columns.items()
     }
     meta |= {name: meta[name][:, :, 0] for name in ("depths", "opacities")}
     meta["radii"] = dr.int32_array_t(type(meta["radii"]))(meta["radii"])

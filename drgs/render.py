@@ -35,12 +35,12 @@ from drgs.cli.commands import (
     finite_number,
     run_command,
 )
-from drgs.cli.execution import add_execution_arguments, executing, select_variant
+from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
 from drgs.config.schema import NAMED_COLORS, FitConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import PluginError, UserError, one_line, reason_of_mitsuba
-from drgs.core.files import atomic_path, open_regular, shortened
+from drgs.core.files import atomic_path, open_regular, shorten_stem
 from drgs.core.processes import process_number, start_mpi
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
@@ -208,7 +208,7 @@ def run(args: argparse.Namespace) -> None:
 
 def run_with(args: argparse.Namespace, render: Render) -> None:
     """Run the command; render: renders views, in this process or in several."""
-    with executing(args.threads, args.debug), open_image_folder(args.out) as folder:
+    with execution_settings(args.threads, args.debug), open_image_folder(args.out) as folder:
         _check(args)
         select_variant(args.variant)
         if args.what.suffix.lower() == ".xml":
@@ -322,7 +322,7 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     else:
         pose = look_at(args.origin, args.target or origin, args.up or UP)
         views = [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
-    return [view.moved(-np.array(origin)) for view in views]
+    return [view.with_offset(-np.array(origin)) for view in views]
 
 
 def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str, str]) -> None:
@@ -341,7 +341,7 @@ def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str,
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
     is_linear, stem, count = (
         _is_linear(scene.integrator()),
-        shortened(path.stem),
+        shorten_stem(path.stem),
         len(scene.sensors()),
     )
     names = [stem] if count == 1 else [f"{stem}_{index}" for index in range(count)]

@@ -21,8 +21,8 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.ending import StopRequest
-from drgs.cli.execution import add_execution_arguments, executing, select_variant
-from drgs.core.environment import required
+from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
+from drgs.core.environment import require_module
 from drgs.core.errors import UserError
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.datasets.types import Viewpoint
@@ -68,12 +68,12 @@ def add_arguments(parser: CommandParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
-    required("viser", "viewer", "drgs view")
+    require_module("viser", "viewer", "drgs view")
     from drgs.viewer.server import ADDRESS, serving, url
 
     if not args.what.exists():
         raise UserError(f"{args.what}: there is no such file or folder")
-    with executing(args.threads, args.debug):
+    with execution_settings(args.threads, args.debug):
         select_variant(args.variant)
         model = load_model(args.what, background=parse_background(args.background))
         views = cameras_of(args, model)

@@ -147,7 +147,7 @@ class CalibratedSensor(mi.Sensor):
             return camera
         from drgs.cameras.motion import Motion, MotionBlur, RollingShutter
 
-        motion = Motion.between(camera, *pose_from_to_world(device["to_world_close"]))
+        motion = Motion.relative_motion(camera, *pose_from_to_world(device["to_world_close"]))
         if self.shutter == "rolling":
             return replace(camera, shutter=RollingShutter(*motion))
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))

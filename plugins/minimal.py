@@ -46,7 +46,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
         with dr.suspend_grad():
-            film, _, _, _, layers = self._composited(scene, sensor)
+            film, _, _, _, layers = self._composite(scene, sensor)
             return develop_pixels(film, _channels(film, layers.planes()), [])
 
     def render_backward(
@@ -54,7 +54,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
     ) -> None:  # fmt: skip
         with dr.suspend_grad():
-            film, camera, bins, records, layers = self._composited(scene, sensor)
+            film, camera, bins, records, layers = self._composite(scene, sensor)
             planes = layers.planes()
             with dr.resume_grad():  # colours are converted again, and differentiated by Dr.Jit
                 dr.enable_grad(planes)
@@ -73,7 +73,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
     def _gaussians(self) -> Gaussians:
         return Gaussians(**{name: dr.detach(getattr(self, name)) for name in PARAMETER_NAMES})
 
-    def _composited(
+    def _composite(
         self, scene: mi.Scene, sensor: int | mi.Sensor
     ) -> tuple[mi.Film, Camera, TileBins, Records, Layers]:
         """Project the Gaussians, sort them into tiles, and composite each tile's front to back."""
@@ -83,7 +83,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         splats = self.pipeline.project(rows, camera)
         grid = TileGrid(camera.width, camera.height)
         bins = bin_footprints(footprints_of(splats, grid, list(splats.colors)), grid, DEFAULT)
-        records = Records.of(bins, bins.rows.load)
+        records = Records.from_ranks(bins, bins.rows.load)
         return sensor.film(), camera, bins, records, composite(bins, records)
 
 

@@ -91,7 +91,7 @@ class SplatPathIntegrator(RBIntegrator):
             with dr.resume_grad(when=not primal):
                 si = path.vertex(attached=not primal)
             splats, arrives = self._pass_splats(scene, path, sampler)
-            emitted = self._emitted(scene, path, si, arrives, primal)
+            emitted = self._emitted_radiance(scene, path, si, arrives, primal)
             goes_on = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
             direct = self._direct(scene, sampler, path, si, arrives, goes_on, primal)
             step = self._bounce(scene, sampler, path, si, arrives)
@@ -111,7 +111,7 @@ class SplatPathIntegrator(RBIntegrator):
                         dr.backward_from(δL * total)
                     else:
                         δL += dr.forward_to(total)
-            path = path.after(step, si)
+            path = path.next_vertex(step, si)
 
         return (L if primal else δL), is_seen, [], L
 
@@ -139,7 +139,7 @@ class SplatPathIntegrator(RBIntegrator):
             last_is_delta=mi.Bool(True),
         )
 
-    def _emitted(
+    def _emitted_radiance(
         self,
         scene: mi.Scene,
         path: _Path,
@@ -178,7 +178,7 @@ class SplatPathIntegrator(RBIntegrator):
             let_through *= rays.transmittance(ray, active)
         with dr.resume_grad(when=not primal):
             if not primal:
-                ds, weight = _attached(scene, si, ds, weight, numbers, active)
+                ds, weight = _attach_sample(scene, si, ds, weight, numbers, active)
             wo = si.to_local(ds.d)
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
             mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
@@ -282,7 +282,7 @@ class _Path:
             si.wi = _replace_grad(si.wi, dr.select(self.depth >= 1, moved, si.wi))
         return si
 
-    def after(self, step: _Step, si: mi.SurfaceInteraction3f) -> _Path:
+    def next_vertex(self, step: _Step, si: mi.SurfaceInteraction3f) -> _Path:
         """Return the path at the next vertex."""
         passes = step.is_null
         length = self.length + dr.dot(step.ray.o - self.ray.o, self.ray.d)
@@ -342,7 +342,7 @@ class _Step:
         return dr.relative_grad(value) * dr.relative_grad(jacobian)
 
 
-def _attached(
+def _attach_sample(
     scene: mi.Scene,
     si: mi.SurfaceInteraction3f,
     ds: mi.DirectionSample3f,

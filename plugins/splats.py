@@ -173,7 +173,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with self._lock, dr.suspend_grad():
             self.state.cache.sensor = sensor
             self._gather(scene)
-            image = ImageRender.of(self.state, scene, sensor, seed, spp).image()
+            image = ImageRender.prepare(self.state, scene, sensor, seed, spp).image()
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -187,7 +187,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self._check_derivatives(scene, sensor, dr.ADMode.Backward)
         with self._lock, dr.suspend_grad():
             self._gather(scene)
-            render = ImageRender.of(self.state, scene, sensor, seed, spp)
+            render = ImageRender.prepare(self.state, scene, sensor, seed, spp)
             gradients = render.backward(params, grad_in)
             means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
             self.last = BackwardResult(
@@ -216,7 +216,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
             self._gather(scene)
             with dr.resume_grad():
                 tangents = self.state.tangents(scene)
-            d_image = ImageRender.of(self.state, scene, sensor, seed, spp).tangent(params, tangents)
+            d_image = ImageRender.prepare(self.state, scene, sensor, seed, spp).tangent(
+                params, tangents
+            )
             sensor.film().clear()  # it holds an attached block
         return d_image
 
@@ -237,7 +239,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         nodes = [self, *scene.shapes(), *([] if sensor is None else [sensor])]
         attached = any(dr.grad_enabled(value) for one in nodes for _, value in mi.traverse(one))
         with dr.suspend_grad():
-            rays = ImageRays.of(sensor, self.state.near, dr.detach(ray))
+            rays = ImageRays.from_rays(sensor, self.state.near, dr.detach(ray))
             assert sensor is not None, "refused by ImageRays.of"
             if self.state.aovs and attached:
                 raise UnsupportedError(

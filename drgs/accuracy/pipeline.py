@@ -56,7 +56,7 @@ def pipeline_of(
 
 
 def _check_no_falloff(approximations: Approximations) -> None:
-    if approximations.falloff != FALLOFFS.shipped[0]:
+    if approximations.falloff != FALLOFFS.shipped_names[0]:
         raise UnsupportedError(
             f"splats: projection '{approximations.projection}' has a falloff of its own, got "
             f"falloff '{approximations.falloff}'; use another projection, or no falloff"

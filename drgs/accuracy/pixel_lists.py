@@ -50,11 +50,11 @@ class AffineDepths:
         assert ray is not None, "as the projection makes them"
         return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
 
-    def at(
+    def depth_ratio(
         self, falloff: GaussianFalloff, geometry: list[Float], keys: list[Float], x: Float, y: Float
     ) -> tuple[Float, Float]:
         """Return a and D at a point of the film, px: the depth is a / D in the unit, if a > 0."""
-        return self._at(keys, *falloff.coordinates(geometry, x, y))
+        return self._depth_ratio(keys, *falloff.coordinates(geometry, x, y))
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
         """Load the bounds, if there are any, for the lanes of one kernel."""
@@ -63,9 +63,9 @@ class AffineDepths:
         near, far = (load_pixels(bound, lanes, grid) for bound in self.bounds)
         return replace(self, bound=list(zip(near, far, strict=True)))
 
-    def along(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
+    def pixel_depths(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
         """Return depths in the unit at the 16 pixels; not positive where there is none."""
-        found, unit = self._along(footprint, keys), keys[-1]
+        found, unit = self._pixel_depths(footprint, keys), keys[-1]
         if not self.bound:
             return found
         return [
@@ -73,12 +73,14 @@ class AffineDepths:
             for along, (near, far) in zip(found, self.bound, strict=True)
         ]
 
-    def _along(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
+    def _pixel_depths(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
         coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
-        return [a / denominator for a, denominator in (self._at(keys, *e) for e in coordinates)]
+        return [
+            a / denominator for a, denominator in (self._depth_ratio(keys, *e) for e in coordinates)
+        ]
 
     @staticmethod
-    def _at(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
+    def _depth_ratio(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
         kx, ky, h = keys[:3]
         a = dr.fma(-kx, u, dr.fma(-ky, v, 1))
         return a, dr.fma(a, a, h * dr.fma(u, u, v * v))
@@ -109,7 +111,7 @@ class ParallelDepths(AffineDepths):
     """The same for rays that are parallel."""
 
     @staticmethod
-    def _at(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
+    def _depth_ratio(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
         kx, ky = keys[:2]
         return dr.fma(kx, u, dr.fma(ky, v, 1)), type(u)(1)
 
@@ -128,7 +130,7 @@ class RayDepths(AffineDepths):
         assert ray is not None and ray.scale is not None, "as exact_shape makes them"
         return [splats.depths * ray.scale]
 
-    def at(
+    def depth_ratio(
         self, falloff: GaussianFalloff, geometry: list[Float], keys: list[Float], x: Float, y: Float
     ) -> tuple[Float, Float]:
         del keys
@@ -138,7 +140,7 @@ class RayDepths(AffineDepths):
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
-    def _along(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
+    def _pixel_depths(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
         del keys
         assert isinstance(footprint, RayFootprint), "made by RayFalloff"
         return footprint.along
@@ -172,7 +174,7 @@ class PixelLists:
         return places
 
     @staticmethod
-    def of(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
+    def build(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
         """Make the lists. The host reads one value, the number of items."""
         t = types_of(bins.rows.Float)
         # Entries as they are made, and one behind the last.
@@ -247,7 +249,7 @@ def _items(
     def body(masks: UInt32, item: UInt32) -> tuple:
         micro = dr.tzcnt(masks)
         middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
-        a, denominator = depths.at(bins.model.falloff, geometry, keys, *middle)
+        a, denominator = depths.depth_ratio(bins.model.falloff, geometry, keys, *middle)
         # Where there is no peak, there may be one at a neighbour.
         along = dr.select(a > 0, a / denominator, 1)
         along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)

@@ -102,7 +102,7 @@ class PixelOrder(CenterOrder):
         before: SplatGradients | None = None,
     ) -> SplatGradients:
         assert isinstance(layers, _OrderedLayers), "made by self.composite"
-        inputs = _WalkInputs.of(bins, records, layers.lists, self, samples)
+        inputs = _WalkInputs.from_lists(bins, records, layers.lists, self, samples)
         return _adjoint(inputs, layers, d_features, d_transmittance, before)
 
     def tangent(
@@ -143,7 +143,7 @@ class _WalkInputs:
     samples: range  # of the lanes
 
     @staticmethod
-    def of(
+    def from_lists(
         bins: TileBins,
         records: Records,
         lists: PixelLists,
@@ -224,7 +224,7 @@ def _walk(
         # once, and changes nothing. When all splats were met, behind them: it takes their places.
         absent = dr.select(active, t.Float(-dr.inf), dr.inf)
         next_queue, visited = [], []
-        for pixel, along in enumerate(order.depths.along(footprint, keys)):
+        for pixel, along in enumerate(order.depths.pixel_depths(footprint, keys)):
             alpha = dr.select(along > 0, alphas[pixel].value, 0)
             depth = dr.select(alpha >= UNORDERED_ALPHA, keys[-1] * along, absent)
             places, nearest = _insert(queue[pixel], [depth, alpha, *carry(met, pixel)])
@@ -274,8 +274,8 @@ class _OrderedLayers(Layers):
 
 def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedLayers:
     t = types_of(bins.rows.Float)
-    lists = PixelLists.of(bins, records, order.depths)
-    inputs = _WalkInputs.of(bins, records, lists, order)
+    lists = PixelLists.build(bins, records, order.depths)
+    inputs = _WalkInputs.from_lists(bins, records, lists, order)
     lanes, model, size = inputs.lanes, inputs.model, inputs.size
     count = model.features.num_planes(bins.num_features)
 
@@ -289,7 +289,7 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
 
     T, C = _walk(
         inputs,
-        carry=lambda met, pixel: model.features.at(met.features, pixel),
+        carry=lambda met, pixel: model.features.pixel_values(met.features, pixel),
         visit=visit,
         state=(inputs.transmittance(), inputs.zeros(count)),
         nothing=[dr.zeros(t.Float, size)] * count,
@@ -468,7 +468,7 @@ def _tangent(
     tangents: SplatGradients,
     order: PixelOrder,
 ) -> Layers:
-    inputs = _WalkInputs.of(bins, records, layers.lists, order)
+    inputs = _WalkInputs.from_lists(bins, records, layers.lists, order)
     model, size = inputs.model, inputs.size
     d_records, count = pack_tangents(bins, tangents), layers.count
 
@@ -478,7 +478,7 @@ def _tangent(
         alpha = met.alphas[pixel]
         return [
             dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),
-            *model.features.at(met.features, pixel),
+            *model.features.pixel_values(met.features, pixel),
             *model.features.tangents(met.features, d_features, pixel),
         ]
 

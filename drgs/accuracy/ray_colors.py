@@ -53,7 +53,7 @@ class RayColors(SplatFeatures):
             "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
         )
 
-    def weighing(self) -> RayColors:
+    def with_weight_derivatives(self) -> RayColors:
         return Weighing(self.sh_degree, self.camera)
 
     def bind(self, lanes: Lanes, positions: Positions) -> RayColors:
@@ -67,7 +67,7 @@ class RayColors(SplatFeatures):
         camera = self.camera.at_row(y)
         return dr.normalize(camera.rotation.T @ camera.lens.ray(camera, x, y))
 
-    def at(self, stored: list[Float], pixel: int) -> list[Float]:
+    def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
         colors = [
             dr.select(value < COLOR_MIN, COLOR_MIN, value) for value in self._sums(stored, pixel)
         ]

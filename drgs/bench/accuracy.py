@@ -32,7 +32,7 @@ from drgs.config.load import load_config
 from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
 from drgs.datasets.types import View
-from drgs.effects.smoothing import baked
+from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.film import SamplePoints
 from drgs.io.figures import new_figure, write_figure
@@ -188,14 +188,16 @@ def load_subject(path: Path, num_views: int) -> Subject:
     """
     if not path.is_dir():
         camera = bench_camera(SIZE)
-        return Subject(path.stem, baked(Gaussians.load(path)), [camera], [], (1.0, 1.0, 1.0))
+        return Subject(
+            path.stem, bake_smoothing(Gaussians.load(path)), [camera], [], (1.0, 1.0, 1.0)
+        )
     ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
     ply = ply if ply.exists() else path / GAUSSIANS
     for file in (ply, config_file):
         if not file.exists():
             raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
     config = load_config(str(config_file), [])
-    gaussians = baked(Gaussians.load(ply))
+    gaussians = bake_smoothing(Gaussians.load(ply))
     dataset = load_dataset(config.data).relative_to(gaussians.origin)
     views = dataset.test[:: max(1, len(dataset.test) // num_views)][:num_views]
     _check_pinholes(views, config_file, ply)

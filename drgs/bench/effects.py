@@ -195,7 +195,7 @@ class CaseRenderer:
             dr.eval(self._render())
         dr.sync_thread()
 
-    def both(self) -> None:
+    def forward_and_backward(self) -> None:
         """Render an image and its derivatives."""
         for name in self.differentiated:
             dr.clear_grad(self.params[name])
@@ -225,7 +225,7 @@ class Fitter:
     def forward(self) -> None:
         """Do nothing: there is no half iteration."""
 
-    def both(self) -> None:
+    def forward_and_backward(self) -> None:
         """Run one iteration."""
         self.trainer.step()
         dr.sync_thread()
@@ -238,7 +238,7 @@ class TimedCase(Protocol):
         """Render an image."""
         ...
 
-    def both(self) -> None:
+    def forward_and_backward(self) -> None:
         """Render an image and its derivatives, or run an iteration."""
         ...
 
@@ -253,7 +253,12 @@ def measure(cases: Sequence[C], make: Callable[[C], TimedCase], rounds: int) -> 
     for case in cases:
         subject = make(case)
         count = operations(subject)
-        calls = base.forward, base.both, subject.forward, subject.both
+        calls = (
+            base.forward,
+            base.forward_and_backward,
+            subject.forward,
+            subject.forward_and_backward,
+        )
         times = np.array([[seconds(call) for call in calls] for _ in range(rounds)])
         ratios = times[:, 2:] / times[:, :2]  # those of a round were taken one after the other
         forward, both = (1e3 * statistics.median(column) for column in times[:, 2:].T.tolist())
@@ -278,8 +283,8 @@ def operations(subject: TimedCase) -> int:
     """Count the operations of an image and its derivatives, or of an iteration; warms up."""
     for _ in range(2):
         subject.forward()
-        subject.both()
-    return count_operations(subject.both)
+        subject.forward_and_backward()
+    return count_operations(subject.forward_and_backward)
 
 
 def table(prices: list[Price], forward: str, both: str) -> str:

@@ -58,7 +58,7 @@ class Point:
     scale: float = 1.0  # of the Gaussians
 
     @property
-    def varied(self) -> int:
+    def varied_number(self) -> int:
         """The number that the sweep varies."""
         return {"pixels": self.size**2, "threads": self.threads}.get(self.sweep, self.count)
 
@@ -203,7 +203,7 @@ def measure(point: Point, num_steps: int) -> Result:
 
 def exponent(results: list[Result], what: str) -> float:
     """Return e of the best fit value = c x^e: the slope of a line through the logarithms."""
-    x = np.log([result.point.varied for result in results])
+    x = np.log([result.point.varied_number for result in results])
     y = np.log([getattr(result, what) for result in results])
     return float(np.polyfit(x, y, 1)[0])
 
@@ -238,7 +238,7 @@ def plot(results: dict[str, list[Result]]) -> Figure:
     figure = new_figure(11, 5.5)
     panels = figure.subplots(2, len(results))
     for column, (name, found) in enumerate(results.items()):
-        x = [result.point.varied for result in found]
+        x = [result.point.varied_number for result in found]
         for row, (what, unit) in enumerate([("milliseconds", "ms"), ("device_mib", "MiB")]):
             panel = panels[row][column]
             panel.loglog(x, [getattr(result, what) for result in found], "o-")

@@ -11,7 +11,7 @@ import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_OPENGL
 from drgs.cameras.camera import Camera
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
@@ -140,7 +140,7 @@ def trainer_of(
     view = replace(view_of(scene), **extras)
     dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
     config = bench_config(scene.gaussians)
-    trainer = Trainer(changed(config, changes), dataset, scene.gaussians)
+    trainer = Trainer(with_changes(config, changes), dataset, scene.gaussians)
     trainer.iteration = 10  # all SH degrees are in use
     return trainer
 

@@ -199,7 +199,7 @@ def _offset(offset: float) -> Scene:
 def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
     """Measure errors and noise of one scene; both sides start from the same, rounded numbers."""
     exact = sweep.scene(value)
-    gaussians, camera = _stored(*exact)
+    gaussians, camera = _round_to_single(*exact)
     rendered = reference.render(gaussians, camera, threshold_width=MARKED_WITHIN)
     kept = ~rendered.near_threshold
     cotangent = np.random.default_rng(5).normal(size=rendered.image.shape) * kept[..., None]
@@ -217,8 +217,8 @@ def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
 
     errors = []
     for sample in range(samples):
-        moved = _by_reference(*_moved(gaussians, camera, sample), cotangent)
-        errors.append([image_error(moved[0]), gradient_error(moved[1])])
+        perturb = _by_reference(*_perturb(gaussians, camera, sample), cotangent)
+        errors.append([image_error(perturb[0]), gradient_error(perturb[1])])
     image_noise, gradient_noise = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
     return StabilityMeasurement(
         value=value,
@@ -231,7 +231,7 @@ def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
     )
 
 
-def _stored(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
+def _round_to_single(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
     """Round a scene to single precision."""
 
     def single(values: np.ndarray) -> np.ndarray:
@@ -242,18 +242,18 @@ def _stored(gaussians: reference.Gaussians, camera: reference.Camera) -> Scene:
     return reference.Gaussians(**fields), camera
 
 
-def _moved(gaussians: reference.Gaussians, camera: reference.Camera, seed: int) -> Scene:
+def _perturb(gaussians: reference.Gaussians, camera: reference.Camera, seed: int) -> Scene:
     """Move every number by up to one rounding; means and camera relative to each other."""
     rng = np.random.default_rng([6, seed])
 
-    def moved(values: np.ndarray) -> np.ndarray:
+    def perturb(values: np.ndarray) -> np.ndarray:
         values = np.asarray(values)
         return values * (1 + UNIT_ROUNDOFF * rng.uniform(-1, 1, values.shape))
 
-    fields = {name: moved(getattr(gaussians, name)) for name in PARAMETER_NAMES}
-    fields["means"] = camera.center + moved(gaussians.means - camera.center)
-    numbers = {name: float(moved(getattr(camera, name))) for name in ("fx", "fy", "cx", "cy")}
-    camera = replace(camera, rotation=moved(camera.rotation), **numbers)
+    fields = {name: perturb(getattr(gaussians, name)) for name in PARAMETER_NAMES}
+    fields["means"] = camera.center + perturb(gaussians.means - camera.center)
+    numbers = {name: float(perturb(getattr(camera, name))) for name in ("fx", "fy", "cx", "cy")}
+    camera = replace(camera, rotation=perturb(camera.rotation), **numbers)
     return reference.Gaussians(**fields), camera
 
 

@@ -92,8 +92,8 @@ def stage_clock() -> Iterator[StageClock]:
     """
     clock = StageClock()
 
-    def wrapped(function: Callable, before: str | None, after: str | None) -> Callable:
-        def timed(*arguments: object, **keywords: object) -> object:
+    def wrap(function: Callable, before: str | None, after: str | None) -> Callable:
+        def call(*arguments: object, **keywords: object) -> object:
             if before:
                 clock.end(before)
             result = function(*arguments, **keywords)
@@ -102,7 +102,7 @@ def stage_clock() -> Iterator[StageClock]:
                 clock.end(after)
             return result
 
-        return timed
+        return call
 
     borders = [
         (tiles, "_store_rows", None, "projection and SH"),
@@ -117,7 +117,7 @@ def stage_clock() -> Iterator[StageClock]:
         dr.sync_thread()
         dr.kernel_history_clear()
         for module, name, before, after in borders:
-            timed = wrapped(getattr(module, name), before, after)
+            timed = wrap(getattr(module, name), before, after)
             patches.enter_context(patch.object(module, name, timed))
         yield clock
 

@@ -143,7 +143,7 @@ class Camera(CameraParameters):
         row = (y - self.film_start.y) / (self.film_end.y - self.film_start.y)
         return self.shutter.pose(self, row)
 
-    def seeing(self, means: Array3f) -> Camera:
+    def for_means(self, means: Array3f) -> Camera:
         """Return the camera when a rolling shutter reads the rows of means (world)."""
         return self if self.shutter is None else self.shutter.camera_of(means, self)
 
@@ -158,7 +158,7 @@ class Camera(CameraParameters):
         """
         lanes = dr.zeros(types_of(type(self.near)).UInt32, width)
         return replace(
-            self, **{name: _gathered(getattr(self, name), lanes) for name in _DIFFERENTIABLE}
+            self, **{name: _gather_lanes(getattr(self, name), lanes) for name in _DIFFERENTIABLE}
         )
 
     def with_lens(self, lens: Lens) -> Camera:
@@ -178,12 +178,12 @@ def _numbers_of(value: Any) -> list[Float]:
     return [n for item in value for n in _numbers_of(item)] if is_sequence else []
 
 
-def _gathered(value: object, lanes: UInt32) -> object:
+def _gather_lanes(value: object, lanes: UInt32) -> object:
     if is_dataclass(value) and not isinstance(value, type):
-        changes = {f.name: _gathered(getattr(value, f.name), lanes) for f in fields(value)}
+        changes = {f.name: _gather_lanes(getattr(value, f.name), lanes) for f in fields(value)}
         return replace(value, **changes)
     if isinstance(value, tuple):
-        return tuple(_gathered(item, lanes) for item in value)
+        return tuple(_gather_lanes(item, lanes) for item in value)
     return dr.gather(type(value), value, lanes) if dr.is_array_v(value) else value
 
 

@@ -67,7 +67,7 @@ def radius_at(
     """
     UInt32 = types_of(type(target)).UInt32
     high = dr.minimum(type(target)(end), UNBOUNDED)
-    first = dr.select(target < high, target, _between(0, high))
+    first = dr.select(target < high, target, _bracket_middle(0, high))
 
     def body(
         count: UInt32, low: Float, high: Float, radius: Float
@@ -77,7 +77,7 @@ def radius_at(
         low, high = dr.select(below, radius, low), dr.select(below, high, radius)
         following = radius - (value - target) / slope
         inside = (following >= low) & (following <= high)
-        following = dr.select(inside, following, _between(low, high))
+        following = dr.select(inside, following, _bracket_middle(low, high))
         return dr.select(following == radius, RADIUS_STEPS, count + 1), low, high, following
 
     # A loop, as most need few steps, and a kernel may have to do this for 16 pixels.
@@ -90,7 +90,7 @@ def radius_at(
     return radius
 
 
-def _between(low: Scalar, high: Float) -> Float:
+def _bracket_middle(low: Scalar, high: Float) -> Float:
     """Return the middle on the scale r / (1 + r): a bracket may reach from 0 to very far."""
     middle = (low / (1 + low) + high / (1 + high)) / 2
     return middle / (1 - middle)

@@ -30,7 +30,9 @@ class Motion(Shutter):
     turn: Array3f  # camera axes: axis times angle (radians), below half a turn
 
     @staticmethod
-    def between(camera: Camera, rotation: Matrix3f, center: Array3f) -> tuple[Array3f, Array3f]:
+    def relative_motion(
+        camera: Camera, rotation: Matrix3f, center: Array3f
+    ) -> tuple[Array3f, Array3f]:
         """Return ``travel`` and ``turn`` from the pose of ``camera`` to another.
 
         rotation: world to camera; center: world.

@@ -116,7 +116,7 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
     else:
         derived = _around_settings(scene, settings, given, own) if own else {}
     if own and settings.cameras != "sensors":
-        derived["up"] = _up(own)
+        derived["up"] = _up_axis(own)
     return replace(settings, **{name: derived[name] for name in derived.keys() - given})
 
 
@@ -186,7 +186,7 @@ def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
     return {"views": len(own) - tests, "val_views": 0, "test_views": tests}
 
 
-def _up(own: list[OwnCamera]) -> str:
+def _up_axis(own: list[OwnCamera]) -> str:
     """Return the axis that is nearest to up in the sensors' images, such as ``z`` or ``-y``."""
     up = np.mean([o.pose[:3, 1] for o in own], axis=0)
     axis = int(np.argmax(np.abs(up)))
@@ -325,7 +325,7 @@ def _views(
         rng = np.random.default_rng([settings.seed, number])
         # Test views lie evenly; training views at random, but without gaps.
         jitter = 0.0 if split == "test" else 1.0
-        directions = within(hemisphere(settings.count(split), jitter, rng), settings)
+        directions = remap_to_ranges(hemisphere(settings.count(split), jitter, rng), settings)
         directions = np.roll(directions, "zxy".index(axis), axis=1) * up.sum()
         offsets = distances(directions)[:, None] * directions
         for index, offset in enumerate(offsets):
@@ -334,7 +334,7 @@ def _views(
     return views
 
 
-def within(directions: np.ndarray, settings: CaptureSettings) -> np.ndarray:
+def remap_to_ranges(directions: np.ndarray, settings: CaptureSettings) -> np.ndarray:
     """Return directions (N, 3) of the upper hemisphere about z, moved evenly into the ranges."""
     elevation = settings.elevation or ELEVATIONS[settings.cameras]
     if settings.azimuth is None and elevation == ELEVATIONS["around"]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, NoReturn
 from drgs.cli.ending import (
     exit_on_interrupt,
     exit_on_user_error,
-    importing,
+    interruptible_imports,
     notes_printed,
     printable_anywhere,
 )
@@ -120,7 +120,7 @@ def run_command(
         parser = CommandParser(prog=prog)
         parser.set_defaults(is_shared=False)
         add_arguments(parser)
-        with importing():
+        with interruptible_imports():
             args = parser.parse_args(arguments)
         words = sys.argv[1:] if arguments is None else arguments
         args.command = shlex.join([*prog.split(), *words])

@@ -121,7 +121,7 @@ def exit_on_interrupt() -> Iterator[None]:
 
 
 @contextmanager
-def importing() -> Iterator[None]:
+def interruptible_imports() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM end the process at once while the block imports.
 
     Extension modules may abort, or hide what was raised, where it is raised while they are

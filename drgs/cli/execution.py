@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.cli.commands import at_least
-from drgs.cli.ending import importing
+from drgs.cli.ending import interruptible_imports
 from drgs.core.environment import VARIANTS, denormals_flushed
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import why_out_of_memory
@@ -57,7 +57,7 @@ def add_variant_argument(
 def select_variant(name: str) -> None:
     """Make ``name`` the active Mitsuba variant; :class:`UserError` where it cannot be used."""
     try:
-        with importing():
+        with interruptible_imports():
             mi.set_variant(name)
     except ImportError as error:
         if why_out_of_memory(error):
@@ -66,7 +66,7 @@ def select_variant(name: str) -> None:
 
 
 @contextmanager
-def executing(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
+def execution_settings(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
     """Run the block on ``threads`` threads (None: as many as now), with range checks if ``debug``.
 
     Yields a function that raises :class:`UserError` if an access was out of range so far; leaving

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from drgs.core.constants import ALPHA_CUT, ALPHA_MAX, LOW_PASS, TRANSMITTANCE_STOP
-from drgs.core.errors import UserError, UserNote, did_you_mean, listed, one_line
+from drgs.core.errors import UserError, UserNote, did_you_mean, format_names, one_line
 from drgs.core.registry import HOW_TO_INSTALL, ClassRegistry
 
 Value = bool | int | float | str
@@ -95,7 +95,7 @@ class Declared:
         return self.given_words if self.registry is None else tuple(self.registry.names())
 
     @property
-    def expected(self) -> str:
+    def expected_values(self) -> str:
         """The values that are allowed, as messages name them after "must be"."""
         if self.limits is not None:
             return self.limits.words
@@ -203,10 +203,10 @@ class Approximations:
         for name, declared in DECLARED.items():
             value = getattr(self, name)
             if not declared.allows(value):
-                raise ValueError(f"{name} must be {declared.expected}, got {value!r}")
+                raise ValueError(f"{name} must be {declared.expected_values}, got {value!r}")
 
     @staticmethod
-    def of(values: Mapping[str, Value | None]) -> Approximations:
+    def from_values(values: Mapping[str, Value | None]) -> Approximations:
         """Return those among ``values``; None, and a default that is not rounded: the default."""
         given = {name: value for name, value in values.items() if name in DECLARED}
         changes = {k: v for k, v in given.items() if v not in (None, DECLARED[k].unrounded)}
@@ -241,7 +241,7 @@ def said_by(where: str, values: Mapping[str, Value]) -> dict[str, Value]:
     unknown = [name for name in values if name not in DECLARED]
     if unknown:
         hint = did_you_mean(unknown[0], DECLARED)
-        note = f"{where}: specifies {listed(unknown)}, which is not known here and ignored"
+        note = f"{where}: specifies {format_names(unknown)}, which is not known here and ignored"
         warnings.warn(UserNote(note + hint), stacklevel=2)
     found: dict[str, Value] = {}
     for name in (name for name in DECLARED if name in values):
@@ -250,7 +250,7 @@ def said_by(where: str, values: Mapping[str, Value]) -> dict[str, Value]:
             value = float(value)
         if type(value) is not declared.kind or not declared.allows(value):
             raise UserError(
-                f"{where}: the header's {name} must be {declared.expected}, got "
+                f"{where}: the header's {name} must be {declared.expected_values}, got "
                 f"{one_line(value, 60)}; correct the line, or remove it"
             )
         found[name] = value

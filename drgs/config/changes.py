@@ -25,7 +25,7 @@ _COUNTS = (
 )
 
 
-def changed(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
+def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
     """Set values by names such as ``densify.every``; the result is checked like a file's."""
     values = config.model_dump()
     for key, value in changes.items():
@@ -45,22 +45,22 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     """
     share = iterations / config.iterations
 
-    def scaled(count: int) -> int:
+    def scale_count(count: int) -> int:
         return max(1, round(count * share)) if count else 0  # 0: from the start
 
     changes: dict[str, Any] = {"iterations": iterations}
     for key in _COUNTS:
         count = _value(config, key)
-        changes[key] = count if count is None else scaled(count)
+        changes[key] = count if count is None else scale_count(count)
     if config.coarse is not None:
-        ends = {scaled(stage.until): stage.factor for stage in reversed(config.coarse)}
+        ends = {scale_count(stage.until): stage.factor for stage in reversed(config.coarse)}
         changes["coarse"] = [{"until": k, "factor": ends[k]} for k in sorted(ends)]
     changes["densify.stop"] = max(changes["densify.stop"], changes["densify.start"] + 1)
     if changes["densify.prune.stop"] is not None:
         least = max(changes["densify.stop"], changes["densify.prune.start"] or 0) + 1
         changes["densify.prune.stop"] = max(changes["densify.prune.stop"], least)
     changes["optimizer.means_lr_aims"] = changes["densify.stop_aims"] = []
-    return changed(config, changes)
+    return with_changes(config, changes)
 
 
 OPEN = ("data.background", "model.near")
@@ -84,7 +84,7 @@ def is_open(config: FitConfig) -> bool:
 def decided_as(config: FitConfig, other: FitConfig) -> FitConfig:
     """Set the values that ``config`` leaves to the dataset as ``other`` has them."""
     changes = {key: _value(other, key) for key in OPEN_AT_START if _value(config, key) is None}
-    return changed(config, changes)
+    return with_changes(config, changes)
 
 
 def _value(config: FitConfig, key: str) -> Any:

@@ -68,7 +68,7 @@ def _name_check(registry: Registry, shipped: tuple[str, ...]) -> AfterValidator:
 
     def check(name: str) -> str:
         if name not in shipped:
-            known = [*shipped, *(extension.name for extension in registry.installed())]
+            known = [*shipped, *(extension.name for extension in registry.installed_extensions())]
             if name not in known:
                 quoted = ", ".join(f"'{each}'" for each in known)
                 raise ValueError(
@@ -81,7 +81,7 @@ def _name_check(registry: Registry, shipped: tuple[str, ...]) -> AfterValidator:
 
 StrategyName = Annotated[str, _name_check(STRATEGIES, GROWTH)]
 LossName = Annotated[str, _name_check(LOSSES, ("photometric",))]
-ReaderName = Annotated[str, _name_check(READERS, ("auto", *READERS.shipped))]
+ReaderName = Annotated[str, _name_check(READERS, ("auto", *READERS.shipped_names))]
 
 
 def _check_sections(sections: object) -> dict[str, BaseModel | None]:
@@ -146,7 +146,7 @@ def extensions_in_use(
     sections: Mapping[str, BaseModel | None], registry: Registry
 ) -> list[Extension]:
     """Return the extensions of a registry that a configuration has a section for."""
-    return [each for each in registry.installed() if each.name in sections]
+    return [each for each in registry.installed_extensions() if each.name in sections]
 
 
 def describe_extensions() -> str:

@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 from drgs.config.extensions import extension_keys
 from drgs.config.schema import FitConfig
 from drgs.config.section import expectation, shown_value
-from drgs.core.errors import UserError, did_you_mean, listed, one_line
+from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import atomic_path, read_text
 
 PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")
@@ -36,7 +36,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
     Raises :class:`UserError` that names the wrong keys, the first of many, in one line.
     """
     path = Path(path)
-    return _validated(_read_yaml(path), str(path), path.resolve().parent, overrides)
+    return _validate(_read_yaml(path), str(path), path.resolve().parent, overrides)
 
 
 def config_from(
@@ -51,7 +51,7 @@ def config_from(
         key: dict(section) if isinstance(section, Mapping) else section
         for key, section in values.items()
     }
-    return _validated(values, where, Path(), overrides)
+    return _validate(values, where, Path(), overrides)
 
 
 def dump_config(config: FitConfig, path: str | Path) -> None:
@@ -123,7 +123,7 @@ def _read_yaml(path: Path) -> dict:
     return values
 
 
-def _validated(values: dict, where: str, folder: Path, overrides: Iterable[str]) -> FitConfig:
+def _validate(values: dict, where: str, folder: Path, overrides: Iterable[str]) -> FitConfig:
     for key in PATH_KEYS:
         section, leaf = key.split(".")
         entries = values.get(section)
@@ -141,7 +141,7 @@ def _validated(values: dict, where: str, folder: Path, overrides: Iterable[str])
         first, *others = (_explain(where, each, overridden) for each in errors[:MAX_EXPLAINED])
         others = [text.removeprefix(f"{where}: ") for text in others]
         rest = [where] * (len(errors) - MAX_EXPLAINED)
-        raise UserError(listed([first, *others, *rest], MAX_EXPLAINED, "; ")) from None
+        raise UserError(format_names([first, *others, *rest], MAX_EXPLAINED, "; ")) from None
 
 
 def _parse_override(override: str) -> tuple[str, object]:

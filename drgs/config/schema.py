@@ -271,7 +271,7 @@ class ModelConfig(_ModelWithApproximations):
         assert field.field_name is not None, "validators of fields have one"
         declared = DECLARED[field.field_name]
         if value is not None and not declared.allows(value):
-            raise ValueError(f"must be {declared.expected}")
+            raise ValueError(f"must be {declared.expected_values}")
         return value
 
     @property
@@ -288,7 +288,7 @@ class ModelConfig(_ModelWithApproximations):
     @property
     def approximations(self) -> Approximations:
         """The approximations that are configured."""
-        return Approximations.of(vars(self))
+        return Approximations.from_values(vars(self))
 
 
 class RateAim(Section):
@@ -454,7 +454,7 @@ def _require(holds: bool, expected: str, got: object) -> None:
         raise ValueError(f"{expected}, got {got}")
 
 
-def _shown(section: BaseModel) -> str:
+def _format_section(section: BaseModel) -> str:
     return f"{{{', '.join(f'{name}: {value}' for name, value in section)}}}"
 
 
@@ -564,14 +564,14 @@ class FitConfig(Section):
             _require(fits, f"init.num_points must be <= {name} ({cap})", init.num_points)
         for before, after in pairwise(self.coarse or ()):
             is_in_order = before.until < after.until and before.factor > after.factor
-            got = f"{_shown(before)} before {_shown(after)}"
+            got = f"{_format_section(before)} before {_format_section(after)}"
             _require(
                 is_in_order, "coarse must be stages with growing until and falling factor", got
             )
         aims = optimizer.means_lr_aims
         starts = [aim.after for aim in aims]
         is_growing = starts == sorted(set(starts)) and all(aim.end > aim.after for aim in aims)
-        got = ", ".join(map(_shown, aims))
+        got = ", ".join(map(_format_section, aims))
         _require(is_growing, "optimizer.means_lr_aims must have growing after < end", got)
         _require(self.loss.window % 2 == 1, "loss.window must be odd", self.loss.window)
         return self

@@ -96,7 +96,7 @@ def empty_on_host(flat_type: type, shape: tuple[int, ...]) -> np.ndarray:
     return storage[start : start + size].view(dtype).reshape(shape)
 
 
-def wrapped(flat_type: type[Array], values: np.ndarray) -> Array:
+def wrap_numpy(flat_type: type[Array], values: np.ndarray) -> Array:
     """Return an array of numbers which Dr.Jit does not copy on the CPU: nobody may change them.
 
     values: from :func:`empty_on_host`.
@@ -195,7 +195,7 @@ class Rows:
         return Rows(blocks, width)
 
     @staticmethod
-    def of(columns: Sequence[types.Float]) -> Rows:
+    def from_columns(columns: Sequence[types.Float]) -> Rows:
         """Return columns of equal length, not evaluated."""
         num_rows = dr.width(columns[0])
         rows = Rows.empty(type(columns[0]), len(columns), num_rows)

@@ -32,8 +32,8 @@ class ChildEndedError(RuntimeError):
 class DeferredInterrupts:
     """A context manager within which Ctrl-C and SIGTERM wait until its end.
 
-    Only :meth:`allowed` lets them through: what cleans up or moves files is not interrupted.
-    Outside of the main thread, which has the signals, it does nothing.
+    Only :meth:`raise_interrupts` raises them, so cleaning up and moving files is not interrupted.
+    Outside of the main thread, which receives the signals, it does nothing.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class DeferredInterrupts:
             signal.raise_signal(self._arrived)
 
     @contextmanager
-    def allowed(self) -> Iterator[None]:
+    def raise_interrupts(self) -> Iterator[None]:
         """Within the block, the first signal raises KeyboardInterrupt, also if it came before."""
         try:
             self._raises = True
@@ -103,7 +103,7 @@ def run_in_child(
             with suppress(BrokenPipeError):  # it has ended: see below
                 _send(child.stdin, (function, arguments))
             while True:
-                with interrupts.allowed():
+                with interrupts.raise_interrupts():
                     kind, content = pickle.load(child.stdout)
                 if kind == "result":
                     return content

@@ -25,7 +25,7 @@ def check_variant(plugin: str, variant: str | None) -> None:
         )
 
 
-def required(module: str, extra: str, asker: str) -> ModuleType:
+def require_module(module: str, extra: str, asker: str) -> ModuleType:
     """Import and return a module of an extra of ``pyproject.toml``.
 
     asker: what needs it, as the user has written it: ``--view``.

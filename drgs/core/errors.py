@@ -71,7 +71,7 @@ def reason_of_mitsuba(error: Exception) -> str:
     return one_line(f"{head} {last}", 1000)
 
 
-def listed(names: Sequence[object], most: int = 3, separator: str = ", ") -> str:
+def format_names(names: Sequence[object], most: int = 3, separator: str = ", ") -> str:
     """The first ``most`` of ``names``, and how many there are besides: ``a, b, c and 4 more``."""
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
     return separator.join(str(name) for name in names[:most]) + more

@@ -41,7 +41,7 @@ STEM_BYTES = 200
 """Bytes of a file's name that is made of another: numbers and suffixes follow."""
 
 
-def shortened(stem: str) -> str:
+def shorten_stem(stem: str) -> str:
     """The beginning of ``stem``, or all of it: as much as a file's name has room for."""
     encoded = os.fsencode(stem)
     if len(encoded) <= STEM_BYTES:
@@ -158,7 +158,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     # The suffix stays last: image writers choose the format by it.
-    temporary = path.with_name(f".{shortened(path.stem)}.{os.getpid()}.tmp{path.suffix}")
+    temporary = path.with_name(f".{shorten_stem(path.stem)}.{os.getpid()}.tmp{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -183,7 +183,7 @@ def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
 
     Those that still run keep theirs, and so do writers of other files.
     """
-    wanted = {(shortened(path.stem), path.suffix) for path in map(Path, names)}
+    wanted = {(shorten_stem(path.stem), path.suffix) for path in map(Path, names)}
     for path in folder.glob(".*.tmp*"):
         found = _TEMPORARY_NAME.fullmatch(path.name)
         if found and (found[1], found[3] or "") in wanted and not psutil.pid_exists(int(found[2])):

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from drgs.core.errors import UserError, listed
+from drgs.core.errors import UserError, format_names
 from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
 
 MAX_BYTES = 1 << 26
@@ -65,8 +65,9 @@ class FolderRecord:
         strangers = [name for name in self.strangers(names) if name not in known]
         if strangers:
             raise UserError(
-                f"{self.folder}: holds {listed(strangers)}, which this command would replace and "
-                "has not written, or which changed since; move that away, or choose another folder"
+                f"{self.folder}: holds {format_names(strangers)}, which this command would replace "
+                "and has not written, or which changed since; move that away, or choose another "
+                "folder"
             )
 
     def claim(
@@ -159,18 +160,18 @@ def sole_writer(folder: Path) -> Iterator[Callable[[], bool]]:
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
         if descriptor is None:
-            descriptor = _locked(folder)
+            descriptor = _lock_folder(folder)
         return descriptor is not None
 
     try:
-        descriptor = _locked(folder)
+        descriptor = _lock_folder(folder)
         yield keep
     finally:
         if descriptor is not None:
             os.close(descriptor)
 
 
-def _locked(folder: Path) -> int | None:
+def _lock_folder(folder: Path) -> int | None:
     """A descriptor of the folder that holds its lock; None where that cannot be had."""
     try:
         import fcntl

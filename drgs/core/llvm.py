@@ -64,7 +64,7 @@ def ensure_usable_llvm() -> None:
         raise LLVMVersionError(_refusal(version))
     if version[0] < TESTED_VERSION:
         warnings.warn(
-            f"drgs: libLLVM {_dotted(version)} is untested; {TESTED_VERSION} or newer is "
+            f"drgs: libLLVM {_format_version(version)} is untested; {TESTED_VERSION} or newer is "
             f"recommended: {_install_command()}",
             stacklevel=2,
         )
@@ -151,7 +151,7 @@ def _library_folders() -> list[str]:
 
 
 def _refusal(version: Version | None) -> str:
-    found = "none that Dr.Jit can load" if version is None else _dotted(version)
+    found = "none that Dr.Jit can load" if version is None else _format_version(version)
     if version is None and (named := os.environ.get(PATH_VARIABLE)):
         found += f" ({PATH_VARIABLE}={named})"
     message = (
@@ -170,5 +170,5 @@ def _install_command() -> str:
     return "brew install llvm" if is_mac else f"apt-get install libllvm{TESTED_VERSION}"
 
 
-def _dotted(version: Version) -> str:
+def _format_version(version: Version) -> str:
     return ".".join(str(part) for part in version)

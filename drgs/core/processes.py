@@ -19,7 +19,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppres
 from importlib import import_module
 from typing import NoReturn
 
-from drgs.core.environment import required
+from drgs.core.environment import require_module
 from drgs.core.errors import UserError, one_line
 
 LAUNCHERS = (
@@ -121,7 +121,7 @@ def start_mpi() -> None:
 
     Raises :class:`UserError` where there is no MPI, or another one than that of ``mpiexec``.
     """
-    required("mpi4py", "mpi", "mpiexec")
+    require_module("mpi4py", "mpi", "mpiexec")
     try:
         mpi = import_module("mpi4py.MPI")
     except (ImportError, RuntimeError) as error:

@@ -127,18 +127,18 @@ class Registry(Generic[T]):
         return name in self._shipped or name in self._extensions or name in self.names()
 
     @property
-    def shipped(self) -> list[str]:
+    def shipped_names(self) -> list[str]:
         """The names of the extensions that drgs ships, in their order."""
         return list(self._shipped)
 
-    def installed(self) -> list[Extension[T]]:
+    def installed_extensions(self) -> list[Extension[T]]:
         """Return the extensions that drgs does not ship, by name."""
         _load_installed()
         return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
 
     def names(self) -> list[str]:
         """Return the names of all extensions, shipped ones first."""
-        return [*self._shipped, *(extension.name for extension in self.installed())]
+        return [*self._shipped, *(extension.name for extension in self.installed_extensions())]
 
     def get(self, name: str, place: str = "") -> Extension[T]:
         """Return the extension of this name, importing what defines it.
@@ -188,7 +188,7 @@ _registries: list[Registry] = []
 
 def all_extensions() -> list[Extension]:
     """Return the extensions that drgs does not ship, of all kinds, by name."""
-    found = [extension for registry in _registries for extension in registry.installed()]
+    found = [extension for registry in _registries for extension in registry.installed_extensions()]
     return sorted(found, key=lambda extension: extension.name)
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError, listed, one_line
+from drgs.core.errors import UserError, format_names, one_line
 from drgs.datasets.files import FileKind, find_files, images_in, key_of, masks_of
 from drgs.datasets.images import is_scaled
 from drgs.datasets.reader import MAX_WIDTH, DatasetReader, Photographs
@@ -156,7 +156,7 @@ def image_folder(config: DataConfig, model: ColmapModel) -> Path:
         )
     if config.downscale is not None:
         if config.downscale not in there:
-            names = listed([path.name for path in there.values()], len(FACTORS))
+            names = format_names([path.name for path in there.values()], len(FACTORS))
             raise UserError(
                 f"data.downscale: {root} has the folders {names}, got {config.downscale}"
             )
@@ -178,7 +178,7 @@ def _values(
             "(colmap image_undistorter), or have COLMAP find another model"
         )
     width, height = _size_as_calibrated(file, camera, image, folder)
-    named = camera.named()
+    named = camera.named_values()
     scale_x, scale_y = width / camera.width, height / camera.height
     focal = named.pop("f", None)
     return FrameValues.model_construct(

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from drgs.core.errors import UserError, listed, one_line
+from drgs.core.errors import UserError, format_names, one_line
 
 IMAGE_SUFFIXES = frozenset(
     {
@@ -97,7 +97,9 @@ def find_files(
     """
     finder = _FileFinder(folder)
     found = {name: path for name in dict.fromkeys(names) if (path := finder.exact(name))}
-    near = {n: finder.near(n, kind.suffixes) for n in dict.fromkeys(names) if n not in found}
+    near = {
+        n: finder.find_similar(n, kind.suffixes) for n in dict.fromkeys(names) if n not in found
+    }
     near = {name: paths[0] for name, paths in near.items() if len(paths) == 1}
     counts = Counter([*found.values(), *near.values()])
     near = {name: path for name, path in near.items() if counts[path] == 1}
@@ -117,7 +119,7 @@ def find_files(
                 f"{places[missing[0]]}: there is no image {one_line(folder / names[missing[0]])} "
                 f"(or with .png added); {kind.remedy}; not there: {count}"
             )
-        shown = listed([one_line(names[index], 100) for index in missing])
+        shown = format_names([one_line(names[index], 100) for index in missing])
         notes.append(f"{source}: not there: {count} ({shown}); {kind.consequence}")
     return found
 
@@ -134,7 +136,7 @@ class _FileFinder:
                 return candidate
         return None
 
-    def near(self, name: str, suffixes: Collection[str]) -> list[Path]:
+    def find_similar(self, name: str, suffixes: Collection[str]) -> list[Path]:
         """Return files whose names differ from ``name`` in what programs change."""
         parts = parts_of(name)
         first = max((index + 1 for index, part in enumerate(parts) if part == ".."), default=0)
@@ -146,24 +148,26 @@ class _FileFinder:
             if is_elsewhere or (start > 0 and self._is_image_folder(parts[start - 1]))
         ]
         places += [] if first else [[IMAGE_FOLDERS[0], *parts]]
-        found = (self._below(place, suffixes) for place in places if place)
+        found = (self._search_below(place, suffixes) for place in places if place)
         return next(filter(None, found), [])
 
     def _is_image_folder(self, name: str) -> bool:
         return bool(_IMAGE_FOLDER.fullmatch(key_of(name))) or name == self._folder.name
 
-    def _below(self, parts: Sequence[str], suffixes: Collection[str]) -> list[Path]:
+    def _search_below(self, parts: Sequence[str], suffixes: Collection[str]) -> list[Path]:
         folders = [self._folder]
         for part in parts[:-1]:
-            folders = [f / name for f in folders for name in self._called(f, part)]
+            folders = [f / name for f in folders for name in self._match_name(f, part)]
         last = parts[-1]
-        found = [f / name for f in folders for name in self._called(f, last)]
+        found = [f / name for f in folders for name in self._match_name(f, last)]
         if not found:
-            names = ((f, name) for f in folders for name in self._called(f, f"{stem_of(last)}.*"))
+            names = (
+                (f, name) for f in folders for name in self._match_name(f, f"{stem_of(last)}.*")
+            )
             found = [f / n for f, n in names if os.path.splitext(n)[1].lower() in suffixes]
         return [path for path in found if os.path.isfile(path)]
 
-    def _called(self, folder: Path, name: str) -> list[str]:
+    def _match_name(self, folder: Path, name: str) -> list[str]:
         """Return the same name, or else those that differ in case."""
         names = self._listing(folder).get(key_of(name), [])
         return [name] if name in names else names
@@ -228,8 +232,8 @@ def note_unnamed_masks(folder: Path, notes: list[str]) -> None:
     """Add a note where there are masks, but no ``mask_path``: none counts, as in nerfstudio."""
     if files := _mask_files(folder):
         notes.append(
-            f"{folder}: masks are not used, as no mask_path names them: {_listed(folder, files)}; "
-            "all pixels of the photographs count"
+            f"{folder}: masks are not used, as no mask_path names them: "
+            f"{_format_files(folder, files)}; all pixels of the photographs count"
         )
 
 
@@ -261,17 +265,17 @@ def _note_masks(
     if without:
         notes.append(
             f"{folder}: all pixels count of {len(without):,} of {len(names):,} photographs, which "
-            f"have no mask ({listed(without)})"
+            f"have no mask ({format_names(without)})"
         )
     if unused := sorted(set(files).difference(chosen)):
         notes.append(
-            f"{folder}: masks of no photograph that has a camera: {_listed(folder, unused)} (the "
-            "mask of a.jpg is a.jpg.png or a.png)"
+            f"{folder}: masks of no photograph that has a camera: {_format_files(folder, unused)} "
+            "(the mask of a.jpg is a.jpg.png or a.png)"
         )
 
 
-def _listed(folder: Path, files: Sequence[Path]) -> str:
-    return listed([one_line(file.relative_to(folder), 100) for file in files])
+def _format_files(folder: Path, files: Sequence[Path]) -> str:
+    return format_names([one_line(file.relative_to(folder), 100) for file in files])
 
 
 def _mask_files(folder: Path) -> list[Path]:

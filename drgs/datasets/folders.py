@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from drgs.config.extensions import READERS, section_of
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig, FitConfig
-from drgs.core.errors import UserError, listed
+from drgs.core.errors import UserError, format_names
 from drgs.datasets.colmap import find_model, folders_in
 from drgs.datasets.files import images_in
 from drgs.datasets.images import downscaled_size
@@ -66,7 +66,7 @@ def find_reader(
         ) from None
     is_auto = config.type == "auto"
     if is_auto:
-        candidates = [*map(READERS.get, READERS.shipped), *READERS.installed()]
+        candidates = [*map(READERS.get, READERS.shipped_names), *READERS.installed_extensions()]
     else:
         candidates = [READERS.get(config.type, "data.type")]
     for extension in candidates:
@@ -132,7 +132,7 @@ def explain_photographs(folder: Path) -> str:
     if first.parent == folder and first != images:
         given = first if len(places) == 1 else folder
         move = "" if len(places) == 1 else f"move those of one scene into {images}, and "
-    there = listed([str(place.relative_to(folder.parent)) for place in places])
+    there = format_names([str(place.relative_to(folder.parent)) for place in places])
     return (
         f"holds photographs ({there}), but no cameras: {move}find out where each was taken: "
         f"drgs poses {shlex.quote(str(given))}; see {GUIDE}"

@@ -54,7 +54,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     if image.shape[2] == 4:
         counts &= image[:, :, 3] > 0.5
     mask = counts.astype(np.float32)
-    return _whole(_resized(mask, *size)) if is_larger else mask
+    return _round_share(_resize(mask, *size)) if is_larger else mask
 
 
 def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
@@ -145,7 +145,7 @@ def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
     """
     height, width = image.shape[:2]
     new_width, new_height = downscaled_size(width, height, max_width)
-    return image if new_width == width else _resized(image, new_width, new_height)
+    return image if new_width == width else _resize(image, new_width, new_height)
 
 
 def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int, int]:
@@ -157,10 +157,10 @@ def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int
 
 def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
     """Return a mask (H, W) of 1 and 0: a pixel counts where all that it covers does."""
-    return _whole(downscale(mask, max_width))
+    return _round_share(downscale(mask, max_width))
 
 
-def _whole(share: np.ndarray) -> np.ndarray:
+def _round_share(share: np.ndarray) -> np.ndarray:
     return (share > WHOLE).astype(np.float32)
 
 
@@ -170,7 +170,7 @@ def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
     return np.where(known > WHOLE, downscale(depth, max_width), 0).astype(np.float32)
 
 
-def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
+def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     rows = _average_rows(image, height)
     return np.ascontiguousarray(_average_rows(rows.swapaxes(0, 1), width).swapaxes(0, 1))
 
@@ -243,13 +243,13 @@ def compact_photograph(
     if 4 * new_width * new_height * channels < pixels.nbytes:
         return image(), alpha() if channels == 4 else None
     if width % new_width or height % new_height:
-        return _rounded(image()), _rounded(alpha()) if channels == 4 else None
+        return _quantize(image()), _quantize(alpha()) if channels == 4 else None
     shape = (new_height, new_width)
     lazy_alpha = LazyImage(shape, alpha, 0) if channels == 4 else None
     return LazyImage((*shape, 3), image, pixels.nbytes), lazy_alpha
 
 
-def _rounded(numbers: np.ndarray) -> LazyImage:
+def _quantize(numbers: np.ndarray) -> LazyImage:
     """Return numbers in 0..1 that are kept in 16 bits each."""
     kept = np.round(numbers * np.float32(MAX_16_BITS)).astype(np.uint16)
     return LazyImage(kept.shape, lambda: as_numbers(kept), kept.nbytes)

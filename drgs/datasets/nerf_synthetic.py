@@ -102,12 +102,12 @@ def _transforms_path(config: DataConfig, split: str) -> Path:
 def _frames(config: DataConfig, split: str, notes: list[str]) -> list[TransformsFrame]:
     """Return the frames of a split whose images are there."""
     meta = read_transforms(_transforms_path(config, split))
-    if unread := [*meta.unread, *_unused(meta)]:
+    if unread := [*meta.unread, *_unused_keys(meta)]:
         notes.append(note_unread(meta.path, unread))
     return frames_with_files(config, meta, notes)
 
 
-def _unused(meta: TransformsFile) -> list[str]:
+def _unused_keys(meta: TransformsFile) -> list[str]:
     """Return keys that other layouts read."""
     values = [frame.values for frame in meta.frames]
     keys = [key for key in UNUSED_KEYS if any(getattr(v, key) is not None for v in values)]
@@ -137,7 +137,7 @@ def _load_split(
                 f"{shape[0]}; scale the images of a split to one size"
             )
         if angle is None:
-            raise UserError(f"{frame.where('camera_angle_x')} is missing")
+            raise UserError(f"{frame.location('camera_angle_x')} is missing")
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(angle, size[0])
         return {"fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.errors import UserNote, listed, one_line
+from drgs.core.errors import UserNote, format_names, one_line
 from drgs.core.folders import digest
 from drgs.datasets.types import View
 from drgs.io.images import unused_content
@@ -43,11 +43,15 @@ class Notices:
     ) -> None:
         """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
         files = {path for view in (*train, *test) for path in view.files.values()}
-        own = [f"photographs {what}: {_listed(names)}" for what, names in self._unused.items()]
+        own = [
+            f"photographs {what}: {_format_files(names)}" for what, names in self._unused.items()
+        ]
         if self._transparent:
-            own.append(f"photographs that are transparent everywhere: {_listed(self._transparent)}")
-        if outside := self._outside(files if cloud is None else {*files, cloud}):
-            own.append(f"files from outside of the folder: {_listed(outside)}")
+            own.append(
+                f"photographs that are transparent everywhere: {_format_files(self._transparent)}"
+            )
+        if outside := self._files_outside(files if cloud is None else {*files, cloud}):
+            own.append(f"files from outside of the folder: {_format_files(outside)}")
         own += self._equal(train, test)
         for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
             warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
@@ -58,7 +62,7 @@ class Notices:
         except ValueError:
             return str(file)
 
-    def _outside(self, files: Iterable[Path]) -> list[str]:
+    def _files_outside(self, files: Iterable[Path]) -> list[str]:
         """Return files that lie elsewhere, by their names or by links."""
         root, folder_of = os.path.realpath(self._folder), cache(os.path.realpath)
         found = []
@@ -73,23 +77,23 @@ class Notices:
         """Return a note on photographs that are there more than once, or none."""
         groups = [[*train, *test]]
         for key in (os.path.getsize, digest):
-            groups = [part for group in groups for part in _grouped(group, cache(key))]
+            groups = [part for group in groups for part in _group_duplicates(group, cache(key))]
         if not groups:
             return []
         pairs = [" = ".join(self._name(v.files["image"]) for v in group) for group in groups]
-        note = f"the same photograph more than once: {_listed(pairs)}"
+        note = f"the same photograph more than once: {_format_files(pairs)}"
         in_train, in_test = ({view.files["image"] for view in views} for views in (train, test))
         files = [{view.files["image"] for view in group} for group in groups]
         both = sum(bool(group & in_train and group & in_test) for group in files)
         return [note + (f"; {both:,} of them both trained and measured on" if both else "")]
 
 
-def _listed(names: Sequence[str]) -> str:
+def _format_files(names: Sequence[str]) -> str:
     ordered = sorted(names)
-    return f"{len(ordered):,} ({listed(ordered)})"
+    return f"{len(ordered):,} ({format_names(ordered)})"
 
 
-def _grouped(views: Sequence[View], key: Callable[[Path], object]) -> list[list[View]]:
+def _group_duplicates(views: Sequence[View], key: Callable[[Path], object]) -> list[list[View]]:
     """Return groups of several views whose photographs have the same key."""
     groups: dict[object, list[View]] = {}
     for view in views:

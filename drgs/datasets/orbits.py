@@ -11,7 +11,7 @@ import numpy as np
 from drgs.config.schema import NEAR_LIMITS, REFERENCE_NEAR
 from drgs.core.errors import UserError
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import focus_of, look_at, pinhole, shown
+from drgs.datasets.viewpoints import focus_of, format_vector, look_at, pinhole
 from drgs.gaussians.parameters import Gaussians
 
 ELEVATION, MAX_ELEVATION = math.radians(30), math.radians(80)
@@ -106,7 +106,7 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
     with np.errstate(over="ignore"):  # becomes infinite, and is refused
         length = np.linalg.norm(up)
     if not 0 < length < np.inf:
-        raise UserError(f"camera: up must not be zero or infinite, got {shown(up)}")
+        raise UserError(f"camera: up must not be zero or infinite, got {format_vector(up)}")
     focus, spread = _middle(gaussians)
     up = up / length
     start, _ = _level_axes(up, np.array([0.0, -1.0, 0.0]))

@@ -242,7 +242,7 @@ def as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
     height, width = pixels.shape[:2]
     raise UserError(
         f"{file}: has the EXIF orientation {orientation}, and w and h do not tell whether the "
-        f"camera's numbers ({frame.where('w')}) are for the image as it is stored, {width} x "
+        f"camera's numbers ({frame.location('w')}) are for the image as it is stored, {width} x "
         f"{height} px, or as that turns it; save the image as the camera's numbers have it, "
         "without the orientation"
     )
@@ -255,7 +255,7 @@ def _intrinsics(
     for key, given, actual in (("w", values.w, width), ("h", values.h, height)):
         if given is not None and given != actual:
             raise UserError(
-                f"{frame.where(key)} must be the image's size, {actual} px "
+                f"{frame.location(key)} must be the image's size, {actual} px "
                 f"({frame.files['image']}), got {given:g}; scale the intrinsics or the images"
             )
     fx = _focal(frame, "x", width)
@@ -269,17 +269,17 @@ def _intrinsics(
 def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
     focal, angle = (getattr(frame.values, f"{key}_{axis}") for key in ("fl", "camera_angle"))
     if focal is not None:
-        return focal_length(focal, frame.where(f"fl_{axis}"), side)
+        return focal_length(focal, frame.location(f"fl_{axis}"), side)
     if angle is not None:
         return focal_from_angle(angle, side)
     raise UserError(
-        f"{frame.where(f'fl_{axis}')} is missing, and there is no camera_angle_{axis} either"
+        f"{frame.location(f'fl_{axis}')} is missing, and there is no camera_angle_{axis} either"
     )
 
 
 def _principal(frame: TransformsFrame, key: str, side: int) -> float:
     value = getattr(frame.values, key)
-    return side / 2 if value is None else principal_point(value, frame.where(key), side)
+    return side / 2 if value is None else principal_point(value, frame.location(key), side)
 
 
 # Images, masks and depths of a frame

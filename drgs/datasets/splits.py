@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError, did_you_mean, listed, one_line
+from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import read_text
 from drgs.datasets.files import IMAGE_FOLDERS, LEAST_SHARE, key_of, parts_of, stem_of
 
@@ -50,19 +50,19 @@ def listed_frames(
 
     Raises :class:`UserError` where fewer than half of a list are names of frames.
     """
-    found, unknown = _matched(listing, names)
+    found, unknown = _match_names(listing, names)
     if len(unknown) > (1 - LEAST_SHARE) * len(listing):
         raise UserError(
             f"{source}: {key} must list the photographs of frames, but {len(unknown):,} of its "
-            f"{len(listing):,} names are not theirs: {listed(unknown)}"
+            f"{len(listing):,} names are not theirs: {format_names(unknown)}"
             f"{did_you_mean(unknown[0], names)}"
         )
     if unknown:
-        notes.append(f"{source}: {key} has names that no frame has: {listed(unknown)}")
+        notes.append(f"{source}: {key} has names that no frame has: {format_names(unknown)}")
     return found
 
 
-def _matched(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], list[str]]:
+def _match_names(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], list[str]]:
     """Return the ``names`` that a list contains, and its other names, for messages."""
     exact = {"/".join(parts_of(name)): name for name in names}
     loose: dict[str, set[str]] = {}
@@ -102,7 +102,7 @@ def unlisted_splits(
             if (file := folder / f"{split}.txt").is_file():
                 lines = map(str.strip, read_text(file, "list of names", MAX_LIST_BYTES).split("\n"))
                 listing = [line for line in lines if line and not line.startswith("#")]
-                if _matched(listing, names)[0]:
+                if _match_names(listing, names)[0]:
                     found[split] = listed_frames(folder, file.name, listing, names, notes)
                 else:
                     notes.append(f"{file}: lists no photograph, and is not read")
@@ -138,8 +138,8 @@ def split_of(
     if both and name != "train":
         raise UserError(
             f"{source}: a photograph must be either to train or to measure on, but {lists.where} "
-            f"have {len(both):,} in both train and {name}: {one_line(listed(both))}; take them out "
-            "of one"
+            f"have {len(both):,} in both train and {name}: {one_line(format_names(both))}; take "
+            "them out of one"
         )
     if not (train and test):
         raise UserError(
@@ -150,7 +150,7 @@ def split_of(
     if left:
         notes.append(
             f"{source}: left out, as no list has them ({lists.where}): {len(left):,} of "
-            f"{len(names):,} photographs ({listed(left)})"
+            f"{len(names):,} photographs ({format_names(left)})"
         )
     trained, measured = ([i for i, n in enumerate(names) if n in m] for m in (train, test))
     return Split(trained, measured, name, f"split {name}, by {lists.where}")

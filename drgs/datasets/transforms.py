@@ -34,8 +34,8 @@ from pydantic_core.core_schema import no_info_after_validator_function
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.config.schema import DataConfig
 from drgs.config.section import expectation
-from drgs.core.errors import UserError, listed, one_line
-from drgs.core.files import read_text, shortened
+from drgs.core.errors import UserError, format_names, one_line
+from drgs.core.files import read_text, shorten_stem
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.files import FileKind, find_files
 from drgs.datasets.types import CameraMotion
@@ -248,7 +248,9 @@ class TransformsFrame:
         try:
             own = FrameValues.model_validate({**values, "transform_matrix": opengl.tolist()})
         except ValidationError as error:
-            raise UserError(f"{source}: frame {index}: {_explained(error.errors()[0])}") from None
+            raise UserError(
+                f"{source}: frame {index}: {_explain_error(error.errors()[0])}"
+            ) from None
         return TransformsFrame(own, source, f"frames[{index}].", files={"image": image})
 
     @property
@@ -257,7 +259,7 @@ class TransformsFrame:
         assert self.values.file_path is not None, "frames without a name are rejected when read"
         return self.values.file_path
 
-    def where(self, key: str) -> str:
+    def location(self, key: str) -> str:
         """Return the file and the key, with the frame if that contains it, for messages."""
         return f"{self.path}: {'' if key in self.inherited else self.place}{key}"
 
@@ -282,7 +284,7 @@ def read_transforms(path: Path) -> TransformsFile:
     try:
         meta = Transforms.model_validate(json.loads(text))
     except ValidationError as error:
-        raise UserError(f"{path}: {_explained(error.errors()[0])}") from None
+        raise UserError(f"{path}: {_explain_error(error.errors()[0])}") from None
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
     top = {name: getattr(meta, name) for name in CameraValues.model_fields} | _extra(meta)
@@ -293,12 +295,12 @@ def read_transforms(path: Path) -> TransformsFile:
         frames.append(TransformsFrame(values, path, f"frames[{index}].", inherited.keys()))
     names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
     lists = {split: listing for split, listing in names.items() if listing}
-    return TransformsFile(path, frames, meta.ply_file_path, lists, _unread(meta))
+    return TransformsFile(path, frames, meta.ply_file_path, lists, _unread_keys(meta))
 
 
 def note_unread(path: Path, keys: Sequence[str]) -> str:
     """Describe keys that are not read, for the user."""
-    return f"{path}: keys that are not read: {listed(keys, 8)}"
+    return f"{path}: keys that are not read: {format_names(keys, 8)}"
 
 
 def _extra(values: CameraValues) -> dict[str, object]:
@@ -306,7 +308,7 @@ def _extra(values: CameraValues) -> dict[str, object]:
     return values.model_extra or {}
 
 
-def _unread(meta: Transforms) -> list[str]:
+def _unread_keys(meta: Transforms) -> list[str]:
     """Return sorted keys; those of frames as ``frames[].key``."""
     models = {values.camera_model for values in (meta, *meta.frames)}
     known = WITHOUT_EFFECT.union(*map(_coefficients, models))
@@ -325,7 +327,7 @@ def _coefficients(model: str | None) -> tuple[str, ...]:
     return LENSES.get(model).value.coefficient_names()
 
 
-def _explained(error: ErrorDetails) -> str:
+def _explain_error(error: ErrorDetails) -> str:
     """Return the key, the expectation and the value of one of pydantic's errors."""
     parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]]
     key = "".join(parts).removeprefix(".")
@@ -355,7 +357,7 @@ def frames_with_files(
     Raises :class:`UserError` where fewer than half of the files of a kind are there.
     """
     if nameless := [frame for frame in meta.frames if frame.values.file_path is None]:
-        raise UserError(f"{nameless[0].where('file_path')} is missing")
+        raise UserError(f"{nameless[0].location('file_path')} is missing")
     ignored = {"mask": config.ignore_masks, "depth": config.ignore_depth}
     frames = list(meta.frames)
     for what, (key, kind) in FILES.items():
@@ -363,7 +365,7 @@ def frames_with_files(
         if ignored.get(what) or not naming:
             continue
         names = [getattr(frame.values, key) for frame in naming]
-        places = [frame.where(key) for frame in naming]
+        places = [frame.location(key) for frame in naming]
         found = find_files(config.path, meta.path, names, kind, places, notes)
         kept = []
         for frame in frames:
@@ -427,7 +429,7 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     given = {k: v for k in _coefficients(model) if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
-            raise UserError(f"{frame.where(key)} must be a finite number, got {_show(value)}")
+            raise UserError(f"{frame.location(key)} must be a finite number, got {_show(value)}")
     if is_of_colmap:
         given = {key: value for key, value in given.items() if value}
         if name == "opencv":
@@ -439,7 +441,7 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     is_rational = model == RATIONAL_MODEL or {"k5", "k6"} & given.keys()
     if is_of_colmap and name == "opencv" and "k4" in given and not is_rational:
         raise UserError(
-            f"{frame.where('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
+            f"{frame.location('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
             f"camera_model is {RATIONAL_MODEL}; nerfstudio's, of a term k4 r^8, is not supported. "
             f"Got k4 = {given['k4']:g} and camera_model {model or 'PINHOLE'}: set "
             "camera_model, or calibrate without k4"
@@ -447,14 +449,14 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     lens = LENSES.get(name).value
     for key in sorted(given.keys() - set(lens.coefficient_names())):
         raise UserError(
-            f"{frame.where(key)}: a lens of the kind {name} has the coefficients "
+            f"{frame.location(key)}: a lens of the kind {name} has the coefficients "
             f"{', '.join(lens.coefficient_names())}, got {key} = {given[key]:g}; set "
             f"camera_model to the model that was calibrated, or leave {key} out"
         )
     try:
         return lens.from_coefficients(**given)
     except UserError as error:
-        raise UserError(f"{frame.where('camera_model')}: {error}") from error
+        raise UserError(f"{frame.location('camera_model')}: {error}") from error
 
 
 def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:
@@ -476,6 +478,6 @@ def unique_names(files: Sequence[str]) -> list[str]:
     if len(set(names)) < len(names):
         relative = [path.with_suffix("").relative_to(path.anchor) for path in paths]
         names = ["_".join(path.parts) for path in relative]
-    if len(set(names)) < len(names) or any(name != shortened(name) for name in names):
-        names = [f"{index:04d}_{shortened(name)}" for index, name in enumerate(names)]
+    if len(set(names)) < len(names) or any(name != shorten_stem(name) for name in names):
+        names = [f"{index:04d}_{shorten_stem(name)}" for index, name in enumerate(names)]
     return names

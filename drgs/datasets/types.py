@@ -90,15 +90,15 @@ class Viewpoint:
         viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
         return viewmat
 
-    def moved(self: V, offset: np.ndarray) -> V:
+    def with_offset(self: V, offset: np.ndarray) -> V:
         """Return the same camera with ``offset`` (3,) added to its position."""
         if not np.any(offset):
             return self
         motion = self.motion
         if motion is not None:
-            motion = replace(motion, close_to_world=_translated(motion.close_to_world, offset))
+            motion = replace(motion, close_to_world=_translate_pose(motion.close_to_world, offset))
         return replace(
-            self, camera_to_world=_translated(self.camera_to_world, offset), motion=motion
+            self, camera_to_world=_translate_pose(self.camera_to_world, offset), motion=motion
         )
 
 
@@ -111,7 +111,7 @@ def _spread(views: Sequence[Viewpoint]) -> float:
     return float(1.1 * distances.max())
 
 
-def _translated(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def _translate_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
     pose = pose.copy()
     pose[:3, 3] += offset
     return pose
@@ -166,6 +166,6 @@ class Dataset:
         """Return the same views with positions relative to ``origin``, world."""
         offset = np.subtract(self.origin, origin)
         train, test = (
-            tuple(view.moved(offset) for view in views) for views in (self.train, self.test)
+            tuple(view.with_offset(offset) for view in views) for views in (self.train, self.test)
         )
         return replace(self, train=train, test=test, origin=origin)

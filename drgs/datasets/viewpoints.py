@@ -56,7 +56,7 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
         if not np.abs(place).max() <= MAX_COORDINATE:
             raise UserError(
                 f"camera: the coordinates of {name} must be at most {MAX_COORDINATE:g} in size, "
-                f"got {shown(place)}; scale the scene down"
+                f"got {format_vector(place)}; scale the scene down"
             )
     forward = target - origin
     with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and is refused
@@ -65,8 +65,8 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
         is_determined = np.linalg.norm(right) > 1e-6 * scale
     if not is_determined:
         raise UserError(
-            f"camera: the direction from origin {shown(origin)} to target {shown(target)} must "
-            f"not be zero or parallel to up {shown(up)}"
+            f"camera: the direction from origin {format_vector(origin)} to target "
+            f"{format_vector(target)} must not be zero or parallel to up {format_vector(up)}"
         )
     forward, right = (v / np.linalg.norm(v) for v in (forward, right))
     pose = np.eye(4)
@@ -108,7 +108,7 @@ def _viewpoint_of(
 
     def value_of(key: str, remedy: str) -> float:
         if (value := getattr(values, key)) is None:
-            raise UserError(f"{frame.where(key)} is missing; {remedy}")
+            raise UserError(f"{frame.location(key)} is missing; {remedy}")
         return value
 
     if size is None:
@@ -117,26 +117,28 @@ def _viewpoint_of(
     else:
         width, height = size
 
-    def scaled(key: str, side: str, check: Callable[[float, str, int], float]) -> float:
+    def scale_length(key: str, side: str, check: Callable[[float, str, int], float]) -> float:
         """Return px of the wanted image from px of the file's."""
         pixels = width if side == "w" else height
         of = value_of(side, "the file's other numbers need it")
-        return check(pixels * getattr(values, key) / of, frame.where(key), pixels)
+        return check(pixels * getattr(values, key) / of, frame.location(key), pixels)
 
     cx, cy = width / 2, height / 2
     if values.fl_x is not None:
-        focal = scaled("fl_x", "w", focal_length)
+        focal = scale_length("fl_x", "w", focal_length)
     else:
         focal = focal_from_angle(value_of("camera_angle_x", "or give fl_x with w"), width)
     has_fl_y = values.fl_x is not None and values.fl_y is not None
-    focal_y = scaled("fl_y", "h", focal_length) if has_fl_y else focal
+    focal_y = scale_length("fl_y", "h", focal_length) if has_fl_y else focal
     if values.cx is not None and values.cy is not None:
-        cx, cy = (scaled(key, side, principal_point) for key, side in (("cx", "w"), ("cy", "h")))
+        cx, cy = (
+            scale_length(key, side, principal_point) for key, side in (("cx", "w"), ("cy", "h"))
+        )
     pose, lens, motion = values.transform_matrix, lens_of(frame), motion_of(frame, shutter_samples)
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 
 
-def shown(vector: np.ndarray) -> str:
+def format_vector(vector: np.ndarray) -> str:
     """Return a vector as messages write it."""
     return f"({', '.join(f'{v:g}' for v in vector)})"
 

@@ -25,9 +25,9 @@ def with_effects(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pi
         model = replace(pipeline.model, falloff=DimmedFalloff(pipeline.model.falloff))
         pipeline = replace(pipeline, shape=Defocused(pipeline.shape), model=model)
     if gaussians.smoothing is not None:
-        from drgs.effects.smoothing import smoothed
+        from drgs.effects.smoothing import apply_smoothing
 
-        pipeline = replace(pipeline, rows=smoothed)
+        pipeline = replace(pipeline, rows=apply_smoothing)
     return pipeline
 
 

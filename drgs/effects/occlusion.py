@@ -83,10 +83,10 @@ class OccludedFeatures(SplatFeatures):
             bound=list(zip(*bound, strict=True)),
         )
 
-    def at(self, stored: list[Float], pixel: int) -> list[Float]:
+    def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
         *others, depth = stored
-        seen = self._seen(depth, pixel)
-        values = [seen * value for value in self.features.at(others, pixel)]
+        seen = self._transmitted_share(depth, pixel)
+        values = [seen * value for value in self.features.pixel_values(others, pixel)]
         return values + self._in_front(type(depth)(1), depth, pixel)
 
     def add(
@@ -94,14 +94,16 @@ class OccludedFeatures(SplatFeatures):
     ) -> list[Float]:
         *others, depth = stored
         own, fronts = self._split(planes)
-        seen = self.features.add(own, others, pixel, self._seen(depth, pixel) * weight)
+        seen = self.features.add(own, others, pixel, self._transmitted_share(depth, pixel) * weight)
         pairs = zip(fronts, self._in_front(weight, depth, pixel), strict=True)
         return [*seen, *(front + more for front, more in pairs)]
 
     def feature_gradient(self, stored: list[Float], pixel: int, g: list[Float]) -> Float:
         *others, depth = stored
         own, fronts = self._split(g)
-        gradient = self._seen(depth, pixel) * self.features.feature_gradient(others, pixel, own)
+        gradient = self._transmitted_share(depth, pixel) * self.features.feature_gradient(
+            others, pixel, own
+        )
         return gradient + sum(
             dr.select(depth <= z, d_front, 0)
             for (z, _), d_front in zip(self.bound[pixel], fronts, strict=True)
@@ -112,13 +114,13 @@ class OccludedFeatures(SplatFeatures):
     ) -> list[Float]:
         *others, depth = stored
         *totals, nothing = totals
-        weight = self._seen(depth, pixel) * weight
+        weight = self._transmitted_share(depth, pixel) * weight
         sums = self.features.add_derivatives(totals, others, pixel, weight, self._split(g)[0])
         return [*sums, nothing]
 
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         *others, depth = stored
-        seen = self._seen(depth, pixel)
+        seen = self._transmitted_share(depth, pixel)
         tangents = self.features.tangents(others, d_stored[:-1], pixel)
         return [seen * value for value in tangents] + [type(depth)(0)] * len(self.surfaces)
 
@@ -126,7 +128,7 @@ class OccludedFeatures(SplatFeatures):
         count = len(self.surfaces)
         return planes[:-count], planes[-count:]
 
-    def _seen(self, depth: Float, pixel: int) -> Float:
+    def _transmitted_share(self, depth: Float, pixel: int) -> Float:
         """Return s, the part of a splat that surfaces in front of it let through."""
         Float = type(depth)
         farther_first = reversed(self.bound[pixel])

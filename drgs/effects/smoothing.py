@@ -5,10 +5,10 @@ depth) holds no detail below its Nyquist limit. Mip-Splatting (Yu et al. 2024, s
 therefore convolves each Gaussian with one of variance 0.2 / nu^2, nu being the largest rate of all
 cameras that see it, and keeps its integral.
 
-:func:`baked` and :func:`baked_for_viewers` change Gaussians in closed form so that other viewers,
-which add 0.3 square pixels to each splat's covariance and leave its opacity as it is, show them
-about as they were fitted. What is added on the film is taken from the Gaussians beforehand, as far
-as there is something to take from, and opacities make up for the rest, such that a splat keeps its
+:func:`bake_smoothing` and :func:`baked_for_viewers` change Gaussians in closed form so that other
+viewers, which add 0.3 square pixels to each splat's covariance and leave its opacity as it is, show
+them about as they were fitted. The variance that viewers add is first subtracted from the
+Gaussians, as far as they have any, and opacities make up for the rest, such that a splat keeps its
 integral over the film (section 5).
 """
 
@@ -42,7 +42,7 @@ FILM_MARGIN = 0.15
 """Parts of the film's size by which a camera is taken to see beyond it (Mip-Splatting's code)."""
 
 
-def smoothed(rows: GaussianRows) -> GaussianRows:
+def apply_smoothing(rows: GaussianRows) -> GaussianRows:
     """Widen the covariance of Gaussians by ``rows.smoothing``^2, and dim them in proportion."""
     assert rows.smoothing is not None, "composed where there is a filter"
     variance = dr.square(rows.smoothing)
@@ -79,7 +79,7 @@ def _rates(points: Array3f, camera: Camera) -> Float:
     return dr.select(seen, dr.max(camera.focal) / depth, 0)
 
 
-def baked(gaussians: Gaussians) -> Gaussians:
+def bake_smoothing(gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians (numpy) with the filter in their scales, and opacities below 1."""
     g = gaussians.numpy()
     if g.smoothing is None:

@@ -29,7 +29,7 @@ def quat_to_rotation(quats: Array4f) -> Matrix3f:
     )
 
 
-def normalized(vector: Array3f) -> Array3f:
+def normalize(vector: Array3f) -> Array3f:
     """Return the unit vector; a zero vector stays zero, with zero gradient."""
     squared_norm = dr.squared_norm(vector)
     usable = squared_norm > 0

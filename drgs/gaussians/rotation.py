@@ -77,7 +77,7 @@ def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
     was in d: sum_k Y_k(d') c'_k = sum_k Y_k(R^T d') c_k for all unit d'. float64.
     """
     directions = _directions()
-    return _projected(_basis(directions @ rotation, degree), degree)
+    return _project_values(_basis(directions @ rotation, degree), degree)
 
 
 @cache
@@ -90,10 +90,10 @@ def sh_rotation_generators(degree: int) -> list[list[np.ndarray]]:
     """
     directions, step = _directions(), 1e-20
     ahead = [directions - 1j * step * np.cross(axis, directions) for axis in np.eye(3)]
-    return [_projected(np.imag(_basis(points, degree)) / step, degree) for points in ahead]
+    return [_project_values(np.imag(_basis(points, degree)) / step, degree) for points in ahead]
 
 
-def _projected(values: np.ndarray, degree: int) -> list[np.ndarray]:
+def _project_values(values: np.ndarray, degree: int) -> list[np.ndarray]:
     """Matrices, by degree from 1 on, of functions with these values in :func:`_directions`."""
     basis = _basis(_directions(), degree)
     bands = [slice(num_coefficients(k - 1), num_coefficients(k)) for k in range(1, degree + 1)]

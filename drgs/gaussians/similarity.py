@@ -27,7 +27,7 @@ class Similarity:
     translation: np.ndarray  # (3,)
 
     @staticmethod
-    def of(matrix: np.ndarray, name: str) -> Similarity:
+    def from_matrix(matrix: np.ndarray, name: str) -> Similarity:
         """Return that of a matrix (4, 4). Raises PluginError that begins with ``name``."""
         matrix = np.asarray(matrix, np.float64)
         linear = matrix[:3, :3]

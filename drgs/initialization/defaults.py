@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
@@ -70,7 +70,7 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     changes |= _numbers_of_gaussians(config, dataset)
     if config.coarse is None:
         changes["coarse"] = _coarse_stages(config, dataset)
-    return changed(config, changes) if changes else config
+    return with_changes(config, changes) if changes else config
 
 
 def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, object]:

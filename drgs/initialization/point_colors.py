@@ -52,7 +52,7 @@ def colors_from_images(
     samples = np.full((len(views), len(points), 3), np.inf, np.float32)
     columns = [np.ascontiguousarray(c, np.float64) for c in np.asarray(points).T]
     for view, sample in zip(views, samples, strict=True):
-        rows, colors = _shown(view, columns, spacing, background)
+        rows, colors = _find_shown_points(view, columns, spacing, background)
         sample[rows] = colors
     colors = np.concatenate(
         [_middle(samples[:, k : k + SORTED_AT_ONCE]) for k in range(0, len(points), SORTED_AT_ONCE)]
@@ -67,7 +67,7 @@ def colors_from_images(
     return colors
 
 
-def _shown(
+def _find_shown_points(
     view: View,
     columns: Sequence[np.ndarray],
     spacing: np.ndarray,

@@ -24,9 +24,9 @@ from drgs.initialization.start_box import (
     box_to_start_in,
     focus_of,
     focus_text,
+    format_point,
     num_looking,
     points_in_view,
-    shown,
 )
 from drgs.io.ply import read_points
 
@@ -152,7 +152,7 @@ def _on_hull(
     if len(means) <= NUM_NEIGHBOURS:
         return None
     what = f"{len(means):,} points on the hull of {len(silhouettes)} masks"
-    return _colored(Start(means.astype(np.float32), None, what), dataset)
+    return _with_colors(Start(means.astype(np.float32), None, what), dataset)
 
 
 def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
@@ -163,7 +163,7 @@ def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
     _check_cloud(cloud, means, config.densify.max_gaussians, dataset)
     kept = "the" if len(means) == num_read else f"{len(means):,} of {num_read:,}"
     start = Start(means, colors, f"{kept} points of {cloud}")
-    return _colored(start, dataset) if colors is None else start
+    return _with_colors(start, dataset) if colors is None else start
 
 
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
@@ -204,13 +204,13 @@ def _random_points(config: FitConfig, dataset: Dataset) -> Start:
         return Start(box.points(num_points, rng), None, what)
     means = points_in_view(dataset.train, num_points, rng)
     focus, distance = focus_of(dataset.train)
-    near = f"about within {distance:.3g} of {shown(focus, distance)}"
+    near = f"about within {distance:.3g} of {format_point(focus, distance)}"
     far = f"the others up to {FARTHEST:g} times as far"
     what = f"{num_points:,} random points that the cameras see, part of them {near}, {far}"
     return Start(means, None, what)
 
 
-def _colored(start: Start, dataset: Dataset) -> Start:
+def _with_colors(start: Start, dataset: Dataset) -> Start:
     """Return the start with the colours of the images, if they show any of the points."""
     from drgs.initialization.point_colors import colors_from_images
 

@@ -63,7 +63,7 @@ class Box:
         """Return the box as messages name it."""
         if not self.center.any():
             return f"[-{self.half_extent:g}, {self.half_extent:g}]^3"
-        center = shown(self.center, self.half_extent)
+        center = format_point(self.center, self.half_extent)
         return f"the cube of half width {self.half_extent:.3g} around {center}"
 
 
@@ -176,14 +176,14 @@ def focus_text(dataset: Dataset) -> str:
         focus, distance = focus_of(dataset.train)
     except UserError:
         return ""
-    return f" (around {shown(focus + dataset.origin, distance)}, from {distance:.3g} away)"
+    return f" (around {format_point(focus + dataset.origin, distance)}, from {distance:.3g} away)"
 
 
 def check_box(box: Box, dataset: Dataset) -> None:
     """Raise :class:`UserError` for a box that most cameras do not look into, or hardly see."""
     points, views = box.points(NUM_SAMPLES, np.random.default_rng(0)), dataset.train
     looking = num_looking(points, views)
-    covered = float(np.median([_covered(points, view) for view in views]))
+    covered = float(np.median([_coverage(points, view) for view in views]))
     if looking < LEAST_LOOKING * len(views):
         reason = f"only {looking} of {len(views)} have it in the middle of their images"
     elif covered < LEAST_COVERED:
@@ -198,7 +198,7 @@ def check_box(box: Box, dataset: Dataset) -> None:
     )
 
 
-def _covered(points: np.ndarray, view: Viewpoint) -> float:
+def _coverage(points: np.ndarray, view: Viewpoint) -> float:
     """Return the share of an image's cells that contain points; lenses are taken for pinholes."""
     seen = points[_in_image(points, view)]
     x, y, z = ((seen - view.center) @ view.camera_to_world[:3, :3]).T
@@ -207,7 +207,7 @@ def _covered(points: np.ndarray, view: Viewpoint) -> float:
     return np.unique(cells, axis=1).shape[1] / NUM_CELLS**2
 
 
-def shown(point: np.ndarray, scale: float) -> str:
+def format_point(point: np.ndarray, scale: float) -> str:
     """Return a point as messages write it; scale: distances beside which rounding is nothing."""
     rounded = np.where(np.abs(point) < 1e-6 * scale, 0, point)
     digits = max(3, math.ceil(math.log10(max(np.abs(point).max() / scale, 1))) + 2)

@@ -50,7 +50,7 @@ class ImageRays:
     positions: tuple[SamplePoints, ...]  # by pass
 
     @staticmethod
-    def of(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> ImageRays:
+    def from_rays(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> ImageRays:
         """Find where in pixels the rays start; UnsupportedError unless they are of an image."""
         if sensor is None:
             raise UnsupportedError(REFUSAL)
@@ -58,16 +58,16 @@ class ImageRays:
         width, height = film.crop_size()
         count, rest = divmod(dr.width(ray), width * height)
         if count == 0 or rest or is_batch(sensor):
-            raise UnsupportedError(_unknown(sensor))
+            raise UnsupportedError(_unknown_sensor_message(sensor))
         camera = camera_from_sensor(read_sensor(sensor, near))
         if camera.shutter is not None:
-            raise UnsupportedError(_unknown(sensor))
+            raise UnsupportedError(_unknown_sensor_message(sensor))
         corner = dr.repeat(pixel_corners(film), count)
         place, on_camera = _look_back(camera, ray)
         within = place - corner
         inside = (dr.min(within) > -SLACK) & (dr.max(within) < 1 + SLACK)
         if not dr.all(inside & on_camera):
-            raise UnsupportedError(_unknown(sensor))
+            raise UnsupportedError(_unknown_sensor_message(sensor))
         within = mi.Point2f(dr.clip(within, 0, 1 - dr.epsilon(mi.Float)))
         positions = split_passes(within, count, width * height)
         dr.eval([(p.x, p.y) for p in positions])
@@ -98,14 +98,14 @@ class ImageRays:
         if hybrid is not None:
             hybrid = hybrid.with_surfaces(view.num_surfaces(hybrid))
             view = replace(view, hybrid=hybrid)
-        channels = self._gathered(view.channels(view.planes(), constant_background(splats)))
+        channels = self._collect_channels(view.channels(view.planes(), constant_background(splats)))
         for kind in ("frames", "surfaces"):
             splats.cache.forget(f"{kind} {NESTED}")
         if hybrid is not None:
             channels = self._with_surfaces(channels, hybrid, sampler, active)
         return channels
 
-    def _gathered(self, passes: Sequence[Channels]) -> Channels:
+    def _collect_channels(self, passes: Sequence[Channels]) -> Channels:
         samples = split_samples(self.positions, passes[: len(self.positions)])
         planes = zip(*samples, strict=True)
         return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
@@ -118,7 +118,7 @@ class ImageRays:
         aovs, own = channels[3 : -len(insertion.channels)], channels[-len(insertion.channels) :]
         behind = own[2 * insertion.num_surfaces :] or [mi.Float(0)] * 3
         images = [*map(list, hybrid.radiances(self.ray, sampler, active)), behind]
-        shown = insertion.shown(own, images)
+        shown = insertion.visible_radiance(own, images)
         return [*(s + c for s, c in zip(shown, channels[:3], strict=True)), *aovs]
 
 
@@ -133,7 +133,7 @@ def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
     return mi.Point2f(place), near & (dr.dot(axis, direction) > 0) & seen
 
 
-def _unknown(sensor: mi.Sensor) -> str:
+def _unknown_sensor_message(sensor: mi.Sensor) -> str:
     return (
         "splats: inside 'aov', rays must be those of the whole film, without sample_border, of a "
         "sensor of type perspective, thinlens, orthographic or calibrated that stands still; "

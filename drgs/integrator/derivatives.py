@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from drgs.core.errors import UnsupportedError, listed
+from drgs.core.errors import UnsupportedError, format_names
 from drgs.integrator.checks import ellipsoids_in
 from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.state import SplatsState
@@ -95,7 +95,7 @@ def check_derivatives(
     for reason, names in reasons.items():
         are = "is" if len(names) == 1 else "are"
         raise UnsupportedError(
-            f"splats: {listed(names)} {are} not differentiated, as {reason}; or detach "
+            f"splats: {format_names(names)} {are} not differentiated, as {reason}; or detach "
             f"{'it' if are == 'is' else 'them'}"
         )
 

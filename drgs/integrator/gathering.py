@@ -79,7 +79,7 @@ class Part(Protocol):
         ...
 
     @property
-    def fixed(self) -> object:
+    def fixed_inputs(self) -> object:
         """Anything else that the conversion depends on; equal if the same."""
         ...
 
@@ -87,7 +87,7 @@ class Part(Protocol):
         """Return all parameters, differentiable with respect to ``values``."""
         ...
 
-    def detached(self) -> Part:
+    def detach(self) -> Part:
         """Return the same conversion of detached values."""
         ...
 
@@ -104,7 +104,7 @@ class Gathered:
         """Return whether gathering these would give the same Gaussians."""
         return same_variables(
             [part.values for part in self.parts], [part.values for part in parts]
-        ) and [part.fixed for part in self.parts] == [part.fixed for part in parts]
+        ) and [part.fixed_inputs for part in self.parts] == [part.fixed_inputs for part in parts]
 
     def accumulate(self, parts: Sequence[Part], gradients: Gaussians) -> None:
         """Accumulate derivatives into the same parts, attached."""
@@ -112,7 +112,7 @@ class Gathered:
         for part, own, (num, degree) in zip(parts, self.parts, self.sizes, strict=True):
             attached = {k: v for k, v in part.values.items() if dr.width(v) and dr.grad_enabled(v)}
             if attached and num > 0:
-                copy = own.detached()
+                copy = own.detach()
                 dr.enable_grad([copy.values[name] for name in attached])
                 rows = _arrays(_rows(gradients, start, num, degree))
                 found = _arrays(copy.gaussians())
@@ -129,7 +129,7 @@ class Gathered:
         """Return derivatives of all Gaussians along those set on the same parts, attached."""
         found = []
         for part, own in zip(parts, self.parts, strict=True):
-            copy = own.detached()
+            copy = own.detach()
             dr.enable_grad(copy.values)
             for name, values in part.values.items():
                 dr.set_grad(copy.values[name], tangent_of(values))
@@ -145,7 +145,7 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     last: the result of the last call, which is returned again while nothing has changed. Features
     and coefficients that a part lacks are zeros, and so is a smoothing filter.
     """
-    parts = [part.detached() for part in parts]
+    parts = [part.detach() for part in parts]
     if last is not None and last.matches(parts):
         return last
     converted = [part.gaussians() for part in parts]
@@ -249,20 +249,20 @@ class Turn:
     matrices: Float  # (9 + 25 + 49,)
 
     @staticmethod
-    def by(rotation: np.ndarray) -> Turn:
+    def from_rotation(rotation: np.ndarray) -> Turn:
         """Return the rotation of spherical harmonics; rotation: (3, 3), x' = R x."""
-        return Turn._from(sh_rotation_matrices(rotation, 3))
+        return Turn._from_matrices(sh_rotation_matrices(rotation, 3))
 
     @staticmethod
     def generators() -> list[Turn]:
         """Return derivatives of turned coefficients along rotations about x, y and z."""
-        return [Turn._from(matrices) for matrices in sh_rotation_generators(3)]
+        return [Turn._from_matrices(matrices) for matrices in sh_rotation_generators(3)]
 
     @staticmethod
-    def _from(matrices: Sequence[np.ndarray]) -> Turn:
+    def _from_matrices(matrices: Sequence[np.ndarray]) -> Turn:
         return Turn(from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices])))
 
-    def of(self, columns: list[Float]) -> list[Float]:
+    def rotate_columns(self, columns: list[Float]) -> list[Float]:
         """Turn columns of the coefficients of degree 1 and above, three a coefficient."""
         turned, start = [], 0
         for degree in range(1, PER_DEGREE[len(columns) // 3 + 1] + 1):
@@ -284,13 +284,13 @@ class Placement:
     """The move of an object into the scene: see :class:`Part`."""
 
     values: ParameterArrays  # of the object's Gaussians, and its to_world
-    fixed: str  # name of the parameter to_world, in messages
+    fixed_inputs: str  # name of the parameter to_world, in messages
 
-    def detached(self) -> Placement:
+    def detach(self) -> Placement:
         return replace(self, values=dr.detach(self.values))
 
     @staticmethod
-    def of(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
+    def from_matrix(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
         """Place Gaussians by a matrix of one lane."""
         return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
 
@@ -298,19 +298,19 @@ class Placement:
         """Return all parameters; PluginError where they leave float32."""
         arrays = {name: values for name, values in self.values.items() if name != TO_WORLD}
         if dr.grad_enabled(self.values[TO_WORLD]) or not self._place.is_identity:
-            arrays |= self._moved(arrays)
+            arrays |= self._transform_arrays(arrays)
         return _gaussians(arrays)
 
     @cached_property
     def _place(self) -> Similarity:
-        return similarity_of(self.values[TO_WORLD], self.fixed)
+        return similarity_of(self.values[TO_WORLD], self.fixed_inputs)
 
-    def _moved(self, arrays: ParameterArrays) -> ParameterArrays:
+    def _transform_arrays(self, arrays: ParameterArrays) -> ParameterArrays:
         place, split = self._place, {k: _columns_of(arrays[k]) for k in ("means", "quats", "shN")}
         turned = {
             "means": product(_device(place.scale * place.rotation), split["means"]),
             "quats": product(_device(left_multiplication_matrix(place.rotation)), split["quats"]),
-            "shN": Turn.by(place.rotation).of(split["shN"]),
+            "shN": Turn.from_rotation(place.rotation).rotate_columns(split["shN"]),
         }
         scale = _device(np.array([place.scale, np.log(place.scale)]))
         log_scales = [c + entry(scale, 1) for c in _columns_of(arrays["log_scales"])]
@@ -333,8 +333,8 @@ class Placement:
         rows = mi.UInt32(dr.compress(reduce(operator.or_, beyond)))
         if dr.width(rows) > 0:
             raise PluginError(
-                f"{self.fixed} moves Gaussian {rows[0]} beyond the end of float32, 3.4e38; crop or "
-                "scale the object"
+                f"{self.fixed_inputs} moves Gaussian {rows[0]} beyond the end of float32, 3.4e38; "
+                "crop or scale the object"
             )
 
     def _with_motion(self, moved: ParameterColumns) -> ParameterColumns:
@@ -350,7 +350,9 @@ class Placement:
         }
         r, (real, *imaginary) = mi.Vector3f(arms["means"]), arms["quats"]
         v = mi.Vector3f(imaginary)
-        about_axes = zip(*(turn.of(arms["shN"]) for turn in Turn.generators()), strict=True)
+        about_axes = zip(
+            *(turn.rotate_columns(arms["shN"]) for turn in Turn.generators()), strict=True
+        )
         changes = {
             "means": list(scale * r + dr.cross(w, r) + shift),
             "quats": [-dr.dot(w, v) / 2, *((w * real + dr.cross(w, v)) / 2)],
@@ -383,7 +385,7 @@ def similarity_of(to_world: Matrix4f, name: str) -> Similarity:
     matrix = np.array(dr.detach(to_world), np.float64)
     if matrix.size != 16:
         raise PluginError(f"{name} must be one transform, got {matrix.shape[2]}")
-    return Similarity.of(matrix.reshape(4, 4), name)
+    return Similarity.from_matrix(matrix.reshape(4, 4), name)
 
 
 def _device(values: np.ndarray) -> mi.Float:
@@ -446,9 +448,9 @@ class Conversion:
     """The conversion of a shape's arrays to raw parameters; see ``gathering.Part``."""
 
     values: ParameterArrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
-    fixed: Turn | None  # of the harmonics, which is not differentiated
+    fixed_inputs: Turn | None  # of the harmonics, which is not differentiated
 
-    def detached(self) -> Conversion:
+    def detach(self) -> Conversion:
         return replace(self, values=dr.detach(self.values))
 
     def gaussians(self) -> Gaussians:
@@ -458,7 +460,7 @@ class Conversion:
         scales, (x, y, z, w) = [dr.abs(scale) for scale in data[3:6]], data[6:]
         # Written such that a NaN is not visible.
         is_visible = (scales[0] > 0) & (scales[1] > 0) & (scales[2] > 0)
-        higher = sh[3:] if self.fixed is None else self.fixed.of(sh[3:])
+        higher = sh[3:] if self.fixed_inputs is None else self.fixed_inputs.rotate_columns(sh[3:])
         opacity = self._opacity(is_visible)
         logits = dr.log(opacity / (1 - opacity))
         log_scales = [dr.log(dr.select(is_visible, scale, 1)) for scale in scales]

@@ -39,7 +39,7 @@ class ImageRender:
     batch: SideBySide | None = None  # for several views
 
     @staticmethod
-    def of(
+    def prepare(
         splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
     ) -> ImageRender:
         """Choose where pixels are evaluated; spp: 0 for that of the sensor's sampler."""
@@ -70,7 +70,7 @@ class ImageRender:
             return ImageRender([whole], samples, hybrid)._with_surfaces()
         from drgs.integrator.sensors import SideBySide
 
-        batch = SideBySide.of(sensor)
+        batch = SideBySide.from_batch(sensor)
         views = [
             replace(
                 whole, index=index, sensor=one, positions=batch.positions(whole.positions, index)
@@ -121,7 +121,7 @@ class ImageRender:
             dr.set_grad(planes, d_planes)
             if constant is not None:
                 dr.set_grad(constant, dr.grad(splats.background))
-            image = self._developed(planes, constant)
+            image = self._develop(planes, constant)
             # The nested integrator, and other images of the same pass, read the gradients of
             # parameters again, also of those that are computed from others.
             dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
@@ -134,9 +134,9 @@ class ImageRender:
 
     def _image_of_splats(self) -> mi.TensorXf:
         constant = constant_background(self.views[0].splats)
-        return self._developed([view.planes() for view in self.views], constant)
+        return self._develop([view.planes() for view in self.views], constant)
 
-    def _developed(self, planes: list[Planes], constant: mi.Color3f | None) -> mi.TensorXf:
+    def _develop(self, planes: list[Planes], constant: mi.Color3f | None) -> mi.TensorXf:
         images = [v.channels(p, constant) for v, p in zip(self.views, planes, strict=True)]
         passes = images[0] if self.batch is None else self.batch.concatenate(images)
         return self.samples.develop(passes)
@@ -152,7 +152,7 @@ def hybrid_of(
     from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces
 
     cache, hide_emitters = splats.cache, splats.hide_emitters
-    surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
+    surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
     nested: mi.SamplingIntegrator
     adjoint: mi.SamplingIntegrator
     if splats.light == "none":
@@ -179,6 +179,6 @@ def hybrid_of(
         shows_background=not hide_emitters and scene.environment() is not None,
         display_space=not splats.srgb_primitives,
     )
-    traced, count = surfaces.traced(scene), splats.nested_spp or spp
+    traced, count = surfaces.scene_to_trace(scene), splats.nested_spp or spp
     rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
     return Hybrid(surfaces, nested, adjoint, sensor, seed, count, insertion, rays)

@@ -72,7 +72,7 @@ class Plane:
         """Return the signed distance of a point."""
         return dr.dot(self.normal, point) - self.offset
 
-    def at(self, mirror: mi.UInt32, active: mi.Bool | bool = True) -> Plane:
+    def gather(self, mirror: mi.UInt32, active: mi.Bool | bool = True) -> Plane:
         """Gather the planes of some of the mirrors."""
         normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
         return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
@@ -101,7 +101,7 @@ class FlatMirror:
     is_specular: bool  # whether all that goes on does so about there
 
     @staticmethod
-    def of(shape: mi.Shape) -> FlatMirror | None:
+    def from_shape(shape: mi.Shape) -> FlatMirror | None:
         """Recognise one; None for all other shapes, and for emitters."""
         bsdf = shape.bsdf()
         if bsdf is None or shape.is_emitter():
@@ -118,7 +118,7 @@ class FlatMirror:
         plane = _plane_through(_points(shape)) if delta or glossy else None
         return plane and FlatMirror(*plane, delta, not (diffuse or through))
 
-    def behind(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def mirror_camera(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mirror a camera's centre, (3,); give the plane, (4,), with its normal to the camera."""
         normal = np.array(self.normal)
         height = normal @ center - self.offset
@@ -159,7 +159,7 @@ class Mirrors:
     views: list[_View]  # by camera
 
     @staticmethod
-    def of(
+    def render(
         mirrors: Sequence[FlatMirror],
         states: Sequence[SensorState],
         scene: mi.Scene,
@@ -179,7 +179,7 @@ class Mirrors:
         for camera in cameras:
             pipeline = _pipeline(approximations, sh_degree, camera.lens)
             images = [
-                _render_mirror(camera, every.at(mi.UInt32(k)), scene, gaussians, pipeline)
+                _render_mirror(camera, every.gather(mi.UInt32(k)), scene, gaussians, pipeline)
                 for k in range(len(mirrors))
             ]
             colors, ends = (dr.concat(parts) for parts in zip(*images, strict=True))
@@ -190,7 +190,7 @@ class Mirrors:
 
     def look(self, mirror: mi.UInt32, segment: PathSegment, active: mi.Bool) -> Seen:
         """Look up the splats along segments that leave a mirror; mirror: its number, of each."""
-        plane, ray = self.planes.at(mirror, active), segment.ray
+        plane, ray = self.planes.gather(mirror, active), segment.ray
         origin = ray.o - 2 * plane.height(ray.o) * plane.normal
         direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
         color, coverage, is_known = mi.Color3f(0), mi.Float(0), mi.Bool(False)

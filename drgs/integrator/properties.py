@@ -80,12 +80,12 @@ def _single(value: float) -> float:
 def read(props: mi.Properties, declared: Mapping[str, Property]) -> dict[str, Any]:
     """Return the values of declared properties that are given, and defaults for the others."""
     return {
-        name: _checked(props, name, one) if name in props else one.default
+        name: _check_property(props, name, one) if name in props else one.default
         for name, one in declared.items()
     }
 
 
-def _checked(props: mi.Properties, name: str, declared: Property) -> Any:
+def _check_property(props: mi.Properties, name: str, declared: Property) -> Any:
     value, where = props[name], f"{props.plugin_name()}: {name} must be"
     if declared.kind is float and type(value) is int:
         value = float(value)
@@ -132,7 +132,7 @@ SETTINGS = {
 """Settings of ``splats`` that are single values, besides the approximations."""
 
 APPROXIMATIONS = {
-    name: Property(one.kind, one.default, one.expected, one.allows, one.words)
+    name: Property(one.kind, one.default, one.expected_values, one.allows, one.words)
     for name, one in DECLARED.items()
 }
 
@@ -171,7 +171,7 @@ def read_state(
     if own.is_moved:
         own.check_to_world()
     every = {"": own} | {f"{name}.": one for name, one in objects.items()}
-    header = _agreed(props, {one.file: one.header for one in every.values() if one.file})
+    header = _merge_headers(props, {one.file: one.header for one in every.values() if one.file})
     given = {name: one for name, one in APPROXIMATIONS.items() if name in props}
     settings = read(props, SETTINGS)
     state = SplatsState(
@@ -229,7 +229,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
             )
         resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  has no type in the stub
         path = resolver.resolve(str(props["filename"]))
-        gaussians = replace(_loaded(str(path)).to(mi.TensorXf), features=features)
+        gaussians = replace(_load_gaussians(str(path)).to(mi.TensorXf), features=features)
     elif given or features or "to_world" in props:
         gaussians = replace(_gaussians_of_tensors(props, given), features=features)
     else:
@@ -258,7 +258,7 @@ def _gaussians_of_tensors(props: mi.Properties, given: Sequence[str]) -> Gaussia
     return Gaussians(**values)
 
 
-def _loaded(path: str) -> Gaussians:
+def _load_gaussians(path: str) -> Gaussians:
     """Return the Gaussians of a file, in coordinates that Mitsuba's float32 can tell apart."""
     gaussians = Gaussians.load(path)
     if gaussians.origin != WORLD:
@@ -297,7 +297,9 @@ def _turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
     turns = {}
     for name in names:
         shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
-        turns[shape] = Turn.by(Similarity.of(matrix(props, name), f"splats: {name}").rotation)
+        turns[shape] = Turn.from_rotation(
+            Similarity.from_matrix(matrix(props, name), f"splats: {name}").rotation
+        )
     return turns
 
 
@@ -333,9 +335,11 @@ def _aovs(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
     return aovs
 
 
-def _agreed(props: mi.Properties, files: Mapping[str, Mapping[str, Value]]) -> dict[str, Value]:
+def _merge_headers(
+    props: mi.Properties, files: Mapping[str, Mapping[str, Value]]
+) -> dict[str, Value]:
     """Return what headers set and no property gives; PluginError where files differ."""
-    made_with = {file: Approximations.of(said) for file, said in files.items()}
+    made_with = {file: Approximations.from_values(said) for file, said in files.items()}
     names = [name for name in DECLARED if name not in props]
     for name in names:
         values = {file: getattr(made, name) for file, made in made_with.items()}

@@ -52,12 +52,14 @@ class StraightRays:
             return hit.is_valid() & (opacity <= INVISIBLE)
 
         def go_on(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float) -> tuple:
-            ray = self.behind(ray, hit, mi.Bool(True))
+            ray = self.continue_rays(ray, hit, mi.Bool(True))
             return ray, *self._meet(ray, mi.Bool(True))
 
         return dr.while_loop(state=(mi.Ray3f(ray), hit, opacity), cond=is_invisible, body=go_on)
 
-    def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Ray3f:
+    def continue_rays(
+        self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+    ) -> mi.Ray3f:
         """Return the rest of rays behind what they hit; ``ray`` where not active."""
         si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         rest = mi.Ray3f(ray)
@@ -74,7 +76,7 @@ class StraightRays:
             hit, opacity = self._meet(ray, goes_on)
             passes = passes * (1 - opacity)
             goes_on = goes_on & hit.is_valid() & (passes > INVISIBLE)
-            return self.behind(ray, hit, goes_on), passes, goes_on
+            return self.continue_rays(ray, hit, goes_on), passes, goes_on
 
         ones = dr.full(mi.Float, 1, dr.width(ray))
         _, passes, _ = dr.while_loop(
@@ -116,7 +118,7 @@ class RaysBehind:
             for _ in range(self.count):
                 rest, hit, opacity = self.rays.next_visible(rest, active)
                 weight *= 1 - opacity
-                rest = self.rays.behind(rest, hit, active & hit.is_valid())
+                rest = self.rays.continue_rays(rest, hit, active & hit.is_valid())
             rest, _, _ = self.rays.next_visible(rest, active & (weight > INVISIBLE))
             offset = rest.o - ray.o
             ray.o, ray.maxt = rest.o, rest.maxt

@@ -110,10 +110,10 @@ class SensorRender:
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
         """Return the mean over times of each pass's channels; constant: the background."""
-        behind = self._behind(constant)
+        behind = self._render_behind(constant)
         seen = repeat(repeat(None))
         if self.hybrid is not None:
-            seen = self._traced_surfaces(self.hybrid, self._state().detached()).value
+            seen = self._traced_surfaces(self.hybrid, self._state().detach()).value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -131,7 +131,7 @@ class SensorRender:
     ) -> Channels:
         """Return channels of a sample; layers: surfaces that it sees, None if there are none."""
         if layers is None:
-            return self._composited(planes, mi.Float(1), behind, color)
+            return self._to_channels(planes, mi.Float(1), behind, color)
         from drgs.integrator.visible_surfaces import rest_behind
 
         planes, fronts = planes[: -len(layers)], planes[-len(layers) :]
@@ -146,11 +146,11 @@ class SensorRender:
             return [_sum(terms) for terms in zip(*found, strict=True)] if found else None
 
         past = [rest_behind(layers) * planes[0], *planes[1:]]
-        own = self._composited(past, whole, behind, color, of_surfaces)
+        own = self._to_channels(past, whole, behind, color, of_surfaces)
         assert self.hybrid is not None, "its surfaces are the layers"
         return own + self.hybrid.insertion.values(layers, fronts, radiance)
 
-    def _composited(
+    def _to_channels(
         self,
         planes: list[Float],
         whole: mi.Float,
@@ -185,7 +185,7 @@ class SensorRender:
             channels += values
         return channels
 
-    def _behind(self, constant: mi.Color3f | None) -> _Behind:
+    def _render_behind(self, constant: mi.Color3f | None) -> _Behind:
         splats = self.splats
         environment = None if splats.hide_emitters else self.scene.environment()
         if environment is None and constant is not None:
@@ -206,7 +206,7 @@ class SensorRender:
     def _frames(self) -> list[list[rendering.Frame]]:
         """Return frames by time and by pass, those of the last image where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
-        state = self._state().detached()
+        state = self._state().detach()
         traced = None if self.hybrid is None else self._traced_surfaces(self.hybrid, state)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
 
@@ -242,7 +242,7 @@ class SensorRender:
 
     def num_surfaces(self, hybrid: Hybrid) -> int:
         """Return the number of surfaces that are seen one through the other."""
-        return len(self._traced_surfaces(hybrid, self._state().detached()).value[0][0])
+        return len(self._traced_surfaces(hybrid, self._state().detach()).value[0][0])
 
     @property
     def _offsets(self) -> list[tuple[Float | float, Float | float]]:

@@ -36,7 +36,7 @@ class SensorState:
         """True if one of the sensor's parameters is attached."""
         return any(dr.grad_enabled(value) for value in self.device.values())
 
-    def detached(self) -> SensorState:
+    def detach(self) -> SensorState:
         """Return a detached copy."""
         return replace(self, device=dr.detach(self.device))
 
@@ -85,7 +85,7 @@ def sensors_of(sensor: mi.Sensor) -> list[mi.Sensor]:
     """Return the sensors of a batch, or the one."""
     if not is_batch(sensor):
         return [sensor]
-    return SideBySide.of(sensor).sensors
+    return SideBySide.from_batch(sensor).sensors
 
 
 def depth_range(sensor: mi.Sensor) -> tuple[float, float]:
@@ -127,7 +127,7 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
     ``state.make(state)`` is the one that Dr.Jit differentiates in the sensor's parameters.
     """
-    state = state.detached()
+    state = state.detach()
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
     camera = state.make(state)
     dr.make_opaque(camera)
@@ -242,7 +242,7 @@ class SideBySide:
     height: int
 
     @staticmethod
-    def of(batch: mi.Sensor) -> SideBySide:
+    def from_batch(batch: mi.Sensor) -> SideBySide:
         """Read a batch; PluginError if its film has a crop window."""
         sensors, film = _children(batch), batch.film()
         if list(film.crop_size()) != list(film.size()):
@@ -265,7 +265,7 @@ class SideBySide:
     def concatenate(self, images: Sequence[Sequence[Channels]]) -> list[Channels]:
         """Return the channels for the film, by pass; images: by sensor, each by pass."""
         return [
-            [self._joined(planes) for planes in zip(*of_pass, strict=True)]
+            [self._concatenate(planes) for planes in zip(*of_pass, strict=True)]
             for of_pass in zip(*images, strict=True)
         ]
 
@@ -275,7 +275,7 @@ class SideBySide:
         place = pixel + row * ((len(self.sensors) - 1) * self.width) + index * self.width
         return dr.gather(mi.Float, plane, place, mode=dr.ReduceMode.Permute)
 
-    def _joined(self, planes: Sequence[mi.Float]) -> mi.Float:
+    def _concatenate(self, planes: Sequence[mi.Float]) -> mi.Float:
         whole = len(self.sensors) * self.width
         pixel = dr.arange(mi.UInt32, len(planes) * dr.width(planes[0]))
         row = pixel // dr.opaque(mi.UInt32, whole)

@@ -53,11 +53,11 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
     Raises PluginError for the name of an object that the scene does not have.
     """
     gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
-    surfaces = cache.surfaces = Surfaces.of(scene, cache.surfaces)
+    surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
 
     def estimate() -> Gaussians:
         rays = _rays_through(surfaces.objects)
-        without = _rays_through(_without(surfaces.objects, splats.shadows))
+        without = _rays_through(_exclude(surfaces.objects, splats.shadows))
         blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
         return _darken(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
 
@@ -65,7 +65,7 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
     cache.shaded = cache.find("shaded", (surfaces,), gaussians, estimate).value
 
 
-def _without(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:
+def _exclude(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:
     shapes = [node for node in objects if isinstance(node, mi.Shape)]
     check_ids("shadows must be ids of the scene's shapes", names, shapes)
     return [node for node in objects if node.id() not in names]
@@ -161,7 +161,7 @@ def _darken(gaussians: Gaussians, ratio: mi.Color3f) -> Gaussians:
     """Multiply colours by ratio^(1 / GAMMA): of 0.5 + basis x coefficients."""
     factor = [dr.power(channel, 1 / GAMMA) for channel in ratio]
 
-    def scaled(tensor: mi.TensorXf, of_half: float) -> mi.TensorXf:
+    def scale(tensor: mi.TensorXf, of_half: float) -> mi.TensorXf:
         flat, width = tensor.array, tensor.shape[1] * 3
         if width == 0:
             return tensor
@@ -172,6 +172,6 @@ def _darken(gaussians: Gaussians, ratio: mi.Color3f) -> Gaussians:
             f = dr.select(channel == k, dr.gather(mi.Float, values, row), f)
         return mi.TensorXf(f * flat + (f - 1) * of_half, tensor.shape)
 
-    found = replace(gaussians, sh0=scaled(gaussians.sh0, 0.5 / SH_C0), shN=scaled(gaussians.shN, 0))
+    found = replace(gaussians, sh0=scale(gaussians.sh0, 0.5 / SH_C0), shN=scale(gaussians.shN, 0))
     dr.eval(found.sh0, found.shN)
     return found

@@ -83,7 +83,7 @@ class RayTransport:
     num_samples: int  # splats that are drawn; 0: all are composited
 
     @staticmethod
-    def of(splats: SplatsState) -> RayTransport:
+    def from_splats(splats: SplatsState) -> RayTransport:
         """Return the transport of an integrator's Gaussians."""
         gaussians = dr.detach(splats.gaussians)
         settings = splats.approximations, splats.sh_degree
@@ -96,18 +96,18 @@ class RayTransport:
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        look = self._sampled if self.num_samples else self._composited
+        look = self._composite_sampled if self.num_samples else self._composite_all
         color, coverage = look(_segment(segment.ray, active), segment.is_open, sample)
         return dr.select(active, self.exposure * color, 0), dr.select(active, 1 - coverage, 1)
 
-    def _composited(
+    def _composite_all(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
         del sample
         color, T = self.splats.composite_segment(segment)
         return decode(mi.Color3f(color), dr.select(is_open, 1, 1 - T)), 1 - T
 
-    def _sampled(
+    def _composite_sampled(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
         seed, n = reinterpret(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
@@ -141,10 +141,10 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
     """Prepare Gaussians for rays, their smoothing filter included."""
     rows = load_rows(gaussians, degree)
     if rows.smoothing is not None:
-        from drgs.effects.smoothing import smoothed
+        from drgs.effects.smoothing import apply_smoothing
 
-        rows = smoothed(rows)
-    return RaySplats.of(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
+        rows = apply_smoothing(rows)
+    return RaySplats.from_gaussians(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
 
 
 def nested_with_transport(
@@ -157,11 +157,11 @@ def nested_with_transport(
         nested = mi.load_dict(settings)
     assert isinstance(nested, TransportIntegrator), "checked with the settings"
     if splats.light == "rays":
-        nested.use_transport(RayTransport.of(splats))
+        nested.use_transport(RayTransport.from_splats(splats))
     else:
         traces = splats.unseen == "rays"
-        unseen = RayTransport.of(splats) if traces else None
-        nested.use_transport(ProbeTransport.of(splats, scene, num_paths, sensors, unseen))
+        unseen = RayTransport.from_splats(splats) if traces else None
+        nested.use_transport(ProbeTransport.from_splats(splats, scene, num_paths, sensors, unseen))
     return nested
 
 
@@ -196,7 +196,7 @@ class ProbeTransport:
     unseen: SplatTransport | None  # for rays of which probes do not know what they meet
 
     @staticmethod
-    def of(
+    def from_splats(
         splats: SplatsState,
         scene: mi.Scene,
         num_paths: int,
@@ -207,7 +207,7 @@ class ProbeTransport:
         objects = _objects(scene, splats.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
-        states = [read_sensor(sensor, splats.near).detached() for sensor in sensors]
+        states = [read_sensor(sensor, splats.near).detach() for sensor in sensors]
         flat = _flat_mirrors(splats, shapes)
         delta_mirrors = {k: mirror for k, mirror in flat.items() if mirror.has_delta}
         return ProbeTransport(
@@ -296,10 +296,10 @@ def _probes(
         approximations = replace(splats.approximations, projection="exact", low_pass=LOW_PASS)
         pipeline = pipeline_of(approximations, splats.sh_degree, (color_features, depth_feature))
         if gaussians.smoothing is not None:
-            from drgs.effects.smoothing import smoothed
+            from drgs.effects.smoothing import apply_smoothing
 
-            pipeline = replace(pipeline, rows=smoothed)
-        probes = Probes.of(gaussians, pipeline, centers, splats.near, _decode, planes)
+            pipeline = replace(pipeline, rows=apply_smoothing)
+        probes = Probes.render(gaussians, pipeline, centers, splats.near, _decode, planes)
         _warn_of_close(splats, objects, flat, probes)
         return probes
 
@@ -333,7 +333,7 @@ def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int,
     from drgs.integrator.mirrors import FlatMirror
 
     def recognise() -> dict[int, FlatMirror]:
-        every = {k: FlatMirror.of(shape) for k, shape in shapes.items()}
+        every = {k: FlatMirror.from_shape(shape) for k, shape in shapes.items()}
         return {k: mirror for k, mirror in every.items() if mirror is not None}
 
     return splats.cache.find("flat mirrors", (splats.cache.surfaces,), (), recognise).value
@@ -354,7 +354,7 @@ def _mirror_images(
         "mirrors",
         settings,
         arrays,
-        lambda: Mirrors.of(mirrors, states, surfaces.traced(scene), gaussians, *how),
+        lambda: Mirrors.render(mirrors, states, surfaces.scene_to_trace(scene), gaussians, *how),
     ).value
 
 
@@ -371,7 +371,7 @@ def _places(
     if specular:
         camera = np.array(camera_from_sensor(sensor).center, np.float64).ravel()
         for k, mirror in specular.items():
-            centers[k], planes[k] = mirror.behind(camera)
+            centers[k], planes[k] = mirror.mirror_camera(camera)
     return centers, planes
 
 

@@ -292,7 +292,9 @@ class SplatsState:
         from drgs.integrator.gathering import Placement
 
         return [
-            Placement.of(self.rendered_part_of(one), one.to_world.matrix, f"splats: {k}to_world")
+            Placement.from_matrix(
+                self.rendered_part_of(one), one.to_world.matrix, f"splats: {k}to_world"
+            )
             for k, one in self.objects.items()
         ]
 

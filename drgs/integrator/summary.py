@@ -32,14 +32,14 @@ class SimulatedEffect:
     why: str = ""  # what asked for it
     ignored: bool = False  # whether it is asked for where it is not to be simulated
 
-    def unless(self, is_ignored: bool) -> SimulatedEffect:
+    def unless_ignored(self, is_ignored: bool) -> SimulatedEffect:
         """Return the effect, not simulated if it ``is_ignored``."""
         if is_ignored and self.what is not None:
             return replace(self, what=None, ignored=True)
         return self
 
 
-def described(effects: Sequence[SimulatedEffect]) -> str:
+def format_effects(effects: Sequence[SimulatedEffect]) -> str:
     """Format the summary: a line for each effect that is simulated, one for all the others."""
     lines = [f"  {e.name}: {e.what} ({e.why})" for e in effects if e.what is not None]
     absent = [
@@ -55,9 +55,9 @@ def described(effects: Sequence[SimulatedEffect]) -> str:
 def summary_of_scene(splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor]) -> str:
     """Return the summary of the integrator ``splats``, whose Gaussians are gathered."""
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
-    cameras = [camera_from_sensor(read_sensor(one, splats.near).detached()) for one in alone]
+    cameras = [camera_from_sensor(read_sensor(one, splats.near).detach()) for one in alone]
     count = len(surfaces_in(scene))
-    return described(summary_of_sensors(splats, cameras, scene.environment(), count))
+    return format_effects(summary_of_sensors(splats, cameras, scene.environment(), count))
 
 
 def summary_of_sensors(
@@ -106,7 +106,7 @@ def summary_of_views(
     """Return the effects for views; said: approximations that the Gaussians' file decided."""
     count = f"{len(views)} cameras"
     of_cameras = [
-        effect_of(views, count).unless(word in splats.ignore)
+        effect_of(views, count).unless_ignored(word in splats.ignore)
         for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
     ]
     return _summary_of_integrator(splats, None, of_cameras, said)
@@ -152,11 +152,11 @@ def _lens_words(lens: Lens) -> str | None:
 
 def antialiasing_effect(opacities: str | None, smoothing: str | None) -> SimulatedEffect:
     """Return the effect, from what asked for compensated opacities and the smoothing filter."""
-    what = joined(
+    what = join_parts(
         "opacities compensated for the low-pass filter" if opacities else None,
         "3D smoothing filter" if smoothing else None,
     )
-    return SimulatedEffect("antialiasing", what, joined(opacities, smoothing) or "")
+    return SimulatedEffect("antialiasing", what, join_parts(opacities, smoothing) or "")
 
 
 def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
@@ -179,6 +179,6 @@ def motion_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras")
     return SimulatedEffect("motion", shutters or None, f"{len(moving)} of {of}")
 
 
-def joined(*parts: str | None) -> str | None:
+def join_parts(*parts: str | None) -> str | None:
     """Join the parts that are not None by commas; None if there is none."""
     return ", ".join(part for part in parts if part) or None

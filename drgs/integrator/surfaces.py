@@ -28,7 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.core.arrays import image_of, planes_of
-from drgs.core.errors import PluginError, UnsupportedError, listed, one_line, root_cause
+from drgs.core.errors import PluginError, UnsupportedError, format_names, one_line, root_cause
 from drgs.core.private import same_variables
 from drgs.integrator.derivatives import Parameter, attached_parameters, parameter_value, type_of
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
@@ -69,7 +69,7 @@ class Surfaces:
     is_transparent: bool  # in parts: whether anything lets light pass straight on
 
     @staticmethod
-    def of(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
+    def find(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
         """Find the surfaces of a scene, or return ``last`` if they are still the same."""
         objects, parameters = _surroundings(scene)
         has_gaussians = any(shape.is_ellipsoids() for shape in scene.shapes())
@@ -83,7 +83,7 @@ class Surfaces:
         apart = scene_of(objects) if has_gaussians else None
         return Surfaces(objects, dr.detach(parameters), apart, has_transparent_parts(scene))
 
-    def traced(self, scene: mi.Scene) -> mi.Scene:
+    def scene_to_trace(self, scene: mi.Scene) -> mi.Scene:
         """Return the scene that the nested integrator renders; scene: the one that these are of."""
         return scene if self.apart is None else self.apart
 
@@ -165,7 +165,7 @@ class Insertion:
 
     def develop(self, image: mi.TensorXf, nested: list[mi.TensorXf]) -> mi.TensorXf:
         """Develop the image of all, which the film then holds."""
-        channels = self._inserted(planes_of(image), [planes_of(each) for each in nested])
+        channels = self._insert(planes_of(image), [planes_of(each) for each in nested])
         return develop_pixels(self.film, channels, self.aovs)
 
     def adjoint(
@@ -175,7 +175,7 @@ class Insertion:
         planes = planes_of(image), [planes_of(each) for each in nested]
         with dr.resume_grad():
             dr.enable_grad(planes)
-            channels = self._inserted(*planes)
+            channels = self._insert(*planes)
             dr.accum_grad(channels, film_adjoint(self.film, self.maps, grad_in, self.aovs))
             dr.enqueue(dr.ADMode.Backward, channels)
             dr.traverse(dr.ADMode.Backward)
@@ -198,22 +198,22 @@ class Insertion:
         with dr.resume_grad():
             dr.enable_grad(planes)
             dr.set_grad(planes, d_planes)
-            channels = self._inserted(*planes)
+            channels = self._insert(*planes)
             dr.forward_to(channels)
             tangents = dr.grad(channels)
         dr.eval(tangents)
         return develop_pixels(self.film, tangents, self.aovs)
 
-    def _inserted(self, planes: list[mi.Float], nested: list[list[mi.Float]]) -> Channels:
+    def _insert(self, planes: list[mi.Float], nested: list[list[mi.Float]]) -> Channels:
         to_developed, to_rgb = self._color_maps()
         count = len(to_developed)
         rest, own = planes[count : -len(self.channels)], planes[-len(self.channels) :]
         behind = _apply_map(to_developed, own[2 * self.num_surfaces :]) or [mi.Float(0)] * count
-        shown = self.shown(own, [*(each[:count] for each in nested), behind])
+        shown = self.visible_radiance(own, [*(each[:count] for each in nested), behind])
         colors = [s + c for s, c in zip(shown, planes[:count], strict=True)]
         return [*_apply_map(to_rgb, colors), *rest]
 
-    def shown(self, own: list[mi.Float], images: list[list[mi.Float]]) -> list[mi.Float]:
+    def visible_radiance(self, own: list[mi.Float], images: list[list[mi.Float]]) -> list[mi.Float]:
         """Return the sum of what surfaces show past the splats.
 
         own: channels of :meth:`values`; images: colours of N_0, N_1, ..., the last of which is
@@ -317,7 +317,7 @@ class Hybrid:
     def tangents(self, params: object, images: list[mi.TensorXf]) -> list[mi.TensorXf]:
         """Return derivatives of the nested images along those set on the parameters."""
 
-        def along(sensor: mi.Sensor) -> mi.TensorXf:
+        def render_nested(sensor: mi.Sensor) -> mi.TensorXf:
             return self.adjoint_integrator.render_forward(
                 self.rays.scene, params, sensor, self.seed, self.spp
             )
@@ -329,7 +329,7 @@ class Hybrid:
                 # objects have computed from their parameters must be known before.
                 dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
                 dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-                found = self._where_they_matter(along)
+                found = self._where_they_matter(render_nested)
         pairs = zip(found, images, strict=True)
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 
@@ -379,7 +379,7 @@ class Hybrid:
             except Exception as error:
                 raise UnsupportedError(
                     f"splats: {type_of(self.adjoint_integrator)} does not differentiate the "
-                    f"surfaces with respect to {listed([p.name for p in parameters])}: "
+                    f"surfaces with respect to {format_names([p.name for p in parameters])}: "
                     f"{one_line(root_cause(error))}"
                 ) from None
 

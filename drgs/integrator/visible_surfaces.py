@@ -38,7 +38,7 @@ class VisibleSurface(Surface):
 
     normal: mi.Normal3f | None  # world, times the coverage; None where no AOV needs it
 
-    def at(self, pixel: mi.UInt32) -> VisibleSurface:
+    def gather(self, pixel: mi.UInt32) -> VisibleSurface:
         return VisibleSurface(
             dr.gather(mi.Float, self.depth, pixel),
             dr.gather(mi.Float, self.coverage, pixel),
@@ -127,13 +127,13 @@ class _Tracer:
             is_last = len(layers) == MAX_SURFACES - 1
             if goes_on and is_last:
                 opacity = 1 - (1 - opacity) * self.rays.transmittance(
-                    self.rays.behind(ray, hit, active), active
+                    self.rays.continue_rays(ray, hit, active), active
                 )
             layers.append(self._surface(camera, ray, hit, rest * opacity))
             if not goes_on or is_last:
                 return layers
             rest = dr.select(active, rest * (1 - opacity), 0)
-            ray = self.rays.behind(ray, hit, active)
+            ray = self.rays.continue_rays(ray, hit, active)
             dr.eval(ray, rest, active)
 
     def _camera_rays(self, camera: Camera, place: mi.Point2f) -> tuple[mi.Ray3f, mi.Bool]:
@@ -184,7 +184,7 @@ class _Tracer:
             for neighbour in (down - 1, down, down + 1):
                 differs |= dr.gather(mi.Float, rest, neighbour) != own
         edge = mi.UInt32(dr.compress(differs))
-        layers = [surface.at(number) for surface in around]
+        layers = [surface.gather(number) for surface in around]
         if dr.width(edge) == 0:
             return layers
         corner = dr.gather(mi.Point2f, corner, edge)

@@ -79,7 +79,7 @@ class ColmapCamera:
     height: int  # px
     values: tuple[float, ...]  # in the order of MODELS; px, and coefficients of distortion
 
-    def named(self) -> dict[str, float]:
+    def named_values(self) -> dict[str, float]:
         """Return the values by name."""
         return dict(zip(MODELS[self.model][1], self.values, strict=True))
 

@@ -82,10 +82,13 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     index, others = drop_largest_component(normalize_quaternions(g["quats"]))
     others = others / (2 * QUATERNION_RANGE) + 0.5
     parts["packed_rotation"] = np.column_stack([index / 3, others])
-    words = np.column_stack([_packed(parts[name], bits) for name, bits in BITS.items()])
+    words = np.column_stack([_pack_words(parts[name], bits) for name, bits in BITS.items()])
     chunk = np.concatenate([side for pair in bounds.values() for side in pair], axis=1)
     names = [f"{s}_{n}" for names in BOUNDED.values() for s in ("min", "max") for n in names]
-    elements = {"chunk": _structured(names, chunk), "vertex": _structured(list(BITS), words)}
+    elements = {
+        "chunk": _structured_array(names, chunk),
+        "vertex": _structured_array(list(BITS), words),
+    }
     if g["shN"].shape[1]:
         elements["sh"] = _packed_harmonics(g["shN"])
     return encode_elements(elements, rendered_with)
@@ -99,7 +102,7 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
         values = sh[:, column % count, column // count].astype(np.float64)
         level = np.floor((values / (2 * SH_RANGE) + 0.5) * SH_LEVELS)
         levels[:, column] = np.clip(level, 0, SH_LEVELS - 1)
-    return _structured([f"f_rest_{i}" for i in range(3 * count)], levels)
+    return _structured_array([f"f_rest_{i}" for i in range(3 * count)], levels)
 
 
 def _bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +119,7 @@ def _parts(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.clip((values - low) / np.where(high > low, high - low, 1), 0, 1)
 
 
-def _packed(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+def _pack_words(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Return words (N,) of numbers from 0 to 1 (N, len(bits))."""
     word = np.zeros(len(parts), "<u4")
     for column, count in enumerate(bits):
@@ -125,7 +128,7 @@ def _packed(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     return word
 
 
-def _structured(names: list[str], rows: np.ndarray) -> np.ndarray:
+def _structured_array(names: list[str], rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in names])[:, 0]
 
 
@@ -147,14 +150,14 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
             f"{path}: element chunk must have a row for each {CHUNK} of the {len(vertex):,} "
             f"vertices, {expected:,}, got {len(chunk):,}"
         )
-    rotation = _unpacked(vertex, "packed_rotation")
+    rotation = _unpack_words(vertex, "packed_rotation")
     largest, others = np.round(3 * rotation[:, 0]), (rotation[:, 1:] - 0.5) * (2 * QUATERNION_RANGE)
-    color = _between(path, rows, "packed_color")
+    color = _dequantize(path, rows, "packed_color")
     arrays = {
-        "means": _between(path, rows, "packed_position"),
+        "means": _dequantize(path, rows, "packed_position"),
         "quats": restore_largest_component(largest.astype(np.intp), others).astype(np.float32),
-        "log_scales": _between(path, rows, "packed_scale"),
-        "logit_opacities": logits_from_opacities(_unpacked(vertex, "packed_color")[:, 3]),
+        "log_scales": _dequantize(path, rows, "packed_scale"),
+        "logit_opacities": logits_from_opacities(_unpack_words(vertex, "packed_color")[:, 3]),
         "sh0": sh0_from_colors(color),
         "shN": _harmonics(path, sh, len(vertex)),
     }
@@ -172,10 +175,10 @@ def _require(
         )
 
 
-def _between(path: str | Path, rows: Mapping[str, np.ndarray], word: str) -> np.ndarray:
+def _dequantize(path: str | Path, rows: Mapping[str, np.ndarray], word: str) -> np.ndarray:
     """Return the values (N, 3) of a word, which lie between the bounds of their groups."""
     names, chunk = BOUNDED[word], rows["chunk"]
-    parts = _unpacked(rows["vertex"], word)[:, :3]
+    parts = _unpack_words(rows["vertex"], word)[:, :3]
     if word == "packed_color" and "min_r" not in (chunk.dtype.names or ()):
         return parts
     _require(path, "chunk", chunk, [f"{s}_{n}" for s in ("min", "max") for n in names], "f4")
@@ -195,8 +198,8 @@ def _between(path: str | Path, rows: Mapping[str, np.ndarray], word: str) -> np.
         return low[group] * (1 - parts) + high[group] * parts
 
 
-def _unpacked(vertex: np.ndarray, word: str) -> np.ndarray:
-    """Return the numbers from 0 to 1 (N, len(bits)) of a word: see :func:`_packed`."""
+def _unpack_words(vertex: np.ndarray, word: str) -> np.ndarray:
+    """Return the numbers from 0 to 1 (N, len(bits)) of a word: see :func:`_pack_words`."""
     words, bits = vertex[word].astype(np.uint32), BITS[word]
     shifts = [sum(bits[column + 1 :]) for column in range(len(bits))]
     columns = [

@@ -132,7 +132,7 @@ def readable_formats() -> list[Extension[type[FileFormat]]]:
 
 
 def _shipped_formats() -> list[Extension[type[FileFormat]]]:
-    return [FORMATS.get(name) for name in FORMATS.shipped]
+    return [FORMATS.get(name) for name in FORMATS.shipped_names]
 
 
 def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
@@ -140,7 +140,7 @@ def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
 
     Installed packages are imported only where no format that drgs ships has such a suffix.
     """
-    for formats in (_shipped_formats, FORMATS.installed):
+    for formats in (_shipped_formats, FORMATS.installed_extensions):
         found = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
         if found:
             return max(found, key=lambda each: len(each.value.suffix))
@@ -167,7 +167,7 @@ def read_gaussians(
                 if not extension.value().recognizes(Path(path)):
                     continue
                 arrays, rendered_with = extension.value().read(Path(path))
-                return extension, _checked(path, arrays), dict(rendered_with)
+                return extension, _check_arrays(path, arrays), dict(rendered_with)
         except ExtensionError as error:
             raise ExtensionError(f"{path}: {error}") from error.__cause__
     raise UserError(f"{path}: not a {named.name} file")
@@ -195,7 +195,7 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
         return extension.value().encode(gaussians, kept)
 
 
-def _checked(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
+def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
     """Return what a format has read as float32; raise ValueError where it is not :data:`Arrays`."""
     if set(arrays) - {"smoothing"} != set(SHAPES) - {"smoothing"}:
         raise ValueError(f"arrays must be {', '.join(SHAPES)}, got {', '.join(arrays)}")

@@ -47,7 +47,7 @@ MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
 """Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several images."""
 
 
-def _transposed(pixels: np.ndarray) -> np.ndarray:
+def _transpose(pixels: np.ndarray) -> np.ndarray:
     return pixels.swapaxes(0, 1)
 
 
@@ -56,10 +56,10 @@ ORIENTATIONS = {
     2: (np.fliplr,),
     3: (np.flipud, np.fliplr),
     4: (np.flipud,),
-    5: (_transposed,),
-    6: (_transposed, np.fliplr),
-    7: (_transposed, np.flipud, np.fliplr),
-    8: (_transposed, np.flipud),
+    5: (_transpose,),
+    6: (_transpose, np.fliplr),
+    7: (_transpose, np.flipud, np.fliplr),
+    8: (_transpose, np.flipud),
 }
 """Turns that make an image upright, by EXIF's orientation."""
 
@@ -107,14 +107,14 @@ class ImageHeader:
 
 def read_header(path: Path) -> ImageHeader:
     """Return the header of an image; raises :class:`UserError` for a file that is none."""
-    with _opened(path) as image:
+    with _open_image(path) as image:
         alpha, orientation = _has_alpha(image), _orientation(image)
         return ImageHeader(_stored_size(image), image.format or "", image.mode, alpha, orientation)
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, px, from the file's header."""
-    with _opened(path) as image:
+    with _open_image(path) as image:
         return _stored_size(image)
 
 
@@ -150,7 +150,7 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def unused_content(path: Path) -> list[str]:
     """Describe content of an image that :func:`read_pixels` does not use; from its header."""
-    with _opened(path) as image:
+    with _open_image(path) as image:
         found = []
         if _bits(image) > BITS.get(image.mode, 8):
             found.append(f"of {_bits(image)} bits a channel, of which 8 are used")
@@ -198,7 +198,7 @@ def as_numbers(pixels: np.ndarray) -> np.ndarray:
 
 def check_readable(path: Path) -> None:
     """Raise :class:`UserError` as :func:`read_pixels` does, as far as a header tells."""
-    with _opened(path) as image:
+    with _open_image(path) as image:
         _check(path, image)
 
 
@@ -209,7 +209,7 @@ def read_pixels(path: Path) -> np.ndarray:
 
     Raises :class:`UserError` for a file that is no such image.
     """
-    with _opened(path) as image:
+    with _open_image(path) as image:
         _check(path, image)  # before memory is allocated for it
         needed = image.width * image.height * PIXEL_BYTES
         require_memory(path, needed, f"a image of {image.width} x {image.height} px")
@@ -249,7 +249,7 @@ def _check(path: Path, image: Image.Image) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[ImageFile.ImageFile]:
+def _open_image(path: Path) -> Iterator[ImageFile.ImageFile]:
     """Open an image without decoding it; errors within the block become the user's."""
     try:
         with open_regular(path, "image", MAX_BYTES) as file, Image.open(file) as image:

@@ -32,7 +32,7 @@ from typing import IO
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 
-from drgs.core.errors import UserError, UserNote, listed, one_line
+from drgs.core.errors import UserError, UserNote, format_names, one_line
 from drgs.core.files import open_regular
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD, near_means
@@ -174,7 +174,7 @@ def has_packed_vertices(path: str | Path) -> bool:
 
     Raises :class:`UserError` as :func:`read_elements` does for a header.
     """
-    with _opened(path) as (_, header):
+    with _open_after_header(path) as (_, header):
         names = [p.name for each in header.elements for p in each.properties]
         return "chunk" in header.counts and "packed_position" in names
 
@@ -189,16 +189,16 @@ def read_elements(
     Raises :class:`UserError` naming the file and what it lacks: it must be whole, and each of the
     elements must have numbers only.
     """
-    with _opened(path) as (file, header):
+    with _open_after_header(path) as (file, header):
         wanted = [each for each in header.elements if each.name in names]
         size = sum(header.counts[each.name] * each.dtype().itemsize for each in wanted)
-        require_memory(path, ROWS_AND_COPIES * size, header.promised)
+        require_memory(path, ROWS_AND_COPIES * size, header.expected_rows)
         rows = (_text_rows if header.text else _binary_rows)(path, file, header, names)
         for name in ("vertex", *(each.name for each in wanted)):
             if name not in rows or not len(rows[name]):
                 raise UserError(
                     f"{path}: element {name} must have at least 1 row, no lists, and come before "
-                    f"elements that have; the file has {header.promised}"
+                    f"elements that have; the file has {header.expected_rows}"
                 )
         return rows, header.statements
 
@@ -215,13 +215,13 @@ class _Header:
     end: int  # byte: of the file
 
     @property
-    def promised(self) -> str:
+    def expected_rows(self) -> str:
         """The rows, as messages name them."""
-        return listed([f"{n} of {one_line(name, 60)}" for name, n in self.counts.items()])
+        return format_names([f"{n} of {one_line(name, 60)}" for name, n in self.counts.items()])
 
 
 @contextmanager
-def _opened(path: str | Path) -> Iterator[tuple[IO[bytes], _Header]]:
+def _open_after_header(path: str | Path) -> Iterator[tuple[IO[bytes], _Header]]:
     """Open a file after its header; whatever fails in the block becomes a :class:`UserError`."""
     try:
         with open_regular(path) as file:
@@ -343,8 +343,8 @@ def _check_end(path: str | Path, header: _Header, more: int) -> None:
     if more:
         raise UserError(
             f"{path}: the file must end after the rows that its header promises "
-            f"({header.promised}), got {more:,} bytes more; correct the header's counts, or get "
-            "the file again"
+            f"({header.expected_rows}), got {more:,} bytes more; correct the header's counts, or "
+            "get the file again"
         )
 
 

@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.core.environment import required
+from drgs.core.environment import require_module
 from drgs.core.errors import Place, UserError, UserNote, one_line
 from drgs.core.files import read_bytes
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
@@ -306,7 +306,7 @@ def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
 
 def _unpacked_stream(place: Place, packed: bytes, expected: int) -> bytes:
     what = f"{place.path}: an SPZ file of version 4"
-    zstandard = required("zstandard", "spz", what)
+    zstandard = require_module("zstandard", "spz", what)
     try:
         stream = zstandard.ZstdDecompressor().stream_reader(packed)
         return _checked_size(place, stream.read(expected), expected)

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drgs.core.environment import required
+from drgs.core.environment import require_module
 from drgs.core.errors import UserError
 from drgs.core.origin import WORLD
 from drgs.io.formats import FORMATS, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
@@ -36,7 +36,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
 
     Raises :class:`UserError` where OpenUSD is not installed or too old.
     """
-    required("pxr", "usd", "USD")
+    require_module("pxr", "usd", "USD")
     # OpenUSD has no stubs.
     Sdf, Usd, UsdGeom, UsdVol, Vt = (
         import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt")

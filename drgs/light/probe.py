@@ -79,7 +79,7 @@ class Probes:
     places: Float  # 2 a texel: coverage, and coverage by distance
 
     @staticmethod
-    def of(
+    def render(
         gaussians: Gaussians,
         pipeline: rendering.Pipeline,
         centers: np.ndarray,
@@ -97,7 +97,7 @@ class Probes:
         planes = np.zeros((len(centers), 4)) if planes is None else planes
         texels, nearest = [], []
         for center, plane in zip(centers, planes, strict=True):
-            beyond = _beyond(t, plane, pipeline)
+            beyond = _clip_to_plane(t, plane, pipeline)
             faces = [_face(center, k, gaussians, beyond, near, decode) for k in range(6)]
             levels = [_concatenate(faces)]
             for level in range(1, LEVELS):
@@ -142,10 +142,10 @@ class Probes:
 
         active &= dr.dot(dr.gather(t.Array3f, self.normals, probe, active), direction) >= 0
         u, meets, is_known = self._search(
-            place, end, _Cube.of(probe, dr.minimum(level, FINE)), active
+            place, end, _Cube.from_level(probe, dr.minimum(level, FINE)), active
         )
         is_known &= active
-        v, texels = place(u), _Cube.of(probe, level).around(place(u))
+        v, texels = place(u), _Cube.from_level(probe, level).bilinear_texels(place(u))
         colors = [w * dr.gather(t.Array4f, self.colors, texel, is_known) for texel, w in texels]
         places = [w * dr.gather(t.Array2f, self.places, texel, is_known) for texel, w in texels]
         red, green, blue, _ = sum(colors[1:], colors[0])
@@ -190,7 +190,9 @@ class Probes:
         return dr.select(meets, high, end), meets, is_known
 
 
-def _beyond(t: ArrayTypes, plane: np.ndarray, pipeline: rendering.Pipeline) -> rendering.Pipeline:
+def _clip_to_plane(
+    t: ArrayTypes, plane: np.ndarray, pipeline: rendering.Pipeline
+) -> rendering.Pipeline:
     """Return a pipeline that leaves out Gaussians whose means are on the other side of a plane."""
     *normal, offset = (dr.opaque(t.Float, float(value)) for value in plane)
 
@@ -217,7 +219,7 @@ class _Cube:
     size: UInt32  # texels of an edge, without border
 
     @staticmethod
-    def of(probe: UInt32, level: UInt32) -> _Cube:
+    def from_level(probe: UInt32, level: UInt32) -> _Cube:
         UInt32 = type(level)
         before, first = 0, UInt32(0)
         for k in range(LEVELS):
@@ -233,7 +235,7 @@ class _Cube:
         column, row = (dr.minimum(UInt32(place * size), last) + BORDER for place in (x, y))
         return self._texel(face, column, row)
 
-    def around(self, v: Array3f) -> list[tuple[UInt32, Float]]:
+    def bilinear_texels(self, v: Array3f) -> list[tuple[UInt32, Float]]:
         """Return four texels around the direction of a vector, and their weights."""
         face, x, y = _place_on_cube(v)
         UInt32, Float = type(self.size), type(x)
@@ -325,7 +327,7 @@ def _halve(columns: list[Float], size: int) -> list[Float]:
         right, down = (
             (t.Float(p) + (d - BORDER)) * (2 / size) - 1 for p, d in ((column, dx), (row, dy))
         )
-        for texel, weight in larger.around(_vector_to(face, right, down)):
+        for texel, weight in larger.bilinear_texels(_vector_to(face, right, down)):
             values = (dr.gather(t.Float, values, texel) for values in columns)
             means = [dr.fma(0.25 * weight, v, m) for v, m in zip(values, means, strict=True)]
     dr.eval(means)

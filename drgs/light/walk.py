@@ -70,7 +70,7 @@ class RaySplats:
     cutoffs: Cutoffs
 
     @staticmethod
-    def of(rows: GaussianRows, sh_degree: int, cutoffs: Cutoffs) -> RaySplats:
+    def from_gaussians(rows: GaussianRows, sh_degree: int, cutoffs: Cutoffs) -> RaySplats:
         """Copy the Gaussians, and sort them into a grid. Waits for the device.
 
         rows: detached, as a pipeline has them. Those that are not finite, or reach beyond
@@ -93,8 +93,8 @@ class RaySplats:
         exists = (exponent > 0) & dr.isfinite(total)
         ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
         exists &= dr.max(dr.abs(ellipsoids.centers) + ellipsoids.half_sizes()) < FARTHEST
-        shapes = Rows.of([*numbers, *[t.Float(0)] * (16 - _SHAPE)])
-        colors = Rows.of(sh)
+        shapes = Rows.from_columns([*numbers, *[t.Float(0)] * (16 - _SHAPE)])
+        colors = Rows.from_columns(sh)
         ellipsoids = replace(ellipsoids, exist=exists)
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
@@ -104,7 +104,7 @@ class RaySplats:
 
         Return the sum of w_i c_i, display space, and the transmittance.
         """
-        walk = _Walk.along(self, segment)
+        walk = _Walk.from_segment(self, segment)
         t = types_of(self.shapes.Float)
         basis = sh_basis(walk.direction, self.sh_degree)
 
@@ -113,7 +113,7 @@ class RaySplats:
             T, color, last = walk.composite(window, basis, T, color)
             # What did not fit comes behind what was composited, and is in the same list.
             last = [dr.select(overflows, last[0], -dr.inf), last[1]]
-            return at.back(overflows), last, T, color
+            return at.rewind(overflows), last, T, color
 
         size = dr.width(walk.origin)
         _, _, T, color = dr.while_loop(
@@ -143,19 +143,19 @@ class RaySplats:
         each whether it exists, independent of them, with the probability 1 - T; and an estimate of
         T, which is independent of the colours.
         """
-        walk = _Walk.along(self, segment)
+        walk = _Walk.from_segment(self, segment)
         t = types_of(self.shapes.Float)
 
         def offer(
             coverage: Float, draws: list, row: UInt32, peak: Float, log2_alpha: Float
         ) -> tuple:
-            chances = _Chances.of(walk.alpha(log2_alpha), coverage)
+            chances = _Chances.from_alpha(walk.alpha(log2_alpha), coverage)
             words = _hashes(row, seed, count)
             drawn = [one.offer(row, peak, chances, u) for one, u in zip(draws, words, strict=True)]
             return chances.coverage, drawn
 
         def choose(at: _Place, coverage: Float, draws: list) -> tuple:
-            at, row, peak, log2_alpha = walk.next(at)
+            at, row, peak, log2_alpha = walk.read_entry(at)
             return at, *dr.if_stmt(
                 args=(coverage, draws, row, peak, log2_alpha),
                 cond=(log2_alpha > -dr.inf) & (peak < _farthest(draws)),
@@ -209,11 +209,11 @@ class RaySplats:
 
     def transmittance(self, segment: Segment, least: Float) -> Float:
         """Return what segments let through; where that is less than ``least``, anything less."""
-        walk = _Walk.along(self, segment)
+        walk = _Walk.from_segment(self, segment)
         t = types_of(self.shapes.Float)
 
         def weaken(at: _Place, T: Float) -> tuple:
-            at, _, _, log2_alpha = walk.next(at)
+            at, _, _, log2_alpha = walk.read_entry(at)
             return at, dr.fma(-walk.alpha(log2_alpha), T, T)
 
         def body(at: _Place, T: Float) -> tuple:
@@ -256,7 +256,7 @@ class _Place:
         """Return whether the list goes on, and other rays need not find another cell first."""
         return (self.entry < self.last) & (self.turn < TURNS)
 
-    def back(self, goes_back: Bool) -> _Place:
+    def rewind(self, goes_back: Bool) -> _Place:
         """Return to the beginning of the list that was read last, on some rays."""
         return replace(self, entry=dr.select(goes_back, self.first, self.entry))
 
@@ -271,7 +271,7 @@ class _Walk:
     stop: Float  # where it ends, or leaves the grid
 
     @staticmethod
-    def along(splats: RaySplats, segment: Segment) -> _Walk:
+    def from_segment(splats: RaySplats, segment: Segment) -> _Walk:
         start, end = splats.grid.span(segment.origin, segment.direction)
         start = dr.select(start > 0, start, 0)
         end = dr.select(end < segment.far, end, segment.far)
@@ -295,7 +295,7 @@ class _Walk:
         )
         return replace(at, turn=type(at.turn)(0))
 
-    def next(self, at: _Place) -> tuple[_Place, UInt32, Float, Float]:
+    def read_entry(self, at: _Place) -> tuple[_Place, UInt32, Float, Float]:
         """Read the next entry: place behind it, Gaussian, where it is met, log2 of its alpha."""
         UInt32 = type(at.entry)
         row = dr.gather(UInt32, self.splats.grid.rows, at.entry)
@@ -336,7 +336,7 @@ class _Walk:
         t = types_of(self.splats.shapes.Float)
 
         def insert(at: _Place, window: list, overflows: Bool) -> tuple:
-            at, row, peak, log2_alpha = self.next(at)
+            at, row, peak, log2_alpha = self.read_entry(at)
             behind = (peak > last[0]) | ((peak == last[0]) & (row > last[1]))
             peak = dr.select(behind & (log2_alpha > -dr.inf), peak, dr.inf)
             item, kept = [peak, row, log2_alpha], []
@@ -448,7 +448,7 @@ class _Chances:
     coverage: Float  # A'
 
     @staticmethod
-    def of(alpha: Float, coverage: Float) -> _Chances:
+    def from_alpha(alpha: Float, coverage: Float) -> _Chances:
         """Compute them for a splat; coverage: before it."""
         t = types_of(type(alpha))
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.progress import RunProgress
 from drgs.config.schema import DataConfig
-from drgs.core.errors import listed
+from drgs.core.errors import format_names
 from drgs.datasets.folders import find_reader
 from drgs.poses.structure_from_motion import (
     ALL_PAIRS,
@@ -100,13 +100,13 @@ def description_of(placed: Placed, search: Search) -> str:
         *(f"camera: {camera}" for camera in placed.cameras[:MAX_NAMES]),
     ]
     if placed.missing:
-        lines.append(f"without a camera: {listed(placed.missing, MAX_NAMES)}")
+        lines.append(f"without a camera: {format_names(placed.missing, MAX_NAMES)}")
         others = placed.num_models - 1
         if others:
             lines.append(f"smaller models that do not hang together with this one: {others}")
         lines.append(
             "photographs that show what lies between would place them; so may "
-            f"{search.others(total)}"
+            f"{search.alternative_options(total)}"
         )
     return "\n".join(lines)
 

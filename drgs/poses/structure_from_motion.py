@@ -24,8 +24,8 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from drgs.core.child_process import ChildEndedError, DeferredInterrupts, run_in_child
-from drgs.core.environment import required
-from drgs.core.errors import UserError, UserNote, listed, one_line
+from drgs.core.environment import require_module
+from drgs.core.errors import UserError, UserNote, format_names, one_line
 from drgs.core.files import why_refused
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.colmap import find_model
@@ -93,7 +93,7 @@ class Search:
         """Return whether every two of ``count`` photographs are compared."""
         return self.compare == "all" or (self.compare == "auto" and count <= ALL_PAIRS)
 
-    def others(self, count: int) -> str:
+    def alternative_options(self, count: int) -> str:
         """Return options that may place more of ``count`` photographs, as text."""
         options = {
             "--compare all": not self.compares_all(count),
@@ -131,7 +131,9 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     found = without_masks([p for p in found if is_image(p.name) and p.is_file()])
     found.sort(key=_numeric_order)
     files = [path for path in found if path.suffix.lower() in SUFFIXES]
-    others = listed([path.relative_to(photographs) for path in found if path not in set(files)])
+    others = format_names(
+        [path.relative_to(photographs) for path in found if path not in set(files)]
+    )
     if not files:
         got = f"{others}, which COLMAP does not read; convert them to JPEG" if others else "none"
         if not others and (below := explain_photographs(folder)):
@@ -233,7 +235,7 @@ def _find(
     watch: Watch,
 ) -> Placed:
     """Write ``folder/model``: the function of the child process."""
-    pycolmap = required("pycolmap", "colmap", "structure from motion")
+    pycolmap = require_module("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # errors are reported below
     try:
         found, count = _Reconstruction(
@@ -242,7 +244,7 @@ def _find(
         written = folder / "model"
         written.mkdir()
         found.write_binary(written)
-        return _described(found, names, count)
+        return _summarize(found, names, count)
     except UserError:
         raise
     except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
@@ -277,7 +279,7 @@ class _Reconstruction:
                 f"{self.photographs}: no cameras were found; take more photographs, neither "
                 "blurred nor of something plain, each showing most of what its neighbours show, "
                 "while walking around (not turning on the spot), or try "
-                f"{self.search.others(len(self.names))}"
+                f"{self.search.alternative_options(len(self.names))}"
             )
         return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), len(models)
 
@@ -427,7 +429,7 @@ def _size_and_lens(file: Path) -> tuple[object, ...]:
     return *image_size(file), *map(str, lens)
 
 
-def _described(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> Placed:
+def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> Placed:
     placed = {image.name for image in found.images.values() if image.has_pose}
     cameras = tuple(
         f"{camera.model.name} {camera.width} x {camera.height} px "

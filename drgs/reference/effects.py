@@ -157,7 +157,7 @@ class OpenCV(Lens):
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return (M, 2), px, film."""
         slopes = points[:, :2] / points[:, 2:]
-        return _focal(camera) * self.distorted(slopes) + _principal(camera)
+        return _focal(camera) * self.distort(slopes) + _principal(camera)
 
     def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return (M,) bool: z >= near, and the slope's length is below ``valid_radius``.
@@ -176,10 +176,10 @@ class OpenCV(Lens):
         slopes of the others need not hold all that the film shows.
         """
         border = (_film_border(camera) - _principal(camera)) / _focal(camera)
-        slopes = self.undistorted(border)
+        slopes = self.undistort(border)
         return (slopes.min(axis=0), slopes.max(axis=0)) if np.isfinite(slopes).all() else None
 
-    def distorted(self, slopes: np.ndarray) -> np.ndarray:
+    def distort(self, slopes: np.ndarray) -> np.ndarray:
         """Return (..., 2) distorted slopes of slopes (..., 2), which may be complex."""
         x, y = slopes[..., 0], slopes[..., 1]
         r2 = x * x + y * y
@@ -222,12 +222,12 @@ class OpenCV(Lens):
         slopes = radii[:, None] * -_unit(np.array([self.p2, self.p1]))
         return _least_eigenvalues(radial, slopes) + _least_eigenvalues(tangential, slopes) - 1
 
-    def undistorted(self, slopes: np.ndarray) -> np.ndarray:
+    def undistort(self, slopes: np.ndarray) -> np.ndarray:
         """Return the slopes (M, 2) within ``valid_radius`` that are distorted to ``slopes`` (M, 2).
 
         NaN where there is none.
         """
-        return _undistorted(self, slopes, self.valid_radius)
+        return _undistort(self, slopes, self.valid_radius)
 
 
 @dataclass(frozen=True)
@@ -297,10 +297,10 @@ class ThinPrismFisheye(Fisheye):
         """Return (M, 2), px, film."""
         rho = np.linalg.norm(points[:, :2], axis=1)
         theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
-        distorted = self.distorted(theta_by_rho[:, None] * points[:, :2])
+        distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
         return _focal(camera) * distorted + _principal(camera)
 
-    def distorted(self, places: np.ndarray) -> np.ndarray:
+    def distort(self, places: np.ndarray) -> np.ndarray:
         """Return (..., 2) places (u', v') of places (u, v) (..., 2), which may be complex."""
         u, v = places[..., 0], places[..., 1]
         r2 = u * u + v * v
@@ -339,12 +339,12 @@ class ThinPrismFisheye(Fisheye):
         places = radii[:, None] * -_unit(4 * p + s)
         return _least_eigenvalues(radial, places) + _least_eigenvalues(others, places) - 1
 
-    def undistorted(self, places: np.ndarray) -> np.ndarray:
+    def undistort(self, places: np.ndarray) -> np.ndarray:
         """Return the places (M, 2) within ``valid_angle`` that are distorted to ``places`` (M, 2).
 
         NaN where there is none.
         """
-        return _undistorted(self, places, self.valid_angle)
+        return _undistort(self, places, self.valid_angle)
 
 
 @dataclass(frozen=True)
@@ -362,8 +362,8 @@ class Orthographic(Lens):
 
 
 def _jacobians(lens: OpenCV | ThinPrismFisheye, places: np.ndarray) -> np.ndarray:
-    """Return (M, 2, 2): derivatives of ``lens.distorted`` at places (M, 2), by complex steps."""
-    columns = [np.imag(lens.distorted(places + 1e-30j * axis)) / 1e-30 for axis in np.eye(2)]
+    """Return (M, 2, 2): derivatives of ``lens.distort`` at places (M, 2), by complex steps."""
+    columns = [np.imag(lens.distort(places + 1e-30j * axis)) / 1e-30 for axis in np.eye(2)]
     return np.stack(columns, axis=-1)
 
 
@@ -379,7 +379,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / length if length > 0 else np.array([1.0, 0.0])
 
 
-def _undistorted(lens: OpenCV | ThinPrismFisheye, targets: np.ndarray, radius: float) -> np.ndarray:
+def _undistort(lens: OpenCV | ThinPrismFisheye, targets: np.ndarray, radius: float) -> np.ndarray:
     """Return the places (M, 2) within ``radius`` that are distorted to targets (M, 2), or NaN.
 
     Newton's method from the target; its step is halved until it stays within the radius and lessens
@@ -389,10 +389,10 @@ def _undistorted(lens: OpenCV | ThinPrismFisheye, targets: np.ndarray, radius: f
     guesses = targets * np.minimum(1.0, 0.9 * radius / np.maximum(lengths, 1e-300))
     fractions = 0.5 ** np.arange(40.0)[:, None, None]
     for _ in range(100):
-        errors = targets - lens.distorted(guesses)
+        errors = targets - lens.distort(guesses)
         steps = np.linalg.solve(_jacobians(lens, guesses), errors[..., None])[..., 0]
         candidates = guesses + fractions * steps
-        left = np.linalg.norm(targets - lens.distorted(candidates), axis=-1)
+        left = np.linalg.norm(targets - lens.distort(candidates), axis=-1)
         better = (np.linalg.norm(candidates, axis=-1) < radius) & (
             left < np.linalg.norm(errors, axis=-1)
         )
@@ -401,7 +401,7 @@ def _undistorted(lens: OpenCV | ThinPrismFisheye, targets: np.ndarray, radius: f
         guesses = np.where(better.any(axis=0)[:, None], moved, guesses)
         if not better.any():
             break
-    errors = np.linalg.norm(targets - lens.distorted(guesses), axis=1)
+    errors = np.linalg.norm(targets - lens.distort(guesses), axis=1)
     return np.where((errors <= 1e-12 * (1 + lengths[:, 0]))[:, None], guesses, np.nan)
 
 
@@ -513,7 +513,7 @@ def project(
     axes = camera.rotation @ reference.quat_to_rotation(gaussians.quats) * scales[:, None, :]
     axes2d = jacobians(lens, camera, _points_of_jacobian(lens, camera, points)) @ axes
     widening = np.full((len(points), 2), low_pass)
-    cov2d, dets, areas = _widened(axes2d, widening)
+    cov2d, dets, areas = _widen(axes2d, widening)
     singular = dets == 0
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if antialiased:
@@ -527,7 +527,7 @@ def project(
             )
         radii = defocus.blur_radii(camera, np.where(seen, depths, 1.0))
         dets_in_focus = dets
-        cov2d, dets, _ = _widened(axes2d, widening + radii**2 / 4)
+        cov2d, dets, _ = _widen(axes2d, widening + radii**2 / 4)
         singular = dets == 0
         dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
         opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, LEAST_CUT)
@@ -571,7 +571,7 @@ def _points_of_jacobian(lens: Lens, camera: Camera, points: np.ndarray) -> np.nd
     return np.hstack([np.clip(points[:, :2] / z, lower - margin, upper + margin) * z, z])
 
 
-def _widened(axes2d: np.ndarray, widening: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _widen(axes2d: np.ndarray, widening: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return cov2d = M M^T + diag(t) (N, 2, 2), det(cov2d) (N,) and sqrt(det(M M^T)) (N,).
 
     M (N, 2, 3) px; t (N, 2) px^2. det(A + diag(t)) = det(A) + t0 A11 + t1 A00 + t0 t1: sums of

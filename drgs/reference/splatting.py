@@ -186,7 +186,7 @@ def covariances(quats: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
     determinant of a needle's covariance cancels, that of its factor does not.
     """
     factors = quat_to_rotation(quats) * np.exp(log_scales)[:, None, :]
-    return factors @ _transposed(factors)
+    return factors @ _transpose(factors)
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
@@ -399,7 +399,7 @@ def _low_passed_covariances(axes2d: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     areas = np.linalg.norm(np.cross(axes2d[:, 0], axes2d[:, 1]), axis=-1)
     traces = np.sum(axes2d**2, axis=(1, 2))
     dets = areas**2 + LOW_PASS * traces + LOW_PASS**2
-    cov2d = axes2d @ _transposed(axes2d) + LOW_PASS * np.eye(2)
+    cov2d = axes2d @ _transpose(axes2d) + LOW_PASS * np.eye(2)
     return cov2d, dets, areas
 
 
@@ -729,8 +729,8 @@ def project_gradients(
 
     # cov2d = M M^T + 0.3 I, M = J V, V = W R diag(s).
     d_axes2d += 2 * d_cov2d @ affine.axes2d
-    d_axes = _transposed(affine.jacobians) @ d_axes2d
-    d_jacobians = d_axes2d @ _transposed(affine.axes)
+    d_axes = _transpose(affine.jacobians) @ d_axes2d
+    d_jacobians = d_axes2d @ _transpose(affine.axes)
     d_factors = camera.rotation.T @ d_axes
     d_scales = np.einsum("nij,nij->nj", affine.rotations, d_factors)
     d_rotations = d_factors * affine.scales[:, None, :]
@@ -908,7 +908,7 @@ def _rows_where(condition: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.where(condition.reshape((-1,) + (1,) * (values.ndim - 1)), values, 0.0)
 
 
-def _transposed(matrices: np.ndarray) -> np.ndarray:
+def _transpose(matrices: np.ndarray) -> np.ndarray:
     return np.swapaxes(matrices, -1, -2)
 
 

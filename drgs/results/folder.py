@@ -14,10 +14,10 @@ from pathlib import Path
 
 import yaml
 
-from drgs.config.changes import changed, decided_as
+from drgs.config.changes import decided_as, with_changes
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, UserNote, listed, one_line
+from drgs.core.errors import UserError, UserNote, format_names, one_line
 from drgs.core.files import is_temporary, read_text, remove_stale_temporaries, why_refused
 from drgs.core.folders import FolderRecord
 from drgs.results.files import (
@@ -67,7 +67,7 @@ def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] =
     if CONFIG not in present:
         raise UserError(
             f"{folder}: the output folder must be new or empty, got one that holds "
-            f"{listed(present)}; choose another with --out"
+            f"{format_names(present)}; choose another with --out"
         )
     record, differences = FolderRecord(folder, COMMAND), _differences_of_run(folder, config)
     is_run, is_config_alone = record.exists or CHECKPOINT in present, present == [CONFIG]
@@ -133,7 +133,7 @@ def require_no_run(folder: Path) -> None:
     if names := _visible_names(folder):
         raise UserError(
             f"{folder}: must be new or empty for a fit with --budget, got one that holds "
-            f"{listed(names)}; choose another with --out, go on with --resume {folder}, or "
+            f"{format_names(names)}; choose another with --out, go on with --resume {folder}, or "
             "replace it with --overwrite"
         )
 
@@ -169,7 +169,7 @@ def load_moved_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
     cloud, data = config.init.point_cloud, before.data.path
     if cloud is None or cloud.exists() or not cloud.is_relative_to(data):
         return config
-    return changed(config, {"init.point_cloud": config.data.path / cloud.relative_to(data)})
+    return with_changes(config, {"init.point_cloud": config.data.path / cloud.relative_to(data)})
 
 
 def relocate_data(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PATHS) -> FitConfig:
@@ -187,7 +187,7 @@ def relocate_data(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PA
             changes[key] = str(found)
             note = f"{key}: {path} is not there any more; taken from {found}"
             warnings.warn(UserNote(note), stacklevel=2)
-    return changed(config, changes) if changes else config
+    return with_changes(config, changes) if changes else config
 
 
 def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
@@ -234,8 +234,8 @@ def _refuse_strangers(
         strangers.append(CONFIG)
     if strangers:
         raise UserError(
-            f"{folder}: must hold nothing but a run to be replaced, got {listed(strangers)}; move "
-            "that away, or choose another folder with --out"
+            f"{folder}: must hold nothing but a run to be replaced, got {format_names(strangers)}; "
+            "move that away, or choose another folder with --out"
         )
 
 
@@ -311,7 +311,7 @@ def _differences_of_run(folder: Path, config: FitConfig) -> str:
         for each in (decided_as(run, config), decided_as(config, run))
     )
     differences = _differences(theirs, ours)
-    return f"which differs in {listed(differences)}" if differences else ""
+    return f"which differs in {format_names(differences)}" if differences else ""
 
 
 def _differences(theirs: object, ours: object, key: str = "") -> list[str]:

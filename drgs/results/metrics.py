@@ -92,10 +92,10 @@ def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarra
     if mask is not None:
         counts = np.asarray(mask)
         x, y = x * counts, y * counts
-    mu_x, mu_y = _windowed(x), _windowed(y)
-    var_x = _windowed(x * x) - mu_x**2
-    var_y = _windowed(y * y) - mu_y**2
-    cov_xy = _windowed(x * y) - mu_x * mu_y
+    mu_x, mu_y = _filter_window(x), _filter_window(y)
+    var_x = _filter_window(x * x) - mu_x**2
+    var_y = _filter_window(y * y) - mu_y**2
+    cov_xy = _filter_window(x * y) - mu_x * mu_y
     luminance = (2 * mu_x * mu_y + 0.01**2) / (mu_x**2 + mu_y**2 + 0.01**2)
     contrast_structure = (2 * cov_xy + 0.03**2) / (var_x + var_y + 0.03**2)
     return luminance * contrast_structure
@@ -125,7 +125,7 @@ def _mean(values: np.ndarray, mask: ArrayLike | None) -> float:
     return float(np.mean(values if mask is None else values[np.asarray(mask) > 0]))
 
 
-def _windowed(values: np.ndarray) -> np.ndarray:
+def _filter_window(values: np.ndarray) -> np.ndarray:
     for axis in (0, 1):
         values = correlate1d(values, WINDOW, axis=axis, mode="constant", cval=0.0)
     return values

@@ -16,7 +16,7 @@ from drgs.config.approximations import said_by
 from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
-from drgs.core.errors import UserError, listed
+from drgs.core.errors import UserError, format_names
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.orbits import near_plane_of
@@ -24,7 +24,7 @@ from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
-from drgs.integrator.summary import described, summary_of_views
+from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.integrator.types import is_splats
 from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
 from drgs.results.folder import relocate_data
@@ -72,8 +72,8 @@ class ImageFolder:
         images = [n for n in sorted(os.listdir(self.path)) if n.lower().endswith(PHOTOGRAPHS)]
         if photographs := FolderRecord(self.path, COMMAND).strangers(images):
             raise UserError(
-                f"--out {self.path}: holds images of the dataset ({listed(photographs)}); choose "
-                "a folder of its own"
+                f"--out {self.path}: holds images of the dataset ({format_names(photographs)}); "
+                "choose a folder of its own"
             )
 
 
@@ -124,7 +124,7 @@ class Model:
         integrator = scene.integrator()
         assert is_splats(integrator), "scene() sets it"
         summary = summary_of_views(integrator.state, views, self.from_header)
-        print(described(summary), flush=True)
+        print(format_effects(summary), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
         return folder.claim(names, self.render(scene, views))
 

@@ -87,7 +87,7 @@ def training_cameras(folder: Path, origin: Origin) -> list[Viewpoint] | None:
 
 
 def _read_relative(path: Path, origin: Origin) -> list[Viewpoint]:
-    return [view.moved(-np.array(origin)) for view in read_viewpoints(path, None)]
+    return [view.with_offset(-np.array(origin)) for view in read_viewpoints(path, None)]
 
 
 def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
@@ -117,7 +117,7 @@ def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
             **{"w": view.width, "h": view.height},
             **_lens_and_motion(view),
         }
-        for view in (view.moved(np.array(origin)) for view in views)
+        for view in (view.with_offset(np.array(origin)) for view in views)
     ]
     return {**recorded, "frames": frames}
 

@@ -69,14 +69,15 @@ class InGroups:
             return row[:geometry] + [features[place] for place in group.stored] + keys
 
         return tuple(
-            Records.of(_only(group, bins), partial(numbers, group)) for group in _groups(bins)
+            Records.from_ranks(_select_group(group, bins), partial(numbers, group))
+            for group in _groups(bins)
         )
 
     def composite(self, bins: TileBins, records: Sequence[Records]) -> GroupedLayers:
         """See :func:`drgs.splatting.rasterize.composite`."""
         groups, count = _groups(bins), bins.model.features.num_planes(bins.num_features)
         parts = [
-            self.order.composite(_only(group, bins), own)
+            self.order.composite(_select_group(group, bins), own)
             for group, own in zip(groups, records, strict=True)
         ]
         return GroupedLayers(groups, tuple(parts), count)
@@ -120,7 +121,9 @@ class InGroups:
             d_own, *d_planes = [cotangents[place] for place in places]
             for place in places:  # planes of several groups count once
                 cotangents[place] = zeros
-            found = self.order.adjoint(_only(group, bins), own, part, d_planes, d_own, samples)
+            found = self.order.adjoint(
+                _select_group(group, bins), own, part, d_planes, d_own, samples
+            )
             geometry = [a + b for a, b in zip(geometry, found.geometry, strict=True)]
             for place, derivative in zip(group.stored, found.features, strict=True):
                 features[place] = features[place] + derivative
@@ -138,7 +141,7 @@ class InGroups:
         parts = []
         for group, own, part in zip(_groups(bins), records, layers.parts, strict=True):
             direction = replace(tangents, features=[tangents.features[k] for k in group.stored])
-            parts.append(self.order.tangent(_only(group, bins), own, part, direction))
+            parts.append(self.order.tangent(_select_group(group, bins), own, part, direction))
         return replace(layers, parts=tuple(parts))
 
 
@@ -147,7 +150,7 @@ def _groups(bins: TileBins) -> tuple[FeatureGroup, ...]:
     return tuple(bins.model.features.groups(bins.num_features, size))
 
 
-def _only(group: FeatureGroup, bins: TileBins) -> TileBins:
+def _select_group(group: FeatureGroup, bins: TileBins) -> TileBins:
     """Return the bins with the features of one group."""
     model = replace(bins.model, features=group.features)
     return replace(bins, num_features=len(group.stored), model=model)

@@ -70,7 +70,7 @@ class Alpha:
     smooth: Bool  # not clamped, so that the derivative flows
 
     @staticmethod
-    def at(log2_alpha: Float, floor: Float | float, alpha_max: float) -> Alpha:
+    def from_log2(log2_alpha: Float, floor: Float | float, alpha_max: float) -> Alpha:
         """alpha = min(alpha_max, 2^log2_alpha), or 0 where log2_alpha is below ``floor``."""
         # Far below the floor the short exp2 returns garbage; the selection discards it.
         unclamped = exp2_function(type(log2_alpha))(log2_alpha)
@@ -393,7 +393,7 @@ class SplatFeatures:
     def check_differentiable_in_camera(self) -> None:
         """Raise UnsupportedError if they depend on the camera but through what is stored."""
 
-    def weighing(self) -> SplatFeatures:
+    def with_weight_derivatives(self) -> SplatFeatures:
         """Return features whose derivatives with respect to the first number are weights."""
         return self
 
@@ -402,7 +402,7 @@ class SplatFeatures:
         del lanes, positions
         return self
 
-    def at(self, stored: list[Float], pixel: int) -> list[Float]:
+    def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
         """The splat's features at a pixel."""
         del pixel
         return stored
@@ -411,13 +411,13 @@ class SplatFeatures:
         self, planes: list[Float], stored: list[Float], pixel: int, weight: Float
     ) -> list[Float]:
         """A pixel's ``planes`` with this splat's share; weight: T alpha."""
-        features = self.at(stored, pixel)
+        features = self.pixel_values(stored, pixel)
         return [dr.fma(weight, c, plane) for c, plane in zip(features, planes, strict=True)]
 
     def feature_gradient(self, stored: list[Float], pixel: int, g: list[Float]) -> Float | int:
         """c . g, with the features c at a pixel and the loss's derivatives g there."""
         result: Float | int = 0  # there may be no features, but alpha alone
-        for c, derivative in zip(self.at(stored, pixel), g, strict=True):
+        for c, derivative in zip(self.pixel_values(stored, pixel), g, strict=True):
             result = dr.fma(c, derivative, result)
         return result
 
@@ -477,7 +477,7 @@ class FootprintModel:
     def alphas(self, geometry: list[Float], footprint: Footprint) -> list[Alpha]:
         """Alpha at the 16 pixels."""
         floor = self.falloff.log2_floor(geometry, self.cutoffs)
-        return [Alpha.at(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]
+        return [Alpha.from_log2(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]
 
 
 DEFAULT = FootprintModel()

@@ -25,7 +25,7 @@ from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, TensorXf
 from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.quaternions import normalized, quat_to_rotation
+from drgs.gaussians.quaternions import normalize, quat_to_rotation
 from drgs.splatting.cutoffs import Cutoffs
 
 
@@ -268,7 +268,7 @@ def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
 
 def color_at_mean(rows: GaussianRows, direction: Array3f, sh_degree: int) -> Array3f:
     """The colour (Array3f) in the ``direction`` in which the mean is seen, of any length."""
-    return sh.sh_color(rows.sh, normalized(direction), sh_degree)
+    return sh.sh_color(rows.sh, normalize(direction), sh_degree)
 
 
 def plain_opacity(opacity: Float, determinant: Float, added_determinant: Float) -> Float:
@@ -303,11 +303,11 @@ def film_axes(
     """
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
 
-    def along(direction: Array3f) -> Array3f:
+    def direction_derivative(direction: Array3f) -> Array3f:
         return (world_from_splat.T @ direction) * scales
 
-    m0, m1 = map(along, camera.lens.projection_jacobian(camera, position, slopes))
-    return m0, m1, along(camera.lens.depth_direction(camera, position))
+    m0, m1 = map(direction_derivative, camera.lens.projection_jacobian(camera, position, slopes))
+    return m0, m1, direction_derivative(camera.lens.depth_direction(camera, position))
 
 
 def world_axes(rows: GaussianRows) -> list[Array3f]:

@@ -130,12 +130,12 @@ class Records:
     num_features: int
 
     @staticmethod
-    def of(bins: TileBins, numbers: Callable[[UInt32, Bool], list[Float]]) -> Records:
+    def from_ranks(bins: TileBins, numbers: Callable[[UInt32, Bool], list[Float]]) -> Records:
         """Copy each rank's ``numbers``, such as those of ``bins.rows.load``, and evaluate them.
 
         numbers: given ranks, and which lanes are active. Entries that touch nothing have zeros.
         """
-        rows = Rows.of(numbers(bins.ranks, bins.masks != 0))
+        rows = Rows.from_columns(numbers(bins.ranks, bins.masks != 0))
         dr.eval(rows)
         return Records(rows, bins.model.falloff.num_geometry, bins.num_features)
 
@@ -278,7 +278,7 @@ def composite_adjoint(
     are added, one after the other, to the derivatives ``before``. Not differentiated: the order,
     the decisions (cut, clamp, stop).
     """
-    pairs = CompositedPairs.of(bins, layers.stop, samples)
+    pairs = CompositedPairs.find(bins, layers.stop, samples)
     bands = bands_of(bins, pairs)
     sums = Rows.empty(bins.rows.Float, bins.num_sums, max(pairs.num_rows, 1))
     for band in bands:
@@ -405,7 +405,7 @@ def splat_gradients(
     if before is None:
         first, columns = 1, terms(t.UInt32(0))
     else:
-        stored = Rows.of(before.geometry + before.features)  # a packet is read at once
+        stored = Rows.from_columns(before.geometry + before.features)  # a packet is read at once
         dr.eval(stored)
         first, columns = 0, stored.load(bins.order)
     if first + 1 == num_samples:  # inside of a loop, the sums would take longer
@@ -458,7 +458,7 @@ def composite_tangent(
             d_alpha = dr.select(alpha.smooth, alpha.value * d_log_alpha[pixel], 0)
             d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha.value * d_before), 0)
             dT[pixel] = d_before - d_weight
-            c = model.features.at(features, pixel)
+            c = model.features.pixel_values(features, pixel)
             d_c = model.features.tangents(features, d_features, pixel)
             for k in range(count):
                 change = dr.fma(d_weight, c[k], weight * d_c[k])
@@ -500,6 +500,6 @@ def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     numbers = bins.model.falloff.pack_tangents(geometry, by_rank(tangents.geometry))
     numbers += by_rank(tangents.features)
     numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # they have no derivatives
-    rows = Rows.of(numbers)
+    rows = Rows.from_columns(numbers)
     dr.eval(rows)
-    return Records.of(bins, rows.load)
+    return Records.from_ranks(bins, rows.load)

@@ -44,7 +44,7 @@ class CompositedPairs:
     samples: range  # of the layers
 
     @staticmethod
-    def of(bins: TileBins, stop: UInt32, samples: range) -> CompositedPairs:
+    def find(bins: TileBins, stop: UInt32, samples: range) -> CompositedPairs:
         """Find the pairs before each micro-tile's ``stop``; see :class:`.Layers`."""
         t, count = types_of(bins.rows.Float), len(samples)
         padded, num_entries = dr.width(bins.masks), bins.num_entries
@@ -132,7 +132,7 @@ class Slots:
     samples: range  # of the pairs
     groups_of_sample: int
 
-    def at(self, group: UInt32, micro: UInt32, active: Bool | bool = True) -> Array2u:
+    def locate(self, group: UInt32, micro: UInt32, active: Bool | bool = True) -> Array2u:
         """Return the first slot of a group of entries in a micro-tile, and its composited bits.
 
         group: among those of all samples of the pairs.
@@ -143,14 +143,14 @@ class Slots:
     def end(self, entries: Entries) -> UInt32:
         """Return the end of each lane's slots."""
         last = self._first_of_sample(entries) + entries.last
-        first, word = self.at(last, entries.micro, entries.head != 0)
+        first, word = self.locate(last, entries.micro, entries.head != 0)
         return first + dr.popcnt(word & entries.tail)
 
     def number(self, entries: Entries) -> UInt32:
         """Return the number of slots of each lane."""
         occupied = entries.head != 0
         first_group = self._first_of_sample(entries) + entries.first
-        first, word = self.at(first_group, entries.micro, occupied)
+        first, word = self.locate(first_group, entries.micro, occupied)
         begin = first + dr.popcnt(word & ~entries.head)
         return dr.select(occupied, self.end(entries) - begin, 0)
 
@@ -204,7 +204,7 @@ def sum_entries(
     def body(micros: UInt32, totals: list) -> tuple:
         for _ in range(2):  # two at a time wait for memory together
             active = micros != 0
-            first, word = slots.at(group, dr.tzcnt(micros), active)
+            first, word = slots.locate(group, dr.tzcnt(micros), active)
             numbers = partials.load(first + dr.popcnt(word & below), active)
             totals = [a + b for a, b in zip(totals, numbers, strict=True)]
             micros = micros & (micros - 1)

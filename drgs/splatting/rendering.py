@@ -102,7 +102,7 @@ class CenterOrder:
 
     def records(self, bins: TileBins) -> Records:
         """Return copies of the numbers that compositing loads of each sorted entry, evaluated."""
-        return Records.of(bins, bins.rows.load)
+        return Records.from_ranks(bins, bins.rows.load)
 
     def composite(self, bins: TileBins, records: Records) -> Layers:
         """Composite front to back."""
@@ -180,7 +180,7 @@ class Pipeline:
     source: ProjectionStage = Projected()
     of_smoothing: bool = False  # whether derivatives include those of a smoothing filter
 
-    def differentiated(self, rows: GaussianRows) -> GaussianRows:
+    def select_differentiable(self, rows: GaussianRows) -> GaussianRows:
         """The numbers with respect to which derivatives are computed."""
         return rows if self.of_smoothing else replace(rows, smoothing=None)
 
@@ -188,7 +188,7 @@ class Pipeline:
         """The first stage with this pipeline's approximations."""
         splats = project(
             self.rows(rows),
-            camera.seeing(rows.means),
+            camera.for_means(rows.means),
             self.sh_degree,
             self.opacity_rule,
             self.shape,
@@ -403,7 +403,7 @@ def _back_to_rows(
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(pipeline.differentiated(rows), numbers)
+        dr.enable_grad(pipeline.select_differentiable(rows), numbers)
         splats = pipeline.project(rows, camera)
         outputs = falloff.differentiable(splats)
         outputs += pipeline.feature_columns(splats, rows, camera)
@@ -412,7 +412,7 @@ def _back_to_rows(
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
-        d_rows = pipeline.differentiated(dr.grad(rows))
+        d_rows = pipeline.select_differentiable(dr.grad(rows))
         return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
 
 
@@ -425,7 +425,9 @@ def weighted_sums(frame: Frame, plane: Float) -> Float:
     unless colours are seen along each pixel's ray.
     """
     model, samples = frame.bins.model, frame.bins.grid.samples
-    bins = replace(frame.bins, model=replace(model, features=model.features.weighing()))
+    bins = replace(
+        frame.bins, model=replace(model, features=model.features.with_weight_derivatives())
+    )
     plane = repeat_array(plane, samples)
     zeros = dr.opaque(type(plane), 0, dr.width(plane))
     d_features = [plane, *[zeros] * (frame.layers.count - 1)]
@@ -505,11 +507,11 @@ def _splat_tangents(
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     with dr.resume_grad():
-        differentiated = frame.pipeline.differentiated(rows)
+        differentiated = frame.pipeline.select_differentiable(rows)
         dr.enable_grad(differentiated, numbers)
         splats = frame.pipeline.project(rows, camera)
         d_rows = load_rows(tangents, frame.pipeline.sh_degree)
-        dr.set_grad(differentiated, frame.pipeline.differentiated(d_rows))
+        dr.set_grad(differentiated, frame.pipeline.select_differentiable(d_rows))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
         falloff = frame.bins.model.falloff

@@ -115,7 +115,11 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
     order = t.UInt32(dr.argsort(depths))
     # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
     box = boxes.load(order)
-    boxes, rows, counts = Rows.of(box), Rows.of(rows.load(order)), t.UInt32(box[-1])
+    boxes, rows, counts = (
+        Rows.from_columns(box),
+        Rows.from_columns(rows.load(order)),
+        t.UInt32(box[-1]),
+    )
     dr.eval(boxes, rows, counts)
     num_splats = dr.width(order)
     rank = dr.arange(t.UInt32, num_splats + 1)
@@ -155,7 +159,10 @@ def _store_rows(
 ) -> tuple[Rows, Rows, Float]:
     """Return, by Gaussian, boxes of tiles, all other numbers, and depths to sort by; evaluated."""
     geometry = model.falloff.geometry(splats)
-    boxes, rows = Rows.of(_tile_box(splats, geometry, grid, model)), Rows.of([*geometry, *stored])
+    boxes, rows = (
+        Rows.from_columns(_tile_box(splats, geometry, grid, model)),
+        Rows.from_columns([*geometry, *stored]),
+    )
     depths = dr.select(splats.visible, splats.depths, dr.inf)
     dr.eval(boxes, rows, depths)
     return boxes, rows, depths

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drgs.config.changes import changed, with_iterations
+from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
@@ -97,7 +97,7 @@ class Strategy:
             least = max(num_points, config.init.num_points or 0)
             number = max(least, round(self.share * target))
             changes[f"densify.{config.densify.strategy}.gaussians"] = number
-        return changed(config, changes)
+        return with_changes(config, changes)
 
 
 def target_of(config: FitConfig) -> int | None:
@@ -291,7 +291,7 @@ def _first_iterations(config: FitConfig, dataset: Dataset) -> tuple[FitConfig, D
     views = dataset.train[:: max(1, len(dataset.train) // count)]
     never = config.iterations + (WARM_UP_ITERATIONS + TIMED_ITERATIONS) * views_per_step
     still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
-    return changed(config, {"coarse": [], **still}), replace(dataset, train=views[:count])
+    return with_changes(config, {"coarse": [], **still}), replace(dataset, train=views[:count])
 
 
 def plan_fit(
@@ -314,7 +314,7 @@ def plan_fit(
             "makes images"
         )
         warnings.warn(UserNote(note), stacklevel=2)
-        config = changed(config, {"output.report": False, "output.save_renders": False})
+        config = with_changes(config, {"output.report": False, "output.save_renders": False})
     else:
         end -= images
     has_one_file = config.model.approximations.are_usual

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.config.changes import changed, decided_as
+from drgs.config.changes import decided_as, with_changes
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, listed, one_line
+from drgs.core.errors import UserError, format_names, one_line
 from drgs.core.files import atomic_path, read_arrays, why_refused
 from drgs.datasets.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
@@ -102,7 +102,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     except UserError as error:
         raise UserError(f"{error}; {_remedy(path)}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise _damaged(path, error) from None
+        raise _damaged_error(path, error) from None
     # What one of them leaves to the dataset, the other has from there.
     if all(decided_as(config, past) != decided_as(past, config) for past in (own, before)):
         raise UserError(
@@ -120,7 +120,7 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
     try:
         _check_state(checkpoint.trainer, start, checkpoint.config)
     except ValueError as error:
-        raise _damaged(folder / CHECKPOINT, error) from None
+        raise _damaged_error(folder / CHECKPOINT, error) from None
 
 
 def check_same_data(folder: Path, where: Path, before: Fingerprint, now: Fingerprint) -> None:
@@ -130,8 +130,9 @@ def check_same_data(folder: Path, where: Path, before: Fingerprint, now: Fingerp
     """
     if differences := before.differences(now):
         raise UserError(
-            f"{folder / CHECKPOINT}: belongs to other data than {where}: {listed(differences)}; "
-            f"give the folder with the data of this fit (--data), or {_remedy(folder / CHECKPOINT)}"
+            f"{folder / CHECKPOINT}: belongs to other data than {where}: "
+            f"{format_names(differences)}; give the folder with the data of this fit (--data), "
+            f"or {_remedy(folder / CHECKPOINT)}"
         )
 
 
@@ -147,7 +148,7 @@ def remove_checkpoint(folder: Path) -> None:
         raise UserError(f"{path}: cannot be removed: {why_refused(error)}") from None
 
 
-def _damaged(path: Path, error: Exception) -> UserError:
+def _damaged_error(path: Path, error: Exception) -> UserError:
     reason = f"{error.args[0]} missing" if isinstance(error, KeyError) else one_line(error)
     return UserError(f"{path}: the checkpoint is damaged: {reason}; {_remedy(path)}")
 
@@ -168,7 +169,7 @@ def _at_the_places_of(config: FitConfig, values: Mapping[str, object]) -> FitCon
         section, name = key.split(".")
         places[key] = getattr(getattr(config, section), name)
     output = config.output.model_dump()
-    return changed(FitConfig.model_validate({**values, "output": output}), places)
+    return with_changes(FitConfig.model_validate({**values, "output": output}), places)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -184,7 +185,7 @@ def _check_state(
     The number of Gaussians may be another.
     """
     if missing := [name for name in start if name not in state]:
-        raise ValueError(f"{listed(missing)} missing")
+        raise ValueError(f"{format_names(missing)} missing")
     num, most = len(np.atleast_1d(state[MEANS_ARRAY])), config.densify.max_gaussians
     if not 1 <= num <= most:
         raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")

@@ -50,7 +50,7 @@ class EventLog:
     def close(self) -> None:
         self._writer.close()
 
-    def after(
+    def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
         """Write the last row, if the iteration has one; the history's clock stands still."""

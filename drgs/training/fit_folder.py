@@ -75,7 +75,7 @@ class FitFolder:
     overwrites: bool = False  # the run that the folder holds
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Keep other commands from writing to the folder, from when it exists."""
         with sole_writer(self.path) as self._keep:
             yield
@@ -225,9 +225,9 @@ def gaussians_on_page(
 def _without_filter(gaussians: Gaussians) -> Gaussians:
     if gaussians.smoothing is None:
         return gaussians
-    from drgs.effects.smoothing import baked  # imported where there is a filter
+    from drgs.effects.smoothing import bake_smoothing  # imported where there is a filter
 
-    return baked(gaussians)
+    return bake_smoothing(gaussians)
 
 
 def _split_metrics(quality: Quality, split: str) -> SplitMetrics:

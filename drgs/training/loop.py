@@ -96,7 +96,7 @@ def smoother(past: float | None, value: float) -> float:
     return value if past is None else SMOOTHING * past + (1 - SMOOTHING) * value
 
 
-def smoothed(values: Iterable[float]) -> np.ndarray:
+def exponential_mean(values: Iterable[float]) -> np.ndarray:
     """Return the exponential mean of the past, (n,) float64."""
     return np.fromiter(accumulate(values, smoother), np.float64)
 
@@ -157,7 +157,7 @@ class Iteration:
 class Observer(Protocol):
     """Follows a fit as it runs; the result has the same bytes without it."""
 
-    def after(
+    def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
         """Called after an iteration, by the thread that fits; history: with its row, if it has one.
@@ -193,7 +193,7 @@ class HeldOutQuality:
         """views: those of the test split; none on other ranks than 0."""
         self._views = measured_views(views)
 
-    def after(
+    def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
         config = trainer.config

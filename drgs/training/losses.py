@@ -266,7 +266,7 @@ def _ssim_and_partials(
         d_mean_xy = 2 * a1 * inv_b1b2
 
         # Windows centred beyond the image are no part of the mean, nor of its adjoint.
-        inside = columns.inside(k)
+        inside = columns.is_inside(k)
         dissimilar += dr.select(inside, 1 - ssim, 0)
         partials.append([dr.select(inside, d, 0) for d in (d_mu_x, d_mean_xx, d_mean_xy)])
     loss = (1 - weight) * absolute + weight * dissimilar
@@ -401,7 +401,7 @@ class _Lines:
     def lane(self) -> UInt32:
         return dr.arange(self.tiling.index_type, self.tiling.num_lines)
 
-    def inside(self, k: int) -> Bool:
+    def is_inside(self, k: int) -> Bool:
         """Return whether the line's k-th pixel belongs to the image."""
         line, (_, *tile) = self.lane % _TILE, self.tiling.split(self.lane // _TILE)
         along = tile[self.axis] * _TILE + k

@@ -71,7 +71,7 @@ class FitMemory:
     pixels: int
 
     @property
-    def needed(self) -> int:
+    def required_bytes(self) -> int:
         """The sum without targets, which can be made anew."""
         return self.process + self.photographs + self.gaussians + self.splats + self.pixels
 
@@ -186,10 +186,10 @@ def room_for_targets(
     """
     memory = estimate(config, dataset, gaussians, view_bytes, share=share)
     usable = round(USABLE_SHARE * (available_memory() / share.on_machine + resident_memory()))
-    if memory.needed > usable:
+    if memory.required_bytes > usable:
         raise UserError(_refusal(config, dataset, gaussians, memory, usable, share))
     # Some are left, as an estimate may be wrong.
-    return max(0, min(most, memory.targets, usable - round(1.15 * memory.needed)))
+    return max(0, min(most, memory.targets, usable - round(1.15 * memory.required_bytes)))
 
 
 def _refusal(
@@ -206,7 +206,9 @@ def _refusal(
     def fits(most: int, scale: float = 1.0) -> bool:
         densify = config.densify.model_copy(update={"max_gaussians": most})
         smaller = config.model_copy(update={"densify": densify})
-        return estimate(smaller, dataset, gaussians, 0, scale, share).needed <= 0.95 * usable
+        return (
+            estimate(smaller, dataset, gaussians, 0, scale, share).required_bytes <= 0.95 * usable
+        )
 
     most = next(filter(fits, _smaller(count, start)), None)
     size = next((s for s in _smaller(width, MIN_WIDTH_PX) if fits(count, s / width)), None)
@@ -216,7 +218,7 @@ def _refusal(
     who = "the fit" if share == ALONE else "a process of the fit"
     part = "" if share.processes == 1 else f"1/{share.processes} of "
     return (
-        f"memory: {who} needs about {readable(memory.needed)} "
+        f"memory: {who} needs about {readable(memory.required_bytes)} "
         f"({readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
         f"{readable(memory.gaussians)} for {part}{count:,} Gaussians, "
         f"{readable(memory.splats + memory.pixels)} for a image of them), and may take "

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.density import StopAim
 from drgs.config.schema import FitConfig, OptimizerConfig
 
@@ -117,7 +117,7 @@ def revised_plan(config: FitConfig, now: int, iterations: int, densify_stop: int
             {"after": after, "end": end} for after, end in begun or _rate_aims(config)
         ],
     }
-    return changed(config, changes)
+    return with_changes(config, changes)
 
 
 def _rate_aims(config: FitConfig) -> list[tuple[int, int]]:

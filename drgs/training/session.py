@@ -32,7 +32,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
-from drgs.integrator.summary import described
+from drgs.integrator.summary import format_effects
 from drgs.results.history import HistoryRow
 from drgs.training.budget import Budget, Deadline, FitObjects, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
@@ -68,7 +68,7 @@ class ProgressLine:
         self._progress, self._criterion = progress, criterion
         self._psnr: float | None = None  # dB, smooth
 
-    def after(
+    def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
         if (row := done.row) is not None:
@@ -121,7 +121,7 @@ class FitSession:
     def run(self) -> bool:
         """Fit, and write the results; False if Ctrl-C stopped the fit, with its state saved."""
         folder = self.folder
-        with nullcontext() if folder is None else folder.locked():
+        with nullcontext() if folder is None else folder.lock():
             if self._is_finished():
                 return True
             plan = self.prepare()
@@ -223,7 +223,7 @@ class FitSession:
         )
         start = start_of(config, dataset)
         self._print(description_of_start(config, start))
-        self._print(described(summary_of_fit(config, dataset)))
+        self._print(format_effects(summary_of_fit(config, dataset)))
         views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
         check_lenses(config.model, views, f"{config.data.path}: ", remedy)
         return gaussians_at(start, config)
@@ -256,7 +256,7 @@ class FitSession:
             for done in iterations(trainer, self.history, criterion):
                 self.check_ranges()
                 for observer in observers:
-                    observer.after(trainer, self.history, done, lambda: stop.requested)
+                    observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
                 stops = bool(comm.broadcast_numbers(stop.requested))
                 if stops or self._is_checkpoint_due(done):
                     self._save_checkpoint()

@@ -128,7 +128,7 @@ class Step:
     is_update: bool  # whether the optimizer steps at its end
 
     @property
-    def last(self) -> int:
+    def last_iteration(self) -> int:
         """The last iteration."""
         return self.iterations[-1]
 

@@ -17,7 +17,7 @@ from drgs.datasets.types import Dataset
 from drgs.integrator.summary import (
     SimulatedEffect,
     antialiasing_effect,
-    joined,
+    join_parts,
     lens_effect,
     motion_effect,
     view_dependence_effect,
@@ -28,7 +28,7 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]
     """Return the effects of a fit, in the order in which they are listed."""
     views, model, ignored = dataset.train, config.model, dataset.ignored
     depths = _of_data("depth", [v.depth for v in views], "supervision", "the dataset's depth")
-    depths = depths.unless(config.loss.depth_weight == 0)
+    depths = depths.unless_ignored(config.loss.depth_weight == 0)
     return [
         view_dependence_effect(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
         SimulatedEffect("background", "a random colour at each iteration", "data.random_background")
@@ -53,7 +53,7 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]
         replace(depths, ignored=depths.ignored or "depth" in ignored),
         SimulatedEffect(
             "camera refinement",
-            _refined(config) if config.cameras.optimise else None,
+            _describe_refinement(config) if config.cameras.optimise else None,
             "cameras.optimise",
         ),
         *_extensions(config),
@@ -72,7 +72,7 @@ def _extensions(config: FitConfig) -> list[SimulatedEffect]:
         (LOSSES, config.loss.type, "loss.type"),
     )
     for registry, name, key in chosen:
-        if name not in registry.shipped:
+        if name not in registry.shipped_names:
             used.append((registry.get(name), f"{key}: {name}"))
     return [SimulatedEffect(e.name, f"{e.kind}: {e.summary}", why) for e, why in used]
 
@@ -90,10 +90,10 @@ def _of_data(name: str, values: Sequence[object], what: str, why: str) -> Simula
     return SimulatedEffect(name, what if count else None, f"{why}, in {count} views")
 
 
-def _refined(config: FitConfig) -> str:
+def _describe_refinement(config: FitConfig) -> str:
     rates = config.cameras
     return (
-        joined(
+        join_parts(
             "poses" if rates.rotation_lr or rates.translation_lr else None,
             "focal lengths" if rates.focal_lr else None,
             "principal point" if rates.principal_lr else None,

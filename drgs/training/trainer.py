@@ -186,26 +186,26 @@ class Trainer:
         report = self._control_density(step)
         for place in losses:
             step.stage.keep_or_free(step.views[place].view)
-        means_lr = self.rates.means(step.last)
-        return StepReport(step.last, self.num_gaussians, means_lr, report, tuple(views))
+        means_lr = self.rates.means(step.last_iteration)
+        return StepReport(step.last_iteration, self.num_gaussians, means_lr, report, tuple(views))
 
     def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
         """Render a view, and add the derivatives of its loss to those of the step."""
         fit = self._fit_state(step, view.iteration)
         for effect in self.effects:
-            effect.before(fit, view.view)
+            effect.before_render(fit, view.view)
         rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
         image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
         dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
         self.gradients.end_view(self._weight_planes(view, dr.detach(image)))
-        return ViewLoss(dr.detach(loss), error, view.view.counted)
+        return ViewLoss(dr.detach(loss), error, view.view.counted_share)
 
     def _begin_step(self) -> Step:
         """Plan the next step, and bring the scene to where the optimizer is."""
         before, step = self.last_step, self.plan(self.iteration + 1)
         if step.stage is not before.stage:
             before.stage.end()
-        self.iteration = step.last
+        self.iteration = step.last_iteration
         self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
         self.params.update(self.optimizer)
         fit = self._fit_state(step, step.iterations[0])
@@ -215,7 +215,7 @@ class Trainer:
         def place(view: StepView) -> None:
             for effect in self.effects:
                 if effect.moves_sensors:
-                    effect.before(fit, view.view)
+                    effect.before_render(fit, view.view)
 
         self.gradients.begin(step.views, place)
         return step
@@ -287,8 +287,8 @@ class Trainer:
 
     def _set_learning_rates(self, step: Step) -> None:
         """Set the rates of a step, times the factors of the strategy."""
-        rates, initial = self.rates(step.last), self.rates.others
-        for name, factor in self.density.rate_factors(step.last).items():
+        rates, initial = self.rates(step.last_iteration), self.rates.others
+        for name, factor in self.density.rate_factors(step.last_iteration).items():
             rates[name] = factor * (rates[name] if name in rates else initial[name])
         state = self.optimizer.state  # shN is not in it, where the degree is 0
         rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in state}
@@ -296,27 +296,29 @@ class Trainer:
 
     def _update_effects(self, step: Step) -> None:
         """Let effects take their own steps."""
-        fit = self._fit_state(step, step.last)
+        fit = self._fit_state(step, step.last_iteration)
         for view in step.views:
             for effect in self.effects:
                 derivatives = {
                     name: self.gradients.share(view, dr.grad(leaf))
                     for name, leaf in effect.leaves(view.view).items()
                 }
-                effect.after(fit, view.view, derivatives)
+                effect.after_backward(fit, view.view, derivatives)
 
     def _control_density(self, step: Step) -> DensityReport | None:
         """Let the strategy change the rows; returns the last report of a step."""
         density, report = self.density, None
         if step.is_update:
-            density.perturb(self.population, step.last, self.rates.means(step.last))
+            density.perturb(
+                self.population, step.last_iteration, self.rates.means(step.last_iteration)
+            )
         for iteration in filter(density.is_due, step.iterations):
             self.check()
             found = density.refine(self.population, iteration)
             if found is not None:
                 report = found
                 for effect in self.effects:
-                    effect.repopulated(self._fit_state(step, iteration))
+                    effect.on_population_change(self._fit_state(step, iteration))
                 # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
                 dr.flush_malloc_cache()
         return report
@@ -403,7 +405,7 @@ class Trainer:
         All ranks call it; rank 0 alone gets images.
         """
         for effect in self.effects:
-            views = effect.measured(views)
+            views = effect.correct_views(views)
         scene = self.full_scene()
         return iter(()) if scene is None else render_views(scene, views)
 
@@ -501,7 +503,7 @@ class Trainer:
     def _restore_effects(self, state: Mapping[str, np.ndarray]) -> None:
         fit = self.fit_state()
         for effect in self.effects:
-            effect.repopulated(fit)
+            effect.on_population_change(fit)
             effect.restore(_part(state, f"{effect.name}/"))
 
     def _is_by_row(self, name: str) -> bool:

@@ -18,12 +18,12 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config.approximations import DECLARED
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
-from drgs.effects.smoothing import baked, baked_for_viewers
+from drgs.effects.smoothing import bake_smoothing, baked_for_viewers
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -62,7 +62,7 @@ class ForViewers:
     def images(self, views: tuple[View, ...]) -> Iterator[np.ndarray]:
         """Yield images (H, W, 3) of views that were not trained on, display space, in [0, 1]."""
         for effect in self.effects:
-            views = effect.measured(views)
+            views = effect.correct_views(views)
         return render_views(make_scene(self.gaussians, self.model, self.background), views)
 
 
@@ -108,7 +108,7 @@ def for_viewers(
 def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
     """Return Gaussians in closed form, by the training cameras as the fit has them."""
     states = (read_sensor(sensor, trainer.integrator.near) for sensor in trainer.sensors())
-    on_device = baked(gaussians).to(mi.TensorXf)
+    on_device = bake_smoothing(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
         cameras = map(camera_from_sensor, states)
         return baked_for_viewers(on_device, cameras, trainer.config.model.approximations)
@@ -131,7 +131,7 @@ def tuning(config: FitConfig) -> FitConfig:
     }
     if config.colors.lr is not None:
         changes["colors.lr"] = NEGLIGIBLE_RATE
-    return changed(config, changes)
+    return with_changes(config, changes)
 
 
 def _configured_default(name: str) -> object:

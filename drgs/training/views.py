@@ -36,7 +36,7 @@ class TrainingView:
         self._view, self._make_target = view, make_target
 
     @cached_property
-    def counted(self) -> float:
+    def counted_share(self) -> float:
         """The share of the pixels that count: those that no mask leaves out."""
         mask = self._view.mask
         return 1.0 if mask is None else max(float(np.asarray(mask).mean()), 1e-10)

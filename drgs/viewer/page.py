@@ -119,17 +119,17 @@ class CameraControls:
         """fitted: the approximations of the fit; fov: degrees, at first."""
         self._gui, self._fitted, self._changed = gui, fitted, event_handler(changed)
         first = round(min(MAX_FOV, fov), 1)
-        self._angle = self._observed(gui.add_slider("Angle of view", 5.0, MAX_FOV, 0.5, first))
-        self._shows = self._observed(gui.add_dropdown("Show", tuple(SHOWN)))
-        self._side = self._observed(gui.add_dropdown("Size", MAX_SIDES_PX, initial_value="1280"))
-        self._lens = self._observed(gui.add_dropdown("Lens", tuple(VIEWER_LENSES)))
+        self._angle = self._observe(gui.add_slider("Angle of view", 5.0, MAX_FOV, 0.5, first))
+        self._shows = self._observe(gui.add_dropdown("Show", tuple(SHOWN)))
+        self._side = self._observe(gui.add_dropdown("Size", MAX_SIDES_PX, initial_value="1280"))
+        self._lens = self._observe(gui.add_dropdown("Lens", tuple(VIEWER_LENSES)))
         self._numbers = {
-            name: self._observed(gui.add_slider(name, low, high, step, first, visible=False))
+            name: self._observe(gui.add_slider(name, low, high, step, first, visible=False))
             for name, (low, high, step, first) in SLIDERS.items()
         }
         self._lens.on_update(event_handler(self._show_numbers))
         with gui.add_folder("Accuracy", expand_by_default=False):
-            self._values = {name: self._observed(self._control(name)) for name in CONTROLLED}
+            self._values = {name: self._observe(self._control(name)) for name in CONTROLLED}
             button = gui.add_button("As fitted")
         button.on_click(event_handler(self._reset))
         button.on_click(self._changed)
@@ -189,7 +189,7 @@ class CameraControls:
         largest = max(MAX_NUMBER, value) if limits.le is None else limits.le
         return gui.add_number(name, value, min=limits.ge, max=largest, step=step, hint=hint)
 
-    def _observed(self, control: Control) -> Control:
+    def _observe(self, control: Control) -> Control:
         control.on_update(self._changed)
         return control
 

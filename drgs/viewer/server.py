@@ -70,7 +70,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
     def control(uuid: str) -> ValueControl | None:
         return server.gui._gui_input_handle_from_uuid.get(uuid)
 
-    with _silent(), _guarded(address, control):
+    with _silent(), _guard_servers(address, control):
         server = LocalServer(address, port, verbose=False)
     server.get_event_loop().set_exception_handler(_note_errors_once())
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -136,7 +136,7 @@ def _refusal(request: Request, address: str) -> str:
 
 
 @contextmanager
-def _guarded(address: str, control: ControlOf) -> Iterator[None]:
+def _guard_servers(address: str, control: ControlOf) -> Iterator[None]:
     """Let servers that viser starts within the block serve only valid requests and messages.
 
     viser has no setting for it. The logger is silent: websockets would print a traceback for each
@@ -146,7 +146,7 @@ def _guarded(address: str, control: ControlOf) -> Iterator[None]:
     connection_type = partial(PageConnection, control=control, connections=set())
     logger = logging.Logger("page", logging.CRITICAL)
 
-    def guarded(
+    def serve_guarded(
         *arguments: Any,
         process_request: Callable[[ServerConnection, Request], Response | None],
         **settings: Any,
@@ -160,7 +160,7 @@ def _guarded(address: str, control: ControlOf) -> Iterator[None]:
         settings["max_size"] = MAX_MESSAGE_BYTES
         return serve(*arguments, process_request=process, **settings)
 
-    websockets.asyncio.server.serve = guarded
+    websockets.asyncio.server.serve = serve_guarded
     try:
         yield
     finally:

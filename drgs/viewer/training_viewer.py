@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.datasets.types import Dataset
 from drgs.results.history import HistoryRow
-from drgs.training.loop import History, Iteration, StopCriterion, smoothed
+from drgs.training.loop import History, Iteration, StopCriterion, exponential_mean
 from drgs.training.trainer import Trainer
 from drgs.viewer.frames import LiveScene
 from drgs.viewer.page import Page, StartView, event_handler
@@ -82,7 +82,7 @@ class TrainingViewer:
         self._progress_at = 0.0  # by time.monotonic
         self._fit_s = 0.0  # seconds of the fit's own, waited for here
 
-    def after(
+    def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
         """Render what is due, and wait while the fit is paused; its clock stands still."""
@@ -139,7 +139,7 @@ class TrainingPage(Page):
     def show_progress(self, trainer: Trainer, history: History, total: int) -> None:
         """Show the progress without waiting for anything; total: iterations in all."""
         last, done = history.rows[-1], trainer.iteration
-        psnr = smoothed([row.psnr for row in history.rows])
+        psnr = exponential_mean([row.psnr for row in history.rows])
         self._status.content = (
             f"**{done:,}** of {total:,} iterations, {last.iteration / max(last.wall_s, 1e-9):.1f} "
             f"a second\n\nPSNR {psnr[-1]:.2f} dB of training views, "
@@ -215,7 +215,7 @@ def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:
     """Return the PSNR of training views, smoothed, and of test views, where it was measured."""
     kept = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).round().astype(int))
     iterations = np.array([row.iteration for row in rows], np.float64)
-    training = smoothed([row.psnr for row in rows])
+    training = exponential_mean([row.psnr for row in rows])
     measured = [(row.iteration, row.test_psnr) for row in rows if row.test_psnr is not None]
     test = np.array(measured, np.float64).reshape(-1, 2).T
     return [(iterations[kept], training[kept]), (test[0], test[1])]

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.capture.path_tracing import first_hits, load_scene
-from drgs.config.changes import changed, with_iterations
+from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.datasets import load_dataset
 from drgs.datasets.images import smaller_view
@@ -90,12 +90,12 @@ def base_config(iterations: int) -> FitConfig:
     It starts at random points. Masks would be carved through the spoiled cameras.
     """
     small = {"data.image_size": SIZE, "init.num_points": NUM_POINTS}
-    return with_iterations(changed(config_of(PAPERS, SCENE), small), iterations)
+    return with_iterations(with_changes(config_of(PAPERS, SCENE), small), iterations)
 
 
 def fit_case(case: Case, config: FitConfig) -> tuple[Trainer, Dataset, Dataset]:
     """One fit: the trainer at its end, the data as it is, and what was fitted."""
-    config = changed(config, dict(case.changes))
+    config = with_changes(config, dict(case.changes))
     dataset = load_dataset(config.data)
     spoiled = case.spoil(dataset, np.random.default_rng(0))
     trainer = Trainer(config, spoiled, initial_gaussians(config, spoiled))
@@ -231,7 +231,7 @@ def at_sizes(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, 
 
 def views_at_sizes(config: FitConfig) -> dict[str, list[View]]:
     """The test views, each with its photograph at that size."""
-    views = load_dataset(changed(config, {"data.image_size": None}).data).test
+    views = load_dataset(with_changes(config, {"data.image_size": None}).data).test
     return {
         name: [smaller_view(view, view.width / (SIZE * factor)) for view in views]
         for name, factor in SIZES.items()
@@ -258,7 +258,7 @@ def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, f
     refinements = [effect for effect in trainer.effects if effect.name == "cameras"]
     views = list(spoiled.train)
     for refinement in refinements:
-        views = refinement.refined(views)
+        views = refinement.refined_views(views)
     scale, turn, move = similarity([v.center for v in views], [v.center for v in dataset.train])
     shifts, angles, distances = [], [], []
     for view, true in zip(views, dataset.train, strict=True):

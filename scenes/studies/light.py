@@ -188,7 +188,9 @@ def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
     segment = PathSegment(
         ray, hit.shape, hit.shape.emitter(), mi.Float(dr.inf), is_open=mi.Bool(False)
     )
-    T = RayTransport.of(integrator.state).transmittance(segment, mi.Float(0), mi.Bool(True))
+    T = RayTransport.from_splats(integrator.state).transmittance(
+        segment, mi.Float(0), mi.Bool(True)
+    )
     shows = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (T > LIT)
     return np.array(shows).reshape(height, width)
 

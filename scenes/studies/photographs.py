@@ -27,7 +27,7 @@ from fits import add_only, fit_words, make_parser
 import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.config.schema import FitConfig
-from drgs.core.environment import required
+from drgs.core.environment import require_module
 from drgs.datasets import load_dataset
 from drgs.datasets.colmap import image_folder, model_folder
 from drgs.datasets.folders import config_for, find_reader
@@ -61,7 +61,7 @@ def undistorted(config: FitConfig, folder: Path) -> Path:
 
     It has no masks: COLMAP undistorts photographs alone.
     """
-    pycolmap = required("pycolmap", "colmap", "undistorting")
+    pycolmap = require_module("pycolmap", "colmap", "undistorting")
     model = model_folder(config.data.path)
     renders = image_folder(config.data, read_model(model))
     found = pycolmap.Reconstruction(str(model))

@@ -30,7 +30,7 @@ import numpy as np
 
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.timing import seconds, steps
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.core.environment import denormals_flushed
 from drgs.core.processes import ending_together, process_number
 from drgs.datasets import load_dataset
@@ -130,7 +130,7 @@ def run_process(folder: Path, views: int, threads: int) -> None:
         "model.sh_increase_every": 1,
         "optimizer.views_per_step": views,
     }
-    config = changed(load_run_config(folder), changes)
+    config = with_changes(load_run_config(folder), changes)
     dataset, gaussians = load_dataset(config.data), Gaussians.load(folder / GAUSSIANS)
     comm = TimedCommunicator() if process_number() is None else TimedCommunicator.world()
     exchange.wait = comm.timed(exchange.wait)

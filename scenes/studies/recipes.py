@@ -22,7 +22,7 @@ from fits import SCENES as SCENES_FOLDER
 from fits import add_only, fit, make_parser
 
 from drgs.bench.output import machine, markdown_table, write_csv
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.io.figures import new_figure, write_figure
@@ -257,7 +257,7 @@ def config_of(case: Case, scene: Scene, data: Path | None = None) -> FitConfig:
     values = paper_of(scene)
     for ingredient in case.ingredients:
         values.update(ingredient.changes(scene))
-    return changed(config, values)
+    return with_changes(config, values)
 
 
 # ----------------------------------------------------------------------------------------------

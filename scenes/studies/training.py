@@ -22,7 +22,7 @@ from fits import SCENES, add_only, fit, fit_words, make_parser, write_curves
 
 import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table, write_rows
-from drgs.config.changes import changed, with_iterations
+from drgs.config.changes import with_changes, with_iterations
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.datasets import load_dataset
@@ -91,7 +91,7 @@ def apply(choice: Strategy | dict[str, object], config: FitConfig) -> FitConfig:
     """Return a configuration with a choice."""
     if isinstance(choice, Strategy):
         return choice.apply(config, config.init.num_points)
-    return changed(config, choice)
+    return with_changes(config, choice)
 
 
 def seconds_at_start() -> float:

@@ -89,7 +89,7 @@ def test_derivatives_do_not_add_up_over_rounds(small):
     renderer = effects.CaseRenderer(cases["camera refinement"], scenes.bench_gaussians(150))
     found = []
     for _ in range(2):
-        renderer.both()
+        renderer.forward_and_backward()
         gradients = [np.array(dr.grad(renderer.params[n])) for n in renderer.differentiated]
         found.append([np.asarray(gradient) for gradient in gradients])
     for first, second in zip(*found, strict=True):
@@ -107,7 +107,7 @@ def test_prices_are_medians_against_the_first_case(monkeypatch):
         def forward(self):
             return self.cost
 
-        def both(self):
+        def forward_and_backward(self):
             return 3 * self.cost
 
     cases = [effects.FittingCase("none", "none"), effects.FittingCase("slow", "x")]

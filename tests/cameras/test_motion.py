@@ -232,7 +232,7 @@ def test_motion_along_the_rows_is_exact_in_the_middle_of_each_row():
     )  # fmt: skip
     device = lens_camera(camera, effects.Pinhole(), FLOAT64)
     end = lens_camera(close, effects.Pinhole(), FLOAT64)
-    motion = Motion.between(device, end.rotation, end.center)
+    motion = Motion.relative_motion(device, end.rotation, end.center)
     device = replace(device, shutter=RollingShutter(*motion))
     frame = rendering.render(device_gaussians(gaussians, FLOAT64), device, rendering.Pipeline(0))
     alpha = 1 - planes_of(frame)[0].reshape(height, 32)

@@ -13,7 +13,7 @@ from support.small_capture import blobs
 from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs import fit, render
-from drgs.cli.execution import executing
+from drgs.cli.execution import execution_settings
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
 from drgs.training import fit_folder
@@ -51,7 +51,7 @@ def write_beyond_the_end():
 
 def test_range_checks_are_on_only_if_asked_for_and_only_within():
     for debug in (False, True):
-        with executing(threads=None, debug=debug):
+        with execution_settings(threads=None, debug=debug):
             assert dr.flag(DEBUG) == debug
         assert not dr.flag(DEBUG)
 
@@ -63,7 +63,7 @@ def test_debuggers_trace_function_is_given_back():
     before = sys.gettrace()
     sys.settrace(trace)
     try:
-        with executing(threads=None, debug=True):
+        with execution_settings(threads=None, debug=True):
             assert sys.gettrace() is not trace  # Dr.Jit notes the lines that operations come from
         assert sys.gettrace() is trace
     finally:
@@ -80,7 +80,7 @@ def test_debuggers_trace_function_is_given_back():
 def test_access_out_of_range_is_an_error_that_names_it(capsys, access, line, report):
     with (
         pytest.raises(UserError) as error,
-        executing(threads=None, debug=True) as check_ranges,
+        execution_settings(threads=None, debug=True) as check_ranges,
     ):
         check_ranges()
         access()
@@ -92,7 +92,7 @@ def test_access_out_of_range_is_an_error_that_names_it(capsys, access, line, rep
 
 
 def test_error_of_the_block_is_not_replaced_by_a_report():
-    with pytest.raises(ZeroDivisionError), executing(threads=None, debug=True):
+    with pytest.raises(ZeroDivisionError), execution_settings(threads=None, debug=True):
         read_beyond_the_end()
         1 / 0  # noqa: B018
 
@@ -100,7 +100,7 @@ def test_error_of_the_block_is_not_replaced_by_a_report():
 def test_threads_are_as_many_as_asked_for_within():
     before = dr.thread_count()
     for count in (1, before + 1):
-        with executing(threads=count, debug=False):
+        with execution_settings(threads=count, debug=False):
             assert dr.thread_count() == count
         assert dr.thread_count() == before
 
@@ -117,7 +117,7 @@ def denormal_product(count):
 )
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_denormal_numbers_are_zero_on_any_number_of_threads(count):
-    with executing(threads=count, debug=False):
+    with execution_settings(threads=count, debug=False):
         for size in (1, 64, 1_000_000):
             assert np.all(denormal_product(size) == 0)
     # The calling thread's own mode is given back.
@@ -135,7 +135,7 @@ def test_number_of_threads_that_the_system_refuses_is_the_users_to_change(monkey
     monkeypatch.setattr(dr, "set_thread_count", refuse)
     with (
         pytest.raises(UserError, match=r"--threads 100000: .*: Resource temporarily"),
-        executing(threads=100_000, debug=False),
+        execution_settings(threads=100_000, debug=False),
     ):
         pass
 

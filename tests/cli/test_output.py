@@ -178,7 +178,7 @@ def ended_process(*lines):
     """Status and standard error output of a process that does this within a command."""
     program = "\n".join([
         "import signal",
-        "from drgs.cli.ending import exit_on_interrupt, importing",
+        "from drgs.cli.ending import exit_on_interrupt, interruptible_imports",
         "signal.signal(signal.SIGINT, signal.default_int_handler)",
         "with exit_on_interrupt():",
         *(f"    {line}" for line in lines),
@@ -198,7 +198,7 @@ def test_an_interrupt_within_an_exec_ends_a_process_with_its_status():
 )
 def test_a_signal_within_an_import_ends_a_process_at_once(name, expected):
     """Modules may hide what is raised."""
-    lines = "with importing():", "  try:", f"    signal.raise_signal(signal.{name})"
+    lines = "with interruptible_imports():", "  try:", f"    signal.raise_signal(signal.{name})"
     assert ended_process(*lines, "  except BaseException:", "    pass") == expected
 
 

@@ -41,7 +41,7 @@ def far(tmp_path_factory):
     """A folder as a fit leaves it, whose world is at ``PLACE``."""
     folder = tmp_path_factory.mktemp("far")
     dataset = make_dataset()
-    views = {n: tuple(v.moved(PLACE) for v in getattr(dataset, n)) for n in ("train", "test")}
+    views = {n: tuple(v.with_offset(PLACE) for v in getattr(dataset, n)) for n in ("train", "test")}
     write_dataset(folder / "data", replace(dataset, **views))
     means = (blobs().means + (PLACE - ORIGIN)).astype(np.float32)
     (folder / "run").mkdir()

@@ -18,7 +18,7 @@ from support.commands import run_in_process
 from support.folders import visible
 from support.viewer_rendering import VIEWER_RENDERING
 
-from drgs.cli.execution import executing
+from drgs.cli.execution import execution_settings
 from drgs.config.load import dump_config, load_config
 from drgs.datasets import load_dataset
 from drgs.fit import main
@@ -211,7 +211,7 @@ def test_the_configuration_changes_all_that_a_fit_can_change(fitted, configurati
     """The tests below compare the bytes of such fits, this one with those of a longer process."""
     config = load_config(configuration)
     reports, degrees, opacities = [], set(), {}
-    with executing(threads=None, debug=False):
+    with execution_settings(threads=None, debug=False):
         trainer = make_trainer(config)
         for iteration in range(1, config.iterations + 1):
             reports.append(trainer.step().density)
@@ -252,7 +252,7 @@ def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
     trainer = make_trainer(config)
     start, results = trainer.state(), {}
     for threads in (1, 2, 5):
-        with executing(threads, debug=False):
+        with execution_settings(threads, debug=False):
             trainer.restore(start)
             for _ in range(8):
                 trainer.step()

@@ -9,7 +9,7 @@ import pytest
 from support.fit_command import assert_fits, write_project
 from support.small_fits import config_of, plain_dataset, true_blobs
 
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserNote
 from drgs.results.files import (
@@ -55,7 +55,7 @@ def test_a_budget_leaves_time_for_the_second_file(planned):
     """And for measuring it."""
     end, _ = planned(config_of(), 100.0)
     assert end == 90
-    end, _ = planned(changed(config_of(), {"model.antialiased": True}), 100.0)
+    end, _ = planned(with_changes(config_of(), {"model.antialiased": True}), 100.0)
     assert end == pytest.approx(84 * (1 - TIME_SHARE))
 
 
@@ -65,9 +65,9 @@ def test_a_short_budget_is_for_iterations_and_not_for_images(planned):
     with pytest.warns(UserNote, match=r"no report, orbit and images are written"):
         end, config = planned(config_of(), 12.0)
     assert end == 6 and not config.output.report and not config.output.save_renders
-    end, config = planned(changed(config_of(), {"output.report": False}), 12.0)
+    end, config = planned(with_changes(config_of(), {"output.report": False}), 12.0)
     assert end == 5 and config.output.save_renders
-    nothing = changed(config_of(), {"output.report": False, "output.save_renders": False})
+    nothing = with_changes(config_of(), {"output.report": False, "output.save_renders": False})
     assert planned(nothing, 7.0) == (1, nothing)
 
 

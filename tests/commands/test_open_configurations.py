@@ -2,7 +2,7 @@
 
 from conftest import REPOSITORY
 
-from drgs.config.changes import changed, is_open
+from drgs.config.changes import is_open, with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.results.files import METRICS
@@ -21,8 +21,8 @@ def test_the_background_of_renderings_is_that_of_a_fit_to_the_photographs(photog
 
 def test_a_fit_that_decided_is_finished_for_the_configuration_that_left_it_open(tmp_path):
     given = FitConfig(data={"path": tmp_path})
-    decided = changed(given, {"data.background": "black", "model.near": 0.3})
+    decided = with_changes(given, {"data.background": "black", "model.near": 0.3})
     claim_output_folder(tmp_path / "out", decided)
     (tmp_path / "out" / METRICS).write_text("{}")
     assert is_finished(tmp_path / "out", given)
-    assert not is_finished(tmp_path / "out", changed(given, {"model.near": 0.2}))
+    assert not is_finished(tmp_path / "out", with_changes(given, {"model.near": 0.2}))

@@ -1,6 +1,6 @@
 """A fit of fewer iterations has the same schedule, in proportion."""
 
-from drgs.config.changes import changed, with_iterations
+from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 
 
@@ -12,7 +12,7 @@ def test_a_shorter_schedule_keeps_its_shares():
     assert short.iterations == 6000 and short.seed == 7
     assert (short.densify.start, short.densify.stop, short.densify.every) == (100, 3000, 100)
     assert short.cameras.start == 0
-    refined = changed(config, {"cameras.start": 1000})
+    refined = with_changes(config, {"cameras.start": 1000})
     assert with_iterations(refined, 6000).cameras.start == 200
     assert (short.densify.adc.reset_every, short.densify.adc.white_background_reset) == (600, 100)
     assert short.model.sh_increase_every == 150 and short.coarse[0].until == 600

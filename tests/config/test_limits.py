@@ -138,4 +138,4 @@ def test_focal_lengths_that_run_away_are_an_error_that_names_their_rate():
     with pytest.raises(
         UserError, match=r"cameras.focal_lr: .* up to 1000, got e to the power of 88"
     ):
-        effect.measured(())
+        effect.correct_views(())

@@ -118,7 +118,7 @@ def test_an_interrupt_is_let_through_once_where_it_is_allowed(comes_before):
         try:
             if comes_before:
                 signal.raise_signal(signal.SIGINT)
-            with interrupts.allowed():
+            with interrupts.raise_interrupts():
                 signal.raise_signal(signal.SIGINT)
                 done.append("not reached")
         finally:
@@ -129,5 +129,5 @@ def test_an_interrupt_is_let_through_once_where_it_is_allowed(comes_before):
 
 def test_an_ignored_signal_stays_ignored():
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with DeferredInterrupts() as interrupts, interrupts.allowed():
+    with DeferredInterrupts() as interrupts, interrupts.raise_interrupts():
         signal.raise_signal(signal.SIGINT)

@@ -10,7 +10,7 @@ from drgs.core.files import (
     open_regular,
     read_bytes,
     read_text,
-    shortened,
+    shorten_stem,
 )
 
 
@@ -116,10 +116,10 @@ def test_only_regular_files_are_read_and_none_is_waited_for(tmp_path):
 
 
 def test_names_are_shortened_between_two_characters():
-    assert shortened("a" * 200) == "a" * 200
-    assert shortened("a" * 201) == "a" * 200
-    assert shortened("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
-    assert shortened(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9
+    assert shorten_stem("a" * 200) == "a" * 200
+    assert shorten_stem("a" * 201) == "a" * 200
+    assert shorten_stem("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
+    assert shorten_stem(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9
 
 
 def test_a_file_may_be_too_large_to_be_opened(tmp_path):

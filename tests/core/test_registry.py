@@ -32,7 +32,7 @@ def test_shipped_extensions_are_imported_when_used(monkeypatch, tmp_path):
     assert "shipped_later" not in sys.modules
     found = kinds.get("later")
     assert (found.name, found.value.__name__, found.module) == ("later", "Later", "shipped_later")
-    assert kinds.installed() == []
+    assert kinds.installed_extensions() == []
     del sys.modules["shipped_later"]
 
 
@@ -45,7 +45,7 @@ def test_an_installed_package_registers_by_its_entry_point(monkeypatch, tmp_path
     )
     entry_point(monkeypatch, tmp_path, source)
     assert kinds.names() == ["mine"]
-    assert [each.name for each in kinds.installed()] == ["mine"]
+    assert [each.name for each in kinds.installed_extensions()] == ["mine"]
     extension = kinds.get("mine")
     start = r'^kind "mine" \(outside_extension\): KeyError: '
     with pytest.raises(ExtensionError, match=start), extension.reporting():

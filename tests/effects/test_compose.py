@@ -12,7 +12,7 @@ from drgs.accuracy.exact import RayFalloff, exact_shape
 from drgs.cameras.thin_lens import RoundAperture
 from drgs.effects.compose import with_effects, without_effects
 from drgs.effects.defocus import Defocused, DimmedFalloff
-from drgs.effects.smoothing import smoothed
+from drgs.effects.smoothing import apply_smoothing
 from drgs.splatting import rendering
 from drgs.splatting.footprint import FootprintModel
 
@@ -44,7 +44,7 @@ def test_a_filter_changes_the_gaussians_first(scene):
     gaussians, camera = scene
     filtered = replace(gaussians, smoothing=llvm.Float(0.1) + 0 * gaussians.logit_opacities)
     pipeline = rendering.Pipeline(0)
-    assert with_effects(pipeline, filtered, camera) == replace(pipeline, rows=smoothed)
+    assert with_effects(pipeline, filtered, camera) == replace(pipeline, rows=apply_smoothing)
 
 
 def test_what_is_ignored_is_not_composed(scene):

@@ -31,7 +31,7 @@ from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.core.errors import UserError
-from drgs.effects.smoothing import baked, smoothed, smoothing_of
+from drgs.effects.smoothing import apply_smoothing, bake_smoothing, smoothing_of
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects as reference_effects
 from drgs.reference import splatting as reference
@@ -65,7 +65,7 @@ def test_widened_scales_and_opacities_are_those_of_the_reference(precision):
     gaussians, smoothing = Case("filter", 30, 20, 1).gaussians, filter_of(60)
     device = replace(device_gaussians(gaussians, precision), smoothing=precision.array(smoothing))
     before = load_rows(device, 1)
-    after = smoothed(before)
+    after = apply_smoothing(before)
     assert after.smoothing is None and after.means is before.means
     scales, opacities = reference_effects.smoothing_filter(
         gaussians.log_scales, gaussians.logit_opacities, rates_of(smoothing)
@@ -91,7 +91,7 @@ def test_a_wide_filter_makes_a_needle_round_and_keeps_its_integral():
         sh0=np.zeros((1, 1, 3)), shN=np.zeros((1, 0, 3)),
     )  # fmt: skip
     device = replace(device_gaussians(needle, FLOAT64), smoothing=FLOAT64.array([1.0]))
-    after = smoothed(load_rows(device, 0))
+    after = apply_smoothing(load_rows(device, 0))
     widened = np.sqrt([1.0001, 1.01, 2.0])
     np.testing.assert_allclose(np.exp(rows(after.log_scales))[0], widened, rtol=1e-14)
     np.testing.assert_allclose(rows(after.dimming), [0.001 / widened.prod()], rtol=1e-13)
@@ -212,7 +212,7 @@ def test_baked_gaussians_give_the_same_image(precision):
     """Rounded to float32, as files hold them: by the kernels, and by the reference."""
     case = clear(SmoothCase("baked", 37, 29, 1))
     host = replace(as_numpy(case.gaussians), smoothing=case.smoothing.astype(np.float32))
-    plain = baked(host)
+    plain = bake_smoothing(host)
     assert plain.smoothing is None and plain.log_scales.dtype == np.float32
     uploaded = plain.to(precision.TensorXf)
     _, frame = case.render(precision, uploaded)
@@ -229,7 +229,7 @@ def test_baked_gaussians_give_the_same_image(precision):
 
 def test_baking_without_a_filter_changes_nothing():
     host = as_numpy(Case("", 20, 20, 1).gaussians)
-    plain = baked(host)
+    plain = bake_smoothing(host)
     for name in PARAMETER_NAMES:
         assert np.array_equal(getattr(plain, name), getattr(host, name)), name
 
@@ -242,7 +242,7 @@ def test_baked_opacities_stay_finite_where_they_round_to_0_or_1(logit, smoothing
         logit_opacities=np.full(2, logit, np.float32),
         smoothing=np.full(2, smoothing, np.float32),
     )
-    plain = baked(host)
+    plain = bake_smoothing(host)
     assert np.isfinite(plain.logit_opacities).all()
     assert ((plain.logit_opacities > 10) == (logit > 0)).all()
 
@@ -394,7 +394,7 @@ def test_the_plugin_uses_the_filter_of_a_file_unless_it_is_ignored(tmp_path):
     plain.save(tmp_path / "plain.ply")
     filtered = replace(plain, smoothing=scene_filter(scene))
     filtered.save(tmp_path / "filtered.ply")
-    baked(filtered).save(tmp_path / "baked.ply")
+    bake_smoothing(filtered).save(tmp_path / "baked.ply")
 
     def image(name, **settings):
         return image_of(loaded_with(scene, filename=str(tmp_path / name), **settings))

@@ -43,7 +43,7 @@ class Vignetting(TrainingEffect):
         """Return the numbers that are fitted."""
         return self.parameters.leaves(view.index)
 
-    def after(self, fit, view, derivatives):
+    def after_backward(self, fit, view, derivatives):
         """Take a step of Adam."""
         dr.set_grad(self.leaves(view), derivatives)
         self.parameters.step(view.index, fit.rate_decay)

@@ -36,14 +36,14 @@ def as_reference(gaussians) -> reference.Gaussians:
 
 
 def test_a_matrix_is_taken_apart():
-    similarity = Similarity.of(MATRIX, "x")
+    similarity = Similarity.from_matrix(MATRIX, "x")
     assert similarity.scale == pytest.approx(SCALE, rel=1e-14)
     np.testing.assert_allclose(similarity.rotation, ROTATION, atol=1e-14)
     np.testing.assert_array_equal(similarity.translation, TRANSLATION)
 
 
 def test_numbers_of_five_digits_are_a_rotation_and_the_nearest_is_used():
-    similarity = Similarity.of(np.round(MATRIX, 5), "x")
+    similarity = Similarity.from_matrix(np.round(MATRIX, 5), "x")
     np.testing.assert_allclose(similarity.rotation, ROTATION, atol=1e-5)
     np.testing.assert_allclose(similarity.rotation @ similarity.rotation.T, np.eye(3), atol=1e-14)
 
@@ -66,14 +66,14 @@ def test_anything_but_a_similarity_is_refused(case):
         r"along all axes and positive, got the matrix \["
     )
     with pytest.raises(ValueError, match=message):
-        Similarity.of(REFUSED[case], "splats: to_world")
+        Similarity.from_matrix(REFUSED[case], "splats: to_world")
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_a_moved_model_looks_as_before_from_a_camera_that_moved_with_it(degree):
     """Depths are multiplied. float32 parameters of a moved model are rounded anew: 1e-7 each."""
     scene, camera = Scene(degree=degree), Scene().camera
-    moved = Similarity.of(MATRIX, "x").of_gaussians(model(degree))
+    moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(model(degree))
     assert {getattr(moved, n).dtype for n in PARAMETER_NAMES} == {np.dtype(np.float32)}
     follower = replace(
         camera,
@@ -91,13 +91,15 @@ def test_a_moved_model_looks_as_before_from_a_camera_that_moved_with_it(degree):
 
 def test_a_smoothing_filter_grows_with_the_model():
     filters = np.linspace(0.01, 0.2, 40, dtype=np.float32)
-    moved = Similarity.of(MATRIX, "x").of_gaussians(model(smoothing=filters))
+    moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(model(smoothing=filters))
     np.testing.assert_allclose(moved.smoothing, SCALE * filters, rtol=1e-6)
     assert moved.smoothing.dtype == np.float32
 
 
 def test_positions_that_leave_float32_are_refused_and_quaternions_do_not():
-    turn = Similarity.of(matrix_of(Rotation.from_euler("z", 45, degrees=True).as_matrix()), "it")
+    turn = Similarity.from_matrix(
+        matrix_of(Rotation.from_euler("z", 45, degrees=True).as_matrix()), "it"
+    )
     far = model()
     far.quats[:] = 3e38
     assert np.isfinite(turn.of_gaussians(far).quats).all()
@@ -108,5 +110,5 @@ def test_positions_that_leave_float32_are_refused_and_quaternions_do_not():
 
 def test_what_a_move_does_not_touch_stays():
     before = model()
-    moved = Similarity.of(MATRIX, "x").of_gaussians(before)
+    moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(before)
     assert moved.logit_opacities is before.logit_opacities and moved.sh0 is before.sh0

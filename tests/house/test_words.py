@@ -14,7 +14,7 @@ NAMES = re.findall(
     r"\w+",
     """
     about above after along around as at back before behind below between beyond both by for from
-    in inside into last near next of off on only onto other others out outside over own through to
+    in inside into last near next of off on only onto other others out outside over own through
     together towards under unless until up where whole why with within without been begun built
     called chosen drawn found given gone held hidden kept known lost made met paid seen sent shown
     spent taken told unknown unread unseen written asks says seeing weighing importing executing

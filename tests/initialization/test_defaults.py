@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.datasets import dataset_of, view_at
 
-from drgs.config.changes import changed, decided_as, with_iterations
+from drgs.config.changes import decided_as, with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.initialization.defaults import resolve_defaults
 
@@ -60,14 +60,14 @@ def test_what_is_cut_out_is_not(photographs):
 
 def test_neither_are_small_images_and_the_papers_recipe(photographs):
     assert stages(CONFIG, photographs_of(120, 99)) == []
-    assert stages(changed(CONFIG, {"iterations": 1}), photographs) == []
-    assert stages(changed(CONFIG, {"densify.strategy": "adc"}), photographs) == []
+    assert stages(with_changes(CONFIG, {"iterations": 1}), photographs) == []
+    assert stages(with_changes(CONFIG, {"densify.strategy": "adc"}), photographs) == []
 
 
 def test_what_is_given_stays(photographs):
-    none = changed(CONFIG, {"coarse": []})
+    none = with_changes(CONFIG, {"coarse": []})
     assert stages(none, photographs) == []
-    quarter = changed(CONFIG, {"coarse": [{"until": 9, "factor": 4}]})
+    quarter = with_changes(CONFIG, {"coarse": [{"until": 9, "factor": 4}]})
     assert stages(quarter, photographs) == [(9, 4)]
 
 

@@ -108,9 +108,11 @@ def test_nothing_is_known_where_no_image_shows_a_point(ball):
 def test_of_very_many_points_few_views_are_looked_at(ball, monkeypatch):
     monkeypatch.setattr(point_colors, "MAX_BYTES", 12 * COUNT * 9)
     looked_at = []
-    seen = point_colors._shown
+    seen = point_colors._find_shown_points
     monkeypatch.setattr(
-        point_colors, "_shown", lambda view, *rest: looked_at.append(view.name) or seen(view, *rest)
+        point_colors,
+        "_find_shown_points",
+        lambda view, *rest: looked_at.append(view.name) or seen(view, *rest),
     )
     points, spacing = on_the_ball()
     colors = colors_from_images(points, spacing, ball, WHITE)

@@ -203,7 +203,7 @@ def test_rays_of_another_sensor_are_refused():
     def rays(sensor, place=place):
         return sensor.sample_ray_differential(0, 0, place, mi.Point2f(0.5))[0]
 
-    found = ImageRays.of(first, 0.01, rays(first))
+    found = ImageRays.from_rays(first, 0.01, rays(first))
     np.testing.assert_allclose(
         np.array([(p.x, p.y) for p in found.positions]), 0.5, rtol=0, atol=1e-4
     )
@@ -213,9 +213,9 @@ def test_rays_of_another_sensor_are_refused():
         to_world = VIEWS[1].sensor()["to_world"] @ change
         other = mi.load_dict(VIEWS[1].sensor() | {"to_world": to_world})
         with pytest.raises(NotImplementedError, match="inside 'aov'"):
-            ImageRays.of(first, 0.01, rays(other))
+            ImageRays.from_rays(first, 0.01, rays(other))
     mirrored = mi.Point2f(1 - place.x, place.y)
     with pytest.raises(NotImplementedError, match="inside 'aov'"):
-        ImageRays.of(first, 0.01, rays(first, mirrored))
+        ImageRays.from_rays(first, 0.01, rays(first, mirrored))
     with pytest.raises(NotImplementedError, match="inside 'aov'"):
-        ImageRays.of(first, 0.01, dr.gather(mi.Ray3f, mi.Ray3f(rays(first)), pixel[:-1]))
+        ImageRays.from_rays(first, 0.01, dr.gather(mi.Ray3f, mi.Ray3f(rays(first)), pixel[:-1]))

@@ -109,10 +109,10 @@ def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
     assert coverage.max() > fog.opacity / 2
     for is_open, expected in ((False, coverage * decode(color)), (True, decode(seen))):
         which = dr.full(mi.Bool, is_open, RAYS * PATHS)
-        drawn, covered = map(rows, light._sampled(segments(PATHS), which, samples()))
+        drawn, covered = map(rows, light._composite_sampled(segments(PATHS), which, samples()))
         assert_mean(covered, coverage, missed(coverage))
         assert_mean(drawn, expected, missed(coverage))
-        exact, _ = light._composited(segments(1), mi.Bool(is_open), mi.Float(0))
+        exact, _ = light._composite_all(segments(1), mi.Bool(is_open), mi.Float(0))
         assert (np.abs(rows(exact) - expected) < DECODED_WITHIN).all()
 
 

@@ -151,8 +151,8 @@ def test_rough_mirrors_and_mirrors_in_mirrors_are_seen_from_the_mirrored_camera(
 
 
 def test_images_are_kept_until_something_changes(monkeypatch):
-    counts, of = [], Mirrors.of
-    monkeypatch.setattr(Mirrors, "of", lambda *values: counts.append(1) or of(*values))
+    counts, render = [], Mirrors.render
+    monkeypatch.setattr(Mirrors, "render", lambda *values: counts.append(1) or render(*values))
     ball = {"type": "sphere", "radius": 0.3, "to_world": at(0.1, 0.9, 0)}
     found = scene(ball=ball)
     changes = {
@@ -192,7 +192,7 @@ def test_a_camera_that_goes_on_needs_no_new_kernels():
 
 def test_flat_shapes_are_known_by_their_vertices():
     def plane(shape):
-        return FlatMirror.of(mi.load_dict(shape | {"bsdf": CONDUCTOR}))
+        return FlatMirror.from_shape(mi.load_dict(shape | {"bsdf": CONDUCTOR}))
 
     turned = at(1, 2, 3) @ mi.ScalarTransform4f().rotate([0, 1, 0], 30).scale([2, -3, 1])
     normal = np.array([0.5, 0, np.sqrt(0.75)])
@@ -215,6 +215,6 @@ def test_flat_shapes_are_known_by_their_vertices():
 def test_what_is_reflected_elsewhere_is_no_business_of_the_mirrored_camera(
     bsdf, has_delta, is_specular
 ):
-    found = FlatMirror.of(mi.load_dict(floor(bsdf={"type": bsdf})))
+    found = FlatMirror.from_shape(mi.load_dict(floor(bsdf={"type": bsdf})))
     assert (found.has_delta, found.is_specular) == (has_delta, is_specular)
-    assert FlatMirror.of(mi.load_dict(floor(bsdf={"type": "diffuse"}))) is None
+    assert FlatMirror.from_shape(mi.load_dict(floor(bsdf={"type": "diffuse"}))) is None

@@ -34,7 +34,7 @@ def variant():
 
 def moved_by(matrix, gaussians) -> reference.Gaussians:
     """Gaussians moved in double precision."""
-    place = Similarity.of(matrix, "the test's matrix")
+    place = Similarity.from_matrix(matrix, "the test's matrix")
     means, quats, shN = rotate_gaussians(
         gaussians.means, gaussians.quats, gaussians.shN, place.rotation
     )
@@ -97,7 +97,7 @@ def test_a_moved_object_looks_as_a_file_saved_moved(tmp_path):
     arrays = {n: getattr(model, n).astype(np.float32) for n in PARAMETER_NAMES}
     stored = Gaussians(**arrays, smoothing=filters)
     stored.save(tmp_path / "object.ply")
-    Similarity.of(MATRIX, "it").of_gaussians(stored).save(tmp_path / "moved.ply")
+    Similarity.from_matrix(MATRIX, "it").of_gaussians(stored).save(tmp_path / "moved.ply")
 
     def file(name, **settings):
         settings = scene.settings | {"filename": str(tmp_path / name)} | settings
@@ -208,7 +208,7 @@ def test_a_filter_that_grows_with_an_object_is_differentiated():
     weights = scene.weights()
 
     def loss(matrix):
-        k = Similarity.of(matrix, "it").scale
+        k = Similarity.from_matrix(matrix, "it").scale
         return np.sum(
             weights * rendered(scene, smoothed_reference(moved_by(matrix, model), k * filters))
         )
@@ -262,7 +262,7 @@ def test_raw_parameters_have_derivatives_in_the_objects_space():
     scene, model = scene_and_object()
     world = reference.render_gradients(moved_by(MATRIX, model), *_cotangents(scene), None, 3, False)
     found = gradients_of(load(scene, model), scene.weights(), PARAMETER_NAMES)
-    back = Similarity.of(np.linalg.inv(MATRIX), "it")
+    back = Similarity.from_matrix(np.linalg.inv(MATRIX), "it")
     means, quats, shN = rotate_gaussians(
         world["means"], world["quats"], world["shN"], back.rotation
     )

@@ -93,8 +93,8 @@ def test_what_a_probe_does_not_see_is_nothing_or_traced():
 
 
 def test_probes_are_kept_until_something_changes(monkeypatch):
-    counts, of = [], Probes.of
-    monkeypatch.setattr(Probes, "of", lambda *values: counts.append(1) or of(*values))
+    counts, render = [], Probes.render
+    monkeypatch.setattr(Probes, "render", lambda *values: counts.append(1) or render(*values))
     scene = scene_of(around(20), light="probe", probes="ball", spp=1, **mirror_ball())
     changes = {
         "integrator.sh0": lambda sh0: sh0 + 0.1,

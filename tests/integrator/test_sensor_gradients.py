@@ -156,7 +156,7 @@ def rolling_image(scene, values):
     opened, closed = (with_intrinsics(c(VIEWS[1], values), values) for c in (camera_of, closing))
     camera: Camera = device_camera(opened, FLOAT64)
     other = device_camera(closed, FLOAT64)
-    motion = Motion.between(camera, other.rotation, other.center)
+    motion = Motion.relative_motion(camera, other.rotation, other.center)
     camera = replace(camera, shutter=RollingShutter(*motion))
     gaussians = device_gaussians(scene.gaussians, FLOAT64)
     frame = rendering.render(gaussians, camera, rendering.Pipeline(scene.degree))

@@ -15,12 +15,17 @@ import drgs  # noqa: F401  (registers the plugins)
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.fingerprint import fingerprint_of
 from drgs.datasets.types import CameraMotion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.integrator.summary import SimulatedEffect, described, summary_of_sensors, summary_of_views
+from drgs.integrator.summary import (
+    SimulatedEffect,
+    format_effects,
+    summary_of_sensors,
+    summary_of_views,
+)
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from drgs.training.effects.base import integrator_settings, training_effects
 from drgs.training.loop import History
@@ -48,7 +53,7 @@ def variant():
 def config_of(**changes):
     """The default of everything but of filters; ``__`` is written for the dot."""
     values = {key.replace("__", "."): value for key, value in changes.items()}
-    return changed(FitConfig(data={"path": "."}, model=VIEWER_RENDERING), values)
+    return with_changes(FitConfig(data={"path": "."}, model=VIEWER_RENDERING), values)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -63,21 +68,24 @@ def test_a_plan_is_a_line_for_each_effect_and_one_for_all_others():
         SimulatedEffect("c", "some", "z"),
         SimulatedEffect("d", None),
     ]
-    assert described(effects) == "simulated:\n  a: much (x.y)\n  c: some (z)\n  not simulated: b, d"
-    assert described(effects[:1]) == "simulated:\n  a: much (x.y)"
+    assert (
+        format_effects(effects)
+        == "simulated:\n  a: much (x.y)\n  c: some (z)\n  not simulated: b, d"
+    )
+    assert format_effects(effects[:1]) == "simulated:\n  a: much (x.y)"
     ignored = [
         *effects,
         SimulatedEffect("e", None, "z", ignored=True),
         SimulatedEffect("f", "a part", "z", True),
     ]
-    assert described(ignored[4:]) == (
+    assert format_effects(ignored[4:]) == (
         "simulated:\n  f: a part (z)\n  not simulated: e (ignored), f (ignored)"
     )
 
 
 def test_the_plan_of_a_plain_fit():
     config = config_of(data__background="white")
-    assert described(summary_of_fit(config, fits.plain_dataset())) == (
+    assert format_effects(summary_of_fit(config, fits.plain_dataset())) == (
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 3 (model.sh_degree: 3)\n"
         "  background: white (data.background)\n"
@@ -89,8 +97,8 @@ def test_the_plan_of_a_plain_fit():
 def test_the_plan_of_a_fit_by_default_is_antialiased():
     config = config_of(model__antialiased=True, model__low_pass=0.1, data__background="white")
     default = FitConfig(data={"path": ".", "background": "white"})
-    plan = described(summary_of_fit(default, fits.plain_dataset()))
-    assert plan == described(summary_of_fit(config, fits.plain_dataset()))
+    plan = format_effects(summary_of_fit(default, fits.plain_dataset()))
+    assert plan == format_effects(summary_of_fit(config, fits.plain_dataset()))
     assert "antialiasing: opacities compensated for the low-pass filter" in plan
 
 
@@ -116,7 +124,7 @@ EVERYTHING = {
 
 def test_the_plan_of_a_fit_names_what_asked_for_each_effect():
     config = config_of(**EVERYTHING, model__sh_degree=0, cameras__focal_lr=1e-4)
-    assert described(summary_of_fit(config, rich_dataset())) == (
+    assert format_effects(summary_of_fit(config, rich_dataset())) == (
         "simulated:\n"
         "  background: a random colour at each iteration (data.random_background)\n"
         "  lens distortion: fisheye (k1) and opencv (k1, k2) "
@@ -167,15 +175,15 @@ def test_the_plan_follows_the_configuration(changes, name, expected):
 def test_the_plan_of_a_fit_names_what_its_data_has_and_is_ignored():
     """Not what is ignored and not there."""
     ignored = replace(fits.plain_dataset(), ignored=("distortion", "motion", "masks", "depth"))
-    assert described(summary_of_fit(config_of(), ignored)).splitlines()[-1] == (
+    assert format_effects(summary_of_fit(config_of(), ignored)).splitlines()[-1] == (
         "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, exposure and "
         "white balance, masks (ignored), depth (ignored), camera refinement"
     )
     plain = config_of(
         loss__depth_weight=0.0, data__ignore_distortion=True, data__ignore_motion=True
     )
-    assert "ignored" not in described(summary_of_fit(plain, fits.plain_dataset()))
-    assert "depth (ignored)" in described(summary_of_fit(plain, rich_dataset()))
+    assert "ignored" not in format_effects(summary_of_fit(plain, fits.plain_dataset()))
+    assert "depth (ignored)" in format_effects(summary_of_fit(plain, rich_dataset()))
 
 
 def rich_scene(**settings):
@@ -186,7 +194,7 @@ def rich_scene(**settings):
 
 def test_the_plan_of_views_regards_all_of_them():
     views = rich_dataset().train
-    assert described(summary_of_views(rich_scene().state, views[1:])) == (
+    assert format_effects(summary_of_views(rich_scene().state, views[1:])) == (
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
         "  background: a constant colour (the integrator's background)\n"
@@ -198,13 +206,17 @@ def test_the_plan_of_views_regards_all_of_them():
 
 def test_the_plan_of_views_names_what_they_have_and_is_ignored():
     integrator = rich_scene(ignore="distortion, motion, defocus, smoothing")
-    assert described(summary_of_views(integrator.state, rich_dataset().train)).splitlines()[-1] == (
+    assert format_effects(summary_of_views(integrator.state, rich_dataset().train)).splitlines()[
+        -1
+    ] == (
         "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, "
         "smoothing filter (ignored)"
     )
-    assert described(summary_of_views(integrator.state, fits.plain_dataset().train)).splitlines()[
-        -1
-    ] == ("  not simulated: lens distortion, motion, antialiasing, smoothing filter (ignored)")
+    assert format_effects(
+        summary_of_views(integrator.state, fits.plain_dataset().train)
+    ).splitlines()[-1] == (
+        "  not simulated: lens distortion, motion, antialiasing, smoothing filter (ignored)"
+    )
 
 
 def cameras_of_sensors():
@@ -223,7 +235,9 @@ def cameras_of_sensors():
 
 def test_the_plan_of_sensors_regards_all_of_them():
     cameras = cameras_of_sensors()
-    assert described(summary_of_sensors(rich_scene().state, cameras, None)).splitlines()[3:] == [
+    assert format_effects(summary_of_sensors(rich_scene().state, cameras, None)).splitlines()[
+        3:
+    ] == [
         "  lens: Orthographic and RadialTangential (k1) (2 of 4 sensors)",
         "  depth of field: a thin lens (1 of 4 sensors)",
         "  motion: blurred (1 of 4 sensors)",
@@ -231,17 +245,17 @@ def test_the_plan_of_sensors_regards_all_of_them():
         "  not simulated: surfaces",
     ]
     ignoring = rich_scene(ignore="distortion, motion, defocus")
-    assert described(summary_of_sensors(ignoring.state, cameras, None)).splitlines()[3:] == [
+    assert format_effects(summary_of_sensors(ignoring.state, cameras, None)).splitlines()[3:] == [
         "  lens: Orthographic (1 of 4 sensors)",
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
         "  not simulated: lens (ignored), depth of field (ignored), motion (ignored), surfaces",
     ]
     plan = summary_of_sensors(rich_scene().state, cameras[:1], None, num_surfaces=2)
     line = "  surfaces: a nested integrator's image, between the splats (2 of the scene's shapes)"
-    assert line in described(plan).splitlines()
-    assert described(summary_of_sensors(ignoring.state, cameras[:1], None)).splitlines()[-1] == (
-        "  not simulated: lens, depth of field, motion, surfaces"
-    )
+    assert line in format_effects(plan).splitlines()
+    assert format_effects(summary_of_sensors(ignoring.state, cameras[:1], None)).splitlines()[
+        -1
+    ] == ("  not simulated: lens, depth of field, motion, surfaces")
 
 
 def test_the_plan_of_a_fit_says_what_takes_part_in_it():
@@ -424,7 +438,7 @@ from drgs.training.effects.base import training_effects
 from drgs.training.summary import summary_of_fit
 from support import small_capture as capture
 from support.viewer_rendering import VIEWER_RENDERING
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 
 plain = capture.make_dataset(2, 1)
@@ -441,7 +455,7 @@ for name, extras, changes in (
     ("colors", {{}}, {{"colors.lr": 0.1}}),
     ("cameras", {{}}, {{"cameras.optimise": True}}),
 ):
-    config = changed(FitConfig(data={{"path": "."}}), changes)
+    config = with_changes(FitConfig(data={{"path": "."}}), changes)
     summary_of_fit(config, dataset(**extras))
     training_effects(config, dataset(**extras))
     now = set(sys.modules) & set({modules!r})

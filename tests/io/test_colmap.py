@@ -55,10 +55,10 @@ def test_parameters_have_names(tmp_path):
     cameras = [(k, name, 640, 480, values) for k, (name, values) in enumerate(PARAMETERS.items())]
     for name, write in WRITERS.items():
         read = read_model(write(tmp_path / name, Model(cameras))).cameras
-        assert [tuple(camera.named()) for camera in read.values()] == [
+        assert [tuple(camera.named_values()) for camera in read.values()] == [
             MODELS[camera[1]][1] for camera in cameras
         ]
-    assert read[4].named() == {
+    assert read[4].named_values() == {
         "fx": 600, "fy": 620, "cx": 320.5, "cy": 239, "k1": 0.01, "k2": 0.02, "p1": 0.03, "p2": 0.04
     }  # fmt: skip
 

@@ -90,7 +90,7 @@ def rays_of_sensor(view) -> tuple[np.ndarray, np.ndarray]:
 def pass_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
     """Transmittance and colour (H, W, 4) of what rays pass on their whole length."""
     device = load_rows(device_gaussians(gaussians, precision), gaussians.sh_degree)
-    splats = RaySplats.of(device, gaussians.sh_degree, cutoffs or Cutoffs())
+    splats = RaySplats.from_gaussians(device, gaussians.sh_degree, cutoffs or Cutoffs())
     types, count = types_of(precision.Float), len(rays[0])
     far, active = dr.full(types.Float, dr.inf, count), dr.full(types.Bool, True, count)
     color, T = splats.composite_segment(Segment(*map(precision.vectors, rays), far, active))

@@ -48,7 +48,7 @@ def probes_of(gaussians, precision, centers=CENTERS) -> probe.Probes:
     ).to(precision.TensorXf)
     approximations = Approximations(projection="exact", low_pass=1e-3)
     pipeline = pipeline_of(approximations, gaussians.sh_degree, (color_features, depth_feature))
-    return probe.Probes.of(ours, pipeline, centers, 1e-3, lambda color: color)
+    return probe.Probes.render(ours, pipeline, centers, 1e-3, lambda color: color)
 
 
 def look(probes, rays, precision, number=0, level=0):

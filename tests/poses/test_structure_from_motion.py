@@ -394,10 +394,16 @@ def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below
 
 def test_options_that_are_offered_are_others():
     few, many = sfm.ALL_PAIRS, sfm.ALL_PAIRS + 1
-    assert "--compare all" not in Search().others(few) + Search(compare="all").others(many)
-    assert "--compare all" in Search().others(many) + Search(compare="neighbours").others(few)
-    assert "--share one" in Search().others(9) and "--camera-model SIMPLE" in Search().others(9)
-    assert Search("SIMPLE_RADIAL", "all", "one").others(9) == (
+    assert "--compare all" not in Search().alternative_options(few) + Search(
+        compare="all"
+    ).alternative_options(many)
+    assert "--compare all" in Search().alternative_options(many) + Search(
+        compare="neighbours"
+    ).alternative_options(few)
+    assert "--share one" in Search().alternative_options(
+        9
+    ) and "--camera-model SIMPLE" in Search().alternative_options(9)
+    assert Search("SIMPLE_RADIAL", "all", "one").alternative_options(9) == (
         "--camera-model OPENCV_FISHEYE (a fisheye)"
     )
 

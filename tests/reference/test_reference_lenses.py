@@ -167,7 +167,7 @@ def test_tangential_terms_alone_fold_on_one_side(p1, p2):
     toward = -np.array([p2, p1]) / q
     for part in (0.5, 0.99):
         beyond = (1 / (3 * q) - part * lens.valid_radius) * toward
-        images = [lens.distorted(s) for s in (part * lens.valid_radius * toward, beyond)]
+        images = [lens.distort(s) for s in (part * lens.valid_radius * toward, beyond)]
         np.testing.assert_allclose(*images, rtol=1e-9)
 
 
@@ -180,9 +180,9 @@ def test_within_its_radius_a_lens_with_tangential_terms_is_undone(k1):
     slopes = (parts * lens.valid_radius)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
     slopes = slopes.reshape(-1, 2)
     # Next to the fold the inverse is steeper than the distortion by a factor of 1000.
-    np.testing.assert_allclose(lens.undistorted(lens.distorted(slopes)), slopes, atol=1e-8)
+    np.testing.assert_allclose(lens.undistort(lens.distort(slopes)), slopes, atol=1e-8)
     toward = lens.valid_radius * np.array([0.8, -0.6])
-    steps = [lens.distorted(f * toward) - lens.distorted((f - 1e-3) * toward) for f in (1, 1.002)]
+    steps = [lens.distort(f * toward) - lens.distort((f - 1e-3) * toward) for f in (1, 1.002)]
     assert steps[0] @ toward > 0 and (steps[1] @ toward < 0) == (k1 < 0)
 
 
@@ -198,7 +198,7 @@ def test_lenses_with_tangential_terms_have_no_fold_within_their_radius():
         slopes = (radius * radii)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
         h = 1e-6 * radius
         (a, c), (b, d) = (
-            np.moveaxis((lens.distorted(slopes + step) - lens.distorted(slopes - step)) / h, -1, 0)
+            np.moveaxis((lens.distort(slopes + step) - lens.distort(slopes - step)) / h, -1, 0)
             for step in h * np.eye(2) / 2
         )
         assert (a * d - b * c).min() > 0 and (a + d).min() > 0, lens
@@ -255,7 +255,7 @@ def test_distortion_is_undone(lens):
     slopes = np.random.default_rng(0).uniform(-0.55, 0.55, (300, 2))
     assert np.linalg.norm(slopes, axis=1).max() < lens.valid_radius
     # Newton stops at rounding; near no fold the inverse is as accurate as the residual.
-    np.testing.assert_allclose(lens.undistorted(lens.distorted(slopes)), slopes, atol=1e-11)
+    np.testing.assert_allclose(lens.undistort(lens.distort(slopes)), slopes, atol=1e-11)
 
 
 def test_undistorted_radius_is_the_root_of_the_radial_equation():
@@ -263,11 +263,11 @@ def test_undistorted_radius_is_the_root_of_the_radial_equation():
     highest = radial(lens, lens.valid_radius)
     for radius in (0.1, 0.5, 0.999 * highest):
         expected = brentq(lambda r, t=radius: radial(lens, r) - t, 0, lens.valid_radius)
-        actual = lens.undistorted(np.array([[0.6, -0.8]]) * radius)
+        actual = lens.undistort(np.array([[0.6, -0.8]]) * radius)
         # brentq's own tolerance, 2e-12; the fold amplifies the residual by a few hundred.
         np.testing.assert_allclose(actual, [[0.6 * expected, -0.8 * expected]], atol=1e-9)
     beyond = np.array([[0.6, -0.8]]) * [[1.001 * highest], [3.0]]
-    assert np.isnan(lens.undistorted(beyond)).all()
+    assert np.isnan(lens.undistort(beyond)).all()
 
 
 @pytest.mark.parametrize("degrees", [1e-6, 30, 90, 120, 170])
@@ -337,7 +337,7 @@ def test_a_prism_or_a_tangential_term_alone_folds_on_one_side():
     lens = ThinPrismFisheye(sx1=0.3, sy1=-0.4)
     assert lens.valid_angle == pytest.approx(1.0, rel=1e-12)
     places = np.array([[0.5], [0.99], [1.5], [1.01]]) * [-0.6, 0.8]
-    shown = lens.distorted(places)
+    shown = lens.distort(places)
     np.testing.assert_allclose(shown[:2], shown[2:], rtol=1e-12)
 
 
@@ -358,7 +358,7 @@ def test_thin_prism_fisheyes_have_no_fold_within_their_angle():
         unit = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
         places, h = (limit * parts)[..., None] * unit, 1e-6 * limit
         columns = [
-            (lens.distorted(places + step) - lens.distorted(places - step)) / h
+            (lens.distort(places + step) - lens.distort(places - step)) / h
             for step in h * np.eye(2) / 2
         ]
         quotients = np.stack(columns, axis=-1)
@@ -379,7 +379,7 @@ def test_a_thin_prism_fisheye_is_undone_within_its_angle():
         places = angles[..., None] * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
         places = places.reshape(-1, 2)
         # Next to a fold the inverse is steeper than the distortion by a factor of 1000.
-        np.testing.assert_allclose(lens.undistorted(lens.distorted(places)), places, atol=1e-8)
+        np.testing.assert_allclose(lens.undistort(lens.distort(places)), places, atol=1e-8)
 
 
 def test_depth_is_distance_for_a_fisheye_and_z_otherwise():

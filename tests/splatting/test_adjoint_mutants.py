@@ -312,7 +312,7 @@ class TestDefault(MutationChecks):
     } | {
         site: "test_placement: a smoothing filter that grows with an object"
         for site in (
-            "rendering.Pipeline.differentiated"
+            "rendering.Pipeline.select_differentiable"
             "return rows if self.of_smoothing else replace(rows, smoothing=None)",
             "rendering._columns_ofd_rows.smoothing",
         )

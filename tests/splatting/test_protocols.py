@@ -89,4 +89,12 @@ def test_a_class_has_what_its_protocol_says(protocol, implementation):
 def test_what_is_missing_is_found():
     assert "view_direction" in missing(lens.Lens, thin_lens.RoundAperture)
     assert missing(lens.Lens, lens.Perspective) == ["project_point", "projection_jacobian"]
-    assert "at" in missing(pixel_lists.AffineDepths, footprint.SplatFeatures)
+
+    class Protocol:
+        def area(self, width, height): ...
+
+    class Implementation:
+        def area(self, width):
+            return width
+
+    assert missing(Protocol, Implementation) == ["area"]

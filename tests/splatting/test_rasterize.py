@@ -304,7 +304,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     """Every pair that is composited has a slot of its own, and a lane's slots are contiguous."""
     scene = SCENES["opaque"]
     bins, _, layers = scene.composite(precision)
-    composited_pairs = CompositedPairs.of(bins, layers.stop, ONE_SAMPLE)
+    composited_pairs = CompositedPairs.find(bins, layers.stop, ONE_SAMPLE)
     (band,) = bands_of(bins, composited_pairs)
     slots, composited = assign_slots(composited_pairs, band), np.array(composited_pairs.masks)
     pairs = np.array(slots.pairs).astype(np.int64).reshape(-1, MICROS, 2)
@@ -353,7 +353,7 @@ def test_bands_make_no_difference(band_slots, monkeypatch):
         found = composite_adjoint(bins, records, layers, d_planes[1:], d_planes[0])
         return [np.array(column).tobytes() for column in found.geometry + found.features]
 
-    pairs = CompositedPairs.of(bins, layers.stop, ONE_SAMPLE)
+    pairs = CompositedPairs.find(bins, layers.stop, ONE_SAMPLE)
     (whole,), expected = bands_of(bins, pairs), gradients()
     monkeypatch.setattr(slots_module, "BAND_SLOTS", band_slots)
     bands = bands_of(bins, pairs)

@@ -63,7 +63,7 @@ def image_of(
     fine = (np.arange(size * samples) + 0.5) / samples
     slopes = np.stack(np.meshgrid(fine, fine), axis=-1).reshape(-1, 2) / focal - middle / focal
     if lens is not None:
-        slopes = lens.undistorted(slopes)
+        slopes = lens.undistort(slopes)
     rays = np.column_stack([slopes, np.ones(len(slopes))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays @ pose[:3, :3].T

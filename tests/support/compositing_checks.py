@@ -143,7 +143,7 @@ class FlatScene:
         columns = [precision.array(column) for column in self.features.T]
         grid, model = TileGrid(self.width, self.height), FootprintModel(cutoffs=self.cutoffs)
         bins = bin_splats(self.splats(precision), grid, columns, model)
-        records = rasterize.Records.of(bins, bins.rows.load)
+        records = rasterize.Records.from_ranks(bins, bins.rows.load)
         return bins, records, composite(bins, records)
 
     def as_images(self, planes) -> dict[str, np.ndarray]:

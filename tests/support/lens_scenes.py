@@ -85,13 +85,13 @@ def points_at(lens: effects.Lens, camera: reference.Camera, film, distances) -> 
     if isinstance(lens, Orthographic):
         return np.column_stack([plane, distances])
     if isinstance(lens, ThinPrismFisheye):
-        places = lens.undistorted(plane)
+        places = lens.undistort(plane)
         angles = np.linalg.norm(places, axis=1)
         directions = np.column_stack([np.sinc(angles / np.pi)[:, None] * places, np.cos(angles)])
     elif isinstance(lens, Fisheye):
         directions = _fisheye_directions(lens, plane)
     else:
-        slopes = lens.undistorted(plane) if isinstance(lens, OpenCV) else plane
+        slopes = lens.undistort(plane) if isinstance(lens, OpenCV) else plane
         directions = np.column_stack([slopes, np.ones(len(plane))])
     return directions * distances[:, None]
 

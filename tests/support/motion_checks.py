@@ -76,7 +76,7 @@ class MovingCase(LensCase):
     def device_camera(self, precision) -> Camera:
         camera = super().device_camera(precision)
         close = lens_camera(self.close_camera, self.lens, precision)
-        motion = Motion.between(camera, close.rotation, close.center)
+        motion = Motion.relative_motion(camera, close.rotation, close.center)
         if self.samples:
             camera = replace(camera, shutter=MotionBlur(*motion, self.samples))
         else:

@@ -48,4 +48,6 @@ def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=DEFAULT) -> Ray
     ours = Gaussians(
         **{name: np.asarray(value, precision.dtype) for name, value in vars(gaussians).items()}
     ).to(precision.TensorXf)
-    return RaySplats.of(load_rows(ours, gaussians.sh_degree), gaussians.sh_degree, cutoffs)
+    return RaySplats.from_gaussians(
+        load_rows(ours, gaussians.sh_degree), gaussians.sh_degree, cutoffs
+    )

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -106,7 +106,7 @@ def config_of(**changes) -> FitConfig:
         },
         iterations=400,
     )
-    return changed(config, changes)
+    return with_changes(config, changes)
 
 
 def make_trainer(dataset: Dataset, gaussians: Gaussians | None = None, **changes) -> Trainer:
@@ -173,7 +173,7 @@ def assert_no_new_kernels(trainer: Trainer, warm=7, count=5) -> None:
 def end_view(effect: TrainingEffect, trainer: Trainer, view) -> None:
     """Let an effect take its step, as the trainer does."""
     derivatives = {name: dr.grad(leaf) for name, leaf in effect.leaves(view).items()}
-    effect.after(trainer.fit_state(), view, derivatives)
+    effect.after_backward(trainer.fit_state(), view, derivatives)
 
 
 def gradients_of_loss(trainer: Trainer, view) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ from support.small_capture import make_dataset, write_dataset
 from support.trainers import make_trainer
 
 from drgs import fit
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
@@ -120,7 +120,7 @@ def test_a_configuration_that_cannot_shrink_is_planned():
     values = {"coarse": [{"until": 10, "factor": 4}, {"until": 20, "factor": 2}]}
     values |= {"densify.start": 500, "densify.stop": 501}
     values |= {"optimizer.means_lr_aims": [{"after": 0, "end": 5}, {"after": 1, "end": 7}]}
-    config = changed(CONFIG, values)
+    config = with_changes(CONFIG, values)
     result = make_plan(config, 50, 400, 25, 0.1, curves_of())
     assert result.chosen.strategy is plan.STRATEGIES[0]
     assert result.config.iterations == 250 and result.config.optimizer.means_lr_aims == []
@@ -141,15 +141,15 @@ def test_too_short_a_time_is_refused():
 
 def test_a_share_of_the_gaussians_is_not_less_than_the_start():
     half = Strategy("x", share=0.5)
-    growing = changed(CONFIG, {"densify.budget.gaussians": 400})
+    growing = with_changes(CONFIG, {"densify.budget.gaussians": 400})
     assert half.apply(growing, 50).densify.budget.gaussians == 200
     assert half.apply(growing, 300).densify.budget.gaussians == 300
-    capped = changed(growing, {"densify.max_gaussians": 160})
+    capped = with_changes(growing, {"densify.max_gaussians": 160})
     assert half.apply(capped, 50).densify.budget.gaussians == 80
-    mcmc = changed(growing, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600})
+    mcmc = with_changes(growing, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600})
     assert half.apply(mcmc, 50).densify.mcmc.gaussians == 300
     # A hull may have fewer points than were asked for.
-    more = changed(mcmc, {"init.num_points": 320})
+    more = with_changes(mcmc, {"init.num_points": 320})
     assert half.apply(more, 310).densify.mcmc.gaussians == 320
 
 
@@ -157,11 +157,11 @@ def test_a_share_is_planned_only_where_there_is_a_number():
     """The population of adc comes out of a threshold."""
     half = next(strategy for strategy in plan.STRATEGIES if strategy.share == 0.5)
     curves = {plan.STRATEGIES[0].name: SLOW, half.name: replace(FAST, psnr=(31.0, 32.0))}
-    growing = changed(CONFIG, {"densify.budget.gaussians": 400})
+    growing = with_changes(CONFIG, {"densify.budget.gaussians": 400})
     result = make_plan(growing, 50, 400, 100, 0.1, curves)
     assert result.chosen.strategy is half and result.config.densify.budget.gaussians == 200
     assert "at most 200 Gaussians" in result.reasons
-    adc = changed(CONFIG, {"densify.strategy": "adc"})
+    adc = with_changes(CONFIG, {"densify.strategy": "adc"})
     result = make_plan(adc, 50, 400, 100, 0.1, curves)
     assert [candidate.strategy for candidate in result.candidates] == [plan.STRATEGIES[0]]
     assert "at most 1,000,000 Gaussians" in result.reasons
@@ -191,7 +191,7 @@ class FakeTrainer:
         self.clock, self.second, self.iteration = clock, second, 0
         self.extent = 1.0
         values = {"iterations": 1000, "densify.start": 100, "densify.stop": 600}
-        self.config = changed(CONFIG, {**values, **changes})
+        self.config = with_changes(CONFIG, {**values, **changes})
         self.rates = rates_over_time(self.config, self.extent)
         self.density = SimpleNamespace(state=dict)
 
@@ -328,7 +328,9 @@ def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
     first, second = ([(out / name).read_bytes() for name in files] for out in (fitted.out, again))
     assert first[0] == second[0]
     configs = [load_config(out / "config.yml") for out in (fitted.out, again)]
-    assert changed(configs[0], {"output.dir": None}) == changed(configs[1], {"output.dir": None})
+    assert with_changes(configs[0], {"output.dir": None}) == with_changes(
+        configs[1], {"output.dir": None}
+    )
 
 
 def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
@@ -336,7 +338,7 @@ def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(tmp_
     config = FitConfig(data={"path": tmp_path}, iterations=40_000)
     state = empty_checkpoint()
     save_checkpoint(tmp_path, config, state)
-    revised = changed(config, {"iterations": config.iterations + 10})
+    revised = with_changes(config, {"iterations": config.iterations + 10})
     for module, name, saved in (
         (checkpoint.np, "savez", config),
         (checkpoint, "write_run_config", revised),
@@ -354,10 +356,10 @@ def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(tmp_
 def test_a_checkpoint_of_another_configuration_is_refused(tmp_path):
     config = FitConfig(data={"path": tmp_path}, iterations=40_000)
     save_checkpoint(tmp_path, config, empty_checkpoint())
-    other = changed(config, {"iterations": 50_000})
+    other = with_changes(config, {"iterations": 50_000})
     with pytest.raises(UserError, match="belongs to another configuration than"):
         load_checkpoint(tmp_path, other)
-    moved = changed(config, {"data.path": tmp_path / "moved", "output.history_every": 3})
+    moved = with_changes(config, {"data.path": tmp_path / "moved", "output.history_every": 3})
     assert load_checkpoint(tmp_path, moved).config == moved
 
 

@@ -99,7 +99,7 @@ def test_the_sensor_is_the_camera_moved_in_numpy():
     trainer.iteration = 1
     for index in (0, 5):
         view = trainer.views[index]
-        effect_of(trainer).before(trainer.fit_state(), view)
+        effect_of(trainer).before_render(trainer.fit_state(), view)
         expected = moved(fits.plain_dataset().train[index], **row_of(random_numbers(), index))
         params = mi.traverse(view.sensor)
         to_world = np.array(params["to_world"].matrix)[..., 0]
@@ -142,7 +142,7 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
     photo, row = fits.plain_dataset().train[index], row_of(numbers, index)
     rendered = fits.photograph(fits.double(start), moved(photo, **row))
     assert not rendered.near_threshold.any() and rendered.image.max() <= 1
-    effect.before(trainer.fit_state(), view)
+    effect.before_render(trainer.fit_state(), view)
     leaves = effect.parameters.leaves(view.index)
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
@@ -291,7 +291,7 @@ def test_a_disturbed_camera_is_found_before_true_blobs():
     )
     start = trainer.step().loss
     end = fits.steps(trainer, 150).step().loss
-    (found,) = effect_of(trainer).refined(dataset.train)
+    (found,) = effect_of(trainer).refined_views(dataset.train)
     assert errors(disturbed, true)[0] > 1.9 and errors(disturbed, true)[1] > 0.08
     assert errors(found, true)[0] < 0.3 and errors(found, true)[1] < 0.025, errors(found, true)
     assert end < 0.05 * start
@@ -310,7 +310,7 @@ def test_a_focal_length_and_a_principal_point_that_are_off_are_found():
         **STILL,
     )
     fits.steps(trainer, 100)
-    (found,) = effect_of(trainer).refined([disturbed])
+    (found,) = effect_of(trainer).refined_views([disturbed])
     for name in ("fx", "fy", "cx", "cy"):
         before, after = (abs(getattr(v, name) - getattr(true, name)) for v in (disturbed, found))
         assert before > 0.3 and after < 0.3 * before, name
@@ -375,7 +375,7 @@ def test_other_views_are_measured_through_the_lens_that_was_found():
     lens = {name: random_numbers()[name][0] for name in ("log_focals", "shifts")}
     dataset = fits.plain_dataset()
     expected = [moved(view, **lens) for view in dataset.test]
-    for view, other in zip(effect_of(trainer).measured(dataset.test), expected, strict=True):
+    for view, other in zip(effect_of(trainer).correct_views(dataset.test), expected, strict=True):
         np.testing.assert_array_equal(view.camera_to_world, other.camera_to_world)
         for name in ("fx", "fy", "cx", "cy"):
             assert getattr(view, name) == pytest.approx(getattr(other, name), rel=1e-7)
@@ -386,7 +386,7 @@ def test_other_views_are_measured_through_the_lens_that_was_found():
 
 def test_without_rates_of_the_lens_other_views_are_as_they_were():
     views = fits.plain_dataset().test
-    for view, other in zip(effect_of(make_trainer()).measured(views), views, strict=True):
+    for view, other in zip(effect_of(make_trainer()).correct_views(views), views, strict=True):
         assert [getattr(view, n) for n in INTRINSICS] == [getattr(other, n) for n in INTRINSICS]
 
 
@@ -412,7 +412,7 @@ def test_a_dataset_is_read_with_the_cameras_that_were_refined(tmp_path):
     np.testing.assert_allclose(np.linalg.inv(begin) @ end, between, atol=1e-9)
     for view, start in zip(found.test, smaller.test, strict=True):
         np.testing.assert_array_equal(view.camera_to_world, start.camera_to_world)
-        assert view.fx == pytest.approx(effect_of(trainer).measured((start,))[0].fx)
+        assert view.fx == pytest.approx(effect_of(trainer).correct_views((start,))[0].fx)
 
 
 SPLITS = ("train", "test")
@@ -462,7 +462,7 @@ def test_the_filter_of_refined_cameras_is_that_of_where_they_are():
         cameras__focal_lr=0.1, model__smoothing=True, coarse=[{"until": 5, "factor": 2}]
     )
     fits.steps(trainer, 7)
-    refined = effect_of(trainer).refined(fits.plain_dataset().train)
+    refined = effect_of(trainer).refined_views(fits.plain_dataset().train)
     plain = fits.make_trainer(
         replace(fits.plain_dataset(), train=tuple(refined)), model__smoothing=True
     )
@@ -495,7 +495,7 @@ def test_a_camera_that_moves_while_it_exposes_is_refined_as_well():
     numbers = {"turns": [[0.01, 0.02, -0.01]], "moves": [[0.1, -0.2, 0.05]]}
     with_numbers(trainer, **numbers)
     trainer.iteration = 1
-    effect_of(trainer).before(trainer.fit_state(), trainer.views[0])
+    effect_of(trainer).before_render(trainer.fit_state(), trainer.views[0])
     params = mi.traverse(trainer.views[0].sensor)
     first, last = (
         np.array(params[name].matrix)[..., 0] @ np.diag([-1, -1, 1, 1])
@@ -527,7 +527,7 @@ def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
         trainer = make_trainer(replace(dataset, train=(replace(photo, motion=motion),)))
         trainer.iteration = 1
         effect, view = effect_of(trainer), trainer.views[0]
-        effect.before(trainer.fit_state(), view)
+        effect.before_render(trainer.fit_state(), view)
         leaves = effect.parameters.leaves(view.index)
         fits.gradients_of_loss(trainer, view)
         fits.end_view(effect, trainer, view)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.small_capture import make_dataset
 
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.fingerprint import fingerprint_of
@@ -30,7 +30,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def config(tmp_path):
-    return changed(
+    return with_changes(
         FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000), DECIDED
     )
 

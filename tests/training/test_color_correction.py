@@ -70,7 +70,7 @@ def test_the_identity_gives_the_plain_loss_and_gradients_to_the_last_bit():
         trainer.iteration = 1
     (effect,) = corrected.effects
     for index in (0, 4):
-        effect.before(corrected, corrected.views[index])
+        effect.before_render(corrected, corrected.views[index])
         expected = fits.gradients_of_loss(plain, plain.views[index])
         got = fits.gradients_of_loss(corrected, corrected.views[index])
         for name, values in expected.items():
@@ -112,7 +112,7 @@ def test_loss_and_derivatives_of_a_transform_are_those_of_numpy():
     (effect,) = trainer.effects
     image, target = small_image(), fits.plain_dataset().train[2].image.astype(np.float64)
     view, matrix = trainer.views[2], single(random_matrices()[2])
-    effect.before(trainer.fit_state(), view)
+    effect.before_render(trainer.fit_state(), view)
     _, loss, _ = trainer.compare(mi.TensorXf(image.astype(np.float32)), view)
     assert float(loss[0]) == pytest.approx(numpy_loss(image, matrix, target, weight), rel=2e-6)
     dr.backward(loss)
@@ -139,7 +139,7 @@ def test_the_penalty_pulls_to_the_identity():
     (effect,) = trainer.effects
     view, start = trainer.views[1], random_matrices()[1]
     for iteration in range(60):
-        effect.before(trainer.fit_state(), view)
+        effect.before_render(trainer.fit_state(), view)
         (penalty,) = effect.penalties(view)
         if iteration == 0:
             expected = 0.1 * np.square(start - IDENTITY).mean()
@@ -233,7 +233,7 @@ def test_where_a_photograph_is_transparent_the_background_stays():
     trainer = with_matrices(make_trainer(dataset), random_matrices())
     (effect,) = trainer.effects
     image, matrix, view = small_image(), random_matrices()[2], trainer.views[2]
-    effect.before(trainer.fit_state(), view)
+    effect.before_render(trainer.fit_state(), view)
     actual = np.array(dr.detach(effect.adjust(mi.TensorXf(image.astype(np.float32)), view)))
     alpha = dataset.train[2].alpha[:, :, None]
     assert (alpha == 0).any() and (alpha > 0.9).any()

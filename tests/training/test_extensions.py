@@ -12,7 +12,7 @@ from support import small_fits as fits
 
 import drgs
 from drgs.cli.commands import CommandParser
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.load import config_from, dump_config, load_config
 from drgs.core import registry
 from drgs.core.errors import UserError
@@ -68,7 +68,7 @@ def test_a_configuration_names_extensions_and_sets_their_sections(tmp_path):
     assert config.extensions["vignetting"].lr == 0.01
     dump_config(config, tmp_path / "config.yml")
     again = load_config(tmp_path / "config.yml", ["extensions.binary_opacity.weight=2.5"])
-    assert changed(again, {"extensions": {}}) == changed(config, {"extensions": {}})
+    assert with_changes(again, {"extensions": {}}) == with_changes(config, {"extensions": {}})
     assert again.extensions["binary_opacity"].weight == 2.5
     assert type(again.extensions["halving"]) is type(config.extensions["halving"])
 
@@ -209,10 +209,10 @@ def test_what_an_extension_raises_is_reported_with_its_name(examples, monkeypatc
 
 def test_the_summary_and_the_help_name_extensions():
     from drgs.fit import add_arguments
-    from drgs.integrator.summary import described
+    from drgs.integrator.summary import format_effects
     from drgs.training.summary import summary_of_fit
 
-    text = described(summary_of_fit(configured(), fits.plain_dataset()))
+    text = format_effects(summary_of_fit(configured(), fits.plain_dataset()))
     assert "vignetting: effect: Renderings are darkened" in text and "extensions.vignetting" in text
     assert "halving: density strategy: Keeps the more" in text
     assert "(densify.strategy: halving)" in text

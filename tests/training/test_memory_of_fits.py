@@ -13,7 +13,7 @@ import yaml
 from PIL import Image
 
 from drgs.cameras.axes import between_opencv_and_opengl
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.types import CameraMotion, Dataset, LazyImage, View
@@ -45,7 +45,7 @@ def dataset_of(width, height, count, channels=3):
 def config_of(start, most, **changes):
     values = {"data.path": ".", "init.num_points": start, "densify.max_gaussians": most}
     config = FitConfig(data={"path": "."}, densify={"strategy": "adc"})
-    return changed(config, values | changes)
+    return with_changes(config, values | changes)
 
 
 @cache
@@ -80,7 +80,7 @@ def test_estimates_are_what_was_measured(size, start, most, views, measured_mb):
     """Peaks of resident memory, MiB, of fits that grew to their cap, with all targets kept."""
     dataset = dataset_of(size, size, views)
     peak = estimated(config_of(start, most), dataset)
-    assert (peak.needed + peak.targets) / 2**20 == pytest.approx(measured_mb, rel=0.18)
+    assert (peak.required_bytes + peak.targets) / 2**20 == pytest.approx(measured_mb, rel=0.18)
 
 
 def test_entries_and_slots_at_the_start_are_those_of_a_rendering(monkeypatch):
@@ -172,7 +172,7 @@ def test_targets_get_what_is_left(available):
     peak = estimated(config, dataset)
     assert peak.targets == 7_200_000
     for left, expected in ((0, 0), (10**6, 10**6), (GB, 7_200_000)):
-        available(1.15 * peak.needed + left)
+        available(1.15 * peak.required_bytes + left)
         assert room(config, dataset) == pytest.approx(expected, abs=10)
     assert room(config, dataset, most=3) == 3
 
@@ -185,9 +185,9 @@ def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
     shared = memory.estimate(config, dataset, gaussians, TARGET_BYTES, share=share)
     assert shared.gaussians == pytest.approx(alone.gaussians / 4, abs=1)
     assert (shared.splats, shared.pixels) == (alone.splats, alone.pixels)
-    assert shared.needed < alone.needed / 1.5
+    assert shared.required_bytes < alone.required_bytes / 1.5
     for factor, fits in ((2.1, True), (1.9, False)):
-        available(factor * shared.needed)
+        available(factor * shared.required_bytes)
         arguments = config, dataset, gaussians, TARGET_BYTES, GB, share
         if fits:
             memory.room_for_targets(*arguments)
@@ -223,7 +223,7 @@ def test_smaller_images_are_advised_where_they_help(available):
     width = int(str(error.value).rpartition("image_size=")[2])
     assert 500 < width < 4000 and "max_gaussians" not in str(error.value)
     peak = estimated(config, dataset, scale=width / 5376)
-    assert 2 * GB < peak.needed < 3 * GB
+    assert 2 * GB < peak.required_bytes < 3 * GB
 
 
 def test_nothing_is_advised_where_nothing_helps(available):

@@ -114,7 +114,7 @@ def test_a_fit_is_the_same_far_from_the_origin(case, tmp_path):
 
 
 def moved_to(dataset: Dataset, place: np.ndarray) -> Dataset:
-    views = (tuple(v.moved(place) for v in views) for views in (dataset.train, dataset.test))
+    views = (tuple(v.with_offset(place) for v in views) for views in (dataset.train, dataset.test))
     return replace(dataset, **dict(zip(("train", "test"), views, strict=True)))
 
 

@@ -61,7 +61,7 @@ class Counted(TrainingEffect):
 
     name, count = "counted", 0
 
-    def before(self, fit, view):
+    def before_render(self, fit, view):
         self.count += 1
 
 

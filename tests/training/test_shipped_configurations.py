@@ -11,7 +11,7 @@ import pytest
 from conftest import REPOSITORY, SHARED_DATA
 from support.photographs import moved
 
-from drgs.config.changes import changed, with_iterations
+from drgs.config.changes import with_changes, with_iterations
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
 from drgs.initialization.defaults import resolve_defaults
@@ -46,7 +46,7 @@ def configured(name, folder):
     if name != "lego_paper":
         small.append(f"iterations={ITERATIONS}")
     config = load_config(file, [f"data.path={folder}", *small])
-    config = changed(config, {"data.source": ""})
+    config = with_changes(config, {"data.source": ""})
     dataset = load_dataset(config.data_for_training)
     if name == "lego_paper":  # it says for how many iterations its schedule is
         config = with_iterations(config, ITERATIONS)
@@ -71,7 +71,7 @@ def test_faster_and_better_fits_differ_in_few_values_only(blender, name):
     for key in ("init.num_points", *FASTER_OR_BETTER[name]):
         value = attrgetter(key)(config)
         assert value != attrgetter(key)(usual), key
-        usual = changed(usual, {key: value})
+        usual = with_changes(usual, {key: value})
     assert config == usual
 
 

@@ -10,7 +10,7 @@ from support.viewer_rendering import VIEWER_RENDERING
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.config.schema import FitConfig
-from drgs.effects.smoothing import baked
+from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects as reference_effects
 from drgs.reference import splatting as reference
@@ -175,7 +175,7 @@ def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(run_python, t
     assert "without False" in lines and "with True" in lines and "baked True" in lines
     written = {name: Gaussians.load(tmp_path / name / "point_cloud.ply") for name, *_ in runs}
     assert written["without"].smoothing is written["baked"].smoothing is None
-    expected = baked(written["with"])
+    expected = bake_smoothing(written["with"])
     for name in PARAMETER_NAMES:
         actual = getattr(written["baked"], name)
         np.testing.assert_array_equal(actual, getattr(expected, name), err_msg=name)

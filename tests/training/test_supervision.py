@@ -408,13 +408,13 @@ def colors(trainer, count):
     """What is behind the splats in each of the coming iterations."""
     found = []
     for effect in trainer.effects:
-        original = effect.before
+        original = effect.before_render
 
         def before(trainer, view, original=original):
             original(trainer, view)
             found.append(color_of(trainer))
 
-        effect.before = before
+        effect.before_render = before
     fits.steps(trainer, count)
     return np.array(found)
 
@@ -435,7 +435,7 @@ def test_colors_fill_the_cube():
     found = []
     for iteration in range(1, 401):
         trainer.iteration = iteration
-        effect.before(trainer.fit_state(), trainer.views[0])
+        effect.before_render(trainer.fit_state(), trainer.views[0])
         found.append(color_of(trainer))
     fits.end_view(effect, trainer, trainer.views[0])
     found = np.array(found)
@@ -457,7 +457,7 @@ def test_the_target_is_the_transparent_image_over_the_color():
     for iteration, index in ((1, 0), (2, 3)):
         view, photo = trainer.views[index], dataset.train[index]
         trainer.iteration = iteration
-        effect.before(trainer.fit_state(), view)
+        effect.before_render(trainer.fit_state(), view)
         color = color_of(trainer)
         assert np.abs(color - GREY).max() > 0.1
         premultiplied = fits.photograph(blobs, photo, (0, 0, 0)).image
@@ -508,7 +508,7 @@ def test_what_masks_leave_out_stays_black_over_any_color():
     assert names == ["background", "masks"]
     trainer.iteration = 1
     view = trainer.views[3]
-    trainer.effects[0].before(trainer.fit_state(), view)
+    trainer.effects[0].before_render(trainer.fit_state(), view)
     left_out = mask_of(3) == 0
     assert left_out.any() and (target_of(view)[left_out] == 0).all()
     expected = trainer.views[2]

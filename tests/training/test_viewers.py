@@ -7,7 +7,7 @@ from support import small_fits as fits
 from support.small_capture import decibels
 from support.viewer_rendering import VIEWER_RENDERING
 
-from drgs.config.changes import changed
+from drgs.config.changes import with_changes
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserNote
 from drgs.integrator.scene import make_scene, render_views
@@ -26,7 +26,7 @@ def variant():
 def ended_fit(iterations=20, **changes):
     """A trainer that has done all of its iterations, its dataset, and its Gaussians."""
     dataset = fits.plain_dataset()
-    config = changed(fits.config_of(iterations=iterations), {**OTHERWISE, **changes})
+    config = with_changes(fits.config_of(iterations=iterations), {**OTHERWISE, **changes})
     trainer = Trainer(config, dataset, fits.disturbed_blobs())
     for _ in range(iterations):
         trainer.step()
@@ -103,7 +103,7 @@ def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
 
 
 def test_the_population_and_the_schedule_stay():
-    config = changed(fits.config_of(iterations=400), {**OTHERWISE, "model.order": "pixel"})
+    config = with_changes(fits.config_of(iterations=400), {**OTHERWISE, "model.order": "pixel"})
     further = tuning(config)
     assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
     assert further.model.approximations.are_usual and not config.model.approximations.are_usual

@@ -188,13 +188,13 @@ def test_effects_of_all_views_of_a_step_begin_with_the_same_numbers():
     trainer = make_trainer(3, cameras__optimise=True, cameras__focal_lr=1e-3)
     fits.steps(trainer, 2)
     (effect,) = trainer.effects
-    shared, before = [], effect.before
+    shared, before = [], effect.before_render
 
     def watched(fit, view):
         before(fit, view)
         shared.append(effect.parameters.numpy()["log_focals"].copy())
 
-    effect.before = watched
+    effect.before_render = watched
     start = effect.parameters.numpy()["log_focals"].copy()
     trainer.step()
     assert len(shared) == 3 and all(np.array_equal(s, start) for s in shared)

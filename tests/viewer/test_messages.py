@@ -241,7 +241,7 @@ def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
             for done in iterations(watched, history, length):
                 honest.send(msgspec.msgpack.encode(CAMERA))
                 time.sleep(0.05)
-                watching.after(watched, history, done, lambda: False)
+                watching.after_iteration(watched, history, done, lambda: False)
     finally:
         is_over.set()
         attacker.join()

@@ -75,7 +75,7 @@ def run(trainer, queue=None, dataset=None, before=lambda iteration: None, stops=
     for done in iterations(trainer, history, length):
         if queue is not None:
             before(done.report.iteration)
-            watching.after(trainer, history, done, stops)
+            watching.after_iteration(trainer, history, done, stops)
     return screen, history
 
 
@@ -175,7 +175,7 @@ def test_a_pause_holds_the_fit_and_its_clock_and_shows_what_is_asked_for():
             queue.pause(True)
             queue.put(1, FrameRequest(EYE, 8, 8))
             before = history.wall_s
-            watching.after(trainer, history, done, lambda: False)
+            watching.after_iteration(trainer, history, done, lambda: False)
             assert history.wall_s - before < 0.2  # of at least 0.5 s
     assert during == [2] * 5
     assert [frame.shape[1] for frame in screen.frames] == [8, 9, 10, 11, 12]

@@ -63,7 +63,7 @@ class RandomBackground(TrainingEffect):
             transparent = transparent * np.asarray(view.mask)
         return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
 
-    def before(self, fit: FitState, view: TrainingView) -> None:
+    def before_render(self, fit: FitState, view: TrainingView) -> None:
         rng = np.random.default_rng([self.seed, RANDOM_STREAM, fit.iteration])
         color = rng.uniform(size=3)
         set_background(fit.integrator, color)
@@ -76,7 +76,7 @@ class RandomBackground(TrainingEffect):
         image = view.photograph.image.array + transparent.array * shift
         view.replacement = prepare_target(type(transparent)(image, transparent.shape), *self.window)
 
-    def after(
+    def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
         set_background(fit.integrator, self.background)

@@ -88,7 +88,7 @@ class TrainingEffect(Protocol):
     def begin(self, fit: FitState) -> None:
         """Called before the views of a step are rendered."""
 
-    def before(self, fit: FitState, view: TrainingView) -> None:
+    def before_render(self, fit: FitState, view: TrainingView) -> None:
         """Called before the view is rendered."""
 
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
@@ -106,7 +106,7 @@ class TrainingEffect(Protocol):
         """
         return {}
 
-    def after(
+    def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
         """Take a step, when the derivatives of all views of the fit's step are known.
@@ -115,13 +115,13 @@ class TrainingEffect(Protocol):
         order of the views, some of which other processes may have rendered.
         """
 
-    def repopulated(self, fit: FitState) -> None:
+    def on_population_change(self, fit: FitState) -> None:
         """Called when Gaussians were added or removed, before the integrator gets the others."""
 
     def finish(self, fit: FitState) -> None:
         """Called before the Gaussians are taken out."""
 
-    def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
+    def correct_views(self, views: tuple[View, ...]) -> tuple[View, ...]:
         """Return views that were not trained on, with what the fit knows of their cameras."""
         return views
 
@@ -153,7 +153,7 @@ def training_effects(
     """
     installed = extensions_in_use(config.extensions, EFFECTS)
     used = [each for each in installed if each.value.is_used(config, dataset)]
-    used += [EFFECTS.get(n) for n in EFFECTS.shipped if _is_shipped_used(n, config, dataset)]
+    used += [EFFECTS.get(n) for n in EFFECTS.shipped_names if _is_shipped_used(n, config, dataset)]
     effects = [*given]
     for extension in used:
         section = section_of(extension, config.extensions)

@@ -85,14 +85,14 @@ class CameraRefinement(OptimisedEffect):
         dr.make_opaque(start)
         return start
 
-    def before(self, fit: FitState, view: TrainingView) -> None:
+    def before_render(self, fit: FitState, view: TrainingView) -> None:
         # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
         self.numbers[view.index] = numbers = dr.detach(self._camera_of(view))
-        if self._begun(fit):
+        if self._has_begun(fit):
             dr.enable_grad(numbers)
         _put(view.sensor, numbers)
 
-    def _begun(self, fit: FitState) -> bool:
+    def _has_begun(self, fit: FitState) -> bool:
         return fit.iterations_of_step[0] > self.first
 
     def place(self, view: TrainingView) -> None:
@@ -101,12 +101,12 @@ class CameraRefinement(OptimisedEffect):
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         return self.numbers[view.index]
 
-    def after(
+    def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
         """Step the view's numbers, at the means' rate: cameras are refined against these."""
         del self.numbers[view.index]
-        if not self._begun(fit):
+        if not self._has_begun(fit):
             return
         # Views of a step may share numbers, which the one before has moved.
         for name, value in self._camera_of(view).items():
@@ -139,7 +139,7 @@ class CameraRefinement(OptimisedEffect):
             poses["to_world_close"] = moved @ start.motion @ signs
         return poses | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
-    def refined(self, views: Sequence[View]) -> list[View]:
+    def refined_views(self, views: Sequence[View]) -> list[View]:
         """Return the training views with their cameras as they are now."""
         numbers, result = self.parameters.numpy(), []
         for index, view in enumerate(views):
@@ -176,14 +176,14 @@ class CameraRefinement(OptimisedEffect):
             changes["principal"] = tuple(numbers["shifts"].tolist())
         return LensChange(**changes)
 
-    def measured(self, views: tuple[View, ...]) -> tuple[View, ...]:
+    def correct_views(self, views: tuple[View, ...]) -> tuple[View, ...]:
         """Return the views with the refined lens; their poses are known no better than before."""
         return tuple(map(self.lens_change.apply, views))
 
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
         with atomic_path(folder / CAMERAS) as temporary:
-            cameras = cameras_json(self.refined(dataset.train), dataset.origin)
+            cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
             found = {"lens_change": asdict(self.lens_change), **cameras}
             temporary.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -61,7 +61,7 @@ class ColorCorrection(OptimisedEffect):
             return None
         return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
 
-    def before(self, fit: FitState, view: TrainingView) -> None:
+    def before_render(self, fit: FitState, view: TrainingView) -> None:
         self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
 
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
@@ -75,7 +75,7 @@ class ColorCorrection(OptimisedEffect):
         difference = self.matrix - as_numbers(IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
-    def after(
+    def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
         """Step the view's transform, and all a little back: their mean stays."""

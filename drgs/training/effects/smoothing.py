@@ -39,7 +39,7 @@ class TrainingSmoothing(TrainingEffect):
         """Set the filter of the means as they are; the fit goes on with the former one."""
         fit.integrator.smoothing = _smoothing(fit)
 
-    def repopulated(self, fit: FitState) -> None:
+    def on_population_change(self, fit: FitState) -> None:
         self.filter = fit.integrator.smoothing = None
 
     def state(self) -> dict[str, np.ndarray]:

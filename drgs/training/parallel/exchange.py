@@ -21,7 +21,15 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.camera import Camera, cameras_in_time
-from drgs.core.arrays import Array, Rows, block_widths, empty_on_host, from_host, types_of, wrapped
+from drgs.core.arrays import (
+    Array,
+    Rows,
+    block_widths,
+    empty_on_host,
+    from_host,
+    types_of,
+    wrap_numpy,
+)
 from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.effects.compose import with_effects, without_effects
@@ -99,7 +107,7 @@ class LocalProjection:
 
     def footprints(self, blocks: Blocks) -> Footprints:
         """Return received splats without copying them."""
-        box, *stored, depths = (wrapped(self.boxes.Float, block) for block in blocks)
+        box, *stored, depths = (wrap_numpy(self.boxes.Float, block) for block in blocks)
         rows, boxes = Rows(tuple(stored), self.num_stored), Rows((box,), BOX_NUMBERS)
         return Footprints(boxes, rows, depths, self.num_features, self.num_keys)
 
@@ -125,7 +133,9 @@ class PackedProjection:
         count, float_type = dr.width(rows), found.rows.Float
         blocks = _empty_blocks(0, local.widths, float_type)
         if count > 0:
-            boxes, stored = (Rows.of(each.load(rows)) for each in (found.boxes, found.rows))
+            boxes, stored = (
+                Rows.from_columns(each.load(rows)) for each in (found.boxes, found.rows)
+            )
             depths = dr.gather(float_type, found.depths, rows)
             dr.eval(boxes, stored, depths)
             flat = [*boxes.blocks, *stored.blocks, depths]
@@ -142,7 +152,7 @@ class PackedProjection:
         place = dr.full(t.UInt32, nowhere, num_rows)
         dr.scatter(place, dr.arange(t.UInt32, self.count), self.rows)
         dr.eval(place)
-        rows = Rows(tuple(wrapped(t.Float, block) for block in blocks), width)
+        rows = Rows(tuple(wrap_numpy(t.Float, block) for block in blocks), width)
         return rows.load(place, place != nowhere)
 
 
@@ -366,7 +376,7 @@ class ViewExchange:
     def _cameras(self, view: StepView) -> list[Camera]:
         """Return what is simulated of the view's camera, by time, detached."""
         state = read_sensor(view.view.sensor, self.integrator.near)
-        camera = without_effects(camera_from_sensor(state.detached()), self.integrator.ignore)
+        camera = without_effects(camera_from_sensor(state.detach()), self.integrator.ignore)
         return cameras_in_time(camera)
 
     def _project(self, each: _View, cameras: Sequence[Camera]) -> None:
@@ -386,7 +396,7 @@ class ViewExchange:
             return columns
         ranks = range(self.comm.size)
         ends = np.cumsum([each.num_splats(rank, time) for rank in ranks])
-        rows = Rows.of(columns)
+        rows = Rows.from_columns(columns)
         dr.eval(rows)
         widths = block_widths(rows.width)
         blocks = [b.numpy().reshape(-1, w) for b, w in zip(rows.blocks, widths, strict=True)]

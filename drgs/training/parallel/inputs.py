@@ -23,7 +23,7 @@ import PIL
 
 import drgs
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, listed
+from drgs.core.errors import UserError, format_names
 from drgs.core.private import llvm_vector_width, llvm_version
 from drgs.datasets import load_dataset
 from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
@@ -142,8 +142,8 @@ def check_scene(
 
 def _not_the_same(file: object, differences: Sequence[object]) -> UserError:
     return UserError(
-        f"{file}: not the same on {platform.node()} as for process 0: {listed(differences)}; all "
-        "processes must see the same files and options"
+        f"{file}: not the same on {platform.node()} as for process 0: {format_names(differences)}; "
+        "all processes must see the same files and options"
     )
 
 

@@ -6,7 +6,7 @@ from drjit.llvm.ad import Float
 from scipy.special import expit, logit
 from support.populations import make, moments, rows_of, values
 
-from drgs.config.changes import changed, with_iterations
+from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training.density.pruning import (
@@ -48,7 +48,7 @@ def test_the_phase_can_be_named_and_comes_after_growth_wherever_that_ends():
     config = config_of(to=100, start=2500, stop=2730, every=100)
     schedule = PruneSchedule.from_config(config)
     assert [i for i in range(5000) if schedule.is_due(i)] == [2600, 2700, 2730]
-    later = PruneSchedule.from_config(changed(config, {"densify.stop": 2600}))
+    later = PruneSchedule.from_config(with_changes(config, {"densify.stop": 2600}))
     assert (later.start, later.stop) == (2600, 2730)
 
 
