@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
-from drgs.config.approximations import DECLARED, Approximations, said_by
+from drgs.config.approximations import DECLARED, Approximations, from_ply_header
 from drgs.core.constants import LOW_PASS
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
@@ -32,7 +32,7 @@ from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
 from drgs.results.refined_cameras import training_cameras
-from drgs.results.viewer import HONOURED, InitialView, Shown, viewer_page
+from drgs.results.viewer import HONOURED, DisplaySettings, InitialView, viewer_page
 
 COMMAND = "export"
 
@@ -48,7 +48,7 @@ PLAYCANVAS = "compressed-ply"
 PLAYCANVAS_LOW_PASS = 0.075
 """Square pixels that the viewers of that format add to splats, where others add 0.3."""
 
-SNAPPED = np.cos(np.radians(5))
+MIN_SNAP_COSINE = np.cos(np.radians(5))
 """Cosine of the angle to an axis within which the training cameras' up is that axis."""
 
 
@@ -113,7 +113,7 @@ def _page(source: ExportSource) -> bytes:
         initial_view = InitialView.from_views(cameras, gaussians)
     else:
         initial_view = InitialView.from_gaussians(gaussians, Z_UP)
-    shown = Shown(gaussians, Approximations.from_values(gaussians.rendered_with or {}))
+    shown = DisplaySettings(gaussians, Approximations.from_values(gaussians.rendered_with or {}))
     return viewer_page(title, shown, initial_view, background)
 
 
@@ -250,7 +250,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
             shows_own = fitted.others_than_default.keys() <= honoured(fitted)
         path = what / (names[-1] if shows_own else names[0])
     gaussians = Gaussians.load(path)
-    said = said_by(str(path), gaussians.rendered_with or {})
+    said = from_ply_header(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in said.items() if value != DECLARED[name].default}
     shown = frozenset() if honoured is None else honoured(Approximations.from_values(said))
     if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
@@ -292,7 +292,7 @@ def _target_of(path: Path) -> str | None:
     return None if found is None else found.name
 
 
-def kept_by(
+def find_kept(
     gaussians: Gaussians[np.ndarray],
     box: Sequence[float] | None = None,
     min_opacity: float | None = None,
@@ -325,7 +325,7 @@ def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.nda
 
 
 def _select(source: ExportSource, args: argparse.Namespace) -> Gaussians[np.ndarray]:
-    found = kept_by(source.gaussians, args.crop, args.min_opacity, args.max_size)
+    found = find_kept(source.gaussians, args.crop, args.min_opacity, args.max_size)
     if not found:
         return source.gaussians
     kept = np.logical_and.reduce(list(found.values()))
@@ -354,7 +354,7 @@ def _up_direction(
             )
         up, why = up_of(cameras), " (the training cameras')"
         axis = np.argmax(np.abs(up))
-        if abs(up[axis]) >= SNAPPED:  # what was estimated is off by a little
+        if abs(up[axis]) >= MIN_SNAP_COSINE:  # what was estimated is off by a little
             up = np.sign(up[axis]) * np.eye(3)[axis] + 0.0
     else:
         up, why = _direction(words), "" if args.up else " (give --up otherwise)"

@@ -21,7 +21,7 @@ from drgs.core.arrays import from_host, interleave, types_of
 from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
-from drgs.core.memory import why_too_large
+from drgs.core.memory import too_large_reason
 from drgs.core.types import Float, TensorXf
 from drgs.effects.compose import NamedFeature
 from drgs.gaussians.parameters import Gaussians
@@ -163,7 +163,7 @@ def rasterization(
     selected = _approximations(approximations, eps2d, rasterize_mode, sh_degree)
     _require(render_mode in RENDER_MODES, "render_mode", f"one of {RENDER_MODES}", render_mode)
     _require(width >= 1 and height >= 1, "width and height", "1 px or more", (width, height))
-    why = why_too_large(int(width), int(height))
+    why = too_large_reason(int(width), int(height))
     _require(why is None, "width and height", f"smaller: {why}", (width, height))
     tensor_type = _tensor_type(means)
     if "llvm" in tensor_type.__module__:
@@ -296,7 +296,9 @@ def use_activated(rows: GaussianRows) -> GaussianRows:
     t = types_of(type(rows.logit_opacities))
     sizes = [dr.abs(scale) for scale in rows.features["scales"]]
     logs = [dr.log(dr.select(size > LEAST_SCALE, size, LEAST_SCALE)) for size in sizes]
-    return replace(rows, log_scales=t.Array3f(logs), dimming=rows.features["opacities"][0])
+    return replace(
+        rows, log_scales=t.Array3f(logs), opacity_compensation=rows.features["opacities"][0]
+    )
 
 
 @dataclass(frozen=True)

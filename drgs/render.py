@@ -198,15 +198,15 @@ def add_background(parser: argparse._ActionsContainer) -> None:
 def run(args: argparse.Namespace) -> None:
     """Render what the command line names."""
     if process_number() is None:
-        run_with(args, render_views)
+        run_with_arguments(args, render_views)
         return
     start_mpi()
     from drgs.training.parallel.images import run_together
 
-    run_together(args, partial(run_with, args))
+    run_together(args, partial(run_with_arguments, args))
 
 
-def run_with(args: argparse.Namespace, render: Render) -> None:
+def run_with_arguments(args: argparse.Namespace, render: Render) -> None:
     """Run the command; render: renders views, in this process or in several."""
     with execution_settings(args.threads, args.debug), open_image_folder(args.out) as folder:
         _check(args)
@@ -221,7 +221,7 @@ def run_with(args: argparse.Namespace, render: Render) -> None:
 def render_model(args: argparse.Namespace, model: Model, folder: ImageFolder) -> None:
     """Render Gaussians from the cameras that the command line names."""
     if model.config is not None:
-        folder.refuse_photographs(model.config.data.path)
+        folder.check_no_photographs(model.config.data.path)
     if args.orbit is not None:
         render_orbit(model, args, folder)
     elif args.camera is not None or args.origin is not None:
@@ -269,7 +269,7 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
         "views": {view.name: score for view, score in zip(views, scores, strict=True)},
     }
     with atomic_path(folder.path / METRICS) as temporary:
-        temporary.write_text(json.dumps(_without_infinities(report), indent=2) + "\n")
+        temporary.write_text(json.dumps(_replace_infinities(report), indent=2) + "\n")
     return quality
 
 
@@ -483,10 +483,10 @@ def _line(psnr: float, ssim: float) -> str:
     return f"{psnr:9.2f}  {ssim:.4f}"
 
 
-def _without_infinities(value: object) -> object:
+def _replace_infinities(value: object) -> object:
     """Replace infinities, such as the PSNR of equal images, by JSON's null."""
     if isinstance(value, dict):
-        return {key: _without_infinities(item) for key, item in value.items()}
+        return {key: _replace_infinities(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

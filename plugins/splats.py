@@ -193,7 +193,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             self.last = BackwardResult(
                 mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
                 gradients.visible,
-                gradients.first_fault,
+                gradients.first_nonfinite,
                 [frame for of_time in frames for frame in of_time],
             )
             if gradients.parameters is not None:

@@ -59,7 +59,7 @@ from scipy.spatial.transform import Rotation
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import markdown_table
 from drgs.cli.ending import exit_on_user_error
-from drgs.config.approximations import said_by
+from drgs.config.approximations import from_ply_header
 from drgs.core.arrays import interleave
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
@@ -242,7 +242,7 @@ class Stage(ABC):
         """Set it up; model: as :func:`load` gives it; size: px, of the image's sides."""
         names = [*PARAMETER_NAMES, *(["smoothing"] if model.smoothing is not None else [])]
         tensors = {name: mi.TensorXf(getattr(model, name)) for name in names}
-        said = said_by("the model's file", model.rendered_with or {})
+        said = from_ply_header("the model's file", model.rendered_with or {})
         scene = mi.load_dict(
             {
                 "type": "scene",

@@ -132,7 +132,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode():
 
 
 derivatives, adjoint = GaussianFalloff.derivatives, CenterOrder.adjoint
-rotation, whiten = projection.quat_to_rotation, projection.whiten
+rotation, whiten = projection.quat_to_rotation, projection.apply_conic_factor
 
 MUTANTS = {
     "factor 1.01": (GaussianFalloff, "derivatives", lambda *a: [1.01 * d for d in derivatives(*a)]),

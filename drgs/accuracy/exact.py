@@ -56,16 +56,22 @@ from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Array2f, Array3f, Bool, Float
-from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions, flat_columns
+from drgs.splatting.footprint import (
+    Footprint,
+    GaussianFalloff,
+    Offsets,
+    SamplePositions,
+    flat_columns,
+)
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
     ProjectionModel,
     RayTerms,
     Splats2D,
+    apply_conic_factor,
     ewa,
     film_axes,
-    whiten,
 )
 
 MOST_ECCENTRIC = 0.99
@@ -73,7 +79,7 @@ MOST_ECCENTRIC = 0.99
 long as wide, whose size is known to 1e-5 in single precision. The same for t h, the share of the
 way to the camera."""
 
-_EVERYWHERE = 1e-12
+_UNBOUNDED_OUTLINE = 1e-12
 """1 / px: U of an outline that holds every film."""
 
 LARGEST_EXPONENT = 1e4
@@ -85,11 +91,11 @@ def exact_shape(
 ) -> FilmShape:
     """Project to the shape that :class:`RayFalloff` evaluates; its slopes are not clamped.
 
-    Its whitening is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
+    Its conic factor is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
     where the anchor is, which makes no difference.
     """
     m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
-    film = whiten(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
+    film = apply_conic_factor(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     mean = dr.detach(film.means2d)
     anchor = closest_on_film(camera, *mean)
     slopes = list((anchor - camera.principal) / camera.focal)
@@ -102,7 +108,7 @@ def exact_shape(
     size = dr.abs(a)
     gx, gy = dr.fma(kx, a, h * u) / size, dr.fma(ky, a, h * v) / size
     ray = RayTerms(-p * gx, -dr.fma(r, gx, s * gy), h / denominator, denominator / size)
-    return replace(film, whitening=film.whitening * (denominator / a), ray=ray)
+    return replace(film, conic_factor=film.conic_factor * (denominator / a), ray=ray)
 
 
 def closest_on_film(camera: Camera, x: Float, y: Float) -> Array2f:
@@ -130,8 +136,8 @@ def _seen_along(
 ) -> tuple[Array3f, tuple[Float, Float], Float]:
     """Return U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
-    film = whiten(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
-    p, _, s = film.whitening
+    film = apply_conic_factor(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
+    p, _, s = film.conic_factor
     # kappa and h by minors (Binet-Cauchy), free of the cancellation in p k_x + r k_y and in
     # w - |kappa|^2. The rows are scaled first, or giants overflow.
     low_pass_s = low_pass * dr.square(s)
@@ -141,7 +147,7 @@ def _seen_along(
     m0 = p * m0
     h = dr.square(dr.dot(p * minors, n)) + low_pass_s * dr.squared_norm(dr.cross(m0, n))
     h += low_pass * dr.square(p) * (dr.squared_norm(minors_n) + low_pass_s * dr.squared_norm(n))
-    return film.whitening, (kx, ky), h
+    return film.conic_factor, (kx, ky), h
 
 
 @dataclass(frozen=True)
@@ -232,7 +238,7 @@ class RayFalloff(GaussianFalloff):
         shift = -q / squared
         shift_y = ky / s
         shift_x = (kx - r * shift_y) / p
-        everywhere = [x, y, _EVERYWHERE, 0, _EVERYWHERE]
+        everywhere = [x, y, _UNBOUNDED_OUTLINE, 0, _UNBOUNDED_OUTLINE]
         ellipse = [
             x + shift * shift_x,
             y + shift * shift_y,
@@ -271,7 +277,7 @@ class RayFalloff(GaussianFalloff):
         )
 
     def moments(
-        self, footprint: Footprint, weights: list[Float], positions: Positions
+        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         """Sum over the 16 pixels w = d loss / d ln(alpha) times each of these.
 

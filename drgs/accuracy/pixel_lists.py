@@ -99,7 +99,7 @@ class WithAffineDepth:
         film = self.shape(rows, camera, position, low_pass)
         slopes = camera.lens.clamped_slopes(camera, position)
         m0, m1, n = film_axes(rows, camera, position, slopes)
-        p, r, s = film.whitening
+        p, r, s = film.conic_factor
         kx, ky = dr.dot(m0, n), dr.dot(m1, n)
         kx, ky = dr.fma(p, kx, r * ky), s * ky
         h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
@@ -146,7 +146,7 @@ class RayDepths(AffineDepths):
         return footprint.along
 
 
-FARTHEST = 4.0
+MAX_DEPTH_RATIO = 4.0
 """Between this and its inverse is the depth by which a list is sorted, relative to the mean's."""
 
 
@@ -252,8 +252,8 @@ def _items(
         a, denominator = depths.depth_ratio(bins.model.falloff, geometry, keys, *middle)
         # Where there is no peak, there may be one at a neighbour.
         along = dr.select(a > 0, a / denominator, 1)
-        along = dr.select(along < 1 / FARTHEST, 1 / FARTHEST, along)
-        along = dr.select(along > FARTHEST, FARTHEST, along)
+        along = dr.select(along < 1 / MAX_DEPTH_RATIO, 1 / MAX_DEPTH_RATIO, along)
+        along = dr.select(along > MAX_DEPTH_RATIO, MAX_DEPTH_RATIO, along)
         values = keys[-1] * along, tile * MICROS + micro, entry
         for column, value in zip(items, values, strict=True):
             dr.scatter(column, value, item)

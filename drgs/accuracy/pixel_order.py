@@ -37,7 +37,7 @@ from drgs.core.arrays import Rows, scatter_rows, types_of
 from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.footprint import Alpha, Footprint, FootprintModel, flat_columns
 from drgs.splatting.grid import PIXELS, Lanes
-from drgs.splatting.lanes import grouped_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
+from drgs.splatting.lanes import group_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
 from drgs.splatting.projection import Projection, ProjectionModel, Splats2D, ewa
 from drgs.splatting.rasterize import (
     ONE_SAMPLE,
@@ -118,7 +118,7 @@ class PixelOrder(CenterOrder):
 
 
 @dataclass(frozen=True)
-class _Met:
+class _Crossing:
     """A splat that the lanes meet."""
 
     place: UInt32  # in the lists
@@ -154,7 +154,7 @@ class _WalkInputs:
         samples = range(bins.grid.samples) if samples is None else samples
         tiles = bins.grid.tiles_of(samples)
         begin, end = lists.range(make_lanes(bins.rows.Float, bins.grid, tiles=tiles))
-        lanes = grouped_by_work(bins.rows.Float, bins.grid, end - begin, tiles)
+        lanes = group_by_work(bins.rows.Float, bins.grid, end - begin, tiles)
         order = replace(order, depths=order.depths.bind(lanes, bins.grid))
         model = bins.model.bind(lanes, bins.grid)
         return _WalkInputs(bins, records, lists, order, lanes, model, samples)
@@ -196,7 +196,7 @@ class _WalkInputs:
 
 def _walk(
     inputs: _WalkInputs,
-    carry: Callable[[_Met, int], list],
+    carry: Callable[[_Crossing, int], list],
     visit: Callable[[S, list[list]], tuple[S, Bool]],
     state: S,
     nothing: list,
@@ -219,7 +219,7 @@ def _walk(
         keys = records.load_keys(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         alphas = model.alphas(geometry, footprint)
-        met = _Met(place, entry, active, geometry, features, footprint, alphas)
+        met = _Crossing(place, entry, active, geometry, features, footprint, alphas)
         # The place of a pixel where there is no splat: before all others, and so it is visited at
         # once, and changes nothing. When all splats were met, behind them: it takes their places.
         absent = dr.select(active, t.Float(-dr.inf), dr.inf)
@@ -326,7 +326,7 @@ def _adjoint(
 
 
 def _feature_gradient(
-    inputs: _WalkInputs, met: _Met, pixel: int, g: list[list[Float]]
+    inputs: _WalkInputs, met: _Crossing, pixel: int, g: list[list[Float]]
 ) -> Float | int:
     """Return c . g of a splat at a pixel; g: [plane][pixel] derivative of the loss."""
     features = inputs.model.features
@@ -472,7 +472,7 @@ def _tangent(
     model, size = inputs.model, inputs.size
     d_records, count = pack_tangents(bins, tangents), layers.count
 
-    def carry(met: _Met, pixel: int) -> list[Float]:
+    def carry(met: _Crossing, pixel: int) -> list[Float]:
         d_geometry, d_features = d_records.load(met.entry, met.active)
         d_log_alpha = model.falloff.tangent(met.geometry, met.footprint, d_geometry)[pixel]
         alpha = met.alphas[pixel]

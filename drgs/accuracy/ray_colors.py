@@ -15,7 +15,7 @@ from drgs.core.constants import COLOR_MIN
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Array3f, Float
 from drgs.gaussians.sh import num_coefficients, sh_basis
-from drgs.splatting.footprint import Positions, SplatFeatures
+from drgs.splatting.footprint import SamplePositions, SplatFeatures
 from drgs.splatting.grid import Lanes
 from drgs.splatting.projection import GaussianRows
 
@@ -56,7 +56,7 @@ class RayColors(SplatFeatures):
     def with_weight_derivatives(self) -> RayColors:
         return Weighing(self.sh_degree, self.camera)
 
-    def bind(self, lanes: Lanes, positions: Positions) -> RayColors:
+    def bind(self, lanes: Lanes, positions: SamplePositions) -> RayColors:
         assert self.camera is not None, "bound by for_camera"
         points = positions.points(lanes, type(self.camera.near))
         basis = tuple(sh_basis(self._direction(x, y), self.sh_degree) for x, y in points)

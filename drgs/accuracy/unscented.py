@@ -24,23 +24,23 @@ from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
     ProjectionModel,
+    apply_conic_factor,
     ewa,
     film_axes,
-    whiten,
     world_axes,
 )
 
-SPREAD = math.sqrt(3)
+SIGMA_POINT_STDS = math.sqrt(3)
 """Standard deviations from the mean to a sigma point: sqrt(n + lambda), lambda = 0."""
 
 CENTER_WEIGHT = 2.0
 """Weight of the mean in the covariance, lambda / (n + lambda) + 1 - alpha^2 + beta; its weight in
 the mean of the points is 0."""
 
-WEIGHT = 1 / 6
+SIGMA_POINT_WEIGHT = 1 / 6
 """Weight of each other point, in both."""
 
-NEAREST = 1 / 3
+MIN_RELATIVE_DEPTH = 1 / 3
 """Part of the mean's depth: where a point would be nearer, a Gaussian has no mean or covariance on
 the film, or ones that have nothing to do with its middle. The same holds far outside the film,
 where slopes are clamped. Such splats are projected by the affine approximation."""
@@ -49,17 +49,19 @@ where slopes are clamped. Such splats are projected by the affine approximation.
 def unscented_shape(
     rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
-    """Return the unscented transform; not differentiated: where :data:`NEAREST` decides."""
+    """Return the unscented transform; the limit MIN_RELATIVE_DEPTH is not differentiated."""
     points = _sigma_points(camera.lens, rows, camera, position)
     # The mean itself has the offset 0.
     columns = [
-        [-math.sqrt(CENTER_WEIGHT) * mu, *(math.sqrt(WEIGHT) * (o - mu) for o in axis)]
+        [-math.sqrt(CENTER_WEIGHT) * mu, *(math.sqrt(SIGMA_POINT_WEIGHT) * (o - mu) for o in axis)]
         for axis, mu in zip(points.offsets, points.mean, strict=True)
     ]
     shift = types_of(type(position.z)).Array2f(points.mean)
     means2d = camera.lens.project_point(camera, position) + shift
     affine = ewa(rows, camera, position, low_pass)
-    return dr.select(points.usable, whiten(means2d, columns[0], columns[1], low_pass), affine)
+    return dr.select(
+        points.usable, apply_conic_factor(means2d, columns[0], columns[1], low_pass), affine
+    )
 
 
 @PROJECTIONS.register("unscented")
@@ -84,18 +86,18 @@ def _sigma_points(
 ) -> _SigmaPoints:
     """Project the sigma points through any lens, as it projects points."""
     center, slopes = lens.project_point(camera, position), lens.true_slopes(camera, position)
-    not_nearer = replace(camera, near=NEAREST * lens.visibility(camera, position)[2])
+    not_nearer = replace(camera, near=MIN_RELATIVE_DEPTH * lens.visibility(camera, position)[2])
     usable = _same(slopes, lens.clamped_slopes(camera, position))
     offsets: list[list[Float]] = [[], []]
     for axis in world_axes(rows):
-        for c in (SPREAD, -SPREAD):
+        for c in (SIGMA_POINT_STDS, -SIGMA_POINT_STDS):
             seen, point, _ = lens.visibility(not_nearer, position + c * (camera.rotation @ axis))
             usable &= seen
             for side, offset in zip(
                 offsets, lens.project_point(camera, point) - center, strict=True
             ):
                 side.append(offset)
-    return _SigmaPoints(offsets, [WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
+    return _SigmaPoints(offsets, [SIGMA_POINT_WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
 
 
 @_sigma_points.register
@@ -103,7 +105,9 @@ def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Array3f) -> _
     """Project the sigma points through a pinhole, by formulas that do not cancel."""
     slopes = lens.true_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
-    far_enough = dr.max(dr.abs(n)) <= (1 - NEAREST) / SPREAD  # no point is too near
+    far_enough = (
+        dr.max(dr.abs(n)) <= (1 - MIN_RELATIVE_DEPTH) / SIGMA_POINT_STDS
+    )  # no point is too near
     return _SigmaPoints(
         offsets=[_sigma_offsets(m, n) for m in (m0, m1)],
         mean=[_mean_offset(m, n) for m in (m0, m1)],
@@ -124,20 +128,22 @@ def _sigma_offsets(m: Array3f, n: Array3f) -> list[Float]:
     its place c m / (1 + c n): a difference that does not cancel.
     """
     return [
-        c * m_k / _depth(c * n_k) for c in (SPREAD, -SPREAD) for m_k, n_k in zip(m, n, strict=True)
+        c * m_k / _depth(c * n_k)
+        for c in (SIGMA_POINT_STDS, -SIGMA_POINT_STDS)
+        for m_k, n_k in zip(m, n, strict=True)
     ]
 
 
 def _mean_offset(m: Array3f, n: Array3f) -> Float:
     """Return their weighted mean: two of opposite c add up to -2 c^2 m n / (1 - c^2 n^2)."""
     terms = [
-        m_k * n_k / (_depth(SPREAD * n_k) * _depth(-SPREAD * n_k))
+        m_k * n_k / (_depth(SIGMA_POINT_STDS * n_k) * _depth(-SIGMA_POINT_STDS * n_k))
         for m_k, n_k in zip(m, n, strict=True)
     ]
-    return -2 * SPREAD**2 * WEIGHT * sum(terms[1:], terms[0])
+    return -2 * SIGMA_POINT_STDS**2 * SIGMA_POINT_WEIGHT * sum(terms[1:], terms[0])
 
 
 def _depth(change: Float) -> Float:
     """Return a point's depth, relative to the mean's; finite also where it is not used."""
-    nearest, depth = NEAREST / 2, 1 + change
+    nearest, depth = MIN_RELATIVE_DEPTH / 2, 1 + change
     return dr.select(depth > nearest, depth, nearest)

@@ -41,7 +41,7 @@ from drgs.reference import splatting as reference
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
 from drgs.splatting import rendering
-from drgs.splatting.footprint import PixelCenters, Positions
+from drgs.splatting.footprint import PixelCenters, SamplePositions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,10 +50,10 @@ ROUNDS, QUICK_ROUNDS = 9, 3
 SLOW_S, SLOW_ROUNDS = 1.0, 2
 """Rungs that take longer than this are timed in so many rounds."""
 
-SIZE = 400
+FILM_SIZE_PX = 400
 """px: film of scenes that have no cameras of their own."""
 
-CROP = 8
+CROP_SIZE_PX = 8
 """px: side of the crops on which every splat is evaluated at every pixel."""
 
 LEAST_ALPHA = 1e-6
@@ -158,7 +158,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure both scenes; write table, CSV and plot."""
     subjects = [
         load_subject(Path(args.scene), 1 if args.quick else args.views),
-        Subject("stress", *stress_scene(SIZE), [], (0.0, 0.0, 0.0)),
+        Subject("stress", *stress_scene(FILM_SIZE_PX), [], (0.0, 0.0, 0.0)),
     ]
     print(f"{machine()}")
     results = []
@@ -187,7 +187,7 @@ def load_subject(path: Path, num_views: int) -> Subject:
     Raises UserError for views that are not those of pinholes at rest.
     """
     if not path.is_dir():
-        camera = bench_camera(SIZE)
+        camera = bench_camera(FILM_SIZE_PX)
         return Subject(
             path.stem, bake_smoothing(Gaussians.load(path)), [camera], [], (1.0, 1.0, 1.0)
         )
@@ -224,7 +224,7 @@ def camera_of(view: View, near: float) -> reference.Camera:
     return reference.Camera(rotation, center, fx, fy, cx, cy, view.width, view.height, near)
 
 
-def positions(samples: int, camera: reference.Camera, float_type: type) -> list[Positions]:
+def positions(samples: int, camera: reference.Camera, float_type: type) -> list[SamplePositions]:
     """Return a grid of points in each pixel."""
     if samples == 1:
         return [PixelCenters()]
@@ -240,7 +240,7 @@ class RungRenderer:
     rung: Rung
     gaussians: Gaussians  # on the device
     camera: Camera
-    positions: list[Positions]
+    positions: list[SamplePositions]
     background: tuple[float, float, float]
 
     @staticmethod
@@ -307,8 +307,11 @@ def check_on_crops(subject: Subject, accurate: np.ndarray) -> float:
     """Return the largest difference of three crops from ones in which pixels have every splat."""
     camera, errors = subject.cameras[0], []
     for x, y in ((0.5, 0.5), (0.35, 0.6), (0.6, 0.35)):
-        column, row = int(x * (camera.width - CROP)), int(y * (camera.height - CROP))
-        region = slice(row, row + CROP), slice(column, column + CROP)
+        column, row = (
+            int(x * (camera.width - CROP_SIZE_PX)),
+            int(y * (camera.height - CROP_SIZE_PX)),
+        )
+        region = slice(row, row + CROP_SIZE_PX), slice(column, column + CROP_SIZE_PX)
         uncut = most_accurate(subject, camera, 0.0, region)
         errors.append(np.abs(uncut - accurate[region]).max())
     return max(errors)

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 STEPS, QUICK_STEPS = 12, 4
 
-DENSITY = 100_000 / 400**2
+GAUSSIANS_PER_PIXEL = 100_000 / 400**2
 """Gaussians per pixel of the bench scene, which the sweep over N keeps."""
 
 
@@ -163,7 +163,13 @@ def points(quick: bool) -> list[Point]:
     base = 30_000 if quick else 100_000
     scales = {n: math.sqrt(100_000 / n) for n in counts}
     found = [
-        Point("constant entries per Gaussian", n, round(math.sqrt(n / DENSITY)), threads, scales[n])
+        Point(
+            "constant entries per Gaussian",
+            n,
+            round(math.sqrt(n / GAUSSIANS_PER_PIXEL)),
+            threads,
+            scales[n],
+        )
         for n in counts
     ]
     found += [Point("bench scene as it is", n, 400, threads) for n in counts]

@@ -35,7 +35,7 @@ from drgs.bench.timing import (
 from drgs.cli.commands import CommandParser
 from drgs.config.schema import ModelConfig
 from drgs.core.files import atomic_path
-from drgs.core.private import leave_out_avx512
+from drgs.core.private import disable_avx512
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene
 from drgs.io.figures import new_figure, write_figure
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 IMAGE_SIZE_PX = 400
 
-SHELL = 3.0
+SHELL_STDS = 3.0
 """Standard deviations at which Mitsuba's ellipsoids end (its default, and 3DGS's extent)."""
 
 ROUNDS, QUICK_ROUNDS = 15, 5
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure all scenes; write tables, CSV, JSON and a plot."""
     mi.set_variant("llvm_ad_rgb")
     if args.without_avx512:
-        leave_out_avx512()
+        disable_avx512()
     where = f"{machine()}, without AVX-512" if args.without_avx512 else machine()
     print(where)
     rounds = QUICK_ROUNDS if args.quick else ROUNDS
@@ -203,7 +203,7 @@ def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str,
         "type": "scene",
         "integrator": integrator,
         "emitter": {"type": "constant"},
-        "shapes": {"type": shape, "extent": SHELL, **tensors},
+        "shapes": {"type": shape, "extent": SHELL_STDS, **tensors},
     }
 
 

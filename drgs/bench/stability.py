@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
 """px: small images, since the reference draws each of them many times."""
 
-COUNT = 60
+NUM_GAUSSIANS = 60
 """Gaussians in a scene, but for the stacks."""
 
 UNIT_ROUNDOFF = 2.0**-24
@@ -148,10 +148,10 @@ def _ordinary(camera: reference.Camera, near: float, far: float) -> reference.Ga
     rng = np.random.default_rng(2)
     return _gaussians(
         camera,
-        rng.uniform(0, 1, (COUNT, 2)) * [WIDTH, HEIGHT],
-        rng.uniform(near, far, COUNT),
-        rng.uniform(1, 6, (COUNT, 3)),
-        rng.normal(0, 1, COUNT),
+        rng.uniform(0, 1, (NUM_GAUSSIANS, 2)) * [WIDTH, HEIGHT],
+        rng.uniform(near, far, NUM_GAUSSIANS),
+        rng.uniform(1, 6, (NUM_GAUSSIANS, 3)),
+        rng.normal(0, 1, NUM_GAUSSIANS),
     )
 
 
@@ -176,10 +176,10 @@ def _needles(ratio: float) -> Scene:
     camera = _camera(np.zeros(3))
     gaussians = _gaussians(
         camera,
-        rng.uniform(0, 1, (COUNT, 2)) * [WIDTH, HEIGHT],
-        rng.uniform(1, 4, COUNT),
-        8 * np.array([[1, 1 / ratio, 1 / ratio]] * COUNT),
-        rng.normal(1, 1, COUNT),
+        rng.uniform(0, 1, (NUM_GAUSSIANS, 2)) * [WIDTH, HEIGHT],
+        rng.uniform(1, 4, NUM_GAUSSIANS),
+        8 * np.array([[1, 1 / ratio, 1 / ratio]] * NUM_GAUSSIANS),
+        rng.normal(1, 1, NUM_GAUSSIANS),
     )
     return gaussians, camera
 

@@ -16,7 +16,7 @@ from drgs.cameras.lens import PINHOLE, CameraParameters, Lens
 from drgs.core.arrays import types_of
 from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar, UInt32
 
-MISSED = 0.01  # px: largest distance of the point of a ray from the place of the ray
+MAX_RAY_ERROR_PX = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
 
 class Aperture(Protocol):
@@ -112,7 +112,7 @@ class Camera(CameraParameters):
         seen, _, _ = self.lens.visibility(replace(self, near=type(self.near)(0)), direction)
         t = types_of(type(self.near))
         missed = self.lens.project_point(self, direction) - t.Array2f(x, y)
-        return origin, direction, seen & (dr.squared_norm(missed) < MISSED**2)
+        return origin, direction, seen & (dr.squared_norm(missed) < MAX_RAY_ERROR_PX**2)
 
     def view_directions(self, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool, int]:
         """Return directions of rays through places of the film (px): world, any length.

@@ -24,7 +24,7 @@ RADIUS_STEPS = 24
 """Steps of the search for a radius: most need 4 or 5; next to the end of the function, each at
 least halves the error."""
 
-UNBOUNDED = 1e4  # a slope that no film shows
+UNBOUNDED_SLOPE = 1e4  # a slope that no film shows
 
 NEWTON_STEPS = 5  # steps for the other terms, which are small: the search starts nearby
 
@@ -66,7 +66,7 @@ def radius_at(
     it converges whatever the function, and stays finite. Not differentiated.
     """
     UInt32 = types_of(type(target)).UInt32
-    high = dr.minimum(type(target)(end), UNBOUNDED)
+    high = dr.minimum(type(target)(end), UNBOUNDED_SLOPE)
     first = dr.select(target < high, target, _bracket_middle(0, high))
 
     def body(
@@ -105,13 +105,13 @@ def usable_coefficients(given: Mapping[str, float]) -> dict[str, float]:
     return {n: v if abs(v) >= NEGLIGIBLE_COEFFICIENT else 0.0 for n, v in given.items()}
 
 
-def up_to_the_last(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
+def trim_zeros(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
     """Return coefficients of a polynomial: zero where one is not given but a later one is."""
     count = max((n for n, name in enumerate(names, 1) if name in given), default=0)
     return tuple(float(given.get(name, 0.0)) for name in names[:count])
 
 
-def both_or_none(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
+def check_pair(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
     """Return coefficients if one is given, zero for another that is not."""
     return tuple(float(given.get(name, 0.0)) for name in names if set(names) & set(given))
 

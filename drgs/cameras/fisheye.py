@@ -19,7 +19,7 @@ from drgs.cameras.distortion import (
     horner,
     polynomial,
     radius_at,
-    up_to_the_last,
+    trim_zeros,
     usable_coefficients,
 )
 from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
@@ -56,7 +56,7 @@ class Fisheye(Lens):
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> Fisheye:
         """Return the lens with OpenCV's ``k1`` to ``k4``; what is not given is zero."""
-        terms = up_to_the_last(cls.groups["radial_terms"], usable_coefficients(coefficients))
+        terms = trim_zeros(cls.groups["radial_terms"], usable_coefficients(coefficients))
         growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(terms))]
         turn = math.sqrt(first_root(np.array(growth)))
         return cls(terms, math.cos(min(turn, MAX_ANGLE)))

@@ -18,7 +18,7 @@ from drgs.core.types import Array3f, Bool, Float, Matrix3f, Scalar
 NEWTON_STEPS = 3
 """Steps of the search for a splat's time: pixels move little while the film is read."""
 
-SLOWEST = 1e-4
+MIN_TURN_RAD = 1e-4
 """Radians: turns below this are composed by their series, the formulas being 0 / 0 at 0."""
 
 
@@ -123,7 +123,7 @@ def rotation_vector(rotation: Matrix3f) -> Array3f:
     )
     squared = dr.squared_norm(twice_sine)
     trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
-    turns = (squared > (2 * SLOWEST) ** 2) | (trace < 1)
+    turns = (squared > (2 * MIN_TURN_RAD) ** 2) | (trace < 1)
     sine = dr.sqrt(dr.select(turns, squared, 1)) / 2
     angle = dr.atan2(sine, (trace - 1) / 2)
     return twice_sine * dr.select(turns, angle / (2 * sine), 0.5)
@@ -133,7 +133,7 @@ def rotation_matrix(turn: Array3f) -> Matrix3f:
     """Return the rotation matrix of axis times angle, radians (Rodrigues)."""
     t = types_of(type(turn.x))
     squared = dr.squared_norm(turn)
-    turns = squared > SLOWEST**2
+    turns = squared > MIN_TURN_RAD**2
     angle = dr.sqrt(dr.select(turns, squared, 1))
     a = dr.select(turns, dr.sin(angle) / angle, 1 - squared / 6)
     # (1 - cos) / angle^2, which cancels for small angles.

@@ -16,14 +16,14 @@ from typing import ClassVar
 import drjit as dr
 
 from drgs.cameras.distortion import (
-    UNBOUNDED,
+    UNBOUNDED_SLOPE,
     PlaneDistortion,
-    both_or_none,
+    check_pair,
     derivative,
     largest_squared_radius,
     polynomial,
     steepest_fall,
-    up_to_the_last,
+    trim_zeros,
     usable_coefficients,
 )
 from drgs.cameras.lens import (
@@ -38,8 +38,10 @@ from drgs.cameras.lens import (
 from drgs.core.arrays import types_of
 from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
 
-BORDER = 65  # points on each side of the film's border, whose slopes bound those on the film
-MISSED = 1e-6  # squared distance, in slopes, at which Newton's method may end
+BORDER_POINTS_PER_SIDE = 65
+"""Points on each side of the film's border, whose slopes bound those on the film."""
+
+MAX_SQUARED_SLOPE_ERROR = 1e-6  # squared distance, in slopes, at which Newton's method may end
 
 
 @LENSES.register("opencv")
@@ -71,9 +73,9 @@ class RadialTangential(PlaneDistortion, Perspective):
     def from_coefficients(cls, **coefficients: float) -> RadialTangential:
         """Return the lens with OpenCV's ``k1`` to ``k6``, ``p1``, ``p2``; others are zero."""
         given = usable_coefficients(coefficients)
-        numerator = up_to_the_last(cls.groups["numerator"], given)
-        denominator = up_to_the_last(cls.groups["denominator"], given)
-        tangential = both_or_none(cls.groups["tangential"], given)
+        numerator = trim_zeros(cls.groups["numerator"], given)
+        denominator = trim_zeros(cls.groups["denominator"], given)
+        tangential = check_pair(cls.groups["tangential"], given)
         fall = steepest_fall(tangential or (0.0, 0.0))
         radius = largest_squared_radius(numerator, denominator, fall)
         return cls(numerator, denominator, tangential, radius)
@@ -131,18 +133,18 @@ def _slopes_on_border(lens: RadialTangential, camera: CameraParameters) -> tuple
     Where the lens does not see all of them, only the end of its model bounds the slopes.
     """
     t = types_of(type(camera.near))
-    side = dr.linspace(t.Float, 0, 1, BORDER)
-    zero, one = dr.zeros(t.Float, BORDER), dr.ones(t.Float, BORDER)
+    side = dr.linspace(t.Float, 0, 1, BORDER_POINTS_PER_SIDE)
+    zero, one = dr.zeros(t.Float, BORDER_POINTS_PER_SIDE), dr.ones(t.Float, BORDER_POINTS_PER_SIDE)
     start, end = camera.film_start, camera.film_end
     x = dr.concat([side, side, zero, one]) * (end.x - start.x) + start.x
     y = dr.concat([zero, one, side, side]) * (end.y - start.y) + start.y
     film = film_coordinates(camera, x, y)
     slopes = lens.undistort(film.x, film.y)
     missed = dr.squared_norm(t.Array2f(*lens.distort(*slopes)) - film)
-    bounded = dr.all(lens.is_within(*slopes) & (missed < MISSED))
+    bounded = dr.all(lens.is_within(*slopes) & (missed < MAX_SQUARED_SLOPE_ERROR))
     least, largest = (
         t.Array2f([dr.select(bounded, _mean_where(s, extreme(s)), other) for s in slopes])
-        for extreme, other in ((dr.min, -UNBOUNDED), (dr.max, UNBOUNDED))
+        for extreme, other in ((dr.min, -UNBOUNDED_SLOPE), (dr.max, UNBOUNDED_SLOPE))
     )
     return least, largest
 

@@ -14,12 +14,12 @@ import drjit as dr
 
 from drgs.cameras.distortion import (
     PlaneDistortion,
-    both_or_none,
+    check_pair,
     derivative,
     largest_squared_radius,
     polynomial,
     steepest_fall,
-    up_to_the_last,
+    trim_zeros,
     usable_coefficients,
 )
 from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
@@ -57,8 +57,8 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
     def from_coefficients(cls, **coefficients: float) -> ThinPrismFisheye:
         """Return the lens with COLMAP's coefficients; what is not given is zero."""
         given, (radial, *pairs) = usable_coefficients(coefficients), cls.groups.values()
-        kept = up_to_the_last(radial, given)
-        tangential, prism = (both_or_none(names, given) for names in pairs)
+        kept = trim_zeros(radial, given)
+        tangential, prism = (check_pair(names, given) for names in pairs)
         fall = steepest_fall(tangential or (0.0, 0.0), prism or (0.0, 0.0))
         angle = min(math.sqrt(largest_squared_radius(kept, (), fall)), MAX_ANGLE)
         return cls(kept, math.cos(angle), tangential, prism)

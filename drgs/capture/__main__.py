@@ -30,9 +30,9 @@ from drgs.cli.commands import (
 )
 from drgs.cli.execution import add_variant_argument, select_variant
 from drgs.core.errors import UserError
-from drgs.core.files import why_refused
+from drgs.core.files import refusal_reason
 from drgs.core.folders import sole_writer
-from drgs.core.memory import why_too_large
+from drgs.core.memory import too_large_reason
 
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
@@ -131,7 +131,7 @@ def run(args: argparse.Namespace) -> None:
     except BrokenPipeError:  # of the output, whose reader has gone
         raise
     except OSError as error:
-        raise UserError(f"{error.filename or args.out}: {why_refused(error)}") from None
+        raise UserError(f"{error.filename or args.out}: {refusal_reason(error)}") from None
     except KeyboardInterrupt:
         print("\nthe same command continues", file=sys.stderr)
         raise
@@ -140,7 +140,7 @@ def run(args: argparse.Namespace) -> None:
 def _capture(args: argparse.Namespace) -> None:
     given = _given_settings(args)
     settings = replace(CaptureSettings(), **given)
-    if reason := why_too_large(*settings.size):
+    if reason := too_large_reason(*settings.size):
         raise UserError(f"--size: {reason}")
     if not args.scene.is_file():
         raise UserError(f"{args.scene}: there is no such scene file")

@@ -55,20 +55,21 @@ UNUSED = {
 }
 """Settings that a kind of cameras does not use."""
 
-CLOSED = 0.75
+MIN_ENCLOSED_SHARE = 0.75
 """Least part of all directions with a surface in a room. Cornell's box, which has five of six
 sides, has 5/6."""
 
 NUM_SPOTS, NUM_DIRECTIONS = 128, 128
 """Points of the bounding box that may be in a room, and rays from each."""
 
-CLEARANCE = 0.1  # quantile of the distances from a spot to its surroundings that measures its room
+ROOM_QUANTILE = 0.1
+"""Quantile of the distances from a spot to its surroundings that measures its room."""
 
 PREVIEWS, PREVIEW_SIZE, PREVIEW_SPP = 12, (16, 16), 4
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
-PLASTIC = 1.2207440846057596
+PLASTIC_RATIO = 1.2207440846057596
 """The root of x^4 = x + 1: its powers spread points evenly over a box (Roberts 2018, "R_3")."""
 
 
@@ -144,7 +145,9 @@ def _kind_for(
     _, is_closed = _room(scene, settings)
     if not is_closed:
         return "around"
-    author_is_inside = any(_look_around(scene, [o.pose[:3, 3] for o in own])[0] >= CLOSED)
+    author_is_inside = any(
+        _look_around(scene, [o.pose[:3, 3] for o in own])[0] >= MIN_ENCLOSED_SHARE
+    )
     if not author_is_inside and _is_lit(scene, replace(settings, cameras="around"), given):
         return "around"
     return "inside" if _is_lit(scene, replace(settings, cameras="inside"), given) else "around"
@@ -212,10 +215,10 @@ def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]
         if not ((low < spots[0]) & (spots[0] < high)).all():
             return spots[0], False
     else:
-        steps = np.arange(NUM_SPOTS)[:, None] * PLASTIC ** -np.arange(1.0, 4.0)
+        steps = np.arange(NUM_SPOTS)[:, None] * PLASTIC_RATIO ** -np.arange(1.0, 4.0)
         spots = low + (high - low) * ((0.5 + steps) % 1)
     closed, room = _look_around(scene, spots)
-    is_closed = closed >= CLOSED
+    is_closed = closed >= MIN_ENCLOSED_SHARE
     best = np.argmax(np.where(is_closed, room, -1)) if is_closed.any() else np.argmax(closed)
     return spots[best], bool(is_closed.any())
 
@@ -231,7 +234,7 @@ def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndar
     pairs = np.repeat(spots, len(directions), axis=0), np.tile(directions, (len(spots), 1))
     distances, is_front = _free_way(scene, *pairs)
     shape = len(spots), len(directions)
-    room = np.quantile(distances.reshape(shape), CLEARANCE, axis=1, method="lower")
+    room = np.quantile(distances.reshape(shape), ROOM_QUANTILE, axis=1, method="lower")
     return is_front.reshape(shape).mean(axis=1), room
 
 

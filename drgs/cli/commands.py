@@ -22,7 +22,7 @@ from drgs.cli.ending import (
 )
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import UserError, did_you_mean, one_line
-from drgs.core.processes import ending_together, one_voice, process_count
+from drgs.core.processes import end_job_on_error, process_count, root_output_only
 from drgs.core.registry import reporting_extensions
 
 MAX_ERROR = 500
@@ -110,11 +110,11 @@ def run_command(
     prog: how the command is called. arguments: its words; None: those of this process.
     """
     with (
-        ending_together(),
+        end_job_on_error(),
         printable_anywhere(),
         exit_on_interrupt(),
         exit_on_user_error(),
-        one_voice(),
+        root_output_only(),
         notes_printed(),
     ):
         parser = CommandParser(prog=prog)

@@ -14,9 +14,9 @@ from types import FrameType
 from typing import NoReturn, TextIO
 
 from drgs.core.errors import UserError, UserNote
-from drgs.core.files import why_refused
+from drgs.core.files import refusal_reason
 from drgs.core.llvm import LLVMVersionError
-from drgs.core.memory import why_out_of_memory
+from drgs.core.memory import out_of_memory_reason
 from drgs.core.processes import process_number
 
 USER_ERROR_STATUS = 2
@@ -64,10 +64,10 @@ def _user_message(error: Exception) -> str | None:
     """Return the message for the user; None: the error is a fault of the program."""
     if isinstance(error, (UserError, LLVMVersionError)):
         return str(error)
-    if (reason := why_out_of_memory(error)) is not None:
+    if (reason := out_of_memory_reason(error)) is not None:
         return reason
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{os.fsdecode(error.filename)}: {why_refused(error)}"
+        return f"{os.fsdecode(error.filename)}: {refusal_reason(error)}"
     if isinstance(error, ImportError) and error.name and error.name.partition(".")[0] != "drgs":
         return f"{error}, by {sys.executable}; install drgs there with all that it needs"
     return None
@@ -112,7 +112,7 @@ def exit_on_interrupt() -> Iterator[None]:
             signal.signal(signal.SIGTERM, _terminate)
         yield
     except (Exception, KeyboardInterrupt) as error:
-        if (cause := _interrupt_behind(error)) is None:
+        if (cause := _interrupt_after(error)) is None:
             raise
         _exit_interrupted(cause)
     finally:
@@ -149,7 +149,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
+def _interrupt_after(error: BaseException | None) -> KeyboardInterrupt | None:
     """Return the interrupt, if there is one: Dr.Jit raises errors of its own for one."""
     causes: list[BaseException] = []
     while error is not None and error not in causes:

@@ -19,7 +19,7 @@ from drgs.cli.commands import at_least
 from drgs.cli.ending import interruptible_imports
 from drgs.core.environment import VARIANTS, denormals_flushed
 from drgs.core.errors import UserError, one_line
-from drgs.core.memory import why_out_of_memory
+from drgs.core.memory import out_of_memory_reason
 
 MAX_THREADS = 4096
 """Dr.Jit starts a thread for each, whatever there is to do."""
@@ -60,7 +60,7 @@ def select_variant(name: str) -> None:
         with interruptible_imports():
             mi.set_variant(name)
     except ImportError as error:
-        if why_out_of_memory(error):
+        if out_of_memory_reason(error):
             raise
         raise UserError(f"--variant {name}: not usable here: {one_line(error)}") from None
 

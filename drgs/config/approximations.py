@@ -213,15 +213,15 @@ class Approximations:
         return replace(Approximations(), **changes)
 
     @property
-    def others_than_default(self) -> dict[str, Value]:
+    def non_default(self) -> dict[str, Value]:
         """The values that are not the default, by name."""
         values = {name: getattr(self, name) for name in DECLARED}
         return {name: value for name, value in values.items() if value != DECLARED[name].default}
 
     @property
-    def are_usual(self) -> bool:
+    def is_default(self) -> bool:
         """True if viewers of 3DGS files render with the same."""
-        return not self.others_than_default
+        return not self.non_default
 
 
 DECLARED: dict[str, Declared] = {
@@ -230,7 +230,7 @@ DECLARED: dict[str, Declared] = {
 """All approximations by name, in the order in which they are listed."""
 
 
-def said_by(where: str, values: Mapping[str, Value]) -> dict[str, Value]:
+def from_ply_header(where: str, values: Mapping[str, Value]) -> dict[str, Value]:
     """Return the approximations among ``values`` of a file, each of its declared type.
 
     where: the file, for messages. A name that is not known, of a later version perhaps, is noted

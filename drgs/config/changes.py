@@ -81,7 +81,7 @@ def is_open(config: FitConfig) -> bool:
     return any(_value(config, key) is None for key in OPEN)
 
 
-def decided_as(config: FitConfig, other: FitConfig) -> FitConfig:
+def with_decisions(config: FitConfig, other: FitConfig) -> FitConfig:
     """Set the values that ``config`` leaves to the dataset as ``other`` has them."""
     changes = {key: _value(other, key) for key in OPEN_AT_START if _value(config, key) is None}
     return with_changes(config, changes)

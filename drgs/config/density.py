@@ -205,7 +205,7 @@ class DensifyConfig(Section):
     mcmc: McmcConfig = subsection(McmcConfig)
     prune: PruneConfig = subsection(PruneConfig)
 
-    def stop_seen_from(self, iteration: int) -> int:
+    def stop_at_iteration(self, iteration: int) -> int:
         """Return what ``stop`` was when this iteration was done."""
         aims = [aim.stop for aim in self.stop_aims if aim.after < iteration]
         return aims[-1] if aims else self.stop
@@ -226,7 +226,7 @@ class DensifyConfig(Section):
         start = max(self.stop, self.prune.start or 0)
         return start, self.prune.stop or (start + iterations + 1) // 2
 
-    def settled_from(self, iterations: int) -> int:
+    def settled_iteration(self, iterations: int) -> int:
         """Return the iteration from which on no row is added or removed; iterations: of the fit."""
         last = self.stop if self.prune.to is None else self.prune_window(iterations)[1]
         return max(self.stop, last) + 1

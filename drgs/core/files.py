@@ -164,7 +164,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise UserError(f"{path}: cannot write the file: {why_refused(error)}") from error
+        raise UserError(f"{path}: cannot write the file: {refusal_reason(error)}") from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -196,7 +196,7 @@ def is_temporary(name: str) -> bool:
     return _TEMPORARY_NAME.fullmatch(name) is not None
 
 
-def why_refused(error: OSError) -> str:
+def refusal_reason(error: OSError) -> str:
     """Return the file system's reason, and what to do about it where that is known."""
     reason = error.strerror or str(error) or type(error).__name__
     remedy = _REMEDIES.get(error.errno or 0)

@@ -48,7 +48,7 @@ fits render hundreds in a second."""
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
-_UNLIMITED = 1 << 60
+_UNLIMITED_BYTES = 1 << 60
 """Bytes; what version 1 of control groups calls a limit where there is none is more."""
 
 
@@ -109,7 +109,7 @@ def _if_insufficient(needed: int, unasked: int) -> int | None:
     return available if needed > available else None
 
 
-def why_out_of_memory(error: BaseException) -> str | None:
+def out_of_memory_reason(error: BaseException) -> str | None:
     """Return what to tell the user where an error means that memory is exhausted, else None.
 
     Python and NumPy raise MemoryError, Dr.Jit a RuntimeError, and the loader of libraries an
@@ -123,7 +123,7 @@ def why_out_of_memory(error: BaseException) -> str | None:
     return None
 
 
-def why_too_large(width: int, height: int, channels: int = 3, samples: int = 1) -> str | None:
+def too_large_reason(width: int, height: int, channels: int = 3, samples: int = 1) -> str | None:
     """Return why a image of ``width`` x ``height`` px cannot be rendered here; None: it can.
 
     channels: of the film, without alpha; samples: per pixel, times those of an open shutter.
@@ -155,14 +155,14 @@ def _flush_cache_of_drjit() -> None:
 def _of_process() -> int:
     process = psutil.Process()
     if not hasattr(psutil, "RLIMIT_AS"):  # not Linux
-        return _UNLIMITED
+        return _UNLIMITED_BYTES
     limit, _ = process.rlimit(psutil.RLIMIT_AS)
-    return _UNLIMITED if limit == psutil.RLIM_INFINITY else limit - process.memory_info().vms
+    return _UNLIMITED_BYTES if limit == psutil.RLIM_INFINITY else limit - process.memory_info().vms
 
 
 def _of_control_groups() -> int:
     """Bytes that the limits of the process's control groups leave; both versions."""
-    rooms = [_UNLIMITED]
+    rooms = [_UNLIMITED_BYTES]
     for line in _lines(_PROC / "self" / "cgroup"):
         _, controllers, path = line.split(":", 2)
         if not controllers:
@@ -181,8 +181,8 @@ def _of_control_groups() -> int:
 def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
     """Bytes that a control group has left; files that it keeps in memory can be dropped."""
     most, used = (next(iter(_lines(group / name)), "") for name in (limit, usage))
-    if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED:
-        return _UNLIMITED
+    if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED_BYTES:
+        return _UNLIMITED_BYTES
     cached = [
         line.split()[1] for line in _lines(group / "memory.stat") if line.split()[0] == reclaimable
     ]

@@ -18,7 +18,7 @@ Origin = tuple[float, float, float]
 WORLD: Origin = (0.0, 0.0, 0.0)
 """The world's own origin."""
 
-FAR = 1000
+MAX_SCENE_SIZES = 1000
 """Sizes of a scene: farther away, its positions are kept relative to another origin. At that
 distance float32 resolves 6e-5 of the size, which costs a fit nothing that was measured; three times
 as far it costs 0.3 dB, a million times as far 5 dB."""
@@ -31,7 +31,7 @@ def near_origin(middle: ArrayLike, size: float) -> Origin:
     else ``middle``, rounded to as many decimal digits as do not matter beside ``size``.
     """
     middle = np.asarray(middle)
-    if not (size > 0 and np.abs(middle).max() > FAR * size):
+    if not (size > 0 and np.abs(middle).max() > MAX_SCENE_SIZES * size):
         return WORLD
     digits = -math.floor(math.log10(size))
     x, y, z = (round(float(value), digits) + 0.0 for value in middle)

@@ -77,7 +77,7 @@ def llvm_vector_width() -> int:
         return 0
 
 
-def leave_out_avx512() -> None:
+def disable_avx512() -> None:
     """Compile from now on for this processor as if it had AVX2 and no AVX-512.
 
     To be called before the first kernel. Raises :class:`UserError` where there is no AVX-512, or no

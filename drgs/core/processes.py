@@ -58,7 +58,7 @@ def _from_launcher(index: int) -> int | None:
 
 
 @contextmanager
-def one_voice() -> Iterator[None]:
+def root_output_only() -> Iterator[None]:
     """Let only the first process print within the block; others, once they have failed alone.
 
     An error that leaves the block on another process does so after that one's patience, by which
@@ -79,7 +79,7 @@ def one_voice() -> Iterator[None]:
 
 
 @contextmanager
-def ending_together() -> Iterator[None]:
+def end_job_on_error() -> Iterator[None]:
     """End all processes of the job where an error ends the block on this one."""
     if process_number() is None:
         yield

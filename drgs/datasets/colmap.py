@@ -36,7 +36,7 @@ WORKSPACES = ("", "dense/0", "dense")
 FACTORS = {"images": 1, "images_2": 2, "images_4": 4, "images_8": 8}
 """Divisors of the size of photographs, by folder."""
 
-SIDEWAYS = 5
+FIRST_TRANSPOSED_ORIENTATION = 5
 """EXIF's orientations from this one exchange width and height."""
 
 PHOTOGRAPHS = FileKind("photographs", remedy="put the photographs there that COLMAP saw")
@@ -208,7 +208,7 @@ def _size_as_calibrated(
     header = read_header(file)
     (width, height), seen = header.size, (camera.width, camera.height)
     sizes = [(width, height)]
-    if header.orientation >= SIDEWAYS:
+    if header.orientation >= FIRST_TRANSPOSED_ORIENTATION:
         sizes.append((height, width))
     if seen in sizes:
         return seen

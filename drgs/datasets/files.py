@@ -207,7 +207,7 @@ def masks_of(
         marked.setdefault(_photograph_key(stem), file)
         loose.setdefault(stem_of(_photograph_key(stem) or stem), file)
     if images is not None:
-        for file in _marked_beside(images, names):
+        for file in _masks_beside(images, names):
             marked.setdefault(_photograph_key(_mask_key(file.relative_to(images).as_posix())), file)
     chosen = []
     for name in names:
@@ -237,7 +237,7 @@ def note_unnamed_masks(folder: Path, notes: list[str]) -> None:
         )
 
 
-def _marked_beside(images: Path, names: Sequence[str]) -> list[Path]:
+def _masks_beside(images: Path, names: Sequence[str]) -> list[Path]:
     """Return files beside photographs with the name of a mask, which are no photographs."""
     photographs = {images / name for name in names}
     folders = {path.parent for path in photographs}

@@ -14,9 +14,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drgs.core.folders import digest
 from drgs.datasets.reader import in_parallel
-from drgs.datasets.types import Dataset, Keeps, View, all_of_them
+from drgs.datasets.types import Dataset, Keeps, View, all_views
 
-TOLERANCE = 1e-9
+CAMERA_TOLERANCE = 1e-9
 """Relative and absolute, of a camera's numbers: rounding of another machine's mathematics."""
 
 FILE_NAMES = {"image": "the image", "mask": "the mask", "depth": "the depth"}
@@ -57,7 +57,7 @@ class ViewPrint(BaseModel):
             sizes = ("x".join(map(str, view.size)) for view in (self, now))
             yield "the size ({}, now {})".format(*sizes)
         elif (self.kind, len(self.camera)) != (now.kind, len(now.camera)) or not np.allclose(
-            self.camera, now.camera, rtol=TOLERANCE, atol=TOLERANCE
+            self.camera, now.camera, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE
         ):
             yield "the camera"
         for what in {**self.files, **now.files}:
@@ -101,7 +101,7 @@ class Fingerprint(BaseModel):
         ]
 
 
-def fingerprint_of(dataset: Dataset, reads: Keeps = all_of_them) -> Fingerprint:
+def fingerprint_of(dataset: Dataset, reads: Keeps = all_views) -> Fingerprint:
     """Return the fingerprint of a dataset, for which the files of its views are read.
 
     reads: accepts views by name; the files of others have empty digests.

@@ -29,7 +29,7 @@ from drgs.io.images import (
 MAX_PIXELS_AT_ONCE, MAX_THREADS = 1 << 25, 8
 """Pixels of photographs that are read at a time: of 40 bytes each, at most."""
 
-WHOLE = 1 - 1e-4
+MIN_WHOLE_SHARE = 1 - 1e-4
 """Share of a pixel's area that counts as all of it, up to rounding."""
 
 DEPTH_BYTES = 24
@@ -161,13 +161,13 @@ def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
 
 
 def _round_share(share: np.ndarray) -> np.ndarray:
-    return (share > WHOLE).astype(np.float32)
+    return (share > MIN_WHOLE_SHARE).astype(np.float32)
 
 
 def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
     """Return mean depths (H, W) of what each pixel covers; 0 where a part of that has none."""
     known = downscale((depth > 0).astype(np.float32), max_width)
-    return np.where(known > WHOLE, downscale(depth, max_width), 0).astype(np.float32)
+    return np.where(known > MIN_WHOLE_SHARE, downscale(depth, max_width), 0).astype(np.float32)
 
 
 def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -27,7 +27,7 @@ from drgs.datasets.transforms import (
     note_unread,
     read_transforms,
 )
-from drgs.datasets.types import Dataset, Keeps, View, all_of_them
+from drgs.datasets.types import Dataset, Keeps, View, all_views
 from drgs.io.images import image_size
 
 START_HALF_EXTENT = 1.3
@@ -46,7 +46,7 @@ class NerfSyntheticReader(DatasetReader):
         del folder
         return "transforms_train.json" in names
 
-    def load(self, config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
+    def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
         """Return split ``train`` and the split to measure on.
 
         That is ``config.test_split``, by default ``test`` if its transforms file is there, else

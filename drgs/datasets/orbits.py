@@ -30,7 +30,7 @@ LARGEST_GAP = math.radians(100)
 """Azimuth between two neighbouring cameras of a capture from all sides. What is beyond a larger gap
 was not photographed."""
 
-AMPLITUDE = 0.8
+SWAYING_ARC_SHARE = 0.8
 """Share of the cameras' arc of an orbit that sways instead of going all the way round."""
 
 NEAR_RANGE, NEAR_SHARE = (0.01, 0.5), 0.1
@@ -176,4 +176,4 @@ def _covered_arc(azimuths: np.ndarray) -> tuple[float, float | None]:
         return 0.0, None
     arc = 2 * math.pi - gaps[widest]
     first = azimuths[(widest + 1) % len(azimuths)]
-    return float(first + arc / 2), float(AMPLITUDE * arc / 2)
+    return float(first + arc / 2), float(SWAYING_ARC_SHARE * arc / 2)

@@ -40,7 +40,7 @@ from drgs.datasets.images import (
 from drgs.datasets.notices import Notices
 from drgs.datasets.splits import Lists, split_of
 from drgs.datasets.transforms import (
-    CLOSE,
+    CLOSE_POSE_KEY,
     TransformsFrame,
     focal_from_angle,
     focal_length,
@@ -49,7 +49,7 @@ from drgs.datasets.transforms import (
     principal_point,
     unique_names,
 )
-from drgs.datasets.types import Dataset, Keeps, View, all_of_them
+from drgs.datasets.types import Dataset, Keeps, View, all_views
 from drgs.io.images import read_header, read_pixels, upright
 
 __all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame", "dataset_of"]
@@ -100,7 +100,7 @@ class DatasetReader:
         """
         raise NotImplementedError
 
-    def load(self, config: DataConfig, keeps: Keeps = all_of_them) -> Dataset:
+    def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
         """Return the dataset, with the images of the views whose names ``keeps`` accepts.
 
         Splits, sizes, masks and backgrounds follow the section ``data``.
@@ -112,7 +112,7 @@ class DatasetReader:
         return [frame.files["image"] for frame in self.photographs(config).frames]
 
 
-def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_of_them) -> Dataset:
+def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_views) -> Dataset:
     """Return all views of the splits, by :func:`drgs.datasets.splits.split_of`, with notes.
 
     Raises :class:`UserError` as that does, and for a photograph or a frame that cannot be read.
@@ -360,5 +360,5 @@ def describe_extras(
     elif units := sorted({_depth_unit(f) for f in frames if "depth" in f.files}):
         text += f"; depth in units of {' and '.join(f'{unit:g}' for unit in units)}"
     if "motion" in ignored:
-        text += f"; motion ({CLOSE}) ignored"
+        text += f"; motion ({CLOSE_POSE_KEY}) ignored"
     return ignored, text

@@ -93,7 +93,7 @@ WITHOUT_EFFECT = frozenset(
 )
 """Keys that change nothing of what is read here: none is missed."""
 
-CLOSE = "transform_matrix_close"
+CLOSE_POSE_KEY = "transform_matrix_close"
 """A frame's camera pose when the shutter closed; ``transform_matrix``: when it opened."""
 
 FILES = {

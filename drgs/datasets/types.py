@@ -132,7 +132,7 @@ Keeps = Callable[[str], bool]
 """Accepts a view by its name if its images are to be read; others have only sizes."""
 
 
-def all_of_them(name: str) -> bool:
+def all_views(name: str) -> bool:
     """Accept all views."""
     del name
     return True

@@ -16,7 +16,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, Positions
+from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, SamplePositions
 from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
 
 
@@ -29,7 +29,7 @@ class Defocused:
     def __call__(
         self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
-        """Return the blurred shape, whose ``dimming`` keeps the integral."""
+        """Return the blurred shape, whose ``opacity_compensation`` keeps the integral."""
         film = self.shape(rows, camera, position, low_pass)
         assert camera.aperture is not None, "see with_effects"
         spread = camera.aperture.variance(camera, position.z)
@@ -38,7 +38,7 @@ class Defocused:
             blurred,
             determinant=film.determinant,
             added_determinant=film.added_determinant,
-            dimming=blurred.root_determinant() / film.root_determinant(),
+            opacity_compensation=blurred.root_determinant() / film.root_determinant(),
         )
 
 
@@ -69,12 +69,12 @@ class DimmedFalloff(GaussianFalloff):
         return dr.select(floor > least, floor, least)
 
     def geometry(self, splats: Splats2D) -> list[Float]:
-        assert splats.dimming is not None, "see Defocused"
-        return [*self.of.geometry(splats), dr.log2(splats.dimming)]
+        assert splats.opacity_compensation is not None, "see Defocused"
+        return [*self.of.geometry(splats), dr.log2(splats.opacity_compensation)]
 
     def differentiable(self, splats: Splats2D) -> list[Float]:
-        assert splats.dimming is not None, "see Defocused"
-        return [*self.of.differentiable(splats), dr.detach(splats.dimming)]
+        assert splats.opacity_compensation is not None, "see Defocused"
+        return [*self.of.differentiable(splats), dr.detach(splats.opacity_compensation)]
 
     def bounds(
         self, splats: Splats2D, geometry: list[Float], reach: Float
@@ -93,7 +93,7 @@ class DimmedFalloff(GaussianFalloff):
         return self.of.footprint(geometry[:-1], offsets_from, active)
 
     def moments(
-        self, footprint: Footprint, weights: list[Float], positions: Positions
+        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         return self.of.moments(footprint, weights, positions)
 

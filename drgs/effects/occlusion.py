@@ -27,7 +27,7 @@ import drjit as dr
 
 from drgs.cameras.camera import Camera
 from drgs.core.types import Float
-from drgs.splatting.footprint import FeatureGroup, FootprintModel, Positions, SplatFeatures
+from drgs.splatting.footprint import FeatureGroup, FootprintModel, SamplePositions, SplatFeatures
 from drgs.splatting.grid import PIXELS, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 
@@ -70,7 +70,7 @@ class OccludedFeatures(SplatFeatures):
     def check_differentiable_in_camera(self) -> None:
         self.features.check_differentiable_in_camera()
 
-    def bind(self, lanes: Lanes, positions: Positions) -> OccludedFeatures:
+    def bind(self, lanes: Lanes, positions: SamplePositions) -> OccludedFeatures:
         rests, bound = [1.0] * PIXELS, []
         for surface in self.surfaces:
             depths = load_pixels(surface.depth, lanes, self.grid)

@@ -5,7 +5,7 @@ depth) holds no detail below its Nyquist limit. Mip-Splatting (Yu et al. 2024, s
 therefore convolves each Gaussian with one of variance 0.2 / nu^2, nu being the largest rate of all
 cameras that see it, and keeps its integral.
 
-:func:`bake_smoothing` and :func:`baked_for_viewers` change Gaussians in closed form so that other
+:func:`bake_smoothing` and :func:`bake_for_viewers` change Gaussians in closed form so that other
 viewers, which add 0.3 square pixels to each splat's covariance and leave its opacity as it is, show
 them about as they were fitted. The variance that viewers add is first subtracted from the
 Gaussians, as far as they have any, and opacities make up for the rest, such that a splat keeps its
@@ -35,7 +35,7 @@ from drgs.splatting.projection import (
     project,
 )
 
-VARIANCE = 0.2
+FILTER_VARIANCE = 0.2
 """Variance of the filter, in squared distances between samples (Mip-Splatting, equation 9)."""
 
 FILM_MARGIN = 0.15
@@ -48,7 +48,7 @@ def apply_smoothing(rows: GaussianRows) -> GaussianRows:
     variance = dr.square(rows.smoothing)
     log_scales = dr.log(dr.exp(2 * rows.log_scales) + variance) / 2
     dimming = dr.exp(dr.sum(rows.log_scales - log_scales))
-    return replace(rows, log_scales=log_scales, smoothing=None, dimming=dimming)
+    return replace(rows, log_scales=log_scales, smoothing=None, opacity_compensation=dimming)
 
 
 def smoothing_of(means: TensorXf, cameras: Iterable[Camera]) -> Float:
@@ -65,7 +65,7 @@ def smoothing_of(means: TensorXf, cameras: Iterable[Camera]) -> Float:
         rates = dr.maximum(rates, _rates(points, camera))
         dr.eval(rates)
     lowest = dr.min(dr.select(rates > 0, rates, dr.inf))
-    return math.sqrt(VARIANCE) / dr.select(rates > 0, rates, lowest)
+    return math.sqrt(FILTER_VARIANCE) / dr.select(rates > 0, rates, lowest)
 
 
 def _rates(points: Array3f, camera: Camera) -> Float:
@@ -103,11 +103,11 @@ KEPT_VARIANCE = 0.04
 """Parts of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
 derivatives by their scales."""
 
-USUAL = Approximations()
+VIEWER_APPROXIMATIONS = Approximations()
 """Approximations of viewers."""
 
 
-def baked_for_viewers(
+def bake_for_viewers(
     gaussians: Gaussians, cameras: Iterable[Camera], fitted: Approximations
 ) -> Gaussians:
     """Return Gaussians (numpy) that look the same without ``low_pass`` and ``antialiased``.
@@ -126,12 +126,14 @@ def baked_for_viewers(
     cameras = list(cameras)
     host = dr.detach(gaussians).numpy()
     nyquist = np.array(smoothing_of(gaussians.means, cameras), np.float64)
-    taken = (USUAL.low_pass - fitted.low_pass) * np.square(nyquist) / VARIANCE
+    taken = (
+        (VIEWER_APPROXIMATIONS.low_pass - fitted.low_pass) * np.square(nyquist) / FILTER_VARIANCE
+    )
     variances = np.exp(2 * host.log_scales.astype(np.float64))
     left = np.maximum(variances - taken[:, None], KEPT_VARIANCE * variances)
     baked = replace(host, log_scales=(np.log(left) / 2).astype(np.float32))
     before = _integrals(gaussians, cameras, fitted)
-    after = _integrals(baked.to(type(gaussians.means)), cameras, USUAL)
+    after = _integrals(baked.to(type(gaussians.means)), cameras, VIEWER_APPROXIMATIONS)
     factor = np.divide(before, after, out=np.ones_like(after), where=after > 0)
     opacities = factor / (1 + np.exp(-host.logit_opacities.astype(np.float64)))
     tiny = np.finfo(np.float32).tiny
@@ -156,6 +158,6 @@ def _integrals(
 def _integral(rows: GaussianRows, camera: Camera, rule: OpacityRule, low_pass: float) -> Float:
     splats = project(rows, camera, 0, rule, low_pass=low_pass, least_alpha=0.0)
     beside = (splats.means2d < camera.film_start) | (splats.means2d > camera.film_end)
-    p, _, s = splats.whitening
+    p, _, s = splats.conic_factor
     seen = splats.visible & ~(beside.x | beside.y)
     return dr.select(seen, splats.opacities / dr.abs(p * s), 0)

@@ -13,7 +13,7 @@ from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
-TOLERANCE = 1e-4
+ROTATION_TOLERANCE = 1e-4
 """Limit of A^T A / s^2 - I: numbers written with five digits are a rotation, a shear by a pixel in
 ten thousand is one. What is left is then taken off: the nearest rotation is used."""
 
@@ -34,7 +34,7 @@ class Similarity:
         is_affine = np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()
         if is_affine and (determinant := np.linalg.det(linear)) > 0:
             scale = np.cbrt(determinant)
-            if np.abs(linear.T @ linear / scale**2 - np.eye(3)).max() <= TOLERANCE:
+            if np.abs(linear.T @ linear / scale**2 - np.eye(3)).max() <= ROTATION_TOLERANCE:
                 left, _, right = np.linalg.svd(linear)
                 return Similarity(float(scale), left @ right, matrix[:3, 3])
         rows = "; ".join(" ".join(f"{number:g}" for number in row) for row in matrix)

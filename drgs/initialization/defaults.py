@@ -105,11 +105,11 @@ def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
 
 def _is_cut_out(dataset: Dataset) -> bool:
     """Return whether most of some images are transparent in part."""
-    from drgs.initialization.visual_hull import LEAST_TRANSPARENT, TRANSPARENT
+    from drgs.initialization.visual_hull import LEAST_TRANSPARENT, MAX_EMPTY_ALPHA
 
     some = dataset.train[:: -(-len(dataset.train) // NUM_ALPHA_VIEWS) or 1]
     alphas = [np.asarray(view.alpha) for view in some if view.alpha is not None]
-    shares = [float(np.mean(alpha <= TRANSPARENT)) for alpha in alphas]
+    shares = [float(np.mean(alpha <= MAX_EMPTY_ALPHA)) for alpha in alphas]
     return sum(share >= LEAST_TRANSPARENT for share in shares) > len(some) / 2
 
 

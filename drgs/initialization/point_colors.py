@@ -27,7 +27,7 @@ PIXEL, BEHIND = 1.5, 1.5
 """Width of a pixel of the z-buffer, and distance behind its depth of points that are seen, in
 distances of the points. In smaller pixels, points are seen through gaps of a surface."""
 
-OPAQUE = 0.5
+MIN_ALPHA = 0.5
 """Least alpha: less opaque pixels have mostly the colour of what is behind them."""
 
 SORTED_AT_ONCE = 1 << 13
@@ -90,9 +90,9 @@ def _find_shown_points(
     colors, opaque = np.asarray(view.image)[at], np.ones(len(rows), bool)
     if view.alpha is not None:
         alpha = np.asarray(view.alpha)[at][:, None]
-        opaque = alpha[:, 0] >= OPAQUE
+        opaque = alpha[:, 0] >= MIN_ALPHA
         behind = (1 - alpha) * np.asarray(background, np.float32)
-        colors = (colors - behind) / np.maximum(alpha, OPAQUE)
+        colors = (colors - behind) / np.maximum(alpha, MIN_ALPHA)
     if view.mask is not None:
         opaque &= np.asarray(view.mask)[at] > 0
     return rows[opaque], np.clip(colors[opaque], 0, 1)

@@ -25,7 +25,7 @@ from drgs.initialization.start_box import (
     focus_of,
     focus_text,
     format_point,
-    num_looking,
+    num_views_facing,
     points_in_view,
 )
 from drgs.io.ply import read_points
@@ -279,7 +279,7 @@ def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Da
         raise UserError(
             f"{file}: must hold at most densify.max_gaussians ({max_gaussians}) points, got {num}"
         )
-    looking = num_looking(points, views)
+    looking = num_views_facing(points, views)
     if looking < LEAST_LOOKING * len(views):
         raise UserError(
             f"{file}: must hold what the cameras look at{focus_text(dataset)}, in their frame "

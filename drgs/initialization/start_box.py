@@ -35,7 +35,7 @@ FILL_RANGE = (0.5, 2.0)
 LEAST_LOOKING = 0.5
 """Share of the cameras that must look at where a fit starts."""
 
-MIDDLE = 0.5
+CENTRAL_SHARE = 0.5
 """Share of an image's width and height that contains what its camera looks at."""
 
 LEAST_COVERED = 0.005
@@ -161,13 +161,13 @@ def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndar
 # Checks of given boxes and point clouds
 
 
-def num_looking(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
+def num_views_facing(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
     """Return how many cameras have one of the points (N, 3) in the middle of their image.
 
     Of very many points, which would take long, every n-th is considered.
     """
     points = points[:: max(1, len(points) // MAX_CLOUD_POINTS)]
-    return sum(bool(_in_image(points, view, MIDDLE).any()) for view in views)
+    return sum(bool(_in_image(points, view, CENTRAL_SHARE).any()) for view in views)
 
 
 def focus_text(dataset: Dataset) -> str:
@@ -182,7 +182,7 @@ def focus_text(dataset: Dataset) -> str:
 def check_box(box: Box, dataset: Dataset) -> None:
     """Raise :class:`UserError` for a box that most cameras do not look into, or hardly see."""
     points, views = box.points(NUM_SAMPLES, np.random.default_rng(0)), dataset.train
-    looking = num_looking(points, views)
+    looking = num_views_facing(points, views)
     covered = float(np.median([_coverage(points, view) for view in views]))
     if looking < LEAST_LOOKING * len(views):
         reason = f"only {looking} of {len(views)} have it in the middle of their images"

@@ -24,10 +24,10 @@ from drgs.datasets.types import View
 from drgs.initialization.film import Columns, is_projectable, to_camera, to_film
 from drgs.initialization.start_box import Box
 
-TRANSPARENT = 4 / 255
+MAX_EMPTY_ALPHA = 4 / 255
 """Alpha up to which a pixel is empty. Mattes have noise."""
 
-SOLID = 0.5
+MIN_POINT_ALPHA = 0.5
 """Least alpha of pixels that show points: others are mostly beside what there is. Parts that are
 nowhere more opaque are found as thin parts are."""
 
@@ -45,7 +45,7 @@ MAX_VIEWS, MAX_SIDE = 120, 512
 LEAST_SEEN = 0.5
 """Share of the views that must see a cube: others cannot show it empty."""
 
-ROOTS = 16
+ROOT_CUBES_PER_SIDE = 16
 """Cubes along the longest side of the box that is divided first."""
 
 COARSE_CUBES, COARSE_LEVELS = 4000, 7
@@ -64,7 +64,7 @@ THIN, THIN_LEVELS = 1.5, 3
 """Edges of a cube: one so far from all points of the hull is a part of it too thin to be hit; and
 divisions, at most, that tell whether it is one. Where there are many, they are noise."""
 
-CHUNK = 1 << 15
+CUBES_PER_CHUNK = 1 << 15
 """Cubes that are projected at once: their numbers stay in the processor's cache."""
 
 
@@ -95,7 +95,7 @@ def thin_out(views: Sequence[View]) -> Sequence[View]:
 
 def _silhouette(view: View) -> Silhouette:
     alpha = np.asarray(view.alpha)
-    opaque, solid = alpha > TRANSPARENT, alpha >= SOLID
+    opaque, solid = alpha > MAX_EMPTY_ALPHA, alpha >= MIN_POINT_ALPHA
     transparent = 1 - float(opaque.mean())
     if view.mask is not None:
         unknown = np.asarray(view.mask) == 0
@@ -168,7 +168,7 @@ def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: i
     The same seed gives the same points.
     """
     corners = box.center - box.half_extent, box.center + box.half_extent
-    coarse = Cubes.filling(*corners, 2 * box.half_extent / ROOTS)
+    coarse = Cubes.filling(*corners, 2 * box.half_extent / ROOT_CUBES_PER_SIDE)
     coarse = _surface(silhouettes, coarse, COARSE_LEVELS, COARSE_CUBES)
     points = _points_in(silhouettes, coarse, seed)
     if not len(points):
@@ -176,7 +176,7 @@ def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: i
     edge = coarse.edge * math.sqrt(len(points) / (SPARE * count))
     centers = coarse.centers()
     low, high = (c + s * coarse.edge / 2 for c, s in ((centers.min(0), -1), (centers.max(0), 1)))
-    levels = max(0, int(np.ceil(np.log2((high - low).max() / (ROOTS * edge)))))
+    levels = max(0, int(np.ceil(np.log2((high - low).max() / (ROOT_CUBES_PER_SIDE * edge)))))
     cubes = Cubes.filling(low, high, edge * 2**levels)
     cubes = _surface(silhouettes, cubes, levels, MAX_CUBES * count)
     points = _points_in(silhouettes, cubes, seed)
@@ -217,7 +217,7 @@ def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np
 def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
     """Return points (M, 3) of the hull in cubes without a point, at most one in each eighth."""
     levels = 0
-    while levels == 0 or (levels < THIN_LEVELS and len(cubes) <= CHUNK):
+    while levels == 0 or (levels < THIN_LEVELS and len(cubes) <= CUBES_PER_CHUNK):
         cubes = cubes.divide()
         cubes = cubes.select(_shown_by_all(silhouettes, cubes.centers(), cubes.edge))
         levels += 1
@@ -260,7 +260,7 @@ def _half_empty(silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: fl
 
 
 def _chunks(rows: np.ndarray) -> list[np.ndarray]:
-    return [rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK)]
+    return [rows[start : start + CUBES_PER_CHUNK] for start in range(0, len(rows), CUBES_PER_CHUNK)]
 
 
 def _look_at_points(

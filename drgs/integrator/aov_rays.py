@@ -34,10 +34,10 @@ REFUSAL = (
 NESTED = -1
 """Number of the view."""
 
-SLACK = 1 / 16
+PIXEL_MARGIN_PX = 1 / 16
 """px: how far outside of its pixel a ray may be found. Single precision finds it to 1e-3."""
 
-ROUNDING = 1e-5
+MAX_CENTER_ERROR = 1e-5
 """Largest distance of a ray from the camera's centre, relative to their coordinates."""
 
 
@@ -65,7 +65,7 @@ class ImageRays:
         corner = dr.repeat(pixel_corners(film), count)
         place, on_camera = _look_back(camera, ray)
         within = place - corner
-        inside = (dr.min(within) > -SLACK) & (dr.max(within) < 1 + SLACK)
+        inside = (dr.min(within) > -PIXEL_MARGIN_PX) & (dr.max(within) < 1 + PIXEL_MARGIN_PX)
         if not dr.all(inside & on_camera):
             raise UnsupportedError(_unknown_sensor_message(sensor))
         within = mi.Point2f(dr.clip(within, 0, 1 - dr.epsilon(mi.Float)))
@@ -129,7 +129,7 @@ def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
     origin, axis, seen = camera.look_through(place.x, place.y)
     passes_by = dr.norm(dr.cross(offset - origin, direction))
     size = dr.norm(camera.center) + dr.norm(ray.o) + dr.norm(offset - origin)
-    near = passes_by <= radius * (1 + SLACK) + ROUNDING * size
+    near = passes_by <= radius * (1 + PIXEL_MARGIN_PX) + MAX_CENTER_ERROR * size
     return mi.Point2f(place), near & (dr.dot(axis, direction) > 0) & seen
 
 

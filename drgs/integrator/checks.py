@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError, UnsupportedError
-from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, why_too_large
+from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_large_reason
 from drgs.gaussians.parameters import Gaussians
 
 MAX_SAMPLES = 4096
@@ -109,7 +109,7 @@ def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: 
             f"splats: a pixel can have at most {MAX_SAMPLES:,} samples, got {spp:,}{times}; take "
             "the mean of images with other seeds, or, for surfaces alone, set nested_spp"
         )
-    why = why_too_large(width, height, 3 + num_aovs, spp * poses)
+    why = too_large_reason(width, height, 3 + num_aovs, spp * poses)
     if why is not None:
         raise PluginError(f"splats: {why}")
     samples, most = width * height * nested_spp, MAX_LANES

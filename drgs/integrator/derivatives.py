@@ -87,7 +87,7 @@ def check_derivatives(
             )
     parameters, reasons = list(attached_parameters(scene)), {}
     for parameter in parameters:
-        reason = _why_not(parameter, splats)
+        reason = _refusal(parameter, splats)
         if reason is None and mode == dr.ADMode.Forward and _is_padded(parameter):
             reason = "forward mode does not reach its texels; use dr.backward"
         if reason is not None:
@@ -145,20 +145,20 @@ def _is_padded(parameter: Parameter) -> bool:
     return parameter.owners[0].class_name() == "EnvironmentMapEmitter" and parameter.key == "data"
 
 
-def _why_not(parameter: Parameter, splats: SplatsState) -> str | None:
+def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
     nested, owner = splats.nested, parameter.owners[0]
     kind = SPLATPATH if nested is None else type_of(nested)
     is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)
     if splats.shadows and (is_of_emitter or parameter.is_geometry):
         return "how surfaces shade splats, which changes with it, is not; leave out shadows"
     if parameter.bsdfs:
-        return _why_not_of_bsdf(parameter, kind)
+        return _bsdf_refusal(parameter, kind)
     if (
         isinstance(owner, mi.Shape)
         and parameter.is_geometry
         and kind in (SPLATPATH, *ATTACHED, *REPLAYED)
     ):
-        return _why_not_of_geometry(owner, kind)
+        return _geometry_refusal(owner, kind)
     if isinstance(owner, mi.Emitter) and parameter.key in ("position", "to_world"):
         if kind in (ATTACHED if owner.is_environment() else REPLAYED):
             return f"{kind} does not follow a lamp that moves; {TO_SPLATPATH}"
@@ -167,7 +167,7 @@ def _why_not(parameter: Parameter, splats: SplatsState) -> str | None:
     return None
 
 
-def _why_not_of_geometry(shape: mi.Shape, kind: str) -> str | None:
+def _geometry_refusal(shape: mi.Shape, kind: str) -> str | None:
     if kind in ATTACHED:
         return f"{kind} does not differentiate where paths hit surfaces; {TO_SPLATPATH}"
     if shape.is_emitter():
@@ -180,7 +180,7 @@ def _why_not_of_geometry(shape: mi.Shape, kind: str) -> str | None:
     return None
 
 
-def _why_not_of_bsdf(parameter: Parameter, kind: str) -> str | None:
+def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
     bsdf, outer = parameter.bsdfs[0], parameter.bsdfs[-1]
     name, own = bsdf.class_name(), parameter.name_in(bsdf)
     if own in COVERAGE.get(name, ()):

@@ -21,7 +21,7 @@ import numpy as np
 from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Float
-from drgs.splatting.footprint import PixelCenters, Positions, flat_columns, total
+from drgs.splatting.footprint import PixelCenters, SamplePositions, flat_columns, total
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 
@@ -54,7 +54,7 @@ def num_samples(film: mi.Film, x: Float | float) -> int:
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
 
-def sample_offsets(positions: Positions) -> tuple[Float | float, Float | float]:
+def sample_offsets(positions: SamplePositions) -> tuple[Float | float, Float | float]:
     """Return x and y of sample positions from their pixels' upper left corners, px."""
     return (positions.x, positions.y) if isinstance(positions, SamplePoints) else (0.5, 0.5)
 
@@ -62,7 +62,7 @@ def sample_offsets(positions: Positions) -> tuple[Float | float, Float | float]:
 class CenterSamples:
     """A single sample per pixel, at its centre. Exact for films whose filter is a box."""
 
-    positions: Sequence[Positions] = (PixelCenters(),)  # by pass
+    positions: Sequence[SamplePositions] = (PixelCenters(),)  # by pass
     key: object = None  # equal for equal positions
 
     def __init__(
@@ -252,7 +252,7 @@ class DrawnSamples(CenterSamples):
 
 
 @dataclass(frozen=True)
-class SamplePoints(Positions):
+class SamplePoints(SamplePositions):
     """Points in each pixel, one for each of some samples; equal if the arrays are the same."""
 
     margin: ClassVar[float] = 0.5
@@ -266,7 +266,7 @@ class SamplePoints(Positions):
 
 
 @dataclass(frozen=True)
-class LanePoints(Positions):
+class LanePoints(SamplePositions):
     """Points in the 16 pixels of each lane."""
 
     x: list[Float]  # in [0, 1): from the pixel's left border, px

@@ -396,14 +396,14 @@ def _columns_of(tensor: mi.TensorXf) -> list[Float]:
     return columns(tensor.array, math.prod(tensor.shape[1:]))
 
 
-DATA = 10
+ELLIPSOID_DATA_WIDTH = 10
 """Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""
 
 OPACITIES = (2.0**-64, 1 - 2.0**-24)
 """The largest float32 below 1, whose logit is 16.6; and an opacity that no image shows, so far
 from zero that neither it nor its reciprocal leaves float32."""
 
-HIDDEN = -1e4
+TRANSPARENT_LOGIT = -1e4
 """A logit whose sigmoid is exactly zero."""
 
 
@@ -423,7 +423,7 @@ def read(shape: mi.Shape) -> ParameterArrays:
             f"{where} must have the attributes opacities and sh_coeffs; missing: "
             f"{', '.join(missing)}; it has: {', '.join(others)}"
         )
-    num = dr.width(values["data"]) // DATA
+    num = dr.width(values["data"]) // ELLIPSOID_DATA_WIDTH
     allowed = {"opacities": [1], "sh_coeffs": [3 * k for k in PER_DEGREE]}
     for name, widths in allowed.items():
         got = dr.width(values[name])
@@ -455,7 +455,7 @@ class Conversion:
 
     def gaussians(self) -> Gaussians:
         num = dr.width(self.values["opacities"])
-        data = columns(self.values["data"], DATA)
+        data = columns(self.values["data"], ELLIPSOID_DATA_WIDTH)
         sh = columns(self.values["sh_coeffs"], dr.width(self.values["sh_coeffs"]) // num)
         scales, (x, y, z, w) = [dr.abs(scale) for scale in data[3:6]], data[6:]
         # Written such that a NaN is not visible.
@@ -468,7 +468,7 @@ class Conversion:
             means=mi.TensorXf(interleave(data[:3]), (num, 3)),
             quats=mi.TensorXf(interleave([w, x, y, z]), (num, 4)),
             log_scales=mi.TensorXf(interleave(log_scales), (num, 3)),
-            logit_opacities=dr.select(is_visible, logits, HIDDEN),
+            logit_opacities=dr.select(is_visible, logits, TRANSPARENT_LOGIT),
             sh0=mi.TensorXf(interleave(sh[:3]), (num, 1, 3)),
             shN=mi.TensorXf(interleave_columns(higher), (num, len(sh) // 3 - 1, 3)),
         )

@@ -28,7 +28,7 @@ from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
-from drgs.light.probe import LOW_PASS, Seen
+from drgs.light.probe import LOW_PASS, ProbeHit
 from drgs.splatting import rendering
 
 TEXELS_PER_PIXEL = 2
@@ -38,13 +38,13 @@ FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
 """Texels of all images together, 20 bytes each, from which on there are fewer of a pixel; and
 from which on there are fewer than one."""
 
-BORDER = 8
+BORDER_TEXELS = 8
 """Texels around a image: filters of the film reach beyond its edge."""
 
-FLAT = 1e-5
+MAX_RELATIVE_DEPARTURE = 1e-5
 """Largest distance of a vertex from the plane of a flat shape, relative to the shape's size."""
 
-ROUNDED = 1e-6
+MAX_ROUNDING_DEPARTURE = 1e-6
 """The same, relative to the coordinates: both are allowed."""
 
 OFF_RAY = 1e-3
@@ -145,7 +145,10 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
     middle = points.mean(0)
     offsets = points - middle
     extents, axes = np.linalg.eigh(offsets.T @ offsets)  # from the least on
-    slack = FLAT * np.abs(offsets).max() + ROUNDED * np.abs(points).max()
+    slack = (
+        MAX_RELATIVE_DEPARTURE * np.abs(offsets).max()
+        + MAX_ROUNDING_DEPARTURE * np.abs(points).max()
+    )
     if extents[1] <= 1e-10 * extents[2] or np.abs(offsets @ axes[:, 0]).max() > slack:
         return None
     return axes[:, 0].tolist(), float(axes[:, 0] @ middle)
@@ -188,7 +191,7 @@ class Mirrors:
         dr.make_opaque(every, views)
         return Mirrors(every, views)
 
-    def look(self, mirror: mi.UInt32, segment: PathSegment, active: mi.Bool) -> Seen:
+    def look(self, mirror: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:
         """Look up the splats along segments that leave a mirror; mirror: its number, of each."""
         plane, ray = self.planes.gather(mirror, active), segment.ray
         origin = ray.o - 2 * plane.height(ray.o) * plane.normal
@@ -199,7 +202,7 @@ class Mirrors:
             color = dr.select(seen.is_known, seen.color, color)
             coverage = dr.select(seen.is_known, seen.coverage, coverage)
             is_known |= seen.is_known
-        return Seen(color, coverage, is_known)
+        return ProbeHit(color, coverage, is_known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +221,7 @@ class _View:
         direction: mi.Vector3f,
         far: mi.Float,
         active: mi.Bool,
-    ) -> Seen:
+    ) -> ProbeHit:
         """Look up what mirrored rays meet, as far as they go on along those of the camera."""
         camera, rounding = self.camera, OFF_SURFACE * (1 + dr.max(dr.abs(origin)))
         origin = camera.rotation @ (mi.Vector3f(origin) - camera.center)
@@ -249,7 +252,7 @@ class _View:
             weights += weight
         is_known = active & (weights > LEAST_WEIGHT)
         *color, coverage = dr.select(is_known, total / weights, 0)
-        return Seen(mi.Color3f(color), coverage, is_known)
+        return ProbeHit(mi.Color3f(color), coverage, is_known)
 
 
 def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
@@ -271,14 +274,14 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
 def _enlarge(camera: Camera, scale: float) -> Camera:
     factor = dr.opaque(mi.Float, scale)
     changes = {
-        name: factor * getattr(camera, name) + BORDER
+        name: factor * getattr(camera, name) + BORDER_TEXELS
         for name in ("principal", "film_start", "film_end")
     }
     camera = replace(
         camera,
         focal=factor * camera.focal,
-        width=math.ceil(scale * camera.width) + 2 * BORDER,
-        height=math.ceil(scale * camera.height) + 2 * BORDER,
+        width=math.ceil(scale * camera.width) + 2 * BORDER_TEXELS,
+        height=math.ceil(scale * camera.height) + 2 * BORDER_TEXELS,
         **changes,
     )
     dr.make_opaque(camera)

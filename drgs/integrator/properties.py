@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.approximations import DECLARED, Approximations, Value, said_by
+from drgs.config.approximations import DECLARED, Approximations, Value, from_ply_header
 from drgs.core.constants import MAX_INT, NEAR
 from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
 from drgs.core.origin import WORLD, shown_origin
@@ -167,7 +167,9 @@ def read_state(
         )
     gaussians, file = load_gaussians(props), str(props.get("filename", ""))
     said = {n: v for n, v in (gaussians.rendered_with or {}).items() if n not in props}
-    own = SplatObject(gaussians, _to_world(props), "to_world" in props, file, said_by(file, said))
+    own = SplatObject(
+        gaussians, _to_world(props), "to_world" in props, file, from_ply_header(file, said)
+    )
     if own.is_moved:
         own.check_to_world()
     every = {"": own} | {f"{name}.": one for name, one in objects.items()}

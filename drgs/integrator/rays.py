@@ -20,7 +20,7 @@ from drgs.core.types import Bool, Float
 
 Ray = TypeVar("Ray", bound="mi.Ray3f")
 
-INVISIBLE = 1e-6
+MAX_INVISIBLE_OPACITY = 1e-6
 """Opacity, of which rounding leaves up to 2e-7 where there is none."""
 
 
@@ -49,13 +49,17 @@ class StraightRays:
             return ray, hit, opacity
 
         def is_invisible(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float):
-            return hit.is_valid() & (opacity <= INVISIBLE)
+            return hit.is_valid() & (opacity <= MAX_INVISIBLE_OPACITY)
 
-        def go_on(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float) -> tuple:
+        def pass_surface(
+            ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float
+        ) -> tuple:
             ray = self.continue_rays(ray, hit, mi.Bool(True))
             return ray, *self._meet(ray, mi.Bool(True))
 
-        return dr.while_loop(state=(mi.Ray3f(ray), hit, opacity), cond=is_invisible, body=go_on)
+        return dr.while_loop(
+            state=(mi.Ray3f(ray), hit, opacity), cond=is_invisible, body=pass_surface
+        )
 
     def continue_rays(
         self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
@@ -75,7 +79,7 @@ class StraightRays:
         def go_on(ray: mi.Ray3f, passes: mi.Float, goes_on: mi.Bool) -> tuple:
             hit, opacity = self._meet(ray, goes_on)
             passes = passes * (1 - opacity)
-            goes_on = goes_on & hit.is_valid() & (passes > INVISIBLE)
+            goes_on = goes_on & hit.is_valid() & (passes > MAX_INVISIBLE_OPACITY)
             return self.continue_rays(ray, hit, goes_on), passes, goes_on
 
         ones = dr.full(mi.Float, 1, dr.width(ray))
@@ -84,7 +88,7 @@ class StraightRays:
             cond=lambda ray, passes, goes_on: goes_on,
             body=go_on,
         )
-        return dr.select(passes > INVISIBLE, passes, 0)
+        return dr.select(passes > MAX_INVISIBLE_OPACITY, passes, 0)
 
     def _meet(
         self, ray: mi.Ray3f, active: mi.Bool
@@ -119,12 +123,12 @@ class RaysBehind:
                 rest, hit, opacity = self.rays.next_visible(rest, active)
                 weight *= 1 - opacity
                 rest = self.rays.continue_rays(rest, hit, active & hit.is_valid())
-            rest, _, _ = self.rays.next_visible(rest, active & (weight > INVISIBLE))
+            rest, _, _ = self.rays.next_visible(rest, active & (weight > MAX_INVISIBLE_OPACITY))
             offset = rest.o - ray.o
             ray.o, ray.maxt = rest.o, rest.maxt
             if isinstance(ray, mi.RayDifferential3f):
                 ray.o_x, ray.o_y = ray.o_x + offset, ray.o_y + offset
-            return ray, dr.select(weight > INVISIBLE, weight, 0)
+            return ray, dr.select(weight > MAX_INVISIBLE_OPACITY, weight, 0)
 
 
 def sensor_behind(sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind) -> mi.Sensor:

@@ -13,7 +13,7 @@ import numpy as np
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
-from drgs.core.memory import why_too_large
+from drgs.core.memory import too_large_reason
 from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
@@ -39,7 +39,7 @@ def make_scene(
         "type": "splats",
         "background": _bitmap(background) if isinstance(background, Path) else list(background),
         "near": model.near_plane,
-        **model.approximations.others_than_default,
+        **model.approximations.non_default,
         "srgb_primitives": False,
         **settings,
         **tensors,
@@ -68,7 +68,7 @@ def check_sizes(views: Iterable[Viewpoint], remedy: str) -> None:
     for view in views:
         motion = view.motion
         samples = 1 if motion is None or motion.shutter != "global" else motion.samples
-        if reason := why_too_large(view.width, view.height, samples=samples):
+        if reason := too_large_reason(view.width, view.height, samples=samples):
             raise UserError(f"view {view.name}: {reason}; {remedy}")
 
 

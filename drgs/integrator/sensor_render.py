@@ -25,7 +25,7 @@ from drgs.integrator.film import Channels, num_samples, pixel_corners, sample_of
 from drgs.integrator.sensors import SensorState, camera_from_sensor, depth_range, read_sensor
 from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
-from drgs.splatting.footprint import Positions
+from drgs.splatting.footprint import SamplePositions
 
 if TYPE_CHECKING:  # imported where a scene calls for them
     from drgs.integrator.surfaces import Hybrid
@@ -52,7 +52,7 @@ class SensorRender:
     scene: mi.Scene
     index: int  # of the view, in the cache
     sensor: mi.Sensor
-    positions: Sequence[Positions]  # by pass
+    positions: Sequence[SamplePositions]  # by pass
     key: object  # of these: see drgs.integrator.film.CenterSamples
     has_alpha: bool
     hybrid: Hybrid | None  # the part of surfaces, if there are any
@@ -132,7 +132,7 @@ class SensorRender:
         """Return channels of a sample; layers: surfaces that it sees, None if there are none."""
         if layers is None:
             return self._to_channels(planes, mi.Float(1), behind, color)
-        from drgs.integrator.visible_surfaces import rest_behind
+        from drgs.integrator.visible_surfaces import transmittance_behind
 
         planes, fronts = planes[: -len(layers)], planes[-len(layers) :]
         pairs = list(zip(layers, fronts, strict=True))
@@ -145,7 +145,7 @@ class SensorRender:
             found = [of_surface for of_surface in values if of_surface is not None]
             return [_sum(terms) for terms in zip(*found, strict=True)] if found else None
 
-        past = [rest_behind(layers) * planes[0], *planes[1:]]
+        past = [transmittance_behind(layers) * planes[0], *planes[1:]]
         own = self._to_channels(past, whole, behind, color, of_surfaces)
         assert self.hybrid is not None, "its surfaces are the layers"
         return own + self.hybrid.insertion.values(layers, fronts, radiance)
@@ -305,7 +305,7 @@ def _render(
     gaussians: Gaussians,
     camera: Camera,
     pipeline: rendering.Pipeline,
-    positions: Sequence[Positions],
+    positions: Sequence[SamplePositions],
     surfaces: Sequence[SurfaceLayers] | None,
 ) -> list[rendering.Frame]:
     """Render a frame for each pass; surfaces: the visible ones of each."""

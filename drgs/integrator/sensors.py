@@ -14,7 +14,7 @@ from drgs.core.arrays import types_of
 from drgs.core.errors import PluginError, PluginTypeError
 from drgs.core.types import Array3f, Float, Matrix3f, Matrix4f
 from drgs.integrator.film import Channels, SamplePoints
-from drgs.splatting.footprint import Positions
+from drgs.splatting.footprint import SamplePositions
 
 Pair = tuple[Float, Float]
 """Numbers along the two sides of the film."""
@@ -249,7 +249,9 @@ class SideBySide:
             raise PluginError("splats: the film of a batch sensor must not have a crop window")
         return SideBySide(sensors, film.size()[0] // len(sensors), film.size()[1])
 
-    def positions(self, positions: Sequence[Positions], index: int) -> tuple[Positions, ...]:
+    def positions(
+        self, positions: Sequence[SamplePositions], index: int
+    ) -> tuple[SamplePositions, ...]:
         """Return the points at which the pixels of one image are evaluated, by pass."""
         return tuple(
             replace(p, x=self._cut(p.x, index), y=self._cut(p.y, index))

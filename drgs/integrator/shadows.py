@@ -33,16 +33,16 @@ from drgs.splatting.projection import load_rows
 
 GAMMA = 2.2
 
-HIDDEN = 1 / 64
+MIN_SHADOW_TRANSMITTANCE = 1 / 64
 """Least part of the light that splats let through."""
 
-SAMPLES = 64
+EMITTER_SAMPLES = 64
 """Samples of the scene's emitters for each splat; a pixel shows the mean of many."""
 
-LEAST = 1 / 64
+MIN_SHADED_SHARE = 1 / 64
 """Least part of the light without other splats that objects hold off a splat to be shaded."""
 
-AHEAD = 3.0
+SHADOW_OFFSET_STDS = 3.0
 """Standard deviations of a splat, along its shortest axis, from its mean to where light is asked
 for: its own alpha does not count."""
 
@@ -93,11 +93,11 @@ class _Estimate:
         if not self.scene.scene.emitters():
             return ratio
         lit, dark = self._irradiance(means, normals, lambda ray, sample: mi.Float(1))
-        shaded = mi.UInt32(dr.compress(dr.max(dark) > LEAST * dr.max(lit + dark)))
+        shaded = mi.UInt32(dr.compress(dr.max(dark) > MIN_SHADED_SHARE * dr.max(lit + dark)))
         if dr.width(shaded) > 0:
             points = dr.gather(mi.Point3f, means, shaded)
             directions = dr.gather(mi.Vector3f, normals, shaded)
-            lit, dark = self._irradiance(points, directions, self._let_through)
+            lit, dark = self._irradiance(points, directions, self._transmittance)
             found = dr.select(lit + dark > 0, lit / (lit + dark), 1)
             dr.scatter(ratio, found, shaded)
         dr.eval(ratio)
@@ -119,7 +119,7 @@ class _Estimate:
                 place, sampler.next_2d(), False, True
             )
             cosine = dr.dot(normals, ds.d)  # the normal is as long as the splat is thick
-            start = points + AHEAD * dr.sign(cosine) * normals
+            start = points + SHADOW_OFFSET_STDS * dr.sign(cosine) * normals
             ray = mi.Ray3f(mi.Ray3f(start, ds.d), ds.dist * (1 - mi.math.ShadowEpsilon))
             weight *= dr.abs(cosine) * dr.rcp(dr.norm(normals))
             weight *= let_through(ray, sampler.next_1d())
@@ -132,17 +132,17 @@ class _Estimate:
         zero = dr.zeros(mi.Color3f, dr.width(points))
         _, lit, dark, _ = dr.while_loop(
             state=(mi.UInt32(0), zero, mi.Color3f(zero), sampler),
-            cond=lambda k, lit, dark, sampler: k < SAMPLES,
+            cond=lambda k, lit, dark, sampler: k < EMITTER_SAMPLES,
             body=body,
         )
         dr.eval(lit, dark)
         return lit, dark
 
-    def _let_through(self, ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
+    def _transmittance(self, ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
         """Return HIDDEN or 1, so that the mean is about the transmittance."""
         segment = Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.maxt, dr.full(mi.Bool, True))
         T = self.splats.transmittance(segment, sample)
-        return dr.select(sample > T, HIDDEN, mi.Float(1))
+        return dr.select(sample > T, MIN_SHADOW_TRANSMITTANCE, mi.Float(1))
 
 
 def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:

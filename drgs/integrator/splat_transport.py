@@ -48,7 +48,7 @@ from drgs.integrator.rays import PathSegment, SplatTransport, TransportIntegrato
 from drgs.integrator.sensor_render import decode
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
-from drgs.light.probe import LEVELS, LOW_PASS, SIZE, Probes, Seen
+from drgs.light.probe import CUBE_SIZE_TEXELS, LOW_PASS, NUM_LEVELS, ProbeHit, Probes
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 from drgs.splatting.rendering import color_features, depth_feature
@@ -69,7 +69,7 @@ DECODED_WITHIN = 2e-3
 LEAST_SAMPLES = 3
 """Splats that a ray draws, at least: for the third power."""
 
-ROULETTE = 0.25
+ROULETTE_TRANSMITTANCE = 0.25
 """Transmittance to an emitter, below which the rest of the splats is asked for with a probability:
 few splats make a ray dark, and many more are behind them."""
 
@@ -128,12 +128,12 @@ class RayTransport:
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """Estimate the transmittance of the splats along segments.
 
-        Below :data:`ROULETTE`, Russian roulette: a ray that lets through less than ``sample`` (in
-        0..1) times that is dark, and all others let through as much as that.
+        Below :data:`ROULETTE_TRANSMITTANCE`, Russian roulette: a ray that lets through less than
+        ``sample`` (in 0..1) times that is dark, and all others let through as much as that.
         """
-        least = sample * ROULETTE
+        least = sample * ROULETTE_TRANSMITTANCE
         T = self.splats.transmittance(_segment(segment.ray, active), least)
-        T = dr.select(least > T, 0, dr.maximum(T, ROULETTE))
+        T = dr.select(least > T, 0, dr.maximum(T, ROULETTE_TRANSMITTANCE))
         return dr.select(active, T, 1)
 
 
@@ -169,7 +169,7 @@ def _segment(ray: mi.Ray3f, active: mi.Bool) -> Segment:
     return Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Bool(active))
 
 
-CLOSE = 1.25
+MIN_PROBE_DISTANCE = 1.25
 """Distance of splats from an object's middle, in halves of its size, below which its surface sees
 others."""
 
@@ -178,7 +178,7 @@ TOO_CLOSE = (
     "does, where its probe is: its image may be far from that of light 'rays'"
 )
 
-NOBODY = 0xFFFFFFFF
+NO_PROBE = 0xFFFFFFFF
 """Number in place of a probe's, where there is none."""
 
 
@@ -240,15 +240,15 @@ class ProbeTransport:
         seen, is_asked, _ = self._look(segment, active)
         return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)
 
-    def _look(self, segment: PathSegment, active: mi.Bool) -> tuple[Seen, mi.Bool, mi.Bool]:
+    def _look(self, segment: PathSegment, active: mi.Bool) -> tuple[ProbeHit, mi.Bool, mi.Bool]:
         """Look up segments: result, whether they have a probe, whether it is that of their end."""
-        probe, other = mi.UInt32(NOBODY), mi.UInt32(NOBODY)
+        probe, other = mi.UInt32(NO_PROBE), mi.UInt32(NO_PROBE)
         for k, shape in self.shapes.items():
             probe = dr.select(segment.start == shape, mi.UInt32(k), probe)
         for k, emitter in self.emitters.items():
             other = dr.select(segment.end == emitter, mi.UInt32(k), other)
-        is_reversed = active & (probe == NOBODY) & (other != NOBODY)
-        is_asked = active & ((probe != NOBODY) | is_reversed)
+        is_reversed = active & (probe == NO_PROBE) & (other != NO_PROBE)
+        is_asked = active & ((probe != NO_PROBE) | is_reversed)
         mirrored = self._look_in_mirrors(probe, segment, is_asked)
         ray, far = segment.ray, segment.ray.maxt
         back = dr.select(is_reversed, far, 0)
@@ -260,27 +260,27 @@ class ProbeTransport:
             dr.select(is_reversed, 0, self._level(segment.pdf)),
             is_asked & ~mirrored.is_known,
         )
-        seen = Seen(
+        seen = ProbeHit(
             dr.select(mirrored.is_known, mirrored.color, seen.color),
             dr.select(mirrored.is_known, mirrored.coverage, seen.coverage),
             seen.is_known | mirrored.is_known,
         )
         return seen, is_asked, is_reversed
 
-    def _look_in_mirrors(self, probe: mi.UInt32, segment: PathSegment, active: mi.Bool) -> Seen:
+    def _look_in_mirrors(self, probe: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:
         """Look up segments that leave flat mirrors; probe: that of the shape they leave."""
         if self.mirrors is None:
-            return Seen(mi.Color3f(0), mi.Float(0), mi.Bool(False))
-        mirror = mi.UInt32(NOBODY)
+            return ProbeHit(mi.Color3f(0), mi.Float(0), mi.Bool(False))
+        mirror = mi.UInt32(NO_PROBE)
         for k, number in self.flat.items():
             mirror = dr.select(probe == k, mi.UInt32(number), mirror)
-        return self.mirrors.look(mirror, segment, active & (mirror != NOBODY))
+        return self.mirrors.look(mirror, segment, active & (mirror != NO_PROBE))
 
     def _level(self, pdf: mi.Float) -> mi.UInt32:
         """Return the level whose texels are as large as the solid angle of one path."""
-        texel = 4 * math.pi / (6 * SIZE**2)
+        texel = 4 * math.pi / (6 * CUBE_SIZE_TEXELS**2)
         level = 0.5 * dr.log2(dr.rcp(dr.maximum(pdf * self.num_paths * texel, 1e-20)))
-        return mi.UInt32(dr.clip(level + 0.5, 0, LEVELS - 1))
+        return mi.UInt32(dr.clip(level + 0.5, 0, NUM_LEVELS - 1))
 
 
 def _probes(
@@ -320,7 +320,7 @@ def _warn_of_close(
         for k, node in enumerate(objects)
         if isinstance(node, mi.Shape)
         and not (k in flat and (flat[k].has_delta or flat[k].is_specular))
-        and probes.nearest[k] < CLOSE * float(dr.max(node.bbox().extents())) / 2
+        and probes.nearest[k] < MIN_PROBE_DISTANCE * float(dr.max(node.bbox().extents())) / 2
     }
     for name in sorted(close - splats.cache.too_close):
         message = TOO_CLOSE.format(name)

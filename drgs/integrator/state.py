@@ -203,7 +203,7 @@ class SplatsState:
             "background": self.background,
             "near": self.near,
             "srgb_primitives": self.srgb_primitives,
-            **self.approximations.others_than_default,
+            **self.approximations.non_default,
             **{name: value for name, value in others.items() if value},
         }
 

@@ -136,7 +136,7 @@ def _summary_of_integrator(
     ]
     if splats.has_smoothing and not smooth:
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
-    others = splats.approximations.others_than_default
+    others = splats.approximations.non_default
     values = [f"{k} = {v}" for k, v in others.items() if k in said and k != "antialiased"]
     if values:
         effects.append(SimulatedEffect("approximations", ", ".join(values), AS_THE_FILE_SAYS))

@@ -41,14 +41,14 @@ from drgs.integrator.rays import (
     sensor_behind,
 )
 from drgs.integrator.sensors import sensors_of
-from drgs.integrator.visible_surfaces import SurfaceLayers, rest_behind
+from drgs.integrator.visible_surfaces import SurfaceLayers, transmittance_behind
 
 T = TypeVar("T")
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")
 """Words of errors of Dr.Jit and ``splatpath`` about a image that no parameter changes."""
 
-UNBOUNDED = 0xFFFFFFFF
+UNBOUNDED_DEPTH = 0xFFFFFFFF
 """``max_depth`` of Mitsuba's integrators where there is no limit."""
 
 # ----------------------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ class Insertion:
         values += [nothing] * (2 * (self.num_surfaces - len(layers)))
         if self.shows_background:
             assert radiance is not None, "of the background"
-            values += list(rest_behind(layers) * radiance)
+            values += list(transmittance_behind(layers) * radiance)
         return values
 
     def develop(self, image: mi.TensorXf, nested: list[mi.TensorXf]) -> mi.TensorXf:
@@ -293,7 +293,7 @@ class Hybrid:
             behind, weight = mi.RayDifferential3f(ray), mi.Float(1)
             if self.surfaces.is_transparent:
                 behind, weight = RaysBehind(self.rays, count).advance(behind, active)
-            with _depth_reduced(self.integrator, count):
+            with _reduce_depth(self.integrator, count):
                 # The base class's, as integrators written in Python have another signature.
                 radiance, *_ = mi.SamplingIntegrator.sample(
                     self.integrator, self.rays.scene, sampler, behind, None, active
@@ -312,7 +312,7 @@ class Hybrid:
 
         with self._differentiating() as parameters:
             if parameters:
-                self._where_they_matter(add)
+                self._needed_surfaces(add)
 
     def tangents(self, params: object, images: list[mi.TensorXf]) -> list[mi.TensorXf]:
         """Return derivatives of the nested images along those set on the parameters."""
@@ -329,11 +329,11 @@ class Hybrid:
                 # objects have computed from their parameters must be known before.
                 dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
                 dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-                found = self._where_they_matter(render_nested)
+                found = self._needed_surfaces(render_nested)
         pairs = zip(found, images, strict=True)
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 
-    def _where_they_matter(self, differentiate: Callable[[mi.Sensor], T]) -> list[T | None]:
+    def _needed_surfaces(self, differentiate: Callable[[mi.Sensor], T]) -> list[T | None]:
         """Differentiate nested images; None for those that do not depend on parameters."""
         found: list[T | None] = []
         errors: list[Exception] = []
@@ -356,23 +356,23 @@ class Hybrid:
         the nested integrator says so in Python.
         """
         if not self.surfaces.is_transparent:
-            with _sample_count_kept(self.sensor):
+            with _keep_sample_count(self.sensor):
                 yield self.sensor
             return
         for count in range(self.insertion.num_surfaces):
             behind = RaysBehind(self.rays, count)
             sensor = sensor_behind(self.sensor, sensors_of(self.sensor), behind)
             with (
-                _sample_count_kept(self.sensor),
-                _depth_reduced(self.integrator, count),
-                _depth_reduced(self.adjoint_integrator, count),
+                _keep_sample_count(self.sensor),
+                _reduce_depth(self.integrator, count),
+                _reduce_depth(self.adjoint_integrator, count),
             ):
                 yield sensor
 
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
         """Yield the nested integrator's parameters, with whose names its errors are raised."""
-        with dr.resume_grad(), _sample_count_kept(self.sensor):
+        with dr.resume_grad(), _keep_sample_count(self.sensor):
             parameters = list(attached_parameters(self.rays.scene))
             try:
                 yield parameters
@@ -392,14 +392,14 @@ class _HasMaxDepth(Protocol):
 
 
 @contextmanager
-def _depth_reduced(integrator: mi.Integrator, count: int) -> Iterator[None]:
+def _reduce_depth(integrator: mi.Integrator, count: int) -> Iterator[None]:
     """Shorten paths by ``count`` bounces, where they are bounded by an attribute of Python."""
     counts_windows = not isinstance(integrator, TransportIntegrator)
     if not counts_windows or not isinstance(integrator, _HasMaxDepth):
         yield
         return
     depth = integrator.max_depth
-    if isinstance(depth, int) and depth < UNBOUNDED:
+    if isinstance(depth, int) and depth < UNBOUNDED_DEPTH:
         integrator.max_depth = max(depth - count, 0)
     try:
         yield
@@ -408,7 +408,7 @@ def _depth_reduced(integrator: mi.Integrator, count: int) -> Iterator[None]:
 
 
 @contextmanager
-def _sample_count_kept(sensor: mi.Sensor) -> Iterator[None]:
+def _keep_sample_count(sensor: mi.Sensor) -> Iterator[None]:
     """Restore the sampler's sample count, which Mitsuba's integrators set to their own.
 
     With ``nested_spp``, the splats' next image would have other samples than the one before.

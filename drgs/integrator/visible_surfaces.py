@@ -18,7 +18,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.types import Float
 from drgs.effects.occlusion import Surface
 from drgs.integrator.film import num_samples, pixel_corners
-from drgs.integrator.rays import INVISIBLE, StraightRays
+from drgs.integrator.rays import MAX_INVISIBLE_OPACITY, StraightRays
 
 EDGE_GRID = 4
 
@@ -62,7 +62,7 @@ SurfaceLayers = list[VisibleSurface]
 """The surfaces of each pixel, nearest first."""
 
 
-def rest_behind(surfaces: Sequence[Surface]) -> mi.Float:
+def transmittance_behind(surfaces: Sequence[Surface]) -> mi.Float:
     """Return the part of each pixel's light that all surfaces let through."""
     rest = mi.Float(1)
     for surface in surfaces:
@@ -122,7 +122,7 @@ class _Tracer:
         layers, rest = [], dr.ones(mi.Float, dr.width(ray))
         while True:
             ray, hit, opacity = self.rays.next_visible(ray, active)
-            active = active & (rest * (1 - opacity) > INVISIBLE) & hit.is_valid()
+            active = active & (rest * (1 - opacity) > MAX_INVISIBLE_OPACITY) & hit.is_valid()
             goes_on = self.rays.sees_through and dr.any(active)
             is_last = len(layers) == MAX_SURFACES - 1
             if goes_on and is_last:
@@ -174,7 +174,7 @@ class _Tracer:
         row = dr.arange(mi.UInt32, count) // width
         column = dr.arange(mi.UInt32, count) - row * width
         around = self.trace(camera, mi.Point2f(column, row) - 1, x, y)
-        rest = rest_behind(around)
+        rest = transmittance_behind(around)
         dr.eval(around, rest)
 
         corner = pixel_corners(film)

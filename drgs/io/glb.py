@@ -70,7 +70,7 @@ NOT_NEGATIVE = "linear, so not negative (drafts of the extension had logarithms)
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 """Types of accessors, by number of components."""
 
-OURS = "drgs"
+EXTRAS_KEY = "drgs"
 """Key of our values in ``extras``."""
 
 
@@ -78,7 +78,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     """Return a file of Gaussians; the origin becomes the translation of the node."""
     attributes, said = _attributes(gaussians), dict(rendered_with)
     origin = pop_origin("rendered_with", said)
-    document = _document(attributes, {OURS: said} if said else None, origin)
+    document = _document(attributes, {EXTRAS_KEY: said} if said else None, origin)
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary = b"".join(values.tobytes() for values in attributes.values())
@@ -315,14 +315,14 @@ class _Document:
     def rendered_with(self) -> dict[str, Scalar]:
         """Our values in the primitive's extras; none if another program wrote them."""
         extras = self.primitive.extras
-        said = extras.get(OURS, {}) if isinstance(extras, dict) else {}
+        said = extras.get(EXTRAS_KEY, {}) if isinstance(extras, dict) else {}
         if not isinstance(said, dict) or not all(
-            isinstance(value, Scalar) and STATEMENT.fullmatch(f"{OURS} {name} {value}")
+            isinstance(value, Scalar) and STATEMENT.fullmatch(f"{EXTRAS_KEY} {name} {value}")
             for name, value in said.items()
         ):
             raise UserError(
-                f"{self.path}: {self.place}.extras.{OURS}: must be an object of names and values "
-                f"of one word, got {one_line(repr(said), 60)}; correct it, or remove it"
+                f"{self.path}: {self.place}.extras.{EXTRAS_KEY}: must be an object of names and "
+                f"values of one word, got {one_line(repr(said), 60)}; correct it, or remove it"
             )
         return said
 

@@ -22,7 +22,7 @@ SMALLEST_LOGIT = -125 * math.log(2)
 SMALLEST_LOG_SCALE = -126 * math.log(2)
 """Logarithm of the smallest normal float32: what a scale of 0 becomes."""
 
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_REMAINING_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the other three components, by the index of one of four."""
 
 
@@ -92,14 +92,14 @@ def drop_largest_component(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rows = np.arange(len(quats))
     index = np.argmax(np.abs(quats), axis=1)
     sign = np.where(quats[rows, index] < 0, -1.0, 1.0)
-    return index, sign[:, None] * quats[rows[:, None], _OTHERS[index]]
+    return index, sign[:, None] * quats[rows[:, None], _REMAINING_COMPONENTS[index]]
 
 
 def restore_largest_component(index: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return quaternions (N, 4) float64 of length 1: see :func:`drop_largest_component`."""
     rows = np.arange(len(index))
     quats = np.empty((len(index), 4))
-    quats[rows[:, None], _OTHERS[index]] = others
+    quats[rows[:, None], _REMAINING_COMPONENTS[index]] = others
     quats[rows, index] = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
     return quats
 

@@ -55,7 +55,7 @@ HEADER = struct.Struct("<4sIIBBBB")
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 TABLE_ENTRY = struct.Struct("<QQ")
 
-WRITTEN = 3
+WRITTEN_VERSION = 3
 ANTIALIASED, EXTENSIONS = 1, 2
 """Flags."""
 
@@ -100,7 +100,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         _packed_rotations(g["quats"]),
         _packed_harmonics(g["shN"]),
     )
-    header = HEADER.pack(MAGIC, WRITTEN, num, degree, bits, flags, 0)
+    header = HEADER.pack(MAGIC, WRITTEN_VERSION, num, degree, bits, flags, 0)
     content = b"".join([header, *(part.astype("u1").tobytes() for part in parts)])
     return gzip.compress(content, GZIP_LEVEL, mtime=0)
 

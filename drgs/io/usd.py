@@ -27,7 +27,7 @@ PRIM = "/Gaussians"
 COLOR_SPACE = "srgb_rec709_scene"
 """OpenUSD's name of sRGB's primaries and transfer function."""
 
-EXTENT = 3.0
+EXTENT_STDS = 3.0
 """Standard deviations of a Gaussian that count for the extent."""
 
 
@@ -65,7 +65,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     splats.CreateRadianceSphericalHarmonicsDegreeAttr(round(np.sqrt(harmonics.shape[1])) - 1)
     coefficients = Vt.Vec3fArray.FromNumpy(_float32(harmonics.reshape(-1, 3)))
     splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(coefficients)
-    reach = EXTENT * scales.max(axis=1, keepdims=True)
+    reach = EXTENT_STDS * scales.max(axis=1, keepdims=True)
     corners = _float32([(means - reach).min(axis=0), (means + reach).max(axis=0)])
     splats.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
     with TemporaryDirectory() as folder:  # OpenUSD writes binary layers to files only

@@ -25,7 +25,7 @@ CELLS_PER_GAUSSIAN = 2.0
 RESOLUTIONS = (8, 128)
 """Least and most cells along an edge. All are multiples of 4: the middle half is a finer cube."""
 
-INNERMOST = 0.9
+INNER_CUBE_SHARE = 0.9
 """Part of the means that is in the innermost cube."""
 
 MOST_LEVELS = 24
@@ -36,11 +36,11 @@ MOST_ENTRIES = 32
 
 FREE_ENTRIES = 1 << 20
 
-MARGIN = 1 / 64
+CELL_MARGIN = 1 / 64
 """Parts of a cell by which Gaussians reach into it from outside: far more than rounding moves a
 ray, and than :data:`STEP`."""
 
-STEP = 1 / 1024
+CELL_STEP = 1 / 1024
 """Parts of a cell by which a ray looks ahead for the cell that it is in."""
 
 
@@ -95,7 +95,7 @@ class SplatGrid:
         t_ = types_of(type(self.size))
         count = t_.Float(self.resolution)
         distance = self._distance(origin + direction * t)
-        step = STEP * (self.size * dr.select(distance > 1, distance, 1) * 2 / count)
+        step = CELL_STEP * (self.size * dr.select(distance > 1, distance, 1) * 2 / count)
         rounding = 4 * dr.epsilon(t) * t  # a ray from far away goes on where cells are smaller
         ahead = t + dr.select(step > rounding, step, rounding)
         point = origin + direction * ahead
@@ -143,7 +143,7 @@ def build_grid(ellipsoids: Ellipsoids) -> SplatGrid:
     distances = np.abs(centers - center[:, None]).max(axis=0)
     # Equal or few centres: no cell is much smaller than what it holds.
     spreads = np.stack([distances, sizes.max(axis=0)])
-    size = np.quantile(spreads, INNERMOST, axis=1).max() if shown.any() else 1.0
+    size = np.quantile(spreads, INNER_CUBE_SHARE, axis=1).max() if shown.any() else 1.0
     farthest = (np.abs(centers - center[:, None]) + sizes).max(initial=0.0)
     size = max(size, farthest / 2 ** (MOST_LEVELS - 1), np.finfo(np.float32).tiny)
     # Two cells of a cube with all Gaussians are empty on either side: nothing is at the border.
@@ -210,7 +210,9 @@ class _Boxes:
         for k in range(3):
             offset = self.ellipsoids.centers[k] - dr.opaque(Float, float(self.center[k]))
             low, high = (
-                dr.floor((offset + sign * sizes[k] + half) / half * (0.5 * count) + sign * MARGIN)
+                dr.floor(
+                    (offset + sign * sizes[k] + half) / half * (0.5 * count) + sign * CELL_MARGIN
+                )
                 for sign in (-1, 1)
             )
             misses = ~((high >= 0) & (low < count)) | ~self.ellipsoids.exist
@@ -259,7 +261,7 @@ class _Boxes:
         for axis in self.ellipsoids.axes:
             direction = dr.gather(t.Array3f, axis, row)
             # Along the axis, times its length: how far the cell reaches, and the ellipsoid.
-            of_cell = dr.sum(dr.abs(direction)) * cell * (0.5 + MARGIN)
+            of_cell = dr.sum(dr.abs(direction)) * cell * (0.5 + CELL_MARGIN)
             distance = dr.abs(dr.dot(direction, offset))
             touches &= distance <= of_cell + dr.squared_norm(direction)
         return touches

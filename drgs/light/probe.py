@@ -28,39 +28,39 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.splatting import rendering
 from drgs.splatting.projection import GaussianRows
 
-SIZE = 256
+CUBE_SIZE_TEXELS = 256
 """Texels of an edge of the largest cube."""
 
-LEVELS = 7
+NUM_LEVELS = 7
 """Cubes of a probe; each has half the edges of the one before."""
 
 LOW_PASS = 0.03
 """px^2 of the images: rays have none at all."""
 
-FINE = 2
+LAST_DISTANCE_LEVEL = 2
 """The last level in which distances are searched: those of smaller images are no surface."""
 
-STEPS = 8
+MAX_RAY_STEPS = 8
 """Places of a ray that are looked at, at most."""
 
-REFINEMENTS = 4
+STEP_HALVINGS = 4
 """Halvings of the step that meets something."""
 
-SOLID = 0.5
+MIN_SOLID_COVERAGE = 0.5
 """Coverage of what ends a ray."""
 
-BORDER = 1
+BORDER_TEXELS = 1
 """Texels around each image that show what the neighbours do, for interpolation."""
 
 LEAST_REACH = 0.1
 """Part of the distance to the nearest splats: the first steps of a ray from the centre."""
 
-MARGIN = 0.98
+HIT_DISTANCE_SHARE = 0.98
 """Part of the distance before a step, from which on what is seen behind it is met."""
 
 
 @dataclass(frozen=True)
-class Seen:
+class ProbeHit:
     """Results of looking along rays."""
 
     color: Array3f  # times the coverage
@@ -100,11 +100,11 @@ class Probes:
             beyond = _clip_to_plane(t, plane, pipeline)
             faces = [_face(center, k, gaussians, beyond, near, decode) for k in range(6)]
             levels = [_concatenate(faces)]
-            for level in range(1, LEVELS):
-                levels.append(_halve(levels[-1], SIZE >> level))
+            for level in range(1, NUM_LEVELS):
+                levels.append(_halve(levels[-1], CUBE_SIZE_TEXELS >> level))
             texels.append(_concatenate(levels))
             coverage, nearness = levels[0][3:]
-            distance = dr.select(coverage > SOLID, coverage / nearness, dr.inf)
+            distance = dr.select(coverage > MIN_SOLID_COVERAGE, coverage / nearness, dr.inf)
             nearest.append(dr.select(dr.min(distance) < dr.inf, dr.min(distance), 1))
         columns = _concatenate(texels)
         index = dr.arange(t.UInt32, dr.width(columns[0]))
@@ -127,7 +127,7 @@ class Probes:
         far: Float,
         level: UInt32,
         active: Bool,
-    ) -> Seen:
+    ) -> ProbeHit:
         """Look along unit directions up to ``far``; probe, level: of each ray."""
         t = types_of(type(far))
         start = origin - dr.gather(t.Array3f, self.centers, probe, active)
@@ -142,7 +142,7 @@ class Probes:
 
         active &= dr.dot(dr.gather(t.Array3f, self.normals, probe, active), direction) >= 0
         u, meets, is_known = self._search(
-            place, end, _Cube.from_level(probe, dr.minimum(level, FINE)), active
+            place, end, _Cube.from_level(probe, dr.minimum(level, LAST_DISTANCE_LEVEL)), active
         )
         is_known &= active
         v, texels = place(u), _Cube.from_level(probe, level).bilinear_texels(place(u))
@@ -153,7 +153,7 @@ class Probes:
         # What is too thin to be met counts if it is before the ray's end.
         shows = is_known & (meets | (coverage * (1 - u) < nearness * dr.norm(v)))
         color = dr.select(shows, t.Array3f(red, green, blue), 0)
-        return Seen(color, dr.select(shows, coverage, 0), is_known)
+        return ProbeHit(color, dr.select(shows, coverage, 0), is_known)
 
     def _search(
         self, place: Callable[[Float], Array3f], end: Float, cube: _Cube, active: Bool
@@ -165,25 +165,27 @@ class Probes:
             """Return the distances of a place and of splats there, and which is nearer."""
             v = place(u)
             coverage, nearness = dr.gather(t.Array2f, self.places, cube.nearest(v), active)
-            is_solid, r = coverage > SOLID, dr.norm(v)
+            is_solid, r = coverage > MIN_SOLID_COVERAGE, dr.norm(v)
             is_behind = is_solid & (r * nearness > (1 - u) * coverage)
             return r / (1 - u), dr.select(is_solid, coverage / nearness, dr.inf), is_behind
 
         def step(k: UInt32, before: Float, meets: Bool, is_known: Bool) -> tuple:
-            r, distance, is_behind = look(end * (t.Float(k) / STEPS), active)
-            meets = is_behind & (distance > MARGIN * before)
+            r, distance, is_behind = look(end * (t.Float(k) / MAX_RAY_STEPS), active)
+            meets = is_behind & (distance > HIT_DISTANCE_SHARE * before)
             return k + 1, r, meets, meets | ~is_behind
 
-        r, _, is_behind = look(end * (0.01 / STEPS), active)
+        r, _, is_behind = look(end * (0.01 / MAX_RAY_STEPS), active)
         nothing = dr.full(t.Bool, False, dr.width(r))
         k, _, meets, is_known = dr.while_loop(
             state=(dr.ones(t.UInt32, dr.width(r)), r, nothing, ~is_behind),
-            cond=lambda k, before, meets, is_known: active & (k <= STEPS) & ~meets & is_known,
+            cond=lambda k, before, meets, is_known: (
+                active & (k <= MAX_RAY_STEPS) & ~meets & is_known
+            ),
             body=step,
         )
-        high = end * (t.Float(k - 1) / STEPS)
-        low = high - end / STEPS
-        for _ in range(REFINEMENTS):
+        high = end * (t.Float(k - 1) / MAX_RAY_STEPS)
+        low = high - end / MAX_RAY_STEPS
+        for _ in range(STEP_HALVINGS):
             u = 0.5 * (low + high)
             _, _, is_behind = look(u, active & meets)
             low, high = dr.select(is_behind, low, u), dr.select(is_behind, u, high)
@@ -205,10 +207,10 @@ def _clip_to_plane(
 
 
 def _num_texels(level: int) -> int:
-    return 6 * ((SIZE >> level) + 2 * BORDER) ** 2
+    return 6 * ((CUBE_SIZE_TEXELS >> level) + 2 * BORDER_TEXELS) ** 2
 
 
-NUM_TEXELS = sum(map(_num_texels, range(LEVELS)))
+NUM_TEXELS = sum(map(_num_texels, range(NUM_LEVELS)))
 
 
 @dataclass(frozen=True)
@@ -222,27 +224,27 @@ class _Cube:
     def from_level(probe: UInt32, level: UInt32) -> _Cube:
         UInt32 = type(level)
         before, first = 0, UInt32(0)
-        for k in range(LEVELS):
+        for k in range(NUM_LEVELS):
             first = dr.select(level == k, before, first)
             before += _num_texels(k)
-        return _Cube(probe * UInt32(NUM_TEXELS) + first, UInt32(SIZE) >> level)
+        return _Cube(probe * UInt32(NUM_TEXELS) + first, UInt32(CUBE_SIZE_TEXELS) >> level)
 
     def nearest(self, v: Array3f) -> UInt32:
         """Return the texel in the direction of a vector."""
         face, x, y = _place_on_cube(v)
         UInt32, size = type(self.size), type(x)(self.size)
         last = self.size - 1
-        column, row = (dr.minimum(UInt32(place * size), last) + BORDER for place in (x, y))
+        column, row = (dr.minimum(UInt32(place * size), last) + BORDER_TEXELS for place in (x, y))
         return self._texel(face, column, row)
 
     def bilinear_texels(self, v: Array3f) -> list[tuple[UInt32, Float]]:
         """Return four texels around the direction of a vector, and their weights."""
         face, x, y = _place_on_cube(v)
         UInt32, Float = type(self.size), type(x)
-        x, y = (place * Float(self.size) + (BORDER - 0.5) for place in (x, y))
+        x, y = (place * Float(self.size) + (BORDER_TEXELS - 0.5) for place in (x, y))
         column, row = UInt32(x), UInt32(y)
         right, down = x - Float(column), y - Float(row)
-        texel, edge = self._texel(face, column, row), self.size + 2 * BORDER
+        texel, edge = self._texel(face, column, row), self.size + 2 * BORDER_TEXELS
         return [
             (texel, (1 - right) * (1 - down)),
             (texel + 1, right * (1 - down)),
@@ -251,7 +253,7 @@ class _Cube:
         ]
 
     def _texel(self, face: UInt32, column: UInt32, row: UInt32) -> UInt32:
-        edge = self.size + 2 * BORDER
+        edge = self.size + 2 * BORDER_TEXELS
         return self.first + (face * edge + row) * edge + column
 
 
@@ -289,12 +291,14 @@ def _face(
     Red, green, blue, coverage, nearness of its texels.
     """
     Float = type(gaussians.means.array)
-    UInt32, edge = types_of(Float).UInt32, SIZE + 2 * BORDER
+    UInt32, edge = types_of(Float).UInt32, CUBE_SIZE_TEXELS + 2 * BORDER_TEXELS
     axis, is_negative = divmod(number, 2)
     forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
     if is_negative:
         forward, right, down = -forward, down, right
-    K = np.array([[SIZE / 2, 0, edge / 2], [0, SIZE / 2, edge / 2], [0, 0, 1]])
+    K = np.array(
+        [[CUBE_SIZE_TEXELS / 2, 0, edge / 2], [0, CUBE_SIZE_TEXELS / 2, edge / 2], [0, 0, 1]]
+    )
     rotation = np.stack([right, down, forward])
     camera = Camera.create(Float, rotation, center, K, edge, edge, near)
     T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
@@ -302,7 +306,10 @@ def _face(
     shows = coverage > 0
     color = decode([c / dr.select(shows, coverage, 1) for c in color])
     texel = dr.arange(UInt32, edge * edge)
-    x, y = ((Float(p) + (0.5 - edge / 2)) * (2 / SIZE) for p in (texel % edge, texel // edge))
+    x, y = (
+        (Float(p) + (0.5 - edge / 2)) * (2 / CUBE_SIZE_TEXELS)
+        for p in (texel % edge, texel // edge)
+    )
     distance = depth * dr.sqrt(1 + x * x + y * y)  # times coverage
     nearness = dr.select(shows & (distance > 0), coverage * coverage / distance, 0)
     columns = [*(c * coverage for c in color), coverage, nearness]
@@ -319,13 +326,14 @@ def _concatenate(parts: list[list[Float]]) -> list[Float]:
 def _halve(columns: list[Float], size: int) -> list[Float]:
     """Make a cube of ``size`` texels an edge from twice as many: means of four places each."""
     t = types_of(type(columns[0]))
-    edge, larger = size + 2 * BORDER, _Cube(t.UInt32(0), t.UInt32(2 * size))
+    edge, larger = size + 2 * BORDER_TEXELS, _Cube(t.UInt32(0), t.UInt32(2 * size))
     index = dr.arange(t.UInt32, 6 * edge * edge)
     face, row, column = index // (edge * edge), index // edge % edge, index % edge
     means = [t.Float(0) for _ in columns]
     for dx, dy in ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)):
         right, down = (
-            (t.Float(p) + (d - BORDER)) * (2 / size) - 1 for p, d in ((column, dx), (row, dy))
+            (t.Float(p) + (d - BORDER_TEXELS)) * (2 / size) - 1
+            for p, d in ((column, dx), (row, dy))
         )
         for texel, weight in larger.bilinear_texels(_vector_to(face, right, down)):
             values = (dr.gather(t.Float, values, texel) for values in columns)

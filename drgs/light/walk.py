@@ -33,16 +33,16 @@ from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import GaussianRows
 from drgs.splatting.rasterize import composite_step
 
-WINDOW = 8
+WINDOW_PEAKS = 8
 """Peaks that a ray keeps before it composites them."""
 
-TURNS = 16
+ENTRIES_PER_TURN = 16
 """Entries of a list, after which a ray lets others of its vector find their next cell."""
 
 MOST_RANDOM = 2.0**32 - 2**8
 """Bound of random numbers for a certainty: the largest number of 32 bits in float32."""
 
-FARTHEST = 1e18
+MAX_DISTANCE = 1e18
 """World units from the origin, beyond which Gaussians do not exist: their squares overflow."""
 
 _SHAPE = 13
@@ -74,13 +74,13 @@ class RaySplats:
         """Copy the Gaussians, and sort them into a grid. Waits for the device.
 
         rows: detached, as a pipeline has them. Those that are not finite, or reach beyond
-        :data:`FARTHEST`, do not exist.
+        :data:`MAX_DISTANCE`, do not exist.
         """
         t = types_of(type(rows.logit_opacities))
         rotation, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
         opacity = 1 / (1 + dr.exp(-rows.logit_opacities))
-        if rows.dimming is not None:
-            opacity = opacity * rows.dimming
+        if rows.opacity_compensation is not None:
+            opacity = opacity * rows.opacity_compensation
         log2_opacity = dr.log2(opacity)
         exponent = log2_opacity - cutoffs.log2_floor(log2_opacity)
         reach = dr.sqrt(2 * math.log(2) * dr.select(exponent > 0, exponent, 0))
@@ -92,7 +92,7 @@ class RaySplats:
         total = sum([*numbers, *sh, *(value for axis in half_axes for value in axis)], t.Float(0))
         exists = (exponent > 0) & dr.isfinite(total)
         ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
-        exists &= dr.max(dr.abs(ellipsoids.centers) + ellipsoids.half_sizes()) < FARTHEST
+        exists &= dr.max(dr.abs(ellipsoids.centers) + ellipsoids.half_sizes()) < MAX_DISTANCE
         shapes = Rows.from_columns([*numbers, *[t.Float(0)] * (16 - _SHAPE)])
         colors = Rows.from_columns(sh)
         ellipsoids = replace(ellipsoids, exist=exists)
@@ -123,7 +123,7 @@ class RaySplats:
                 dr.select(segment.active, t.Float(1), -1),
                 [dr.zeros(t.Float, size) for _ in range(3)],
             ),
-            cond=lambda at, last, T, color: (T > 0) & walk.goes_on(at),
+            cond=lambda at, last, T, color: (T > 0) & walk.should_continue(at),
             body=body,
         )
         return t.Array3f(color), dr.abs(T)
@@ -170,7 +170,7 @@ class RaySplats:
                 body=choose,
             )
 
-        def goes_on(at: _Place, coverage: Float, draws: list) -> Bool:
+        def should_continue(at: _Place, coverage: Float, draws: list) -> Bool:
             # Cells that come later are behind what was drawn in this one.
             more = (at.entry < at.last) | ((_farthest(draws) == dr.inf) & (at.end < walk.stop))
             return segment.active & more
@@ -182,7 +182,7 @@ class RaySplats:
                 dr.zeros(t.Float, size),
                 [_Draw.without_splat(t, size) for _ in range(count)],
             ),
-            cond=goes_on,
+            cond=should_continue,
             body=body,
         )
         basis = sh_basis(walk.direction, self.sh_degree)
@@ -229,7 +229,7 @@ class RaySplats:
                 _Place.first_of(dr.zeros(t.Float, size)),
                 dr.select(segment.active, t.Float(1), 0),
             ),
-            cond=lambda at, T: (least <= T) & walk.goes_on(at),
+            cond=lambda at, T: (least <= T) & walk.should_continue(at),
             body=body,
         )
         return T
@@ -254,7 +254,7 @@ class _Place:
 
     def has_entry(self) -> Bool:
         """Return whether the list goes on, and other rays need not find another cell first."""
-        return (self.entry < self.last) & (self.turn < TURNS)
+        return (self.entry < self.last) & (self.turn < ENTRIES_PER_TURN)
 
     def rewind(self, goes_back: Bool) -> _Place:
         """Return to the beginning of the list that was read last, on some rays."""
@@ -278,7 +278,7 @@ class _Walk:
         origin = segment.origin + segment.direction * dr.select(start < end, start, 0)
         return _Walk(splats, origin, segment.direction, end - start)
 
-    def goes_on(self, at: _Place) -> Bool:
+    def should_continue(self, at: _Place) -> Bool:
         """Return whether there is another entry, or another cell."""
         return (at.entry < at.last) | (at.end < self.stop)
 
@@ -360,15 +360,15 @@ class _Walk:
             for peak, _, log2_alpha in window:
                 alpha = dr.select(peak < dr.inf, self.alpha(log2_alpha), 0)
                 through = dr.fma(-alpha, through, through)
-            more = (window[WINDOW // 2][0] == dr.inf) & (through >= stop)
-            return self.goes_on(at) & ((at.entry < at.last) | more)
+            more = (window[WINDOW_PEAKS // 2][0] == dr.inf) & (through >= stop)
+            return self.should_continue(at) & ((at.entry < at.last) | more)
 
         size, stop = dr.width(at.first), self.splats.cutoffs.transmittance_stop
         empty = [dr.full(t.Float, dr.inf, size), dr.zeros(t.UInt32, size), dr.zeros(t.Float, size)]
         return dr.while_loop(
             state=(
                 at,
-                [[type(x)(x) for x in empty] for _ in range(WINDOW)],
+                [[type(x)(x) for x in empty] for _ in range(WINDOW_PEAKS)],
                 dr.full(t.Bool, False, size),
             ),
             cond=goes_on,

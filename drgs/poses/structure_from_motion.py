@@ -26,7 +26,7 @@ from PIL import ExifTags, Image
 from drgs.core.child_process import ChildEndedError, DeferredInterrupts, run_in_child
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, UserNote, format_names, one_line
-from drgs.core.files import why_refused
+from drgs.core.files import refusal_reason
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
@@ -184,7 +184,7 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
         except BrokenPipeError:  # of the output, whose reader has gone
             raise
         except OSError as error:
-            raise UserError(f"{model}: cannot write the model: {why_refused(error)}") from None
+            raise UserError(f"{model}: cannot write the model: {refusal_reason(error)}") from None
         except ChildEndedError as error:
             raise UserError(
                 f"{photographs}: structure from motion was ended: {error}; {REMEDY}"

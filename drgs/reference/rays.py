@@ -60,7 +60,7 @@ D = TypeVar("D", bound="DataclassInstance")
 MAX_PAIRS = 2**18
 """Pairs evaluated at a time: some 100 numbers each, so 200 MB, whatever the film and the scene."""
 
-THINNEST = 1e-30
+MIN_RELATIVE_STD = 1e-30
 """Least standard deviation of an exact splat, relative to its largest (without a low-pass) or to
 its depth (with one): far below rounding, so that it changes nothing, and far from overflow in the
 fourth powers of its inverse. It gives a disc of thickness zero its limit."""
@@ -363,14 +363,14 @@ def _whitened_rays(affine: reference._LocalAffine, camera: Camera, low_pass: flo
     if low_pass == 0:
         largest = np.max(affine.scales, axis=1, keepdims=True)
         largest = np.where(largest > 0, largest, 1.0)
-        scales = np.maximum(affine.scales, THINNEST * largest)
+        scales = np.maximum(affine.scales, MIN_RELATIVE_STD * largest)
         # W^-1, not W^T: a rotation that was rounded to single precision is orthogonal to 1e-7.
         from_camera = np.swapaxes(affine.rotations, 1, 2) @ np.linalg.inv(camera.rotation)
         whitening = from_camera / scales[:, :, None]
     else:
         widening = np.sqrt(low_pass) * z[:, None, None] * np.eye(3)[:, :2] / focal
         whitening = _inverse_factors(
-            np.concatenate([affine.axes, widening], axis=2), smallest=THINNEST * z
+            np.concatenate([affine.axes, widening], axis=2), smallest=MIN_RELATIVE_STD * z
         )
     mean_rays = affine.means / z[:, None]
     return np.concatenate([whitening[:, :, :2] / focal, whitening @ mean_rays[:, :, None]], axis=2)

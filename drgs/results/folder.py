@@ -14,11 +14,11 @@ from pathlib import Path
 
 import yaml
 
-from drgs.config.changes import decided_as, with_changes
+from drgs.config.changes import with_changes, with_decisions
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, format_names, one_line
-from drgs.core.files import is_temporary, read_text, remove_stale_temporaries, why_refused
+from drgs.core.files import is_temporary, read_text, refusal_reason, remove_stale_temporaries
 from drgs.core.folders import FolderRecord
 from drgs.results.files import (
     CHECKPOINT,
@@ -214,7 +214,7 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
                 os.rmdir(path)
         record.remove()
     except OSError as error:
-        raise UserError(f"{error.filename}: cannot be removed: {why_refused(error)}") from error
+        raise UserError(f"{error.filename}: cannot be removed: {refusal_reason(error)}") from error
 
 
 def _refuse_strangers(
@@ -269,7 +269,7 @@ def _visible_names(folder: Path) -> list[str]:
 
 
 def _unusable(folder: Path, error: OSError) -> UserError:
-    return UserError(f"{folder}: cannot be the output folder: {why_refused(error)} (--out)")
+    return UserError(f"{folder}: cannot be the output folder: {refusal_reason(error)} (--out)")
 
 
 def _is_file(path: Path) -> bool:
@@ -308,7 +308,7 @@ def _differences_of_run(folder: Path, config: FitConfig) -> str:
         return f"with a {CONFIG} that is not readable"
     theirs, ours = (
         each.model_dump(mode="json", exclude={"output"})
-        for each in (decided_as(run, config), decided_as(config, run))
+        for each in (with_decisions(run, config), with_decisions(config, run))
     )
     differences = _differences(theirs, ours)
     return f"which differs in {format_names(differences)}" if differences else ""

@@ -12,7 +12,7 @@ from typing import TypeVar
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.approximations import said_by
+from drgs.config.approximations import from_ply_header
 from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
@@ -65,7 +65,7 @@ class ImageFolder:
                 record.claim(names)
             yield image
 
-    def refuse_photographs(self, dataset: Path) -> None:
+    def check_no_photographs(self, dataset: Path) -> None:
         """Raise :class:`UserError` where the folder contains images of the folder ``dataset``."""
         if not self.path.is_dir() or not self.path.resolve().is_relative_to(dataset.resolve()):
             return
@@ -182,7 +182,9 @@ def load_model(
     # The user decides first; a configuration may only name the photographs.
     given = {override.partition("=")[0].strip() for override in overrides}
     header = (gaussians.rendered_with or {}).items()
-    values = said_by(str(path), {k: v for k, v in header if not given & {"model", f"model.{k}"}})
+    values = from_ply_header(
+        str(path), {k: v for k, v in header if not given & {"model", f"model.{k}"}}
+    )
     return Model(
         gaussians,
         settings.model_copy(update=values),

@@ -13,7 +13,7 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text
 from drgs.core.origin import WORLD, Origin
-from drgs.datasets.transforms import CLOSE, MAX_BYTES
+from drgs.datasets.transforms import CLOSE_POSE_KEY, MAX_BYTES
 from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.results.files import CAMERAS, VIEWS
@@ -136,6 +136,6 @@ def _lens_and_motion(view: View) -> dict[str, object]:
         model = MODELS.get(view.lens.kind, view.lens.kind)
         values |= {"camera_model": model, **view.lens.coefficients()}
     if view.motion is not None:
-        values[CLOSE] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
+        values[CLOSE_POSE_KEY] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
         values["shutter"] = view.motion.shutter
     return values

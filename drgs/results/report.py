@@ -46,12 +46,12 @@ from drgs.results.files import (
 )
 from drgs.results.history import FitHistory, summarize_density
 from drgs.results.metrics import FitMetrics, psnr, ssim
-from drgs.results.viewer import Shown, seconds_of_page, write_viewer
+from drgs.results.viewer import DisplaySettings, seconds_of_page, write_viewer
 
 DIFFERENCE_GAIN = 5.0
 """Gain of difference images, 0.5 + gain (fitted - truth): they saturate at 10 % of the range."""
 
-GAP = 4  # px between the images of a comparison, white
+IMAGE_GAP_PX = 4  # px between the images of a comparison, white
 
 ORBIT_FRAMES = 60
 
@@ -91,19 +91,19 @@ def write_images(
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitImages:
     """The result of a fit."""
 
     scene: mi.Scene  # renders ``gaussians``, in display space
     gaussians: Gaussians
     render: Render
-    shown: Shown  # in ``viewer.html``
+    shown: DisplaySettings  # in ``viewer.html``
 
 
 def write_results(
     out: Path,
     dataset: Dataset,
-    fitted: Fitted,
+    fitted: FitImages,
     scores: Sequence[Score],
     history: FitHistory,
     metrics: FitMetrics,
@@ -187,7 +187,7 @@ def _seconds_of_curve(panel: Panel) -> float:
 
 def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
     """Return (H, 3 W + 2 gaps, 3): fitted, truth, 0.5 + 5 (fitted - truth)."""
-    gap = np.ones((len(image), GAP, 3), np.float32)
+    gap = np.ones((len(image), IMAGE_GAP_PX, 3), np.float32)
     return np.concatenate([image, gap, view.image, gap, difference(image, view)], axis=1)
 
 

@@ -50,7 +50,7 @@ SECONDS_PER_BYTE = 0.2e-6
 HONOURED = frozenset({"low_pass", "antialiased"})
 """Approximations that the page renders with; of the others it has its own."""
 
-DISTANCE = 3.0
+PAGE_DISTANCE = 3.0
 """Distance from the first camera to its target in units of the page, where scales are kept in 8
 bits from 6e-6 to 8e3 and the nearest that one can come is 0.01."""
 
@@ -107,12 +107,12 @@ class InitialView:
         """The similarity from the world to the page, whose origin is the target."""
         orbit = self.orbit
         rotation = np.stack([np.cross(orbit.up, orbit.start), orbit.up, orbit.start])
-        scale = DISTANCE / np.linalg.norm(self.target - self.camera.center)
+        scale = PAGE_DISTANCE / np.linalg.norm(self.target - self.camera.center)
         return Similarity(float(scale), rotation, -scale * rotation @ self.target)
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class DisplaySettings:
     """Gaussians on the page, and how they are rendered."""
 
     gaussians: Gaussians  # numpy or Dr.Jit, without a smoothing filter
@@ -121,11 +121,14 @@ class Shown:
 
 def shows_as_fitted(approximations: Approximations) -> bool:
     """Return whether the page renders with all of them that are not the default."""
-    return approximations.others_than_default.keys() <= HONOURED
+    return approximations.non_default.keys() <= HONOURED
 
 
 def viewer_page(
-    title: str, shown: Shown, initial_view: InitialView, background: tuple[float, float, float]
+    title: str,
+    shown: DisplaySettings,
+    initial_view: InitialView,
+    background: tuple[float, float, float],
 ) -> bytes:
     """Return the page, UTF-8; equal arguments give equal bytes.
 
@@ -163,7 +166,7 @@ def seconds_of_page(num_gaussians: int, sh_degree: int) -> float:
     return SECONDS_PER_BYTE * _bytes_of_file(num_gaussians, sh_degree)
 
 
-def write_viewer(out: Path, dataset: Dataset, shown: Shown) -> None:
+def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
     """Write the page of a fit into its folder, atomically; it starts at a refined camera, if any.
 
     A ``UserNote`` tells where it would have more than :data:`MAX_PAGE_BYTES`.

@@ -28,7 +28,7 @@ FEATURES_AT_ONCE = {4: 32, 8: 8}
 7 s and 3 s, forward and backward; those of twice as many in 25 s and 12 s."""
 
 
-def in_groups(order: Any, bins: TileBins) -> Any:
+def group_features(order: Any, bins: TileBins) -> Any:
     """Return ``order``, or one that composites in groups if there are many features.
 
     Each is a :class:`drgs.splatting.rendering.CenterOrder`.

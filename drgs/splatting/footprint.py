@@ -84,13 +84,13 @@ class Alpha:
 # ----------------------------------------------------------------------------------------------
 
 
-class Positions:
+class SamplePositions:
     """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4."""
 
     margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
     samples: int = 1  # times that each pixel is evaluated
 
-    def bind(self, lanes: Lanes, grid: TileGrid) -> Positions:
+    def bind(self, lanes: Lanes, grid: TileGrid) -> SamplePositions:
         """Load what the lanes of one kernel need; the other methods are called of the result."""
         del lanes, grid
         return self
@@ -121,7 +121,7 @@ class Positions:
 
 
 @dataclass(frozen=True)
-class PixelCenters(Positions):
+class PixelCenters(SamplePositions):
     """The pixels' centres: rows and columns share their offsets."""
 
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
@@ -231,12 +231,12 @@ class GaussianFalloff:
 
     def geometry(self, splats: Splats2D) -> list[Float]:
         """Columns, one value per Gaussian."""
-        p, r, s = splats.whitening * WHITENING_SCALE
+        p, r, s = splats.conic_factor * WHITENING_SCALE
         return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
     def differentiable(self, splats: Splats2D) -> list[Float]:
         """Return what :meth:`derivatives` are with respect to: as many columns as geometry."""
-        return [*splats.means2d, *splats.whitening, splats.opacities]
+        return [*splats.means2d, *splats.conic_factor, splats.opacities]
 
     def bounds(
         self, splats: Splats2D, geometry: list[Float], reach: Float
@@ -286,7 +286,7 @@ class GaussianFalloff:
         return Footprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
 
     def moments(
-        self, footprint: Footprint, weights: list[Float], positions: Positions
+        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
         dx, dy = footprint.dx, footprint.dy
@@ -397,7 +397,7 @@ class SplatFeatures:
         """Return features whose derivatives with respect to the first number are weights."""
         return self
 
-    def bind(self, lanes: Lanes, positions: Positions) -> SplatFeatures:
+    def bind(self, lanes: Lanes, positions: SamplePositions) -> SplatFeatures:
         """Return the features for the lanes of one kernel; here, nothing depends on the pixels."""
         del lanes, positions
         return self
@@ -444,7 +444,7 @@ class FootprintModel:
     """The footprint of splats, as tiles and compositing see it; see the module's description."""
 
     falloff: GaussianFalloff = field(default_factory=GaussianFalloff)
-    positions: Positions = field(default_factory=PixelCenters)
+    positions: SamplePositions = field(default_factory=PixelCenters)
     features: SplatFeatures = field(default_factory=SplatFeatures)
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
 

@@ -54,17 +54,17 @@ def make_lanes(
     )
 
 
-def grouped_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
+def group_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
     """Make lanes that are ordered, within each block, by roughly their number of splats.
 
     work: UInt32, the number of splats of each lane of :func:`make_lanes`.
     """
     level = work // 4
     level = dr.select(level < _LEVELS, level, _LEVELS - 1)
-    return make_lanes(Float, grid, with_aligned_stack(_in_blocks(level)), tiles)
+    return make_lanes(Float, grid, with_aligned_stack(_sort_in_blocks(level)), tiles)
 
 
-def _in_blocks(level: UInt32) -> UInt32:
+def _sort_in_blocks(level: UInt32) -> UInt32:
     """Return the lanes ordered by level in each block; the order of equal lanes is arbitrary.
 
     Nothing depends on it but which lanes share a vector. (The host would wait for the order of

@@ -36,7 +36,7 @@ class RayTerms:
     tilt_x: Float  # how the peak's depth changes across the film, kappa or g / |a_c|
     tilt_y: Float
     spread: Float  # h, of the depth where the place on the film is known
-    scale: Float | None = None  # 1 / |a_c|, what the whitening is multiplied by; None: 1
+    scale: Float | None = None  # 1 / |a_c|, what the conic factor is multiplied by; None: 1
 
     def numbers(self) -> list[Float]:
         """Return the numbers that are set."""
@@ -56,7 +56,7 @@ class Splats2D:
     """
 
     means2d: Array2f  # px
-    whitening: Array3f  # (p, r, s), 1 / px
+    conic_factor: Array3f  # (p, r, s), 1 / px
     depths: Float  # z in the camera, scene units
     opacities: Float  # in (0, 1)
     colors: (
@@ -65,13 +65,13 @@ class Splats2D:
     variances: Array2f  # px^2: diagonal of the projected covariance, low-pass included
     visible: Bool  # in front of the near plane, above the alpha cut, finite
     ray: RayTerms | None = None  # only where something needs them
-    dimming: Float | None = None  # factor of the opacity, where the camera is out of focus
+    opacity_compensation: Float | None = None  # factor of the opacity, out of focus
 
     @property
     def conics(self) -> Array3f:
         """Array3f (a, b, c) of the exponent -(a dx^2 + 2 b dx dy + c dy^2) / 2, px^-2."""
-        p, r, s = self.whitening
-        return type(self.whitening)(p * p, p * r, r * r + s * s)
+        p, r, s = self.conic_factor
+        return type(self.conic_factor)(p * p, p * r, r * r + s * s)
 
 
 @dataclass(frozen=True)
@@ -79,16 +79,16 @@ class FilmShape:
     """The mean and covariance of a Gaussian on the film."""
 
     means2d: Array2f  # px
-    whitening: Array3f  # (p, r, s), 1 / px
+    conic_factor: Array3f  # (p, r, s), 1 / px
     variances: Array2f  # px^2, low-pass included
     determinant: Float  # px^2: of the covariance without low-pass, over the variance in y
     added_determinant: Float  # px^2: what the low-pass adds to it
     ray: RayTerms | None = None
-    dimming: Float | None = None  # factor of the opacity; None: 1
+    opacity_compensation: Float | None = None  # factor of the opacity; None: 1
 
     def root_determinant(self) -> Float:
         """The square root of det(conic) at the mean, 1 / px^2."""
-        p, _, s = self.whitening
+        p, _, s = self.conic_factor
         if self.ray is not None and self.ray.scale is not None:
             p, s = p / self.ray.scale, s / self.ray.scale
         return dr.abs(p * s)
@@ -133,7 +133,7 @@ class GaussianRows:
     logit_opacities: Float  #
     sh: list[Array3f]  # (degree + 1)^2
     smoothing: Float | None = None  # see drgs.effects.smoothing; None: there is none
-    dimming: Float | None = None  # factor of the opacity; None: 1
+    opacity_compensation: Float | None = None  # factor of the opacity; None: 1
     features: Mapping[str, list[Float]] | None = None  # by name; None: there are none
 
 
@@ -188,27 +188,27 @@ def project(
     opacities = opacity_rule(
         _sigmoid(rows.logit_opacities), film.determinant, film.added_determinant
     )
-    if rows.dimming is not None:
-        opacities = opacities * rows.dimming
+    if rows.opacity_compensation is not None:
+        opacities = opacities * rows.opacity_compensation
     above_cut = opacities > least_alpha
-    if film.dimming is not None:
-        opacities = opacities * film.dimming
+    if film.opacity_compensation is not None:
+        opacities = opacities * film.opacity_compensation
         above_cut = above_cut & (opacities > NEGLIGIBLE_ALPHA)
     direction = camera.lens.view_direction(camera, offset)
     colors = (color or color_at_mean)(rows, direction, sh_degree)
-    numbers = [*film.means2d, *film.whitening, *colors]
+    numbers = [*film.means2d, *film.conic_factor, *colors]
     numbers += [] if film.ray is None else film.ray.numbers()
     finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
     return Splats2D(
         means2d=film.means2d,
-        whitening=film.whitening,
+        conic_factor=film.conic_factor,
         depths=depth,
         opacities=opacities,
         colors=colors,
         variances=film.variances,
         visible=seen & above_cut & finite & dr.isfinite(dr.sum(film.variances)),
         ray=film.ray,
-        dimming=film.dimming,
+        opacity_compensation=film.opacity_compensation,
     )
 
 
@@ -222,7 +222,7 @@ def ewa(
     """
     lens = camera.lens
     m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
-    return whiten(lens.project_point(camera, position), [*m0], [*m1], low_pass)
+    return apply_conic_factor(lens.project_point(camera, position), [*m0], [*m1], low_pass)
 
 
 @PROJECTIONS.register("ewa")
@@ -232,7 +232,7 @@ class Ewa(ProjectionModel):
     shape = staticmethod(ewa)
 
 
-def whiten(
+def apply_conic_factor(
     means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: Float | float
 ) -> FilmShape:
     """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
@@ -251,7 +251,7 @@ def whiten(
     t = types_of(type(s))
     return FilmShape(
         means2d=means2d,
-        whitening=t.Array3f(p, -p * (xy / yy), s),
+        conic_factor=t.Array3f(p, -p * (xy / yy), s),
         variances=t.Array2f(xx + low_pass, yy),
         determinant=determinant,
         added_determinant=added_determinant,

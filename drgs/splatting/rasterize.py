@@ -57,7 +57,7 @@ from drgs.splatting.lanes import (
     Entries,
     EntriesBackToFront,
     count_entries,
-    grouped_by_work,
+    group_by_work,
     load_lane_row,
     load_pixels,
     make_lanes,
@@ -162,7 +162,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    lanes = grouped_by_work(t.Float, bins.grid, count_entries(Entries(bins, lanes, end)))
+    lanes = group_by_work(t.Float, bins.grid, count_entries(Entries(bins, lanes, end)))
     entries = Entries(bins, lanes, dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1))
     model = bins.model.bind(lanes, bins.grid)
     count = model.features.num_planes(bins.num_features)
@@ -305,7 +305,7 @@ def _partials(
     lanes = make_lanes(t.Float, bins.grid, tiles=tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     work = slots.number(Entries(bins, lanes, stop))
-    lanes = grouped_by_work(t.Float, bins.grid, work, tiles)
+    lanes = group_by_work(t.Float, bins.grid, work, tiles)
     stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
     entries = EntriesBackToFront(bins, lanes, stop)
     model = bins.model.bind(lanes, bins.grid)

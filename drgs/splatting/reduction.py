@@ -99,7 +99,7 @@ def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
     starts = repeat_array(bins.tile_start, count, dr.width(bins.masks))
     slots = dr.gather(t.UInt32, running, starts - 1, starts > 0)
     dr.eval(starts, slots)
-    starts, slots = (_without_inner_ends(column, count) for column in (starts, slots))
+    starts, slots = (_merge_inner_ends(column, count) for column in (starts, slots))
     count = -(-max(slots[-1], 1) // BAND_SLOTS)
     targets = slots[-1] * np.arange(1, count) / count
     edges = np.unique([0, *np.searchsorted(slots, targets, side="right") - 1, len(slots) - 1])
@@ -110,7 +110,7 @@ def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
     ]
 
 
-def _without_inner_ends(column: UInt32, count: int) -> np.ndarray:
+def _merge_inner_ends(column: UInt32, count: int) -> np.ndarray:
     """Return the starts of all tiles and the last end, from ``count`` columns with an end each."""
     columns = np.array(column, np.int64).reshape(count, -1)
     return np.append(columns[:, :-1], columns[-1, -1])

@@ -27,7 +27,7 @@ from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_o
 from drgs.core.constants import LOW_PASS
 from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.splatting.feature_groups import in_groups
+from drgs.splatting.feature_groups import group_features
 from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import TileGrid
 from drgs.splatting.projection import (
@@ -149,7 +149,7 @@ class Projected:
 
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
         """Project them."""
-        return footprints_seen_by(gaussians, camera, pipeline)
+        return project_footprints(gaussians, camera, pipeline)
 
     def gradients(
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
@@ -159,7 +159,7 @@ class Projected:
         return replace(found, visible=on_film(frame.bins))
 
 
-def as_loaded(rows: GaussianRows) -> GaussianRows:
+def load_unchanged(rows: GaussianRows) -> GaussianRows:
     """Return the Gaussians unchanged."""
     return rows
 
@@ -171,7 +171,7 @@ class Pipeline:
     sh_degree: int = 3
     opacity_rule: OpacityRule = plain_opacity
     features: tuple[Feature, ...] = (color_features,)
-    rows: Callable[[GaussianRows], GaussianRows] = as_loaded  # what is done to the Gaussians first
+    rows: Callable[[GaussianRows], GaussianRows] = load_unchanged  # applied to Gaussians first
     shape: Projection = ewa  # how a Gaussian's mean and covariance come to the film
     color: SplatColor = color_at_mean  # what is stored of a splat's colour
     low_pass: float = LOW_PASS  # px^2
@@ -233,7 +233,7 @@ class GaussianGradients:
     parameters: Gaussians | None  # None: the splats came from elsewhere, where theirs are found
     means2d: Array2f  # (N,): loss per px
     visible: Bool  # (N,): the Gaussian's extent touches the film
-    first_fault: UInt32  # (1,): of ``parameters``, see :func:`decode_fault`
+    first_nonfinite: UInt32  # (1,): of ``parameters``, see :func:`decode_fault`
     camera: list[Float] | None = None  # (1,) each: of ``camera.numbers()``, where found here
 
 
@@ -247,13 +247,13 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     model = pipeline.model.for_camera(camera)
     grid = TileGrid(camera.width, camera.height, model.positions.samples)
     bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
-    order = in_groups(pipeline.order.for_camera(camera), bins)
+    order = group_features(pipeline.order.for_camera(camera), bins)
     records = order.records(bins)
     layers = order.composite(bins, records)
     return Frame(pipeline, camera, order, bins, records, layers)
 
 
-def footprints_seen_by(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
     """Project ``gaussians`` and store what compositing needs; see :func:`render`."""
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
@@ -339,7 +339,7 @@ def gradients_by_row(
     rows = load_rows(gaussians, pipeline.sh_degree)
     d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
     columns = _columns_of(d_rows, gaussians, visible)
-    faults = _faults(d_rows, visible)
+    faults = _nonfinite_flags(d_rows, visible)
     parameters = _as_tensors(columns, gaussians, [faults])
     of_rows = [dr.select(visible, number, 0) for number in d_numbers]
     dr.eval(of_rows)
@@ -347,13 +347,13 @@ def gradients_by_row(
         parameters=parameters,
         means2d=of_splats.means2d,
         visible=visible,
-        first_fault=dr.min(faults),
+        first_nonfinite=dr.min(faults),
     )
     return found, of_rows
 
 
 @dataclass(frozen=True)
-class SeenSplats:
+class CameraGradients:
     """The derivatives of the splats that one camera sees."""
 
     camera: Camera
@@ -362,7 +362,7 @@ class SeenSplats:
 
 
 def sum_of_views(
-    gaussians: Gaussians, views: Sequence[Sequence[SeenSplats]]
+    gaussians: Gaussians, views: Sequence[Sequence[CameraGradients]]
 ) -> tuple[Gaussians, list[UInt32]]:
     """Sum :func:`gradients_of` over several views, in one kernel.
 
@@ -380,7 +380,7 @@ def sum_of_views(
             d_rows, visible, _ = _back_to_rows(own, seen.camera, seen.pipeline, seen.gradients)
             columns = _columns_of(d_rows, gaussians, visible)
             total = _sum_of_columns(total, columns) if total else columns
-            of_times.append(_faults(d_rows, visible))
+            of_times.append(_nonfinite_flags(d_rows, visible))
         faults.append(reduce(dr.minimum, of_times))
     return _as_tensors(total, gaussians, faults), [dr.min(each) for each in faults]
 
@@ -442,7 +442,9 @@ def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGrad
         parameters=a.parameters and b.parameters and _sum_of(a.parameters, b.parameters),
         means2d=a.means2d + b.means2d,
         visible=a.visible | b.visible,
-        first_fault=dr.select(a.first_fault < b.first_fault, a.first_fault, b.first_fault),
+        first_nonfinite=dr.select(
+            a.first_nonfinite < b.first_nonfinite, a.first_nonfinite, b.first_nonfinite
+        ),
         # Their cameras are not the same: each has derivatives of its own.
     )
     dr.eval(total)
@@ -458,8 +460,8 @@ def _sum_of(a: Gaussians, b: Gaussians) -> Gaussians:
     return Gaussians(**total)
 
 
-def decode_fault(fault: int) -> tuple[int, str] | None:
-    """The row and the parameter of :attr:`GaussianGradients.first_fault`; None if there is none.
+def decode_nonfinite(fault: int) -> tuple[int, str] | None:
+    """Return row and parameter of :attr:`GaussianGradients.first_nonfinite`, or None.
 
     A row's gradient of a parameter is at fault if its squared norm is not finite: it is NaN or
     infinite, or Adam's second moment, which holds squares, would be.
@@ -517,7 +519,7 @@ def _splat_tangents(
         falloff = frame.bins.model.falloff
         outputs = falloff.differentiable(splats)
         outputs += frame.pipeline.feature_columns(splats, rows, camera)
-        # Some outputs (depths, p of the whitening) are inputs of others: the default would clear
+        # Some outputs (depths, p of the conic factor) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
@@ -588,7 +590,7 @@ def _as_tensors(
     )
 
 
-def _faults(d_rows: GaussianRows, visible: Bool) -> UInt32:
+def _nonfinite_flags(d_rows: GaussianRows, visible: Bool) -> UInt32:
     """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``NO_FAULT``."""
     UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
     row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))

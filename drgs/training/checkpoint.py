@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.config.changes import decided_as, with_changes
+from drgs.config.changes import with_changes, with_decisions
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, format_names, one_line
-from drgs.core.files import atomic_path, read_arrays, why_refused
+from drgs.core.files import atomic_path, read_arrays, refusal_reason
 from drgs.datasets.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
 from drgs.results.folder import load_run_config, write_run_config
@@ -87,7 +87,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     try:
         arrays = read_arrays(path, "checkpoint")
         own, before = (
-            _at_the_places_of(config, json.loads(str(arrays.pop(name))))
+            _match_leaves(config, json.loads(str(arrays.pop(name))))
             for name in ("config", "config_before")
         )
         checkpoint = Checkpoint(
@@ -104,7 +104,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _damaged_error(path, error) from None
     # What one of them leaves to the dataset, the other has from there.
-    if all(decided_as(config, past) != decided_as(past, config) for past in (own, before)):
+    if all(with_decisions(config, past) != with_decisions(past, config) for past in (own, before)):
         raise UserError(
             f"{path}: belongs to another configuration than {folder / CONFIG}; {_remedy(path)}"
         )
@@ -145,7 +145,7 @@ def remove_checkpoint(folder: Path) -> None:
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
-        raise UserError(f"{path}: cannot be removed: {why_refused(error)}") from None
+        raise UserError(f"{path}: cannot be removed: {refusal_reason(error)}") from None
 
 
 def _damaged_error(path: Path, error: Exception) -> UserError:
@@ -162,7 +162,7 @@ def _as_text(config: FitConfig) -> str:
     return json.dumps(config.model_dump(mode="json", exclude={"output"}), sort_keys=True)
 
 
-def _at_the_places_of(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
+def _match_leaves(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
     """Return a checkpoint's configuration, with places and the section ``output`` of another."""
     places = {}
     for key in PATH_KEYS:

@@ -16,7 +16,7 @@ import numpy as np
 
 from drgs.core.errors import UserError
 from drgs.core.types import Float, UInt32
-from drgs.splatting.rendering import decode_fault
+from drgs.splatting.rendering import decode_nonfinite
 
 
 class NonFiniteError(UserError):
@@ -35,16 +35,16 @@ class WatchedIteration:
     number: int
     view: str
     loss: Float  # (1,)
-    first_fault: UInt32  # (1,), of the gradients: see drgs.splatting.rendering.decode_fault
+    first_nonfinite: UInt32  # (1,), of the gradients: see drgs.splatting.rendering.decode_fault
     numbers: Mapping[str, dr.ArrayBase]  # by name: of the view, optimised by effects
 
     def faults(self) -> Iterator[str]:
         """Yield what is not finite; waits for the device."""
         # First: what is wrong with them is wrong with all that follows.
         for name, values in self.numbers.items():
-            if (first := _first_fault(np.array(values))) is not None:
+            if (first := _first_nonfinite(np.array(values))) is not None:
                 yield f"{name} is {first[1]}"
-        loss, fault = float(self.loss[0]), decode_fault(int(self.first_fault[0]))
+        loss, fault = float(self.loss[0]), decode_nonfinite(int(self.first_nonfinite[0]))
         if not math.isfinite(loss):
             yield f"the loss is {loss}"
         if fault is not None:
@@ -88,7 +88,7 @@ def check_values(
         if on_device and dr.all(dr.isfinite(dr.detach(array).array)):
             continue
         host = np.atleast_1d(np.array(dr.detach(array) if on_device else array))
-        if (first := _first_fault(host)) is not None:
+        if (first := _first_nonfinite(host)) is not None:
             row, value = first
             message = f"after iteration {iteration}: {name} is {value} in row {first_row + row}"
             if views:
@@ -96,7 +96,7 @@ def check_values(
             raise NonFiniteError(message, iteration)
 
 
-def _first_fault(array: np.ndarray) -> tuple[int, float] | None:
+def _first_nonfinite(array: np.ndarray) -> tuple[int, float] | None:
     """Return the first row, and in it the first value, that is not finite; None: all are."""
     faults = np.argwhere(~np.isfinite(array))
     return (int(faults[0][0]), float(array[tuple(faults[0])])) if len(faults) else None

@@ -54,8 +54,8 @@ from drgs.results.metrics import (
     mean_quality,
 )
 from drgs.results.refined_cameras import write_views
-from drgs.results.report import Fitted, write_images, write_results
-from drgs.results.viewer import Shown, shows_as_fitted
+from drgs.results.report import FitImages, write_images, write_results
+from drgs.results.viewer import DisplaySettings, shows_as_fitted
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.training.loop import History
 from drgs.training.parallel.inputs import versions
@@ -169,7 +169,7 @@ class FitFolder:
             shown = gaussians_on_page(gaussians, approximations, other)
             scene = trainer.full_scene()
             assert scene is not None, "rank 0 writes the results"
-            fitted = Fitted(scene, gaussians, render, shown)
+            fitted = FitImages(scene, gaussians, render, shown)
             write_results(out, dataset, fitted, scores, history, metrics)
         self.finish(metrics)
         return metrics
@@ -207,22 +207,22 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
     """
     others = config.model.approximations.others_than_default
     gaussians = replace(gaussians, rendered_with=others or None)
-    return _without_filter(gaussians) if config.output.bake_smoothing else gaussians
+    return _remove_filter(gaussians) if config.output.bake_smoothing else gaussians
 
 
 def gaussians_on_page(
     gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
-) -> Shown:
+) -> DisplaySettings:
     """Return the Gaussians of ``viewer.html``: the fit's own, if it renders their approximations.
 
     for_viewers: shown otherwise; None: there are none.
     """
     if for_viewers is not None and not shows_as_fitted(approximations):
-        return Shown(for_viewers, Approximations())
-    return Shown(_without_filter(gaussians), approximations)
+        return DisplaySettings(for_viewers, Approximations())
+    return DisplaySettings(_remove_filter(gaussians), approximations)
 
 
-def _without_filter(gaussians: Gaussians) -> Gaussians:
+def _remove_filter(gaussians: Gaussians) -> Gaussians:
     if gaussians.smoothing is None:
         return gaussians
     from drgs.effects.smoothing import bake_smoothing  # imported where there is a filter

@@ -23,7 +23,7 @@ from drgs.results.metrics import psnr
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
 
-SMOOTHING = 0.9
+PSNR_SMOOTHING = 0.9
 """Weight of the past in the PSNR of training views, each of which is another photograph."""
 
 MAX_MEASURED_VIEWS = 8
@@ -93,7 +93,7 @@ class History(FitHistory):
 
 def smoother(past: float | None, value: float) -> float:
     """Return the next value of a smooth line, given the one before it (None: there is none)."""
-    return value if past is None else SMOOTHING * past + (1 - SMOOTHING) * value
+    return value if past is None else PSNR_SMOOTHING * past + (1 - PSNR_SMOOTHING) * value
 
 
 def exponential_mean(values: Iterable[float]) -> np.ndarray:

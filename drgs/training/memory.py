@@ -84,7 +84,7 @@ class Share:
     on_machine: int = 1  # of these, that share the machine's memory
 
 
-ALONE = Share()
+WHOLE_SHARE = Share()
 
 
 def estimate(
@@ -93,7 +93,7 @@ def estimate(
     gaussians: Gaussians,
     view_bytes: int,
     scale: float = 1.0,
-    share: Share = ALONE,
+    share: Share = WHOLE_SHARE,
 ) -> FitMemory:
     """Estimate the peak, in one process, of a fit that starts with ``gaussians``.
 
@@ -111,7 +111,7 @@ def estimate(
     )
 
     fitted = count * (1 + FITTED_REACH * math.sqrt(pixels / count)) ** 2
-    entries, slots = _at_start(train, gaussians, config.model.near_plane, scale)
+    entries, slots = _bytes_at_start(train, gaussians, config.model.near_plane, scale)
     entries, slots = max(entries, fitted), max(slots, FITTED_SLOTS * fitted)
     numbers = 11 + 3 * (config.model.sh_degree + 1) ** 2
     of_gaussian = NUMBER_BYTES * numbers + GAUSSIAN_BYTES + (GROWTH_BYTES if count > start else 0)
@@ -138,7 +138,7 @@ def _kept_bytes(view: View, scale: float) -> float:
 
 
 @np.errstate(over="ignore")  # of scales beyond all images
-def _at_start(
+def _bytes_at_start(
     views: Sequence[Viewpoint], gaussians: Gaussians, near: float, scale: float
 ) -> tuple[float, float]:
     """Count entries and slots of the view that has most, of some: splats taken as round."""
@@ -177,7 +177,7 @@ def room_for_targets(
     gaussians: Gaussians,
     view_bytes: int,
     most: int,
-    share: Share = ALONE,
+    share: Share = WHOLE_SHARE,
 ) -> int:
     """Return the bytes of targets that may stay on the device, at most ``most``.
 
@@ -215,7 +215,7 @@ def _refusal(
     remedies = [f"densify.max_gaussians={most}"] if most else []
     remedies += [f"data.image_size={size}"] if size else []
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
-    who = "the fit" if share == ALONE else "a process of the fit"
+    who = "the fit" if share == WHOLE_SHARE else "a process of the fit"
     part = "" if share.processes == 1 else f"1/{share.processes} of "
     return (
         f"memory: {who} needs about {readable(memory.required_bytes)} "

@@ -142,7 +142,7 @@ def plan_step(
     first, last = iterations[0], iterations[-1]
     stage = next(stage for stage in stages if first <= stage.until)
     is_late = rates.means.progress(first) > config.optimizer.views_from
-    is_settled = first >= config.densify.settled_from(config.iterations)
+    is_settled = first >= config.densify.settled_iteration(config.iterations)
     late_views = config.optimizer.views if is_late and is_settled else 1
     order = len(stage.views), config.seed, views_per_step
     return Step(
@@ -192,7 +192,7 @@ class ViewGradients:
     means2d_grad: Array2f | TensorXf  # (N, 2): derivative of the step's loss, per px
     visible: Bool  # (N,): the splat's extent touches the film
     weighted_sums: Mapping[str, Float]  # (N,), by name: see DensityStrategy.pixel_weights
-    first_fault: UInt32  # (1,): see drgs.splatting.rendering.decode_fault
+    first_nonfinite: UInt32  # (1,): see drgs.splatting.rendering.decode_fault
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ from drgs.training.optimizer import (
 )
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import (
-    check_can_be_shared,
+    check_shardable,
     local_gaussians,
     make_population,
 )
@@ -122,7 +122,7 @@ class Trainer:
         views_per_step = config.optimizer.views_per_step
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
-        check_can_be_shared(config, comm.size, gaussians.num_gaussians)
+        check_shardable(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset, effects)
         self._given_density, self._given_effects, self._given_loss = density, effects, loss
         share = Share(comm.size, comm.num_on_machine)
@@ -270,7 +270,7 @@ class Trainer:
         first_row = self.population.first_row * len(PARAMETER_NAMES)
         for view, gradients, loss in zip(step.views, found, shared, strict=True):
             total = cast(Float, sum(penalties, loss.loss))
-            fault = gradients.first_fault
+            fault = gradients.first_nonfinite
             if first_row:
                 fault = dr.select(
                     fault == NO_FAULT, fault, fault + dr.opaque(type(fault), first_row)

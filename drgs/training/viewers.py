@@ -23,7 +23,7 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
-from drgs.effects.smoothing import bake_smoothing, baked_for_viewers
+from drgs.effects.smoothing import bake_for_viewers, bake_smoothing
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -111,7 +111,7 @@ def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
     on_device = bake_smoothing(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
         cameras = map(camera_from_sensor, states)
-        return baked_for_viewers(on_device, cameras, trainer.config.model.approximations)
+        return bake_for_viewers(on_device, cameras, trainer.config.model.approximations)
 
 
 def tuning(config: FitConfig) -> FitConfig:

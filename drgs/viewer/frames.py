@@ -28,7 +28,7 @@ from drgs.integrator.scene import NEAR_CLIP, film_description, make_scene, make_
 from drgs.results.metrics import psnr
 
 MAX_SCENES = 2  # scenes kept, each with a copy of the Gaussians: ``error`` needs two
-BACKDROP = 0.12  # grey behind depths, normals and opacities
+BACKDROP_GRAY = 0.12  # grey behind depths, normals and opacities
 MIN_DEPTH_ALPHA = 0.5  # opacity from which a pixel's depth counts for the range of colours
 DEPTH_RANGE = (2, 98)  # percentiles of these depths at the ends of the colour map
 
@@ -160,7 +160,7 @@ def _depth(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     seen = depth[alpha >= MIN_DEPTH_ALPHA]
     if not len(seen):
         return ViewerFrame(
-            to_bytes(np.full((*depth.shape, 3), BACKDROP)), seconds, "nothing is seen"
+            to_bytes(np.full((*depth.shape, 3), BACKDROP_GRAY)), seconds, "nothing is seen"
         )
     near, far = (float(end) for end in np.percentile(seen, DEPTH_RANGE))
     place = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
@@ -210,7 +210,7 @@ def to_bytes(image: np.ndarray) -> np.ndarray:
 def over_backdrop(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Return (H, W, 3) uint8: colours (H, W, 3) with ``alpha`` (H, W) over :data:`BACKDROP`."""
     alpha = alpha[:, :, None]
-    return to_bytes(alpha * colors + (1 - alpha) * BACKDROP)
+    return to_bytes(alpha * colors + (1 - alpha) * BACKDROP_GRAY)
 
 
 # ----------------------------------------------------------------------------------------------

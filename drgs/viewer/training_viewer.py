@@ -30,7 +30,8 @@ REFRESH_SHARE = 0.05  # largest part of the time for frames of a camera that is 
 PROGRESS_SECONDS = 0.5  # time between two reports of progress, where a client reads them
 WAIT_SECONDS = 0.1  # time until a pause notices Ctrl-C
 MAX_POINTS = 300  # points of a curve
-ROOM = 1.1  # iterations that curves have room for, in those that are expected once this has changed
+CURVE_ROOM = 1.1
+"""Length of the curves' axis in expected iterations, when these have changed."""
 
 STEP_BACK = 1.25
 """Distance of the first camera in that of a training camera, so that these are in the image."""
@@ -147,9 +148,9 @@ class TrainingPage(Page):
         )
         self._bar.value = min(100.0, 100.0 * done / max(total, 1))
         curves = psnr_curves(history.rows)
-        if not self._room / ROOM**2 <= total <= self._room:
+        if not self._room / CURVE_ROOM**2 <= total <= self._room:
             # A plan may revise the total twice a second: not each time are the charts drawn again.
-            self._room = round(ROOM * total) if self._charts else total
+            self._room = round(CURVE_ROOM * total) if self._charts else total
             self._draw(curves)
         for chart, curve in zip(self._charts, curves, strict=True):
             chart.data, chart.visible = curve, len(curve[0]) > 0

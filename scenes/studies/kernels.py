@@ -42,7 +42,7 @@ from drgs.bench.timing import (
     steps,
     warm_trainer,
 )
-from drgs.core.private import leave_out_avx512
+from drgs.core.private import disable_avx512
 from drgs.splatting.grid import PIXELS
 
 ROUNDS = 15
@@ -383,7 +383,7 @@ def main() -> None:
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     if args.without_avx512:
-        leave_out_avx512()
+        disable_avx512()
     limits = measure_limits()
     print(
         f"{machine()}; {limits.multiply_adds / 1e9:.1f} G multiply-adds/s in vectors of "

@@ -32,7 +32,7 @@ from drgs.bench.output import machine, markdown_table
 from drgs.bench.timing import seconds, steps
 from drgs.config.changes import with_changes
 from drgs.core.environment import denormals_flushed
-from drgs.core.processes import ending_together, process_number
+from drgs.core.processes import end_job_on_error, process_number
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import GAUSSIANS
@@ -184,7 +184,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, help=argparse.SUPPRESS)  # of one process
     args = parser.parse_args()
     if args.threads is not None:
-        ending_together()(run_process)(args.folder, args.views, args.threads)
+        end_job_on_error()(run_process)(args.folder, args.views, args.threads)
         return
     most = max(args.processes)
     ways = [(0, 1), *((k, 1) for k in args.processes), *([(0, most)] if most > 1 else [])]

@@ -25,7 +25,7 @@ import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table
 from drgs.bench.scenes import mitsuba_sensor
-from drgs.bench.speed import SHELL, volprim_scene
+from drgs.bench.speed import SHELL_STDS, volprim_scene
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
@@ -39,7 +39,7 @@ VOLPRIM = reference_rays.ImageModel(
     alpha_max=0.9999,
     alpha_cut=0.0,
     transmittance_stop=0.01,
-    extent=SHELL,
+    extent=SHELL_STDS,
     step=1e-4,
     low_pass=0.0,
 )

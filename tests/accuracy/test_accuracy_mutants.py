@@ -46,7 +46,7 @@ EQUIVALENT = {
 
 @dataclass(frozen=True)
 class Copies:
-    """Of classes and a function, instrumented."""
+    """Instrumented copies of classes and a function."""
 
     falloff: type
     order: type

@@ -135,7 +135,7 @@ def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monke
 
 
 def test_pixels_that_do_not_count_are_left_out(subject):
-    """Of the photograph."""
+    """The mask is the photograph's."""
     accurate = [accuracy.most_accurate(subject, c, accuracy.LEAST_ALPHA) for c in subject.cameras]
     (view,), mask = subject.photographs, np.ones((24, 24), np.float32)
     mask[:, 5:] = 0
@@ -147,7 +147,7 @@ def test_pixels_that_do_not_count_are_left_out(subject):
 
 
 def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
-    """Of the most accurate form and of all rungs: they agree as they do without it."""
+    """Without the filter, the most accurate form and all rungs agree."""
     gaussians = subject.gaussians
     smoothing = np.full(gaussians.num_gaussians, 0.1, np.float32)
     replace(gaussians, smoothing=smoothing).save(tmp_path / "smooth.ply")
@@ -163,7 +163,7 @@ def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
 
 @pytest.mark.parametrize("has", ["lens distortion", "motion"])
 def test_views_that_are_not_of_pinholes_at_rest_are_refused(tmp_path, capsys, has):
-    """By the folder of a fit; its Gaussians can be measured alone."""
+    """A fit's folder is refused; its Gaussians can be measured alone."""
     dataset = small_capture.make_dataset(2, 1)
     small_capture.write_dataset(tmp_path / "data", dataset)
     path = tmp_path / "data" / "transforms_test.json"

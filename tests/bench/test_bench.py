@@ -35,7 +35,8 @@ def test_stability_writes_its_table_and_plot(stability_run):
 
 @pytest.mark.slow
 def test_stability_finds_no_error_beyond_the_conditioning(stability_run):
-    """As in test_hard_cases.py: 30 times the noise, 4 roundings in the exponential, n in a sum."""
+    """The bounds of test_hard_cases.py: 30 times the noise, 4 roundings in the exponential, n in a
+    sum."""
     with (stability_run / "stability.csv").open() as file:
         for row in csv.DictReader(file):
             layers = float(row["value"]) if row["sweep"] == "Stack depth" else 60

@@ -1,4 +1,4 @@
-"""What effects cost: the command, shrunk, and what it measures."""
+"""Costs of effects: the command with small scenes, and its numbers."""
 
 import csv
 
@@ -46,7 +46,8 @@ def test_the_command_writes_its_table_and_plot(small, tmp_path, capsys):
 
 
 def test_effects_add_operations_and_lower_degrees_take_some_away(small):
-    """Of the kernels of a image and its derivatives: what the table's last column says."""
+    """Operations are those of the kernels of an image and its derivatives, the table's last
+    column."""
     gaussians = scenes.bench_gaussians(150)
     cases = {(c.effect, c.variant): c for c in effects.rendering_cases()}
     plain = effects.operations(effects.CaseRenderer(cases["none", "none"], gaussians))

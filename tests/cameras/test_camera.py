@@ -46,7 +46,7 @@ def test_numbers_are_those_of_the_manuals_definitions(view):
 
 
 def test_a_camera_far_from_the_origin_keeps_its_centre():
-    """Where a translation -R c would have lost 0.06 units, and a film 2 px."""
+    """A translation -R c would have lost 0.06 units there, and 2 px on a film."""
     position = (1e6, -2e6, 5e5)
     view = View("far", to_world=pose([0.3, -1.0, 0.5], 40, position))
     camera = numbers(camera_of(mi.load_dict(view.sensor())))

@@ -76,7 +76,7 @@ def test_unscented_splats_have_the_mean_and_covariance_of_projected_samples(name
         found += zip(rows(splats.means2d), covariances(splats), strict=True)
 
     def errors(found) -> tuple[float, float]:
-        """Of means and of covariances, relative to the splats' sizes."""
+        """Return errors of means and covariances, relative to the splats' sizes."""
         pairs = list(zip(found, by_samples, strict=True))
         sizes = [np.sqrt(np.trace(cov)) for _, (_, cov) in pairs]
         means = [np.abs(a[0] - b[0]).max() for a, b in pairs]

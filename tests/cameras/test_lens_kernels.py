@@ -1,4 +1,4 @@
-"""What a lens does not need is in no kernel; positions that are no numbers."""
+"""Kernels contain only what a lens needs; positions that are not finite."""
 
 import math
 from dataclasses import replace
@@ -229,7 +229,7 @@ def test_each_coefficient_of_a_fisheye_adds_operations():
     ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
 )
 def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
-    """As with them far away: the same image and the same gradients of all others."""
+    """The image and all other gradients are those of the same Gaussians far away."""
     case = clear(case_of(name, count=30))
     means = case.gaussians.means.copy()
     bad = np.array([

@@ -1,4 +1,4 @@
-"""What lenses see, and the rays on which they see it."""
+"""The region that a lens sees, and rays within it."""
 
 from dataclasses import replace
 
@@ -113,7 +113,7 @@ def test_what_lies_beyond_the_lens_model_does_not_fold_back(precision, lens):
     assert inside.sum() >= 3
     splats = splats_of(gaussians_at(points), camera, lens, precision)
     assert not np.array(splats.visible).any()
-    for name in ("means2d", "whitening", "depths", "variances"):
+    for name in ("means2d", "conic_factor", "depths", "variances"):
         assert np.isfinite(rows(getattr(splats, name))).all()
     # As near as single precision can tell, what lies within is seen.
     limit = 1 - 1e-5
@@ -142,7 +142,7 @@ def test_a_lens_knows_the_slopes_on_its_films_border(precision, name):
     expected = lens.slope_bounds(camera)
     actual = lens_camera(camera, lens, precision).lens.on_film
     if expected is None:
-        expected = [[-distortion.UNBOUNDED] * 2, [distortion.UNBOUNDED] * 2]
+        expected = [[-distortion.UNBOUNDED_SLOPE] * 2, [distortion.UNBOUNDED_SLOPE] * 2]
     tolerance = {FLOAT64: 1e-12, FLOAT32: 1e-6}[precision]
     np.testing.assert_allclose([rows(b)[0] for b in actual], expected, rtol=tolerance)
 
@@ -158,7 +158,7 @@ def test_slopes_are_bounded_while_the_lens_reaches_the_whole_border(precision, p
     expected = lens.slope_bounds(camera)
     assert (expected is not None) == (part < np.sqrt(0.5))
     if expected is None:
-        expected = [[-distortion.UNBOUNDED] * 2, [distortion.UNBOUNDED] * 2]
+        expected = [[-distortion.UNBOUNDED_SLOPE] * 2, [distortion.UNBOUNDED_SLOPE] * 2]
     # Near the fold the inverse is steep: a rounding of the radius, over sqrt(1 - part^2).
     tolerance = {FLOAT64: 1e-9, FLOAT32: 1e-4}[precision]
     np.testing.assert_allclose([rows(b)[0] for b in bounds], expected, rtol=tolerance)
@@ -197,7 +197,7 @@ def rays_of(camera, lens, film, precision) -> np.ndarray:
 @both_precisions
 @every_lens
 def test_a_ray_is_seen_where_it_starts(precision, name):
-    """By the reference, wherever the lens shows anything."""
+    """The reference projects points of rays, wherever the lens shows anything."""
     lens, camera = LENSES[name], camera_behind(case_of(name), np.random.default_rng(0))
     y, x = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
     film = np.column_stack([x, y])

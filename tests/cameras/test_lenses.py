@@ -137,7 +137,8 @@ def test_each_number_of_the_gradients_equals_a_difference_of_the_reference(name,
 def test_gradients_equal_differences_of_the_reference_along_a_direction(
     name, antialiased, monkeypatch
 ):
-    """Of each parameter; in larger scenes, without the pixels that a step may take to a jump."""
+    """One direction for each parameter; larger scenes leave out pixels that a step may take to a
+    jump."""
     case = clear(case_of(name, antialiased=antialiased, threshold_width=1e-3))
     keep_bounds(case, monkeypatch)
     check_against_differences(case, kernel_gradients, DIFFERENCES)

@@ -245,7 +245,7 @@ def test_motion_along_the_rows_is_exact_in_the_middle_of_each_row():
 
 @pytest.mark.parametrize("turn", [0.03, 0.1, 0.3])
 def test_times_are_found_though_the_camera_turns_by_a_third_of_the_film(turn):
-    """Of the fraction of the turn that a splat is seen after. Measured: 3e-15."""
+    """Times are fractions of the turn at which a splat is seen. Measured: 3e-15."""
     case = case_of("pinhole", samples=0, turn=turn, travel=0.0)
     camera = case.device_camera(FLOAT64)
     rows_of = load_rows(device_gaussians(case.gaussians, FLOAT64), 0)
@@ -269,7 +269,7 @@ DIFFERENCES = 1e-6
 
 
 def kernel_gradients(case, precision, cotangents):
-    """Of the mean over the times."""
+    """Return gradients of the mean over the times."""
     gaussians, frames = case.frames(precision)
     d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
     parts = [
@@ -313,7 +313,7 @@ def test_single_precision_gradients_equal_double_precision(samples):
 
 
 def test_gradients_with_respect_to_the_motion_equal_their_own_differences():
-    """Of a rolling shutter's travel and turn: what a calibration of the motion would need."""
+    """A calibration of the motion needs those of a rolling shutter's travel and turn."""
     case = clear(case_of("pinhole", samples=0, threshold_width=1e-3))
     weights = single(np.random.default_rng(1).normal(size=(5, case.height * case.width)))
     gaussians, (frame,) = case.frames(FLOAT64)

@@ -34,7 +34,7 @@ def turns() -> np.ndarray:
     """(N, 3), radians: every size from nothing to almost half a turn, about every axis."""
     rng = np.random.default_rng(0)
     angles = np.concatenate([[0], 10.0 ** np.arange(-20, 0.4, 0.1), np.linspace(1, 3.1, 50)])
-    at = shutter.SLOWEST * (1 + np.array([-1e-2, -1e-6, 1e-6, 1e-2]))
+    at = shutter.MIN_TURN_RAD * (1 + np.array([-1e-2, -1e-6, 1e-6, 1e-2]))
     angles = np.concatenate([angles, at])
     axes = rng.normal(size=(len(angles), 3))
     axes[:6] = np.concatenate([np.eye(3), -np.eye(3)])
@@ -60,7 +60,7 @@ def test_the_turn_of_a_rotation_is_found_again(precision):
     # SLOWEST the angle is its sine: off by SLOWEST^3 / 6.
     tolerance = {FLOAT64: 1e-14, FLOAT32: 1e-6}[precision] / np.sin(np.clip(angles, 0.5, 3.1))
     errors = np.abs(actual - turns()).max(axis=1)
-    assert (errors <= tolerance + (angles < 2 * shutter.SLOWEST) * 2e-13).all()
+    assert (errors <= tolerance + (angles < 2 * shutter.MIN_TURN_RAD) * 2e-13).all()
 
 
 @both_precisions

@@ -1,4 +1,4 @@
-"""Where the cameras of a capture stand, if nobody says."""
+"""Default camera positions of a capture."""
 
 import math
 from dataclasses import replace

@@ -74,7 +74,7 @@ def test_a_note_is_a_line_of_the_output():
 
 
 def test_pillow_notes_nothing(tmp_path, monkeypatch):
-    """Of a image that is large, but not too large for us."""
+    """Pillow warns of large images that are not too large for drgs."""
     write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
 
@@ -144,7 +144,7 @@ def interrupted():
 
 
 def interrupted_in_a_callback():
-    """As Dr.Jit does it, whose own error hides what was raised within."""
+    """Raise as Dr.Jit does, whose own error hides the exception raised within it."""
     try:
         interrupted()
     except KeyboardInterrupt as cause:

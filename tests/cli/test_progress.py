@@ -36,7 +36,7 @@ def test_a_log_file_gets_a_line_every_ten_seconds_and_the_last(clock, capsys):
 
 
 def test_the_pace_is_that_since_the_first_update(clock, capsys):
-    """What is there already when it begins takes no time, and compiling is no iteration."""
+    """Work done before the start takes no time, and compiling is no iteration."""
     with RunProgress("iteration", 1000, done=400) as shown:
         clock[0] += 60.0
         shown.update(401, 1000, "loss 0.1")
@@ -64,7 +64,7 @@ def no_notebook(monkeypatch):
 
 
 def written_to(monkeypatch, is_terminal, **variables):
-    """By 2 of 3 images, and then the third."""
+    """Return the output after 2 of 3 images, and after the third."""
 
     class Stream(io.StringIO):
         def isatty(self):

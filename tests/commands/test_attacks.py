@@ -1,4 +1,4 @@
-"""What the commands are attacked with: see ``support.attacks``, where the rules stand.
+"""Attacks on the commands: see ``support.attacks``, which documents the rules.
 
 By default some hundreds that are over in milliseconds, in this process; the slow test has
 thousands, in a process of their own. A failure names the attacks; to repeat one of them:

@@ -440,7 +440,7 @@ def test_folders_of_others_are_left_alone(ball, captured, tmp_path, capsys):
 
 
 def test_cameras_that_see_nothing_are_refused_before_images_are_taken(ball, tmp_path, capsys):
-    """Of points there are none then, which was found out after all of the images."""
+    """No camera sees a point then, which was found only after rendering all images."""
     with pytest.raises(SystemExit) as stop:
         run(ball, tmp_path / "out", *SMALL, "--distance", 3, "--target", 900, 0, 0)
     assert stop.value.code == 2

@@ -75,7 +75,7 @@ def test_files_that_were_edited_since_are_kept(ball, captured, tmp_path):
 
 
 class Killed(BaseException):
-    """What ends the process; nothing of it cleans up."""
+    """An exception that ends the process without any cleaning up."""
 
 
 @pytest.mark.parametrize("place", ["before", "behind"])

@@ -152,7 +152,7 @@ def test_damaged_transforms_files_are_read_or_refused(photographs):
 
 @pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])
 def test_damaged_masks_are_read_or_refused(photographs, layout):
-    """Of 1 and 0, whatever the file is, where the photograph still has one."""
+    """A mask contains only 0 and 1, whatever the file is, and its photograph is complete."""
     folder = photographs / "masks" if layout == "COLMAP" else photographs
     if layout == "COLMAP":
         (photographs / "transforms.json").unlink()
@@ -183,7 +183,7 @@ def test_damaged_masks_are_read_or_refused(photographs, layout):
 
 
 def test_strange_names_are_found_or_said(photographs):
-    """Of photographs, masks, clouds and lists: what is taken is a file, and none is taken twice."""
+    """Names of photographs, masks, clouds and lists: only files are read, and none twice."""
     path, refused = photographs / "transforms.json", []
     meta = json.loads(path.read_text())
     parts = [

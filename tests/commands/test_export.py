@@ -221,7 +221,7 @@ def means_of(path):
     ("suffix", "up"), [(".glb", [0, 1, 0]), (".spz", [0, 1, 0]), (".compressed.ply", [0, -1, 0])]
 )
 def test_what_is_up_in_the_model_is_up_in_the_file(model, suffix, up):
-    """That of a format that says so; y points down in the others, as in COLMAP's worlds."""
+    """One format records its up axis; in the others y points down, as in COLMAP's worlds."""
     out = model.with_name(f"out{suffix}")
     direction = np.array([0.0, 3, 4]) / 5
     run(model, "--out", out, "--up", *(1e100 * direction))  # of any length

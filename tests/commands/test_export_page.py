@@ -37,7 +37,7 @@ def configure(folder, model):
 
 
 def exported(what, out, *options):
-    """What the command says, the page's scene and its Gaussians."""
+    """Return the command's output, the page's scene and its Gaussians."""
     outcome = assert_ends_well(export.main, what, "--out", out, *options)
     page = out.read_text("utf-8")
     scene, splats = (re.search(rf'id="{name}">([^<]*)<', page)[1] for name in ("scene", "splats"))

@@ -247,7 +247,7 @@ def test_the_resolved_configuration_gives_the_same_bytes_on_any_number_of_thread
 
 
 def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
-    """Of 30,000 Gaussians, a few have moments that are denormal numbers from the start."""
+    """Some moments of 30,000 Gaussians are denormal numbers from the start."""
     config = load_config(REPOSITORY / "scenes" / "lego_mini.yml")
     trainer = make_trainer(config)
     start, results = trainer.state(), {}
@@ -263,7 +263,7 @@ def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
 
 
 def test_another_seed_gives_another_result(configuration):
-    """Of the points to start with, and of the order of the views."""
+    """The seed chooses the initial points and the order of the views."""
     results = []
     for seed in (0, 0, 1):
         trainer = make_trainer(load_config(configuration, [f"seed={seed}"]))

@@ -40,7 +40,7 @@ RESULTS = {
 
 
 class Killed(BaseException):
-    """What no code handles."""
+    """An exception that no code handles."""
 
 
 class Revised:
@@ -116,7 +116,7 @@ def assert_done(out):
 
 
 def assert_same_again(out, again):
-    """What ``config.yml`` says gives the same bytes."""
+    """Check that a fit of ``config.yml`` gives the same bytes."""
     assert_fits(out / "config.yml", "--out", again)
     for name in ("point_cloud.ply", "renders/test/r_1.png"):
         assert (out / name).read_bytes() == (again / name).read_bytes(), name

@@ -180,7 +180,7 @@ def another_image(folder, split="train"):
 
 
 def other_sizes(folder):
-    """Of all training images."""
+    """Return other sizes for all training images."""
     from PIL import Image
 
     for path in (folder / "train").iterdir():

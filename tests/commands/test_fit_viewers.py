@@ -49,7 +49,7 @@ def test_both_files_say_what_they_are_rendered_with(fitted):
 
 
 def test_what_viewers_show_is_measured(fitted, tmp_path):
-    """By the float64 reference, which renders as viewers do."""
+    """The float64 reference renders as viewers do."""
     out, outcome = fitted
     metrics = json.loads((out / METRICS).read_text())
     dataset = load_dataset(load_config(out / "config.yml").data)

@@ -35,7 +35,7 @@ def matrices(camera):
 
 @cache
 def cameras():
-    """Of the case, and one that is moved, turned and zoomed."""
+    """Return the case's camera, and one that is moved, turned and zoomed."""
     camera = clear(CASE).camera
     turn = reference.quat_to_rotation(np.array([[1.0, 0.05, -0.04, 0.08]]))[0]
     other = replace(
@@ -112,7 +112,7 @@ def test_images_equal_the_reference(mode):
 
 
 def test_colors_of_any_number_of_channels_are_composited():
-    """As spherical harmonics of degree 0 whose colours they are."""
+    """They equal spherical harmonics of degree 0 with these colours."""
     arrays = scene()
     flat = arrays["colors"][:, 0] * 0.28209479177387814 + 0.5
     flat = np.maximum(flat, 0)
@@ -216,7 +216,8 @@ def tangents_of(arrays, tangents, name, fixed=()):
 
 
 def gradients_of(arrays, weights, name, fixed=()):
-    """Of the sum of weighted images and alphas, numpy, by input that is not fixed."""
+    """Return numpy gradients of the sum of weighted images and alphas, by input that is not
+    fixed."""
     inputs = tensors(arrays)
     dr.enable_grad([value for key, value in inputs.items() if key not in fixed])
     found = results(inputs, name)

@@ -140,7 +140,7 @@ def test_values_of_the_configuration_can_be_set(fit, tmp_path):
 
 def test_a_image_equal_to_its_photograph_has_no_number_in_json():
     quality = {"psnr": float("inf"), "views": {"a": {"psnr": 3.5}}}
-    assert render._without_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
+    assert render._replace_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
 
 
 # ----------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def test_cameras_of_a_transforms_file_give_the_images_of_the_split(fit, tmp_path
 
 
 def write_camera(path, begin, end=None, **says):
-    """Of the small size, in the layout of transforms.json; end: its second pose."""
+    """Write a small camera in the layout of transforms.json; end: its second pose."""
     frame = {"transform_matrix": (begin * [1, -1, -1, 1]).tolist(), **says}
     if end is not None:
         frame["transform_matrix_close"] = (end * [1, -1, -1, 1]).tolist()
@@ -219,7 +219,7 @@ def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path, samples):
 
 @pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
 def test_the_plan_regards_all_cameras_and_names_what_is_ignored(fit, tmp_path, capsys, ignored):
-    """Of a file and of a Mitsuba scene, the first of which is a plain one."""
+    """Cameras come from a file, and from a Mitsuba scene whose first camera is plain."""
     path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3))
     values = json.loads(path.read_text())
     close = {"transform_matrix_close": values["frames"][0]["transform_matrix"]}

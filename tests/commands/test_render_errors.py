@@ -1,4 +1,4 @@
-"""What ``python -m drgs.render`` refuses, in one line, without writing anything."""
+"""Errors of ``python -m drgs.render``: one line, and nothing is written."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""What ``python -m drgs.render`` cannot show, hold or write is refused before anything is."""
+"""Requests that ``python -m drgs.render`` cannot show, hold or write are refused at the start."""
 
 import os
 
@@ -60,7 +60,7 @@ def test_the_largest_animation_is_allowed():
 
 
 def test_the_suffix_may_have_capital_letters(model, tmp_path):
-    """As Windows programs write it."""
+    """Windows programs write such suffixes."""
     (tmp_path / "MODEL.PLY").write_bytes(model.read_bytes())
     size = ("--size", 8, 6)
     outcome = run_in_process(

@@ -32,7 +32,7 @@ def model_of(args):
 
 @pytest.mark.parametrize("refined", [False, True])
 def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path, refined):
-    """As refined, where the fit has refined them."""
+    """Refined cameras are used, where the fit has refined them."""
     run = tmp_path / "run"
     shutil.copytree(fit, run)
     config = yaml.safe_load((run / "config.yml").read_text())

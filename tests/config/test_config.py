@@ -337,7 +337,7 @@ def test_a_dumped_configuration_reloads_equal(load, tmp_path, text):
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
 def test_shipped_configurations_load(scene):
-    """Of the shipped scene, or of data that is told where to get."""
+    """Each names a shipped scene, or leaves the data to the user."""
     config = load_config(scene)
     shipped = config.data.path == REPOSITORY / "scenes" / "lego"
     assert shipped or config.data.path.is_relative_to(REPOSITORY / "data")

@@ -1,4 +1,4 @@
-"""What a configuration accepts, a fit can compute with."""
+"""Values that a configuration accepts are values that a fit can compute with."""
 
 import math
 import warnings

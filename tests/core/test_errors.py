@@ -62,7 +62,7 @@ def test_commands_name_a_package_that_cannot_be_imported(capsys):
 
 
 def test_a_reader_of_the_output_may_go(run_python):
-    """Of two processes: what is printed has to go through a pipe."""
+    """Two processes are needed: the output has to go through a pipe."""
     program = (
         "import os, sys\n"
         "from drgs.cli.ending import exit_on_user_error\n"

@@ -131,7 +131,7 @@ def test_a_file_may_be_too_large_to_be_opened(tmp_path):
 
 @pytest.mark.parametrize("letter", ["x", "\u00e4"])
 def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path, letter):
-    """That of the temporary file would be longer."""
+    """The temporary file's name would be longer."""
     path = tmp_path / f"{letter * (250 // len(letter.encode()))}.txt"
     with atomic_path(path) as temporary:
         temporary.write_text("x")

@@ -1,4 +1,4 @@
-"""What memory there is, as the kernel's files say; what is refused because it cannot be held."""
+"""Available memory, from the kernel's files; requests that exceed it are refused."""
 
 import errno
 import subprocess
@@ -27,7 +27,7 @@ def kernel(tmp_path, monkeypatch):
     """A folder with the kernel's files: of a machine with 8 GB to give, and no control group."""
     monkeypatch.setattr(memory, "_PROC", tmp_path / "proc")
     monkeypatch.setattr(memory, "_CGROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(memory, "_of_process", lambda: memory._UNLIMITED)
+    monkeypatch.setattr(memory, "_of_process", lambda: memory._UNLIMITED_BYTES)
     machine = SimpleNamespace(available=8_000_000 * 1024)
     monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: machine)
     write(tmp_path / "proc" / "self", cgroup="")
@@ -65,7 +65,7 @@ def test_a_control_group_of_version_2_limits_it(kernel, path):
     ],
 )
 def test_exhausted_memory_is_told_from_other_errors(kernel, error, is_exhausted):
-    reason = memory.why_out_of_memory(error)
+    reason = memory.out_of_memory_reason(error)
     assert (reason is not None) == is_exhausted
     assert reason is None or "8.19 GB are available; close other programs" in reason
 
@@ -119,37 +119,37 @@ def eight_gigabytes(monkeypatch):
 
 
 def test_a_image_that_fits_is_not_refused(eight_gigabytes):
-    assert memory.why_too_large(400, 400) is None
-    assert memory.why_too_large(4000, 5000) is None
+    assert memory.too_large_reason(400, 400) is None
+    assert memory.too_large_reason(4000, 5000) is None
 
 
 def test_a_image_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
     needed = 20_000**2 * memory.IMAGE_BYTES / GB
-    assert memory.why_too_large(20_000, 20_000) == (
+    assert memory.too_large_reason(20_000, 20_000) == (
         f"20000 x 20000 px need about {needed:g} GB of memory, of which 8 GB are available; at "
         f"most {8 * GB // memory.IMAGE_BYTES:,} pixels fit"
     )
-    assert "with 1,000 samples each need about" in memory.why_too_large(400, 400, samples=1000)
+    assert "with 1,000 samples each need about" in memory.too_large_reason(400, 400, samples=1000)
 
 
 def test_what_fits_into_memory_may_be_too_many_for_the_library(monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 10**15)
-    assert memory.why_too_large(2**15, 2**15 - 1) is None
-    assert memory.why_too_large(10**9, 100) == (
+    assert memory.too_large_reason(2**15, 2**15 - 1) is None
+    assert memory.too_large_reason(10**9, 100) == (
         "1000000000 x 100 px are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
         "1,073,741,823 pixels fit"
     )
-    assert "too many for Dr.Jit" in memory.why_too_large(400, 400, samples=10**9)
-    assert "too many for Dr.Jit" in memory.why_too_large(2000, 2000, channels=2000)
+    assert "too many for Dr.Jit" in memory.too_large_reason(400, 400, samples=10**9)
+    assert "too many for Dr.Jit" in memory.too_large_reason(2000, 2000, channels=2000)
 
 
 def test_what_drjit_holds_for_its_next_arrays_is_available(monkeypatch):
     rooms = [10**9]
     monkeypatch.setattr(memory, "available_memory", lambda: rooms[-1])
     monkeypatch.setattr(dr, "flush_malloc_cache", lambda: rooms.append(8 * GB))
-    assert memory.why_too_large(3000, 3000) is None
+    assert memory.too_large_reason(3000, 3000) is None
     assert len(rooms) == 2
-    assert memory.why_too_large(3000, 3000) is None
+    assert memory.too_large_reason(3000, 3000) is None
     assert len(rooms) == 2
 
 

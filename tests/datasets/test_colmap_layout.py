@@ -218,7 +218,7 @@ def test_the_mask_of_the_whole_name_is_preferred(tmp_path):
 
 
 def test_masks_may_be_for_larger_images(tmp_path):
-    """Those of COLMAP's are for the images that it saw. A pixel counts where all of it does."""
+    """COLMAP's masks belong to its input images. A pixel counts where all of its area does."""
     write_dataset(tmp_path)
     write_images(tmp_path / "images_2", size=(320, 240))
     mask = np.full((480, 640), 255, np.uint8)
@@ -370,7 +370,7 @@ def test_a_file_is_not_taken_for_two_photographs(tmp_path):
 
 @pytest.mark.parametrize("below", ["sparse/0", "."])
 def test_test_views_are_those_of_a_list(tmp_path, below):
-    """As the 3DGS reference reads it."""
+    """The list is the one that the 3DGS reference reads."""
     write_dataset(tmp_path)
     (tmp_path / below / "test.txt").write_text("\ufeff# held out\r\nb.jpg\r\ncam/2.png\r\n")
     dataset, notes = load_noting(tmp_path)

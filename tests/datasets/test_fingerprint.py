@@ -1,4 +1,4 @@
-"""What is the same data, and what is not, is found by content, wherever the data lies."""
+"""Fingerprints compare data by content, wherever it is stored."""
 
 import json
 import shutil

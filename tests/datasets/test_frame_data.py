@@ -32,7 +32,7 @@ def view_named(dataset, name="01"):
 
 
 def index_of(folder, name="01.png"):
-    """Of a photograph's frame in the file, as errors name it."""
+    """Return the frame of a photograph in the file, as errors name it."""
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     return next(k for k, f in enumerate(frames) if f["file_path"].endswith(name))
 
@@ -114,7 +114,8 @@ def test_a_missing_mask_or_depth_is_named(photographs, key, ignore, kind):
 
 
 def test_few_missing_masks_take_their_photographs_along_and_depths_do_not(photographs):
-    """What a mask hides is not to be fitted; what has no depth can be."""
+    """A photograph without its mask would be fitted where it must not; one without depth can be
+    used."""
     iio.imwrite(photographs / "mask.png", GREY_MASK)
     np.save(photographs / "depth.npy", np.ones((6, 8)))
     for name in ("01", "02", "03", "04"):
@@ -132,7 +133,7 @@ def test_few_missing_masks_take_their_photographs_along_and_depths_do_not(photog
 
 
 def test_a_mask_may_be_an_alpha_channel_or_any_colour(photographs):
-    """What is transparent, or dark in all channels, does not count."""
+    """Transparent pixels, and those that are dark in all channels, do not count."""
     counts = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
     white, zero = np.full((6, 8, 3), 255), 0 * counts
     renders = {}
@@ -231,7 +232,7 @@ def test_depths_of_a_image_are_in_steps_of_a_unit(photographs, place, values, un
 def test_depths_of_an_array_are_in_scene_units_or_in_those_that_are_stated(
     photographs, dtype, shape, values, unit
 ):
-    """What is not finite or not positive is not known."""
+    """Depths that are not finite or not positive are unknown."""
     depths = np.random.default_rng(0).uniform(5, 90, (6, 8)).astype(dtype)
     if dtype != np.uint16:
         depths[0, :5] = [np.nan, np.inf, -1, 0, np.finfo(dtype).max]
@@ -294,7 +295,7 @@ def test_an_array_that_holds_no_depths_is_refused(photographs, write, message):
     ids=["8 bits", "colours"],
 )
 def test_a_image_of_depths_has_16_bits(photographs, pixels, mode):
-    """Of 8 bits its numbers would be read as others."""
+    """Numbers of an image of 8 bits would be read as other depths."""
     iio.imwrite(photographs / "depth.png", pixels)
     give(photographs, depth_file_path="depth.png")
     assert refusal(photographs) == (
@@ -403,7 +404,7 @@ def test_wrong_motion_is_refused_with_the_key(photographs):
 
 
 def test_transparency_is_kept(photographs):
-    """Of photographs that are transparent; not otherwise."""
+    """Only transparent photographs have an alpha channel."""
     rgba = np.random.default_rng(0).integers(0, 256, (6, 8, 4), np.uint8)
     iio.imwrite(photographs / "images" / "01.png", rgba)
     dataset = load(photographs)
@@ -415,7 +416,7 @@ def test_transparency_is_kept(photographs):
 
 
 def test_transparency_of_synthetic_images_is_kept(blender):
-    """Of those to train on."""
+    """Alpha is kept for training views."""
     folder, images = blender
     for width, shape in ((None, (4, 1, 6, 1)), (3, (2, 2, 3, 2))):
         view = load(folder, image_size=width).train[1]
@@ -455,7 +456,7 @@ def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
 
 
 def test_coarse_views_have_smaller_masks_depths_and_transparency():
-    """By blocks of a factor; what is known of a block is known of all its pixels."""
+    """Blocks of pixels are averaged; a block is known if all its pixels are."""
     rng = np.random.default_rng(4)
     depth = rng.uniform(1, 5, (30, 40)).astype(np.float32)
     mask = np.ones((30, 40), np.float32)

@@ -122,7 +122,7 @@ def test_a_kept_image_computes_as_an_array_does():
 
 
 def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photographs, monkeypatch):
-    """Of ten, one with alpha: (9 x 3 + 4) x 48 bytes."""
+    """Ten photographs, one with alpha: (9 x 3 + 4) x 48 bytes."""
     rgba = RNG.integers(0, 256, (6, 8, 4), np.uint8)
     iio.imwrite(photographs / "images" / "01.png", rgba)
     files = sorted((photographs / "images").iterdir())

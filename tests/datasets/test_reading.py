@@ -1,4 +1,4 @@
-"""Of several processes, each reads the photographs of its own views."""
+"""Each of several processes reads the photographs of its own views."""
 
 import json
 
@@ -34,7 +34,7 @@ def folder(tmp_path):
 
 
 def test_images_of_others_are_not_read(folder):
-    """What is behind their headers is damaged; all but their images is known."""
+    """Pixels are damaged behind the headers, so all but the images is known."""
     config = DataConfig(path=folder, image_size=6)
     every = load_dataset(config)
     for name in ("2.png", "5.png"):

@@ -110,7 +110,7 @@ def test_an_orbit_of_parallel_cameras_is_around_the_gaussians():
 
 
 def test_up_is_what_level_cameras_keep_upright_from_any_side():
-    """Where the cameras stand only on one side, the mean of their own up vectors leans over."""
+    """The mean of the cameras' own up vectors leans over if all cameras are on one side."""
     views = views_at([0.1, 0.4, 0.5, 0.9], [0.9, 1.0, 0.8, 1.1])
     mean_up = np.mean([-v.camera_to_world[:3, 1] for v in views], axis=0)
     assert mean_up[2] / np.linalg.norm(mean_up) < 0.7

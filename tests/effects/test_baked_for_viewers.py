@@ -9,7 +9,7 @@ from support.small_capture import blobs, make_dataset
 from support.small_fits import double, reference_camera
 
 from drgs.config.approximations import Approximations
-from drgs.effects.smoothing import KEPT_VARIANCE, baked_for_viewers
+from drgs.effects.smoothing import KEPT_VARIANCE, bake_for_viewers
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.reference import splatting as reference
@@ -23,7 +23,7 @@ def variant():
 
 
 def small_blobs():
-    """Of half a pixel to three: some lose all that they may lose."""
+    """Return blobs of half a pixel to three: some lose all variance that they may lose."""
     gaussians = blobs(40)
     return replace(gaussians, log_scales=gaussians.log_scales - np.float32(np.log(4)))
 
@@ -58,7 +58,7 @@ def film_of(gaussians, view):
 )
 def test_the_closed_form_is_that_of_its_docstring(fitted):
     gaussians, fitted = small_blobs(), Approximations(**fitted)
-    found = baked_for_viewers(gaussians.to(mi.TensorXf), cameras(), fitted)
+    found = bake_for_viewers(gaussians.to(mi.TensorXf), cameras(), fitted)
 
     films = [film_of(gaussians, view) for view in VIEWS]
     nu = np.max([seen * rate for seen, rate, _ in films], axis=0)
@@ -87,7 +87,7 @@ def test_the_closed_form_is_that_of_its_docstring(fitted):
 
 def test_what_viewers_show_right_stays(tmp_path):
     gaussians = small_blobs()
-    found = baked_for_viewers(gaussians.to(mi.TensorXf), cameras(), Approximations())
+    found = bake_for_viewers(gaussians.to(mi.TensorXf), cameras(), Approximations())
     np.testing.assert_allclose(found.log_scales, gaussians.log_scales, atol=1e-6)
     np.testing.assert_allclose(found.logit_opacities, gaussians.logit_opacities, atol=1e-5)
 
@@ -95,7 +95,7 @@ def test_what_viewers_show_right_stays(tmp_path):
 def test_gaussians_that_no_camera_sees_keep_their_opacities():
     gaussians = small_blobs()
     behind = replace(gaussians, means=gaussians.means + np.float32([0, 0, 100]))
-    found = baked_for_viewers(
+    found = bake_for_viewers(
         behind.to(mi.TensorXf), cameras(), Approximations(low_pass=0.1, antialiased=True)
     )
     assert np.isfinite(found.log_scales).all()

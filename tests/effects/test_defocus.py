@@ -114,7 +114,7 @@ def test_a_splat_in_focus_is_not_blurred(precision):
     blurred, in_focus = (
         splats_of(gaussians, camera, precision, defocus) for defocus in (ThinLens(0.125, 2.0), None)
     )
-    for name in ("whitening", "variances", "opacities"):
+    for name in ("conic_factor", "variances", "opacities"):
         a, b = (rows(getattr(splats, name)) for splats in (blurred, in_focus))
         np.testing.assert_array_equal(a[1], b[1])
         assert (np.abs(a[[0, 2]] / b[[0, 2]] - 1).reshape(2, -1).max(axis=1) > 0.1).all()
@@ -133,7 +133,7 @@ def test_the_integral_of_a_splat_stays(precision, rule, scale, low_pass):
     integrals, sizes = [], []
     for defocus in (DEFOCUS, None):
         splats = splats_of(gaussians, camera, precision, defocus, rule, low_pass)
-        p, _, s = rows(splats.whitening)[0]
+        p, _, s = rows(splats.conic_factor)[0]
         integrals.append(rows(splats.opacities)[0] / (p * s))
         sizes.append(1 / (p * s))
     rounding = float(np.finfo(precision.dtype).eps)
@@ -142,7 +142,7 @@ def test_the_integral_of_a_splat_stays(precision, rule, scale, low_pass):
 
 
 def test_the_sum_of_alpha_over_the_film_stays():
-    """Of one splat without cut-offs: sums of a smooth function are its integral."""
+    """One splat without cut-offs: sums of a smooth function are its integral."""
     camera = camera_at_origin(fx=40.0, fy=40.0, cx=30.0, cy=24.0, width=60, height=48)
     gaussians = single_splat([0.05, -0.025, 1.0], 0.05)
     pipeline = pipeline_of(Approximations(alpha_cut=0.0, transmittance_stop=0.0), 0)
@@ -242,7 +242,7 @@ def planes_of_wall(precision=FLOAT64, pipeline=None) -> np.ndarray:
 
 
 def test_a_wall_out_of_focus_keeps_its_alpha_and_its_colour():
-    """As many pinhole images have them.
+    """A mean of many pinhole images has the same alpha and colour.
 
     With S the sum of all alphas at a pixel, a wall of splats that are hardly there lets exp(-S)
     through; one of splats of opacity o lets exp(-S (1 + o / 4 + o^2 / 9 + ...)) through, where the
@@ -371,7 +371,7 @@ APPROXIMATIONS = {
 
 @pytest.mark.parametrize("approximations", APPROXIMATIONS.values(), ids=APPROXIMATIONS)
 def test_gradients_of_other_approximations_equal_their_own_central_differences(approximations):
-    """Those of the Gaussians, and those of the aperture; nothing is cut, so that nothing jumps."""
+    """Gradients of Gaussians and aperture; nothing is cut, so nothing jumps."""
     case = LensCase("choices", 19, 14, 1, 20, defocus=DEFOCUS)
     pipeline = pipeline_of(
         Approximations(alpha_cut=0.0, transmittance_stop=0.0, **approximations), 1

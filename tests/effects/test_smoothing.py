@@ -72,7 +72,8 @@ def test_widened_scales_and_opacities_are_those_of_the_reference(precision):
     )
     actual = {
         "scales": np.exp(rows(after.log_scales)),
-        "opacities": reference.sigmoid(rows(after.logit_opacities)) * rows(after.dimming),
+        "opacities": reference.sigmoid(rows(after.logit_opacities))
+        * rows(after.opacity_compensation),
     }
     expected = {"scales": scales, "opacities": opacities}
     # Each number for itself: a small one is not to hide behind the largest.
@@ -84,7 +85,7 @@ def test_widened_scales_and_opacities_are_those_of_the_reference(precision):
 
 
 def test_a_wide_filter_makes_a_needle_round_and_keeps_its_integral():
-    """By hand: variances 0.01^2, 0.1^2, 1 and a filter of 1."""
+    """Computed by hand: variances 0.01^2, 0.1^2, 1 and a filter of 1."""
     needle = reference.Gaussians(
         means=np.zeros((1, 3)), quats=np.array([[1.0, 0, 0, 0]]),
         log_scales=np.log([[0.01, 0.1, 1.0]]), logit_opacities=np.zeros(1),
@@ -94,7 +95,9 @@ def test_a_wide_filter_makes_a_needle_round_and_keeps_its_integral():
     after = apply_smoothing(load_rows(device, 0))
     widened = np.sqrt([1.0001, 1.01, 2.0])
     np.testing.assert_allclose(np.exp(rows(after.log_scales))[0], widened, rtol=1e-14)
-    np.testing.assert_allclose(rows(after.dimming), [0.001 / widened.prod()], rtol=1e-13)
+    np.testing.assert_allclose(
+        rows(after.opacity_compensation), [0.001 / widened.prod()], rtol=1e-13
+    )
 
 
 CAMERAS = 6
@@ -151,7 +154,7 @@ def test_where_no_camera_sees_anything_there_is_no_filter():
 
 
 def test_the_nearest_of_two_cameras_decides():
-    """By hand: rates 100 / 2 and 100 / 4 px per unit."""
+    """Computed by hand: rates 100 / 2 and 100 / 4 px per unit."""
     camera = reference.Camera(np.eye(3), np.zeros(3), 100.0, 80.0, 50.0, 50.0, 100, 100, 0.1)
     farther = replace(camera, center=np.array([0, 0, -2.0]))
     mean = FLOAT64.TensorXf(FLOAT64.array([0.0, 0.0, 2.0]), (1, 3))
@@ -280,7 +283,7 @@ def outputs_of(case, gaussians) -> list[np.ndarray]:
 @both_precisions
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_each_number_of_the_gradients_equals_a_difference_of_the_reference(precision, antialiased):
-    """Of colours, alpha and depth, through the filter; a scaled one is noticed."""
+    """Gradients of colours, alpha and depth through the filter; a scaled one is noticed."""
     case = SmoothCase("tiny", 13, 11, 1, 6, antialiased, threshold_width=5e-4)
     case = clear(case)
     cotangents = Cotangents.random(case)
@@ -362,7 +365,7 @@ def test_a_filter_that_is_not_finite_is_refused(tmp_path):
 
 
 def test_a_filter_of_another_type_is_read(tmp_path):
-    """As a tool writes it that computes in double precision."""
+    """Tools that compute in double precision write such files."""
     gaussians = with_filter()
     gaussians.save(tmp_path / "a.ply")
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data

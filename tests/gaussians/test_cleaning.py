@@ -5,13 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.formats import distance_of_ellipsoids, gaussians_within_ranges
 
-from drgs.export import kept_by, take
+from drgs.export import find_kept, take
 from drgs.gaussians.similarity import shortest_rotation, turned_towards
 
 
 def test_a_selection_keeps_what_is_within_its_limits():
     g = gaussians_within_ranges(400)
-    found = kept_by(g, box=(1, -1, 2, -1, 1, 0), min_opacity=0.3, max_scale=0.1)
+    found = find_kept(g, box=(1, -1, 2, -1, 1, 0), min_opacity=0.3, max_scale=0.1)
     for name, kept in found.items():
         one_by_one = [
             {
@@ -23,7 +23,7 @@ def test_a_selection_keeps_what_is_within_its_limits():
         ]
         assert kept.tolist() == one_by_one
         assert 0 < kept.sum() < 400
-    assert kept_by(g) == {}
+    assert find_kept(g) == {}
 
 
 def test_rows_are_taken_from_all_that_a_gaussian_has():

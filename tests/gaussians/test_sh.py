@@ -34,7 +34,7 @@ def test_number_of_coefficients(degree):
 
 
 def test_constants_are_those_of_the_normalisation():
-    """Of degrees 0 to 3 from pi alone, to the last digits of a double."""
+    """Degrees 0 to 3 are derived from pi alone, to the last digit of a double."""
     pi = np.pi
     c2, c3 = np.sqrt(15 / pi) / 2, np.sqrt(105 / pi)
     expected = {

@@ -58,7 +58,7 @@ def test_matrices_are_as_many_as_degrees():
 
 @pytest.mark.parametrize("axis", range(3))
 def test_generators_are_the_derivatives_of_matrices(axis):
-    """Of their central differences: third derivatives are at most 27, l^3."""
+    """Central differences: third derivatives are at most 27, l^3."""
     step = 1e-4
     ends = [
         sh_rotation_matrices(Rotation.from_rotvec(sign * step * np.eye(3)[axis]).as_matrix(), 3)

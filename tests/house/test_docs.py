@@ -1,4 +1,4 @@
-"""What the plugins' tables of parameters say is what there is."""
+"""The plugins' tables of parameters agree with the plugins."""
 
 import re
 import sys
@@ -31,7 +31,7 @@ def variant():
 
 @dataclass(frozen=True)
 class Row:
-    """Of a table in Mitsuba's format; it may hold several names."""
+    """One row of a table in Mitsuba's format; it may have several names."""
 
     names: tuple[str, ...]
     kind: str
@@ -40,7 +40,7 @@ class Row:
 
     @property
     def defaults(self) -> dict[str, str]:
-        """By name, as they are written; one for all, or one each."""
+        """Return defaults as written, by name; one for all names, or one each."""
         found = re.search(r"\(Default: ([^)]*)\)", self.text)
         words = found[1].split(", ") if found else []
         words = words * len(self.names) if len(words) == 1 else words
@@ -153,7 +153,7 @@ KINDS = {bool: "bool", int: "int", float: "float", str: "string"}
 
 
 def default_of(plugin, name):
-    """What the loaded plugin has where nothing is given; None where that is not one value."""
+    """Return the loaded plugin's value where nothing is given; None where that is not one value."""
     if plugin == "splats":
         if name in {field.name for field in fields(Approximations)} - {"extent"}:
             return getattr(Approximations(), name)

@@ -1,4 +1,4 @@
-"""What the pages say is what there is: links, paths, names, commands, options, and programs."""
+"""The pages are true: links, paths, names, commands, options, and programs."""
 
 import contextlib
 import importlib.util
@@ -43,7 +43,7 @@ def fenced(page, language) -> list[str]:
 
 
 def inline_code(page) -> list[str]:
-    """What stands in backticks, outside of blocks."""
+    """Return the text in backticks, outside of blocks."""
     prose = re.sub(r"^```.*?^```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
     return re.findall(r"`([^`\n]+)`", prose)
 
@@ -78,7 +78,7 @@ def test_the_readme_leads_to_every_page():
 
 
 def anchors(path) -> set[str]:
-    """Of the headings, as code hosts make them."""
+    """Return the anchors of headings, as code hosts make them."""
     headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
     return {
         re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
@@ -175,7 +175,7 @@ def commands(page) -> list[list[str]]:
 
 @cache
 def help_of(*command) -> str:
-    """What ``--help`` prints."""
+    """Return the output of ``--help``."""
     printed = io.StringIO()
     main = importlib.import_module(MODULES[command[0]]).main
     with contextlib.redirect_stdout(printed), pytest.raises(SystemExit) as end:
@@ -224,7 +224,7 @@ def python_of(page) -> str:
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """Where files lie that the pages' programs read: small ones, under the names of the pages."""
+    """A folder with small files that the pages' programs read, under the pages' names."""
     path = tmp_path / "out" / "lego" / "point_cloud.ply"
     path.parent.mkdir(parents=True)
     gaussians = Scene(count=20, degree=3).gaussians

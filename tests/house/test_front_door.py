@@ -1,4 +1,4 @@
-"""What ``import drgs`` offers, and that no name stands for a module and for something in it."""
+"""Names of ``import drgs``; none stands for a module and for something in it."""
 
 import ast
 

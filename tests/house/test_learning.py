@@ -1,4 +1,4 @@
-"""What learners meet: where reading begins, the paper's symbols, and names of the field."""
+"""The way of a reader: where reading begins, the paper's symbols, and names of the field."""
 
 import ast
 import re

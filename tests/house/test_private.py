@@ -65,7 +65,7 @@ from drjit.llvm.ad import Float
 from drgs.core import private
 from drgs.core.errors import UserError
 try:
-    private.leave_out_avx512()
+    private.disable_avx512()
 except UserError as error:
     print(error)
 dr.set_flag(dr.JitFlag.KernelHistory, True)

@@ -23,7 +23,7 @@ FILES = [
 
 
 def sizes(source):
-    """By function: lines without the docstring, and number of parameters."""
+    """Return lines without the docstring and number of parameters, by function."""
     found = {}
     for node in ast.walk(ast.parse(source)):
         if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):

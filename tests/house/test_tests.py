@@ -20,7 +20,8 @@ the repository itself."""
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Of all import statements, also within functions and in programs that a test runs."""
+    """Return modules of all import statements, also in functions and in programs that a test
+    runs."""
     tree = ast.parse(path.read_text())
     sources = [tree]
     for node in ast.walk(tree):

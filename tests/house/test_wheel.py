@@ -1,4 +1,4 @@
-"""What ``pip install`` of the wheel brings, used far from the checkout.
+"""An installed wheel, used far from the checkout.
 
 Nothing is fetched: the build tools and the dependencies are those of this environment.
 """
@@ -125,7 +125,7 @@ def test_the_script_renders_gaussians_and_a_mitsuba_scene(scripts, model, tmp_pa
 
 
 def test_mitsuba_finds_the_plugins_by_the_entry_point(scripts, model, tmp_path):
-    """As Mitsuba 3.10 does: nothing else imports drgs."""
+    """Mitsuba 3.10 loads it so; nothing else imports drgs."""
     program = (
         "import importlib, importlib.metadata, sys\n"
         "import mitsuba as mi\n"

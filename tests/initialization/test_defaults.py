@@ -1,4 +1,4 @@
-"""What a configuration leaves to the dataset: coarse stages."""
+"""Settings that depend on the dataset: coarse stages."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.datasets import dataset_of, view_at
 
-from drgs.config.changes import decided_as, with_changes, with_iterations
+from drgs.config.changes import with_changes, with_decisions, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.initialization.defaults import resolve_defaults
 
@@ -74,5 +74,5 @@ def test_what_is_given_stays(photographs):
 def test_it_stays_open_until_there_is_a_dataset(photographs):
     assert with_iterations(CONFIG, 200).coarse is None
     known = resolve_defaults(CONFIG, photographs)
-    assert decided_as(CONFIG, known) == known
+    assert with_decisions(CONFIG, known) == known
     assert stages(with_iterations(known, 200), photographs) == [(70, 2)]

@@ -1,4 +1,4 @@
-"""Where points are in images, before anything is rendered: as the float64 reference has it."""
+"""Positions of points in images before anything is rendered, against the float64 reference."""
 
 from dataclasses import replace
 

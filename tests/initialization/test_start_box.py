@@ -122,7 +122,7 @@ def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
 
 
 def test_points_that_are_all_black_get_the_colours_of_the_images(tmp_path):
-    """As of a pipeline that finds out none."""
+    """Some pipelines write points without colours."""
     positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
     given = config(init={"point_cloud": tmp_path / "black.ply"})

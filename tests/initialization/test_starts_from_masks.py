@@ -1,4 +1,4 @@
-"""What a fit starts from: masks, a point cloud or random points, and what it says of that."""
+"""Initial Gaussians from masks, a point cloud or random points, and the messages about them."""
 
 from dataclasses import replace
 

@@ -56,7 +56,7 @@ def test_points_of_a_brick_are_on_its_faces(brick):
 
 @pytest.mark.parametrize("views", ["ball", "brick"])
 def test_no_image_shows_a_point_empty(views, request):
-    """By the reference's projection, pixel by pixel."""
+    """Points are projected by the reference, pixel by pixel."""
     views = request.getfixturevalue(views)
     points = carved(views)
     assert np.all([opaque_at(view, points) for view in views])
@@ -90,7 +90,7 @@ def test_the_same_seed_gives_the_same_points(ball):
 
 
 def test_little_memory_is_taken(ball):
-    """That of a chunk of cubes, and some numbers of each cube."""
+    """The limit is a chunk of cubes, and some numbers of each cube."""
     silhouettes = silhouettes_of(ball)
     tracemalloc.start()
     hull_points(silhouettes, WHOLE, 3000, 0)

@@ -193,7 +193,7 @@ def test_rays_that_are_not_those_of_a_film_are_refused(case):
 
 
 def test_rays_of_another_sensor_are_refused():
-    """As what is not a image may have as many rays as one."""
+    """Other wavefronts may have as many rays as an image."""
     from drgs.integrator.aov_rays import ImageRays
 
     first = mi.load_dict(VIEWS[1].sensor())

@@ -143,7 +143,7 @@ def test_a_feature_that_is_not_put_out_costs_nothing():
 
 
 def test_a_row_whose_feature_is_not_finite_is_not_drawn():
-    """As with other parameters: nothing of it reaches a pixel or another row."""
+    """Neither a pixel nor another row is affected, as with other parameters."""
     scene = clear(Scene())
     spoiled = features_of(scene)
     row = int(np.argmax(np.abs(scene.gradients(scene.weights())["logit_opacities"])))

@@ -57,9 +57,9 @@ def test_a_default_that_is_not_rounded_is_the_default():
     """A configuration writes 0.99 for the float32 next to it."""
     written = ModelConfig(alpha_max=0.99, alpha_cut=1 / 255, extent=None, **VIEWER_RENDERING)
     assert written.approximations == Approximations()
-    assert written.approximations.others_than_default == {}
+    assert written.approximations.non_default == {}
     chosen = ModelConfig(alpha_max=0.98, extent=3.0, **VIEWER_RENDERING).approximations
-    assert chosen.others_than_default == {"alpha_max": 0.98, "extent": 3.0}
+    assert chosen.non_default == {"alpha_max": 0.98, "extent": 3.0}
 
 
 def test_a_configuration_is_refused_that_single_precision_rounds_onto_a_limit(tmp_path):

@@ -66,7 +66,7 @@ class PixelCenters:
 
     @staticmethod
     def image(sensor, emitter) -> np.ndarray:
-        """By Mitsuba's own emitter and sensor, one ray a pixel, alpha 1."""
+        """Render with Mitsuba's own emitter and sensor, one ray a pixel, alpha 1."""
         loaded = load(sensor, {"type": "path"}, sky=EMITTERS[emitter]())
         own = loaded.sensors()[0]
         width, height = own.film().crop_size()
@@ -133,7 +133,8 @@ def test_what_is_seen_past_the_splats_is_what_path_renders(emitter):
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_several_samples_are_each_before_their_own_part_of_the_environment(seed):
-    """Where splats are opaque nothing of it is seen, else what ``path`` sees at the same points."""
+    """Opaque splats hide it; elsewhere it is the environment that ``path`` sees at the same
+    points."""
     sensor, gaussians = Camera().dictionary(), Scene(count=8, seed=1).gaussians
     loaded = load(sensor, integrator_of(gaussians), sky=EMITTERS["envmap"]())
     actual = image_of(loaded, spp=4, seed=seed)

@@ -56,7 +56,7 @@ def hidden_splats() -> dict:
 
 
 def test_an_environment_out_of_focus_is_the_mean_of_what_pinholes_in_the_aperture_see():
-    """Whose principal points agree on the plane in focus. Far away, where they are is all one."""
+    """The pinholes' principal points agree on the plane in focus."""
     sensor = thin_lens().dictionary()
     image = image_of(load(sensor, hidden_splats(), sky=EMITTERS["envmap"]()))
     height, width = image.shape[:2]
@@ -74,7 +74,8 @@ def test_an_environment_out_of_focus_is_the_mean_of_what_pinholes_in_the_apertur
 
 
 def test_an_environment_out_of_focus_is_what_path_renders():
-    """Of many rays through the aperture; in focus at another distance it is less blurred."""
+    """``path`` traces many rays through the aperture; in focus at another distance it is less
+    blurred."""
     for distance in (1.25, 2.5):
         sensor = thin_lens(focus_distance=distance).dictionary()
         image = image_of(load(sensor, hidden_splats(), sky=smooth_sky()))

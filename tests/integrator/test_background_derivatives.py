@@ -186,7 +186,7 @@ def test_gradients_reach_what_the_radiance_was_computed_from(way, kind):
 
 
 def test_the_derivative_of_a_constant_radiance_is_what_passes_the_splats():
-    """By hand, from the transmittance."""
+    """Computed from the transmittance."""
     loaded, key = scene_with("constant")
     weights = weights_of(loaded)
     gradient = gradient_of(loaded, key, weights).ravel()
@@ -200,7 +200,7 @@ def test_the_derivative_of_a_constant_radiance_is_what_passes_the_splats():
 
 @all_kinds
 def test_derivatives_of_the_gaussians_know_what_is_behind_them(kind):
-    """By the reference: its gradients with respect to colour and transmittance, chained by hand."""
+    """The reference's gradients with respect to colour and transmittance are chained by hand."""
     scene = Scene()
     loaded, _ = scene_with(kind)
     weights = weights_of(loaded)
@@ -240,7 +240,7 @@ def test_derivatives_of_the_gaussians_know_what_is_behind_them(kind):
 @all_kinds
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
 def test_forward_and_backward_derivatives_are_transposed(kind, srgb_primitives):
-    """Of radiance and Gaussians together."""
+    """Derivatives with respect to radiance and Gaussians together."""
     loaded, key = scene_with(kind, srgb_primitives)
     keys = [key, "integrator.means", "integrator.sh0", "integrator.logit_opacities"]
     weights, rng = weights_of(loaded), np.random.default_rng(8)

@@ -114,7 +114,7 @@ def test_a_rolling_shutter_sees_from_where_the_camera_is_when_the_row_is_read(se
 
 
 def test_times_are_between_those_at_which_the_shutter_opens_and_closes():
-    """As Mitsuba's integrators choose them: a camera that moves is open from 0 to 1 by default."""
+    """A moving camera is open from 0 to 1 by default, as in Mitsuba's integrators."""
     sensor = replace(PINHOLE, close=CLOSE)
     loaded = sensor.load()
     assert (loaded.shutter_open(), loaded.shutter_open_time()) == (0, 1)

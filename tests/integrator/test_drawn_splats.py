@@ -12,7 +12,12 @@ from support.rays import Rays, splats_of
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.integrator.rays import PathSegment
-from drgs.integrator.splat_transport import DECODED_WITHIN, DECODING, ROULETTE, RayTransport
+from drgs.integrator.splat_transport import (
+    DECODED_WITHIN,
+    DECODING,
+    ROULETTE_TRANSMITTANCE,
+    RayTransport,
+)
 from drgs.light.walk import _hashes
 from drgs.splatting.cutoffs import Cutoffs
 
@@ -69,7 +74,7 @@ def segments(num_paths):
 
 
 def samples():
-    """As a sampler draws them, of which there are 2^23."""
+    """Return numbers like those of a sampler, of which there are 2^23."""
     rng = np.random.default_rng(2)
     return mi.Float(rng.integers(0, 2**23, RAYS * PATHS).astype(np.float32) / 2**23)
 
@@ -119,7 +124,7 @@ def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
 def test_roulette_lets_as_much_light_through_to_an_emitter():
     light = Fog(40, 0.12, True).light(4)
     T = rows(light.splats.composite_segment(segments(1))[1])[:, None]
-    assert T.min() < ROULETTE / 2 and T.max() > ROULETTE, T
+    assert T.min() < ROULETTE_TRANSMITTANCE / 2 and T.max() > ROULETTE_TRANSMITTANCE, T
     found = segments(PATHS)
     ray = mi.Ray3f(mi.Point3f(found.origin), found.direction)
     ends = dr.zeros(mi.ShapePtr), dr.zeros(mi.EmitterPtr)
@@ -129,7 +134,7 @@ def test_roulette_lets_as_much_light_through_to_an_emitter():
 
 @pytest.mark.parametrize("apart", [1, 2, 255])
 def test_draws_of_two_splats_are_independent(apart):
-    """Of neighbours in memory, too, and of those that differ in one bit.
+    """Neighbours in memory are tested, and indices that differ in one bit.
 
     As often as by chance: within 5 standard errors of 2^20 seeds.
     """

@@ -90,7 +90,7 @@ STEP = 1e-7
 
 
 def directions_of(held) -> dict[str, np.ndarray]:
-    """Of opacities so small that they stay within 0..1; of scales and others as their values."""
+    """Return steps: opacities stay within 0..1; those of scales and others are relative."""
     rng = np.random.default_rng(7)
     directions = {name: rng.normal(0, 1, v.shape) * np.abs(v) for name, v in held.items()}
     directions["opacities"] *= 1 - held["opacities"]

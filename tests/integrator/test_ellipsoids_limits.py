@@ -37,7 +37,7 @@ def variant():
 
 
 def rendered_of(scene, **changes) -> np.ndarray:
-    """Of the scene's shape with some numbers changed: name = (row, column, value)."""
+    """Render the scene's shape with some numbers changed: name = (row, column, value)."""
     return image_of(scene.load(shape=shape_of(changed(scene.held, **changes))))
 
 

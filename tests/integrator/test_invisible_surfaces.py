@@ -105,7 +105,8 @@ def sensor_of(kind, origin) -> dict:
 
 @pytest.mark.parametrize("kind", ["batch", "thinlens", "aov"])
 def test_windows_are_seen_by_every_sensor(kind):
-    """As by a pinhole alone: two sensors side by side, one of which sees no window; and ``aov``."""
+    """Images equal a pinhole's alone: two sensors side by side, one without a window; and
+    ``aov``."""
     to_world = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(0.4)
     window = {"pane": WINDOW["pane"] | {"to_world": to_world}}
     mirror = {"wall": placed(MIRROR["wall"])}

@@ -142,7 +142,7 @@ PROGRAMS = {
 
 @cache
 def shown() -> dict[str, str]:
-    """What each program writes to stderr."""
+    """Return each program's output on stderr."""
     programs = [program for program, _ in PROGRAMS.values()]
     between = "\nEND OF PROGRAM\n"
     script = f"{SCENES}\nfor program in {programs!r}:\n    run(program)\n"

@@ -68,7 +68,7 @@ def load(tensors, objects, **settings):
 
 
 def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
-    """Of loading a scene, its image, and derivatives with respect to the splats' colours."""
+    """Load a scene, render it, differentiate the splats' colours; return kernels and bytes."""
     dr.eval()  # what is still pending would be found here
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
@@ -98,7 +98,7 @@ def test_none_is_what_is_not_said(objects):
 
 
 def test_without_surfaces_there_is_no_light_to_pass():
-    """What asks for it makes no kernel of its own, and no difference."""
+    """The property makes no kernel of its own, and no difference."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, {})
     assert kernels_and_bytes(tensors, {}, light="rays", exposure=3.0, light_samples=0) == plain

@@ -31,7 +31,7 @@ def floor(**changes):
 
 
 def wall():
-    """Of another metal, or Mitsuba would merge it with the floor."""
+    """Return a wall of another metal: Mitsuba would merge equal ones."""
     to_world = at(0, 0, 1.2) @ mi.ScalarTransform4f().rotate([1, 0, 0], 180).scale(2)
     bsdf = {"type": "conductor", "material": "Al"}
     return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "twosided", "b": bsdf}}

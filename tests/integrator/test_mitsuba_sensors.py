@@ -34,7 +34,7 @@ def variant():
 @pytest.mark.parametrize("crop", [None, WINDOW])
 @pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
 def test_points_on_the_rays_of_a_thin_lens_are_seen_where_the_rays_start(crop, to_world):
-    """Those through the middle of its aperture."""
+    """Rays go through the middle of the aperture."""
     view = View("", 53, 41, crop=crop, to_world=to_world)
     sensor = mi.load_dict(own_sensor("thinlens", view))
     points, expected = points_on_rays(sensor)
@@ -44,7 +44,7 @@ def test_points_on_the_rays_of_a_thin_lens_are_seen_where_the_rays_start(crop, t
 
 @pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
 def test_rays_of_a_thin_lens_start_on_its_aperture_and_meet_where_it_is_in_focus(to_world):
-    """Those of one place on the film."""
+    """Rays of one place on the film."""
     view = View("", 53, 41, to_world=to_world)
     sensor = mi.load_dict(own_sensor("thinlens", view))
     camera = camera_of(sensor)
@@ -116,7 +116,7 @@ def test_a_image_through_a_thin_lens_is_that_of_the_reference():
 
 
 def test_colours_along_rays_turn_with_a_rolling_shutter():
-    """Of splats that are small, rays have the direction of the mean, with which colours change."""
+    """Rays of small splats have the direction of the mean, with which colours change."""
     count = 3000
     directions = np.random.default_rng(0).normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -48,7 +48,7 @@ SAMPLES = 3
 
 
 def image_by_reference(sensor, gaussians, threshold_width=1e-4) -> reference.RenderedImage:
-    """Of the whole film, on black."""
+    """Render the whole film on black."""
     camera = replace(sensor.camera, near=0.01)
     case = PluginCase(
         "plugin", camera.width, camera.height, 1, lens=sensor.lens, near_camera=camera,
@@ -88,7 +88,7 @@ def replace_samples(sensor) -> dict:
 
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
 def test_gradients_add_up_over_the_times(variant, sensor):
-    """Of mi.render, in single precision, against differences of the float64 reference."""
+    """Gradients of mi.render in single precision, against differences of the float64 reference."""
     gaussians, _ = clear_gaussians(
         sensor, lambda gaussians: image_by_reference(sensor, gaussians, threshold_width=1e-3)
     )
@@ -112,7 +112,7 @@ def test_gradients_add_up_over_the_times(variant, sensor):
 
 
 def test_poses_that_kernels_share_change_no_byte(variant, monkeypatch):
-    """Of more than :data:`PASSES_PER_KERNEL`, which are compiled in parts."""
+    """More poses than :data:`PASSES_PER_KERNEL` are compiled in parts."""
     gaussians, _ = clear_gaussians(
         SENSORS[0], lambda gaussians: image_by_reference(SENSORS[0], gaussians)
     )
@@ -187,6 +187,6 @@ CALLED_FOR = {
 
 @pytest.mark.parametrize(("sensor", "module"), CALLED_FOR.values(), ids=CALLED_FOR)
 def test_modules_are_missed_when_a_sensor_calls_for_them(run_python, sensor, module):
-    """That they are not otherwise is in test_summary, as are the kernels without them."""
+    """test_summary covers other sensors, and kernels without these modules."""
     result = run_python(RENDERING.format(blocked=module, sensor=sensor))
     assert result.returncode != 0 and f"drgs.{module}" in result.stderr, result.stderr

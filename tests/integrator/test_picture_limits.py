@@ -133,7 +133,7 @@ def features(count):
 
 
 def test_features_have_as_many_columns_as_can_be_compiled():
-    """What is not put out is not compiled."""
+    """Only features that an AOV uses are compiled."""
     message = (
         r"splats: aovs can have at most 64 channels together, got 2,003 \(n 3, f 2,000\); render "
         "them in parts, which share a kernel"

@@ -239,7 +239,7 @@ def test_each_number_of_the_matrix_has_the_derivative_of_central_differences():
 
 
 def test_an_object_that_is_not_moved_has_the_same_derivatives():
-    """Of a move of what lies where it is seen: by the chain rule, those above times MATRIX^-1."""
+    """Moving an object in place: by the chain rule, the derivatives above times MATRIX^-1."""
     scene, _ = scene_and_object()
     unmoved = load(scene, scene.gaussians, matrix=None)
     before = image_of(unmoved)

@@ -1,4 +1,4 @@
-"""What the plugins refuse has a type of its own, and what they are is told by types."""
+"""Plugin errors have a type of their own, and plugins are recognised by type."""
 
 import mitsuba as mi
 import numpy as np
@@ -23,7 +23,7 @@ def splats():
 
 
 def test_errors_of_plugins_can_be_caught_by_what_they_are():
-    """As errors of the user, and as what Python calls them."""
+    """They are user errors, and Python's ValueError or TypeError."""
     assert issubclass(PluginError, UserError) and issubclass(UserError, ValueError)
     assert issubclass(PluginTypeError, PluginError) and issubclass(PluginTypeError, TypeError)
     assert issubclass(UnsupportedError, PluginError)

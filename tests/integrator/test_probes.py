@@ -53,7 +53,7 @@ def test_a_mirror_ball_reflects_what_rays_show():
 
 
 def test_a_lamp_with_a_probe_is_shaded_by_fog():
-    """Where the fog is before the lamp, by its alpha; up to 0.01, as rays with four times that."""
+    """Fog before the lamp dims it by its alpha; up to 0.01, as rays with four times that."""
     rng = np.random.default_rng(1)
     splats = gaussians(rng.uniform(-1, 1, (30, 3)) * [1, 1, 0.3] + [0, 0, 1.5], 0.4, 0.3, 0.0)
     wall = {
@@ -123,7 +123,7 @@ def test_probes_see_smoothed_gaussians():
 
 
 def test_objects_that_splats_are_close_to_are_named_once():
-    """Where they are nearer to its middle than 1.25 of its radii, however often they change."""
+    """A splat is nearer to the middle than 1.25 radii; changes repeat no warning."""
     lines = []
 
     class Lines(mi.Appender):

@@ -21,7 +21,7 @@ def variant():
 
 @pytest.fixture
 def file(tmp_path):
-    """Of Gaussians that are made for SAID."""
+    """A file of Gaussians with these settings in its header."""
     return saved(tmp_path / "model.ply", SAID)
 
 

@@ -69,7 +69,7 @@ def make_gaussians(view, count=40, degree=2, seed=0):
 
 @pytest.mark.parametrize("samples", [None, 3])
 def test_a_moving_views_sensor_blurs_with_as_many_times(samples):
-    """Of those of the configuration; by default as many as the sensor's own default."""
+    """The configuration sets their number; the default is the sensor's own."""
     data = DataConfig(path=".", **({} if samples is None else {"shutter_samples": samples}))
     view = make_view()
     view = replace(view, motion=CameraMotion(view.camera_to_world, "global", data.shutter_samples))

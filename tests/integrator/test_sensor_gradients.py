@@ -90,7 +90,7 @@ class Case:
         return self.rendered(scene, {**self.start, name: self.start[name] + step})
 
     def difference(self, scene, name) -> np.ndarray:
-        """Of the image's window, (H, W, 4)."""
+        """Return the difference of the images' window, (H, W, 4)."""
         step = STEP * max(1.0, abs(self.start[name]))
         return (self.at(scene, name, step) - self.at(scene, name, -step)) / (2 * step)
 
@@ -152,7 +152,8 @@ def blurred_image(scene, values):
 
 
 def rolling_image(scene, values):
-    """By the kernels in double precision: the reference has a time for each row, not each splat."""
+    """Render by the kernels in double precision: the reference has a time for each row, not each
+    splat."""
     opened, closed = (with_intrinsics(c(VIEWS[1], values), values) for c in (camera_of, closing))
     camera: Camera = device_camera(opened, FLOAT64)
     other = device_camera(closed, FLOAT64)
@@ -247,7 +248,7 @@ every_parameter = pytest.mark.parametrize(
 
 @cache
 def clear_scene(name) -> Scene:
-    """Where single precision decides as double precision does: both images agree everywhere."""
+    """Return a scene in which single and double precision take the same decisions everywhere."""
     case = CASES[name]
     for seed in range(40):
         scene = Scene(case.view, seed=seed)
@@ -346,7 +347,7 @@ def test_forward_and_backward_derivatives_are_transposed(name):
 
 @all_cases
 def test_two_images_have_twice_the_derivatives_of_one(name):
-    """Of what the sensor's parameters were computed from, in two passes; sums of the same terms."""
+    """Two passes differentiate the inputs of the sensor's parameters; sums of the same terms."""
     case, scene = CASES[name], clear_scene(name)
     weights = single(np.random.default_rng(3).normal(size=image_of(case.load(scene)).shape))
     loaded = case.load(scene)

@@ -54,7 +54,7 @@ def disc(height, radius):
 
 
 def factors(scene):
-    """By which colours of 0.5 + 0.282 sh0 were multiplied, and harmonics."""
+    """Return factors of the colours 0.5 + 0.282 sh0, and of harmonics."""
     integrator = scene.integrator()
     mi.render(scene)
     own = integrator.state.own.gaussians

@@ -180,7 +180,7 @@ class Furnace:
         return (1 - self.alpha) ** 2
 
     def radiances(self, most_depth) -> list[float]:
-        """Of what the camera sees, with paths of a depth of 1, 2, ..., most_depth.
+        """Return the radiance that the camera sees, with paths of a depth of 1, 2, ..., most_depth.
 
         Of two points of the sphere at the distance d, both cosines are d / 2: they see each other
         with cos cos / (pi d^2) = 1 / 4 pi, whichever they are, and what a bounce brings is the mean
@@ -256,7 +256,7 @@ def test_bounces_in_a_furnace_of_fog_converge_to_its_radiance(furnace):
 
 @pytest.mark.parametrize("color", [0.02, 0.5, (0.9, 0.3, 0.1)])
 def test_drawn_splats_have_the_colour_of_all_on_average(color):
-    """Of several colours before each other, whose mean is decoded, not they."""
+    """Splats of several colours overlap: their mean is decoded, not each of them."""
     rng = np.random.default_rng(3)
     colors = np.clip(np.asarray(color) * rng.uniform(0, 2, (40, 3)), 0, 1)
     means = rng.normal(0, 0.4, (40, 3)) + np.array([0, 0, 6])
@@ -302,7 +302,7 @@ def test_glass_that_does_not_refract_changes_nothing():
 
 
 def test_materials_and_lamps_are_differentiated_among_splats():
-    """As central differences of images with many paths."""
+    """Central differences use images with many paths."""
     splats = gaussians([[0.3, 1.2, 0.5], [-0.8, 0.6, 0.4]], 0.4, 0.7, 0.8)
     objects = room()
     objects["sensor"] = camera([0, 2, 4], [0, 0.3, 0], size=8)

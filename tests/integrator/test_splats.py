@@ -296,7 +296,7 @@ def test_pixels_near_a_threshold_are_all_that_may_differ():
 
 @pytest.mark.parametrize("crop", [(13, 7, 29, 18), (40, 30, 13, 11), (0, 0, 5, 5)])
 def test_a_window_is_a_part_of_the_whole_image(crop):
-    """Of splats so large that they reach into the window from far outside."""
+    """Large splats reach into the window from far outside."""
     whole = Scene(View("whole", 53, 41))
     values = tensors(whole.gaussians)
     values["log_scales"] += 1.0

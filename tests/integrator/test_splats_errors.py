@@ -1,4 +1,4 @@
-"""What the ``splats`` integrator refuses."""
+"""Errors of the ``splats`` integrator."""
 
 from dataclasses import replace
 from functools import cache

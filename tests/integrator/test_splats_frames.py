@@ -1,4 +1,4 @@
-"""What the ``splats`` integrator keeps, what it exposes, and that its bytes repeat."""
+"""Caches of the ``splats`` integrator, its parameters, and that its bytes repeat."""
 
 import gc
 import weakref

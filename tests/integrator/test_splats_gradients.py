@@ -41,7 +41,7 @@ def variant():
 
 @all_settings
 def test_gradients_equal_the_references_for_any_setting(scene):
-    """Of all parameters, from random weights on colour and alpha."""
+    """Gradients of all parameters, from random weights on colour and alpha."""
     scene = clear(scene)
     names = [n for n in ALL_PARAMETERS if n != "shN" or scene.degree > 0]
     actual = gradients_of(scene.load(), scene.weights(), names)
@@ -84,7 +84,7 @@ def test_a_derivative_that_is_not_a_number_reaches_the_parameters():
     loaded = scene.load()
     actual = gradients_of(loaded, weights)
     assert not np.isfinite(actual["means"]).all()
-    fault = rendering.decode_fault(int(loaded.integrator().last.first_nonfinite[0]))
+    fault = rendering.decode_nonfinite(int(loaded.integrator().last.first_nonfinite[0]))
     assert fault is not None and fault[1] in PARAMETER_NAMES
 
 
@@ -206,7 +206,7 @@ def test_two_views_before_one_backward_pass():
 
 
 def test_a_backward_pass_differentiates_the_parameters_of_its_time():
-    """As Mitsuba's other integrators do: the scene is all that they know. Documented."""
+    """Mitsuba's other integrators do the same, since they know only the scene. Documented."""
     before, after = clear(Scene()), clear(Scene(seed=100))
     loaded = before.load()
     params = mi.traverse(loaded)

@@ -1,4 +1,4 @@
-"""What the ``splats`` integrator is told to ignore, and what it says about it."""
+"""The property ``ignore`` of the ``splats`` integrator, and its messages."""
 
 import mitsuba as mi
 import numpy as np

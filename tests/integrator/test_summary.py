@@ -407,7 +407,7 @@ def in_a_new_process(run_python, blocked=(), **changes) -> dict:
 
 
 def test_kernels_are_the_same_when_the_modules_of_effects_are_gone(run_python):
-    """Of a image with its derivatives, and of a fit's iterations: hashes and operations."""
+    """Hashes and operations of an image with its derivatives, and of a fit's iterations."""
     whole = in_a_new_process(run_python)
     reduced = in_a_new_process(run_python, blocked=MODULES)
     assert whole == reduced

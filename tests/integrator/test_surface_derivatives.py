@@ -80,7 +80,7 @@ def test_the_gradient_of_what_the_wall_shows_is_its_share():
 
 @pytest.mark.parametrize("srgb_primitives", [False, True])
 def test_forward_mode_is_the_transpose_of_the_gradients(srgb_primitives):
-    """Of the splats, what the wall shows, and the environment past its edges."""
+    """Parameters: the splats, the wall's colour, and the environment past its edges."""
     scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
     weights = weights_of(scene)
     keys = [f"integrator.{name}" for name in PARAMETER_NAMES]
@@ -270,7 +270,7 @@ def test_samples_of_the_nested_integrator_are_left_to_it(spp):
 
 
 def test_gradients_are_those_of_the_image_whatever_the_nested_samples():
-    """Of splats at the centres of pixels, before a wall that covers the film and has no noise."""
+    """Splats at the centres of pixels, before a wall that covers the film and has no noise."""
     scene, weights = apart(SCENE), weights_of(SCENE)
     alone = gradients_of(load(scene), weights, ["means"])["means"]
     with_more = gradients_of(load(scene, nested_spp=16), weights, ["means"])["means"]
@@ -302,7 +302,7 @@ def test_a_image_in_between_does_not_change_the_gradients():
 
 
 def test_gaussians_of_shapes_are_splats_and_no_surfaces():
-    """As if they were the integrator's own; they are left out of the nested image."""
+    """They equal the integrator's own, and the nested image does not show them."""
     scene = apart(SCENE)
     center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center
     one = {

@@ -162,7 +162,7 @@ def test_depth_alpha_and_normal_are_those_of_both():
 
 
 def test_depth_of_surfaces_is_that_of_mitsubas_own_positions():
-    """Where only surfaces are, and in a pixel whose splats are all in front of them."""
+    """Pixels with surfaces alone, and one whose splats are all in front of them."""
     scene, wall = apart(SCENE), Wall(tilt=(0.3, -0.2))
     bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
     loaded = load(scene, wall=wall, aovs="z:depth, a:alpha, f:feature_x", **bare, **feature(scene))
@@ -224,7 +224,7 @@ def test_surfaces_nearer_than_the_near_plane_are_not_seen():
 
 
 def test_surfaces_beyond_the_far_clip_are_not_seen():
-    """As ``path`` has it. Splats are."""
+    """``path`` does the same. Splats are seen there."""
     scene = apart(SCENE)
     loaded = load(scene, sensor=scene.view.sensor() | {"far_clip": 1.5}, aovs="z:depth")
     without = image_of(load(scene, wall=None, aovs="z:depth"))
@@ -308,7 +308,7 @@ def test_the_users_scene_stays_as_it_is():
 
 
 def repeated(shape) -> dict:
-    """Of a shape, the group that holds it and an instance of that."""
+    """Return a shape, its group and an instance of the group."""
     group = {"type": "shapegroup", "shape": shape}
     return {"group": group, "copy": {"type": "instance", "of": {"type": "ref", "id": "group"}}}
 
@@ -345,7 +345,7 @@ def test_instances_are_surfaces(with_shapes):
 
 
 def test_one_integrator_can_render_a_scene_with_and_without_mitsubas_gaussians():
-    """Of the same objects otherwise."""
+    """All other objects are the same."""
     floor, more = mi.load_dict(pane(2.3, {"type": "diffuse"})), mi.load_dict(blob([0, 0, 0]))
     sensor = mi.load_dict(SCENE.view.sensor())
     lamp = mi.load_dict({"type": "point", "position": list(SCENE.camera.center)})

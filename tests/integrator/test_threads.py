@@ -18,7 +18,7 @@ def variant():
 
 
 def in_two_threads(work):
-    """What ``work(0)`` and ``work(1)`` return, at once; their exceptions are raised here."""
+    """Return ``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
     results = [None, None]
 
     def run(number):

@@ -121,7 +121,7 @@ def test_the_same_numbers_agree_where_the_low_pass_is_small():
 
 @all_scenes
 def test_nothing_but_the_derived_difference_sets_them_apart(splats):
-    """What is left when it is taken off is rounding."""
+    """Only rounding is left when it is subtracted."""
     gaussians, view = splats.gaussians, splats.view
     on_film = footprints(gaussians, view.camera, widened(gaussians, view.camera))
     depths = (gaussians.means - view.camera.center) @ view.camera.rotation[2]

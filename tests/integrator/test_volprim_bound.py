@@ -1,4 +1,4 @@
-"""What the bound between drgs and ``volprim_rf_basic`` refuses."""
+"""Scenes that the bound between drgs and ``volprim_rf_basic`` refuses."""
 
 from __future__ import annotations
 

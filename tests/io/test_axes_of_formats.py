@@ -39,7 +39,7 @@ def asymmetric_scene() -> Gaussians:
 
 
 def rendered(gaussians: Gaussians, rotation: np.ndarray) -> np.ndarray:
-    """By the float64 reference, from a camera turned about the origin."""
+    """Render by the float64 reference, from a camera turned about the origin."""
     pose = pose_around(0.7, 0.4)
     pose[:3] = rotation @ pose[:3]
     black = np.zeros((1, 1, 3), np.float32)

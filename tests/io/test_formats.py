@@ -1,4 +1,4 @@
-"""What all formats of Gaussians have in common: what was written is read, and damage is refused."""
+"""Properties of all formats of Gaussians: written files are read back, and damage is refused."""
 
 import re
 import tracemalloc
@@ -105,7 +105,7 @@ def test_another_suffix_is_not_written(tmp_path):
 
 
 def test_compressed_elements_behind_lists_are_missed(tmp_path):
-    """Where lists end, nobody knows; harmonics behind them are not taken for none."""
+    """The end of a list is unknown; harmonics behind it are not taken for none."""
     content = gaussians_within_ranges(5).to_bytes("compressed-ply")
     lists = b"element foo 1\nproperty list uchar int bar\nelement sh"
     path = tmp_path / "a.ply"

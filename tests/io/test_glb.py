@@ -35,7 +35,7 @@ def primitive_of(document):
 
 
 def numbers(document, binary, name):
-    """Of an attribute, as the specification's section 3.6 has them."""
+    """Return an attribute's numbers as the specification's section 3.6 defines them."""
     accessor = document["accessors"][primitive_of(document)["attributes"][name]]
     view = document["bufferViews"][accessor["bufferView"]]
     part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]

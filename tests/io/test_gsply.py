@@ -15,7 +15,8 @@ READERS = {
 
 
 def assert_found_alike(path, degree):
-    """By both readers, in the axes of the file; opacities, as logits of 0 and 1 are a choice."""
+    """Check that both readers agree, in the axes of the file; logits of opacities 0 and 1 are a
+    choice."""
     theirs, ours = (read(path) for read in READERS["".join(path.suffixes[-2:])])
     ours = ours[0]
     pairs = {

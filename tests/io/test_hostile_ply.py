@@ -33,7 +33,7 @@ def gaussians_with(logits):
 
 
 def test_infinite_logits_are_opacities_that_a_sigmoid_tells_from_1_and_0(tmp_path):
-    """Of 8 bits, 255 and 0: what a file that went through SPZ or compressed PLY holds."""
+    """Files that went through SPZ or compressed PLY contain opacities 0 and 255 of 8 bits."""
     path = tmp_path / "a.ply"
     gaussians_with([0.5, np.inf, -np.inf, np.inf, 80.0]).save(path)
     with pytest.warns(UserNote) as notes:
@@ -123,7 +123,7 @@ def test_vertices_with_lists_are_refused_before_they_take_memory(tmp_path):
 
 
 def test_faces_take_no_memory(tmp_path):
-    """What is not read is not made into objects either."""
+    """Elements that are not needed are not made into objects."""
     header = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
     header += b"".join(b"property float %s\n" % axis for axis in (b"x", b"y", b"z"))
     header += b"element face 4000000\nproperty list uchar int vertex_indices\nend_header\n"
@@ -137,7 +137,7 @@ def test_faces_take_no_memory(tmp_path):
 
 
 def edited_headers(lines):
-    """By what was done: headers of a structure that the rows do not have, or of none."""
+    """Return headers, by edit, of a structure that the rows do not have, or of none."""
     for at, line in enumerate(lines):
         word, *words = line.split()
         if words[:1] != [b"sh"]:  # without it, its properties are the vertices': another file

@@ -1,4 +1,4 @@
-"""What the header of a file says that its Gaussians are rendered with."""
+"""Settings that a PLY header records."""
 
 from dataclasses import replace
 from itertools import product
@@ -8,7 +8,7 @@ import pytest
 from drjit.llvm.ad import TensorXf
 from support.small_capture import blobs
 
-from drgs.config.approximations import Approximations, said_by
+from drgs.config.approximations import Approximations, from_ply_header
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
 
@@ -31,7 +31,7 @@ def test_what_is_written_is_read_back_with_its_types(tmp_path):
     found = Gaussians.load(tmp_path / "a.ply")
     assert found.rendered_with == expected
     assert [type(v) for v in found.rendered_with.values()] == [bool, float, int, str, float, float]
-    assert said_by("a.ply", found.rendered_with) == expected
+    assert from_ply_header("a.ply", found.rendered_with) == expected
     assert found.to(TensorXf).numpy().rendered_with == expected
 
 
@@ -122,7 +122,7 @@ def test_values_outside_of_their_limits_are_refused_where_they_are_used(
     path = with_lines(tmp_path / "a.ply", f"comment drgs {name} {text}".encode())
     said = Gaussians.load(path).rendered_with  # reading the Gaussians does not depend on it
     with pytest.raises(UserError) as error:
-        said_by(str(path), said)
+        from_ply_header(str(path), said)
     assert str(error.value) == (
         f"{path}: the header's {name} must be {expected}; correct the line, or remove it"
     )
@@ -130,7 +130,7 @@ def test_values_outside_of_their_limits_are_refused_where_they_are_used(
 
 def said_noted(values):
     with pytest.warns(UserNote) as notes:
-        found = said_by("a.ply", values)
+        found = from_ply_header("a.ply", values)
     (note,) = notes
     assert "\n" not in str(note.message) and str(note.message).isprintable()
     return found
@@ -140,7 +140,7 @@ def test_names_that_are_not_known_are_noted(tmp_path):
     lines = [f"comment drgs new{letter} 1".encode() for letter in "abcde"]
     path = with_lines(tmp_path / "a.ply", b"comment drgs low_pas 0.2", *lines)
     with pytest.warns(UserNote) as notes:
-        assert said_by(str(path), Gaussians.load(path).rendered_with) == {}
+        assert from_ply_header(str(path), Gaussians.load(path).rendered_with) == {}
     assert str(notes[0].message) == (
         f"{path}: specifies low_pas, newa, newb and 3 more, which is not known here and "
         "ignored; did you mean low_pass?"

@@ -16,7 +16,7 @@ def _one_far(rng, means, log_scales, logits):
 
 
 def _one_beyond_squares(rng, means, log_scales, logits):
-    """Of single precision. It does not exist; the others do."""
+    """Move a Gaussian so far that its square overflows single precision. The others exist."""
     means[-1] = np.sign(means[-1]) * rng.uniform(0.1, 3) * 1e38
     logits[-1] = -200 if len(means) == 1 else logits[-1]
 

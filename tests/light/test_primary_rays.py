@@ -1,4 +1,4 @@
-"""What primary rays pass of splats, against images that others make of them.
+"""Splats along primary rays, against images of them by other renderers.
 
 A camera's rays meet Gaussians as images of the projection ``exact`` show them, whose order and
 colours are those along a pixel's ray. Two things differ by definition, and are configured away:
@@ -137,7 +137,7 @@ some_views = pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[10]], id
 @both_precisions
 @some_views
 def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
-    """Of the reference of images, which projects; rays do not. And so does the reference of rays.
+    """The reference of images projects; rays, and the reference of rays, do not.
 
     Within what images by the kernels are.
     """

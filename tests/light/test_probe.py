@@ -1,4 +1,4 @@
-"""What probes see of splats, against a reference that looks at every splat."""
+"""Probes, against a reference that visits every splat."""
 
 import itertools
 
@@ -84,7 +84,7 @@ def test_every_direction_has_one_place_on_the_cube(precision):
 @both_precisions
 @pytest.mark.parametrize("number", [0, 1])
 def test_from_its_centre_a_probe_sees_what_rays_do(precision, number):
-    """Of fourteen balls side by side, also across the edges of the cube.
+    """Fourteen balls side by side, also across the edges of the cube.
 
     Between texels, 2/256 of a distance apart, a Gaussian of 0.08 of it differs from a line by less
     than (2/256 / 0.08)^2 / 8 = 1.2e-3 of itself; where it is cut off, it jumps by 1/255.

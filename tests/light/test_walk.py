@@ -1,4 +1,4 @@
-"""What rays pass of splats, against a reference that looks at every splat."""
+"""Splats along rays, against a reference that visits every splat."""
 
 from dataclasses import replace
 

@@ -93,7 +93,7 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
 
 
 def masks_for_colmap(folder, masks):
-    """What COLMAP is given for photographs of 8 x 6 px; masks: (H, W) by name of the file."""
+    """Return COLMAP's masks of photographs of 8 x 6 px; masks: (H, W) by name of the file."""
     (folder / "masks").mkdir(exist_ok=True)
     for name, mask in masks.items():
         Image.fromarray(np.uint8(mask)).save(folder / "masks" / name)
@@ -106,7 +106,7 @@ def masks_for_colmap(folder, masks):
 
 
 def test_masks_are_found_by_any_name(tmp_path):
-    """As fits find them; transparent pixels do not count."""
+    """Fits find them by the same names; transparent pixels do not count."""
     alpha = Image.new("LA", (8, 6), (255, 255))
     alpha.putpixel((3, 2), (255, 0))
     (tmp_path / "masks").mkdir()

@@ -181,7 +181,8 @@ def test_unscented_transform_tends_to_ewa_far_away():
     gaussians, camera = rotated_splats(), straight_camera()
 
     def errors(factor):
-        """Of the mean in deviations, and of C relative to it, worst over the splats."""
+        """Return errors of the mean in deviations, and of C relative to it, worst over the
+        splats."""
         far = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
         small = replace(gaussians, log_scales=gaussians.log_scales - np.log(factor))
         # A film on which no slope is clamped; no wider, or differences of places would be rounded.

@@ -107,7 +107,7 @@ def test_what_a_mask_leaves_out_does_not_matter():
 
 
 def test_ssim_of_a_mask_is_the_mean_of_the_map_over_the_pixels_that_count():
-    """Of masked images, by a window in two dimensions at each pixel."""
+    """The expected value uses a window in two dimensions at each pixel of masked images."""
     x, y = images(2, (14, 13, 3))
     mask = np.ones((14, 13))
     mask[2:6, 4:9] = 0

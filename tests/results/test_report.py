@@ -1,4 +1,4 @@
-"""What a fit shows of itself, made from a few blobs and noise for photographs."""
+"""Reports of fits, made from a few blobs, and noise for photographs."""
 
 import base64
 import io
@@ -23,7 +23,7 @@ from drgs.integrator.scene import make_scene, render_views
 from drgs.results import curves, report
 from drgs.results.history import DensityRow, HistoryRow, summarize_density
 from drgs.results.metrics import ssim
-from drgs.results.viewer import Shown
+from drgs.results.viewer import DisplaySettings
 
 KINDS = ("still", "moving")
 VOID = {"meta", "link", "img", "source", "br", "input"}
@@ -46,7 +46,7 @@ def images(dataset, scene):
 
 
 def scored(images, dataset):
-    """What renders the test views as ``images``, and their scores."""
+    """Return an object that renders the test views as ``images``, and their scores."""
     by_name = {view.name: image for view, image in zip(dataset.test, images, strict=True)}
     scores = [report.score(by_name[view.name], view) for view in dataset.test]
     return lambda views: [by_name[view.name] for view in views], scores
@@ -94,7 +94,7 @@ def out(tmp_path_factory, dataset, scene, images):
     folder.mkdir()
     render = partial(render_views, scene)
     scores = report.write_images(folder, dataset, render, with_renders=False, with_comparisons=True)
-    fitted = report.Fitted(scene, blobs(), render, Shown(blobs(), Approximations()))
+    fitted = report.FitImages(scene, blobs(), render, DisplaySettings(blobs(), Approximations()))
     report.write_results(folder, dataset, fitted, scores, history(changes=CHANGES), metrics())
     return folder
 
@@ -142,15 +142,15 @@ def test_one_image_is_held_at_a_time(tmp_path, dataset):
 
 def test_a_comparison_is_fitted_photograph_difference(out, dataset, images):
     pixels = np.asarray(Image.open(out / "side_by_side" / "test" / "r_2.png")) / 255
-    step = WIDTH + report.GAP
+    step = WIDTH + report.IMAGE_GAP_PX
     fitted, photograph, difference = (pixels[:, k * step : k * step + WIDTH] for k in range(3))
     rounding = 0.5 / 255 + 1e-6
     assert np.abs(fitted - images[2]).max() < rounding
     assert np.abs(photograph - dataset.test[2].image).max() < rounding
     expected = np.clip(0.5 + 5 * (images[2] - dataset.test[2].image), 0, 1)
     assert np.abs(difference - expected).max() < rounding
-    assert pixels.shape == (HEIGHT, 3 * WIDTH + 2 * report.GAP, 3)
-    assert (pixels[:, WIDTH : WIDTH + report.GAP] == 1).all()
+    assert pixels.shape == (HEIGHT, 3 * WIDTH + 2 * report.IMAGE_GAP_PX, 3)
+    assert (pixels[:, WIDTH : WIDTH + report.IMAGE_GAP_PX] == 1).all()
 
 
 def test_what_a_mask_leaves_out_is_no_difference(dataset, images):

@@ -23,7 +23,7 @@ from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import viewer
 from drgs.results.refined_cameras import write_views
-from drgs.results.viewer import InitialView, Shown, viewer_page
+from drgs.results.viewer import DisplaySettings, InitialView, viewer_page
 
 SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
 MANIFEST = json.loads(SHIPPED.joinpath("MANIFEST.json").read_text())
@@ -33,7 +33,7 @@ TITLE = '<i>"ü" & </script>'
 
 
 class Page(HTMLParser):
-    """What the elements of a page hold, and where they refer to."""
+    """Contents and links of a page's elements."""
 
     def __init__(self, page: bytes):
         super().__init__()
@@ -51,7 +51,7 @@ class Page(HTMLParser):
 
 
 def page_of(gaussians, initial_view, title="title", background=(0.1, 0.2, 0.3)):
-    return viewer_page(title, Shown(gaussians, OWN), initial_view, background)
+    return viewer_page(title, DisplaySettings(gaussians, OWN), initial_view, background)
 
 
 @pytest.fixture(scope="module")
@@ -212,17 +212,17 @@ def test_which_approximations_are_shown():
 def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
     folder, dataset = tmp_path / "blobs", make_dataset()
     folder.mkdir()
-    viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
+    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
     size = (folder / "viewer.html").stat().st_size
     (folder / "viewer.html").unlink()
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size - 1)
     with pytest.warns(
         UserNote, match=r"blobs/viewer\.html: not written, .*export .* --format html"
     ):
-        viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
+        viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
     assert list(folder.iterdir()) == []
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size)
-    viewer.write_viewer(folder, dataset, Shown(blobs(), OWN))
+    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
     assert (folder / "viewer.html").stat().st_size == size
 
 
@@ -230,7 +230,7 @@ def test_what_is_too_large_by_its_number_alone_is_not_built(tmp_path, monkeypatc
     monkeypatch.setattr(viewer, "viewer_page", None)
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.least_bytes(30, blobs().sh_degree) - 1)
     with pytest.warns(UserNote, match=r"not written, as it would have at least 0 MB"):
-        viewer.write_viewer(tmp_path, make_dataset(), Shown(blobs(), OWN))
+        viewer.write_viewer(tmp_path, make_dataset(), DisplaySettings(blobs(), OWN))
     assert list(tmp_path.iterdir()) == []
     assert viewer.seconds_of_page(30, 1) == 0 < viewer.seconds_of_page(29, 0)
 
@@ -249,7 +249,7 @@ def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(initial_
 def test_a_page_in_the_current_folder_is_named_after_it(tmp_path, monkeypatch):
     (tmp_path / "blobs").mkdir()
     monkeypatch.chdir(tmp_path / "blobs")
-    viewer.write_viewer(Path(), make_dataset(), Shown(blobs(), OWN))
+    viewer.write_viewer(Path(), make_dataset(), DisplaySettings(blobs(), OWN))
     assert Page(Path("viewer.html").read_bytes()).texts["title"].strip() == "blobs: Gaussian splats"
 
 
@@ -262,7 +262,7 @@ def test_the_first_view_is_that_of_the_refined_cameras(tmp_path):
         config = {"data": {"path": "data"}, "cameras": {"optimise": folder == "refined"}}
         (tmp_path / folder / "config.yml").write_text(yaml.safe_dump(config))
         write_views(tmp_path / folder / "cameras.json", replace(dataset, train=far))
-        viewer.write_viewer(tmp_path / folder, dataset, Shown(blobs(), OWN))
+        viewer.write_viewer(tmp_path / folder, dataset, DisplaySettings(blobs(), OWN))
         splats = Page((tmp_path / folder / "viewer.html").read_bytes()).texts["splats"]
         (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(splats)))
         sizes.append(np.ptp(Gaussians.load(tmp_path / "a.ply").means, axis=0))

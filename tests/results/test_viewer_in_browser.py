@@ -13,7 +13,7 @@ from drgs.config.schema import ModelConfig
 from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.results.viewer import InitialView, Shown, viewer_page
+from drgs.results.viewer import DisplaySettings, InitialView, viewer_page
 
 browsers = pytest.importorskip("support.browser", reason="needs POSIX", exc_type=ImportError)
 
@@ -78,7 +78,7 @@ def initial_view(gaussians):
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory, gaussians, initial_view):
-    shown = Shown(gaussians, Approximations(**FITTED_WITH))
+    shown = DisplaySettings(gaussians, Approximations(**FITTED_WITH))
     path = tmp_path_factory.mktemp("viewer") / "a page & größe.html"
     path.write_bytes(viewer_page(TITLE, shown, initial_view, BACKGROUND))
     return path

@@ -1,4 +1,4 @@
-"""What splats among surfaces must give is known: a white furnace, the shadow of a ball."""
+"""Splats among surfaces with known results: a white furnace, the shadow of a ball."""
 
 import mitsuba as mi
 import numpy as np

@@ -33,7 +33,7 @@ def run(relight, monkeypatch, *arguments):
 
 
 def errors(true, found) -> dict[str, float]:
-    """Of each unknown, the distance from the truth."""
+    """Return the distance of each unknown from the truth."""
     true = asdict(true)
     return {name: float(np.linalg.norm(np.subtract(v, true[name]))) for name, v in found.items()}
 

@@ -18,7 +18,7 @@ MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name
 
 
 def files_of_the_checkout():
-    """By path, size and time of the last change."""
+    """Return path, size and time of the last change of each file."""
     paths = [path for folder in FOLDERS for path in (REPOSITORY / folder).rglob("*")]
     kept = [path for path in paths if path.is_file() and "__pycache__" not in path.parts]
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in kept}

@@ -122,7 +122,7 @@ def _check_row_that_is_not_finite(case):
 
 @cache
 def _loss_and_gradient(height, width, weight):
-    """Of the naive formula, the gradient by central differences: two images, loss, gradient."""
+    """Return two images, the loss and its gradient by central differences of the naive formula."""
     x, y = loss_checks.images(height, width, seed=1)
     gradient, step = np.empty_like(x), 1e-5
     assert np.abs(x - y).min() > step  # |x - y| has a kink
@@ -148,7 +148,7 @@ def _check_loss_and_gradient():
 
 
 def _detectors(at_thresholds):
-    """Those that see all partials; and those for hard cases, for what the former do not notice."""
+    """Return the detectors of all partials, and those of hard cases for mutants that these miss."""
     case, flat, equal = clear(CASE), _flat_scene(), _scene_at_thresholds()
     chain, stage, loss = rendering_checks, compositing_checks, loss_checks
 

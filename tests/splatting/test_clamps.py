@@ -1,4 +1,4 @@
-"""What each limit of the image model does to the gradient: decided in ``constants.py``, shown here.
+"""Effect of each limit of the image model on the gradient: decided in ``constants.py``.
 
 One splat (or a few), float64 and float32. Each test moves a parameter from one side of a limit to
 the other: on the limited side the gradient is exactly what the constant's docstring says, on the

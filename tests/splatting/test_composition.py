@@ -1,4 +1,4 @@
-"""What a scene does not call for is in no kernel; no kernel adds floats atomically.
+"""Unused effects are in no kernel; no kernel adds floats atomically.
 
 Kernels are compared between fresh processes of one test run: nothing is stored.
 """

@@ -16,7 +16,7 @@ FILM = {"width": CASE.width, "height": CASE.height, "near_plane": 0.25}
 
 
 def arrays(kind, channels):
-    """By the names of drgs.rasterization."""
+    """Return arrays by the names of drgs.rasterization."""
     g, c, rng = CASE.gaussians, CASE.camera, np.random.default_rng(4)
     viewmat, K = np.eye(4), np.eye(3)
     viewmat[:3, :3], viewmat[:3, 3] = c.rotation, -c.rotation @ c.center

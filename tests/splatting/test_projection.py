@@ -234,7 +234,7 @@ def test_a_camera_far_from_the_origin_sees_the_same(precision):
     gaussians, camera = case.scene
     means, center = (np.round(v * 1024) / 1024 for v in (gaussians.means, camera.center))
     shift = np.array([4096.0, -4096.0, 4096.0])
-    fields = ("means2d", "whitening", "depths", "opacities", "colors", "variances")
+    fields = ("means2d", "conic_factor", "depths", "opacities", "colors", "variances")
     here, there = (
         splats_of(
             replace(gaussians, means=means + offset),
@@ -262,7 +262,7 @@ def test_needle_keeps_its_determinant(length, precision):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance * scale)
     # At the distance l along the needle |U d|^2 = 1; a dx^2 + 2 b dx dy + c dy^2 would be noise
     # of l^2 times epsilon. What is left is p + r = 0 up to a rounding of p, against s = 1.4 / l.
-    p, r, s = rows(splats.whitening)[0]
+    p, r, s = rows(splats.conic_factor)[0]
     assert length**2 / 2 * ((p + r) ** 2 + s**2) == pytest.approx(1, rel=1e-3)
 
 
@@ -272,7 +272,7 @@ def test_compensated_splats_keep_their_integral(precision, sizes):
     """o 2 pi sqrt(det cov2d) is that of the splat before the low-pass, for the smallest too."""
     gaussians, camera = needle(np.log([*sizes, 1e-3]))
     splats = splats_of(gaussians, camera, precision, rule=compensated_opacity)
-    p, _, s = rows(splats.whitening)[0]
+    p, _, s = rows(splats.conic_factor)[0]
     integral = rows(splats.opacities)[0] / (p * s)
     expected = reference.sigmoid(np.float64(3.0)) * sizes[0] * sizes[1]
     assert integral == pytest.approx(expected, rel=32 * float(np.finfo(precision.dtype).eps))
@@ -309,4 +309,6 @@ def test_gaussians_that_are_not_finite_are_invisible(precision, name, value):
     assert visible[row] == fine
     others = np.arange(len(visible)) != row
     np.testing.assert_array_equal(visible[others], np.array(healthy.visible)[others])
-    np.testing.assert_array_equal(rows(splats.whitening)[others], rows(healthy.whitening)[others])
+    np.testing.assert_array_equal(
+        rows(splats.conic_factor)[others], rows(healthy.conic_factor)[others]
+    )

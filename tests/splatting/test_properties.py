@@ -1,4 +1,4 @@
-"""What must hold for every scene: the kernels are compared with themselves on random scenes.
+"""Invariants of every scene: the kernels are compared with themselves on random scenes.
 
 Hypothesis draws the structure of a scene (its film, its size, what is rendered) and a seed; the
 numbers come from the recipes of ``helpers`` and ``views``. Every run sees the same examples.
@@ -152,7 +152,7 @@ def test_points_and_camera_may_be_scaled_by_powers_of_two(precision, case, expon
 
 
 def scaled_result(result, factor) -> Result:
-    """What becomes of a result when the unit of length is divided by ``factor``."""
+    """Return the result that a division of the unit of length by ``factor`` must give."""
     return Result(
         rendered=result.rendered | {"depth": factor * result.rendered["depth"]},
         gradients=result.gradients | {"means": result.gradients["means"] / factor},

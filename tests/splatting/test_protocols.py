@@ -22,7 +22,7 @@ from drgs.splatting import footprint, rendering
 
 CLASSES = {
     footprint.GaussianFalloff: (exact.RayFalloff, defocus.DimmedFalloff),
-    footprint.Positions: (footprint.PixelCenters, LanePoints),
+    footprint.SamplePositions: (footprint.PixelCenters, LanePoints),
     footprint.SplatFeatures: (
         occlusion.OccludedFeatures,
         ray_colors.RayColors,

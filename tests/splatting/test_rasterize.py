@@ -149,7 +149,7 @@ def test_the_second_clamped_splat_stops_the_pixel(precision):
 def test_a_clamped_alpha_has_no_derivative_but_the_colour_has(precision):
     scene = stack([0.999, 0.5], offset=(0.3, 0.1))
     gradients = scene.kernel_gradients(precision, np.ones((1, 1, 1)), np.ones((1, 1)))
-    for name in ("means2d", "whitening", "opacities"):
+    for name in ("means2d", "conic_factor", "opacities"):
         assert not gradients[name][0].any() and gradients[name][1].any(), name
     np.testing.assert_allclose(gradients["features"][:, 0], [0.99, 0.005], rtol=1e-3)
     tangents = random_tangents(scene)
@@ -199,7 +199,7 @@ def test_a_needle_leaves_nothing_where_its_exponent_is_far_below_the_range(preci
         scene = replace(
             scene,
             means2d=np.array([[6.0, 4.5]]),
-            whitening=single([[1 / 500, 0, steepness / 0.55]]),
+            conic_factor=single([[1 / 500, 0, steepness / 0.55]]),
         )
         expected = scene.reference_planes()
         assert (expected["transmittance"][4] < 0.2).all()
@@ -289,7 +289,7 @@ def test_records_hold_geometry_and_features_of_each_entry_that_touches(precision
     expected = np.column_stack(
         [
             rows(precision.vectors(scene.means2d)),
-            rows(precision.vectors(scene.whitening) * WHITENING_SCALE),
+            rows(precision.vectors(scene.conic_factor) * WHITENING_SCALE),
             np.array(dr.log2(precision.array(scene.opacities))),
             *(np.array(precision.array(column)) for column in scene.features.T),
         ]
@@ -331,7 +331,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     counted = lanes_module.count_entries(lanes_module.Entries(bins, lanes, lane_stop))
     np.testing.assert_array_equal(counted, expected)
     assert len(set(expected)) > 3
-    similar = lanes_module.grouped_by_work(
+    similar = lanes_module.group_by_work(
         precision.Float, bins.grid, slots.number(lanes_module.Entries(bins, lanes, lane_stop))
     )
     np.testing.assert_array_equal(np.sort(similar.micro_tile), np.sort(lanes.micro_tile))

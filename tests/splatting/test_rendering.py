@@ -117,7 +117,7 @@ def test_gradients_equal_the_reference(precision, case):
 @pytest.mark.parametrize(
     ("field", "first", "end"),
     [("geometry", 0, 2), ("geometry", 2, 5), ("geometry", 5, 6), ("features", 0, 3)],
-    ids=["means2d", "whitening", "opacities", "features"],
+    ids=["means2d", "conic_factor", "opacities", "features"],
 )
 @both_precisions
 def test_gradients_scaled_by_one_percent_are_noticed(precision, field, first, end, monkeypatch):
@@ -208,7 +208,7 @@ def test_features_are_composited_in_the_order_that_was_asked_for(precision, feat
 
 @both_precisions
 def test_attached_parameters_are_detached(precision):
-    """As in ``mi.render``: gradients are suspended while attached parameters are given."""
+    """``mi.render`` does the same: gradients are suspended while attached parameters are given."""
     case = clear(CASES[0])
     gaussians = device_gaussians(case.gaussians, precision)
     dr.enable_grad(gaussians)

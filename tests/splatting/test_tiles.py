@@ -72,7 +72,7 @@ def bin_case(case, precision) -> Binned:
 
 
 def tile_and_micro(x, y, grid) -> tuple[np.ndarray, np.ndarray]:
-    """Of pixels: the tile, and the micro-tile within it, both counted in rows."""
+    """Return the tile of each pixel and the micro-tile in it, both counted in rows."""
     tile = (y // TILE) * grid.columns + x // TILE
     return tile, (y % TILE // MICRO) * GRID + x % TILE // MICRO
 
@@ -268,7 +268,7 @@ def round_splats(precision, means2d, sigma=1.0, depths=None, opacities=0.5, visi
     ones = np.ones(n)
     return tiles.Splats2D(
         means2d=precision.vectors(means2d),
-        whitening=precision.vectors(np.outer(1 / (sigma * ones), [1, 0, 1])),
+        conic_factor=precision.vectors(np.outer(1 / (sigma * ones), [1, 0, 1])),
         depths=precision.array(ones if depths is None else depths),
         opacities=precision.array(opacities * ones),
         colors=precision.vectors(np.ones((n, 3))),
@@ -357,11 +357,11 @@ def test_a_needle_touches_only_what_its_ellipse_touches():
     det = long * short
     p = np.sqrt(yy / det)
     splats = round_splats(FLOAT32, (80, 80), opacities=0.9)
-    whitening = single([[p, -p * xy / yy, 1 / np.sqrt(yy)]])
+    conic_factor = single([[p, -p * xy / yy, 1 / np.sqrt(yy)]])
     splats = tiles.Splats2D(
         **{
             **vars(splats),
-            "whitening": FLOAT32.vectors(whitening),
+            "conic_factor": FLOAT32.vectors(conic_factor),
             "variances": FLOAT32.vectors([[xx, yy]]),
         }
     )

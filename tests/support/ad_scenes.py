@@ -178,7 +178,7 @@ class Background(Means):
 
 
 class DefaultCutoffs(Means):
-    """Where splats end is not differentiated: Mitsuba's thresholds allow for that.
+    """The ends of splats are not differentiated: Mitsuba's thresholds allow for that.
 
     At the end of a splat alpha jumps by 1/255. Where a step of theta moves that past a pixel,
     differences are off by 8 / (12 epsilon 255), 0.13 of Mitsuba's floor. Large splats end flatly,
@@ -231,7 +231,7 @@ class NormalOfRotations(Feature):
 
 
 class AntialiasedScale(Config):
-    """Of splats that are smaller than a pixel."""
+    """Splats smaller than a pixel."""
 
     rendered = "antialiased"
     key = "integrator.log_scales"
@@ -245,7 +245,7 @@ class AntialiasedScale(Config):
 
 
 class UnscentedMeans(Means):
-    """Of which each pixel sees the colour in its own direction."""
+    """Each pixel sees the colour in its own direction."""
 
     rendered = "unscented"
 

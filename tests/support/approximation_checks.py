@@ -193,7 +193,7 @@ STEP = 2.0**-24
 
 @cache
 def central_differences(problem, parameter, weights_seed, seed) -> float:
-    """Of the reference, along :func:`direction`: d sum(weights * planes)."""
+    """Return the reference's d sum(weights * planes) along :func:`direction`."""
     weights, d = problem.weights(weights_seed), direction(problem, parameter, seed)
 
     def moved(sign):
@@ -232,7 +232,7 @@ def check_adjoint_is_the_transpose_of_the_tangent(precision, scene, name):
 
 
 def check_behind_hundreds_of_layers_gradients_keep_their_accuracy():
-    """What lies behind is known as a difference of sums; a splat seen through a transmittance of
+    """Light from behind is known as a difference of sums; a splat seen through a transmittance of
     1e-9 would have no digit left. Colours darken with depth, so that all terms are positive.
     """
     count = 220
@@ -325,7 +325,7 @@ def check_a_splat_without_opacity_has_no_derivatives():
 
 
 def check_a_colour_at_its_minimum_keeps_its_derivative():
-    """As Dr.Jit's selection does for the colour at the mean; below it there is none."""
+    """Dr.Jit's selection does the same for the colour at the mean; below it there is none."""
     number = FLOAT64.Float
     colors = ray_colors.RayColors(sh_degree=0, basis=([number(1)],))
     stored = [number(x) for x in (-0.5, -0.75, 0, -3)]  # colour 0, -0.25, 0.5; another feature

@@ -121,7 +121,7 @@ class Page:
         self.call("Emulation.setDeviceMetricsOverride", **size)
 
     def call(self, method: str, **parameters: object) -> dict:
-        """Of the protocol."""
+        """Call a method of the protocol."""
         return self._browser.call(method, self._session, **parameters)
 
     def cut_off(self) -> None:
@@ -170,7 +170,7 @@ class Page:
             self._mouse(kind, x, y, buttons=1, button="left", clickCount=1)
 
     def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10) -> None:
-        """Of the mouse, with its left button; px."""
+        """Drag the mouse with its left button; px."""
         held = {"button": "left", "clickCount": 1}
         self._mouse("mousePressed", *start, buttons=1, **held)
         for step in range(1, steps + 1):
@@ -205,7 +205,7 @@ class Page:
 
 @contextmanager
 def a_page(width: int, height: int) -> Iterator[Page]:
-    """Of a browser of its own, whose images are made by software."""
+    """Yield a page of a new browser, whose images are made by software."""
     with Browser(*SOFTWARE_WEBGL) as browser:
         yield Page(browser, width, height)
 

@@ -64,7 +64,7 @@ class Calibrated:
 
     @property
     def camera(self) -> reference.Camera:
-        """Of the whole film, at time 0."""
+        """The camera of the whole film, at time 0."""
         (fx, fy), (cx, cy) = self.f, self.c
         return replace(self.view.camera, fx=fx, fy=fy, cx=cx, cy=cy)
 
@@ -79,12 +79,12 @@ class Calibrated:
 
     @property
     def corner(self) -> np.ndarray:
-        """Of the crop window in the film, px."""
+        """The corner of the crop window in the film, px."""
         return np.array((self.view.crop or (0, 0))[:2])
 
     @property
     def size(self) -> np.ndarray:
-        """Of the crop window, px."""
+        """The size of the crop window, px."""
         rows, columns = self.view.window
         return np.array([columns.stop - columns.start, rows.stop - rows.start])
 
@@ -177,7 +177,8 @@ def own_sensor(kind, view) -> dict:
 
 
 def own_camera(view) -> reference.Camera:
-    """Of an orthographic sensor, by the manual: its film is 2 units of its own wide."""
+    """Return the camera of an orthographic sensor, by the manual: its film is 2 units of its own
+    wide."""
     matrix = np.array(view.to_world)[:3, :3]
     scales = np.linalg.norm(matrix, axis=0)
     rotation = np.diag([-1.0, -1.0, 1.0]) @ (matrix / scales).T

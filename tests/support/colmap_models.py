@@ -33,7 +33,7 @@ class Model:
 
 
 def quaternion_and_translation(pose):
-    """Of a pose, as COLMAP has it: world to camera, w first."""
+    """Return a pose in COLMAP's convention: world to camera, w first."""
     inverse = np.linalg.inv(pose)
     return np.roll(Rotation.from_matrix(inverse[:3, :3]).as_quat(), 1), inverse[:3, 3]
 
@@ -53,7 +53,7 @@ def some_model(rng, names=("a.jpg", "b c.jpg", "cam/1.png"), models=("PINHOLE", 
 
 
 def write_binary(folder, model, with_points=True):
-    """As COLMAP writes it; images observe as many points as their number says."""
+    """Write COLMAP's binary model; images observe as many points as their number says."""
     folder.mkdir(parents=True, exist_ok=True)
     data = struct.pack("<Q", len(model.cameras))
     for number, name, width, height, values in model.cameras:
@@ -77,7 +77,8 @@ def write_binary(folder, model, with_points=True):
 
 
 def write_text(folder, model, with_points=True):
-    """As COLMAP writes it: comments first, two lines for each image, of which one may be empty."""
+    """Write COLMAP's text model: comments first, two lines for each image, of which one may be
+    empty."""
     folder.mkdir(parents=True, exist_ok=True)
 
     def words(*values):
@@ -110,7 +111,7 @@ NAMES = ("a.jpg", "b.jpg", "cam/1.png", "cam/2.png")
 
 
 def write_images(folder, names=NAMES, size=SIZE, **options):
-    """Of a colour for each."""
+    """Write images, each of one colour."""
     for number, name in enumerate(names):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

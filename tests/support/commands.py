@@ -12,7 +12,7 @@ from support.folders import contents
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a process would leave."""
+    """Exit status and output of a process."""
 
     returncode: int
     stdout: str

@@ -37,7 +37,7 @@ class FlatScene:
     """Splats on the film: the same numbers for both sides, representable in float32."""
 
     means2d: np.ndarray  # (N, 2) px
-    whitening: np.ndarray  # (N, 3) p, r, s of U
+    conic_factor: np.ndarray  # (N, 3) p, r, s of U
     opacities: np.ndarray  # (N,)
     features: np.ndarray  # (N, C)
     depths: np.ndarray  # (N,)
@@ -48,7 +48,7 @@ class FlatScene:
     @property
     def conics(self) -> np.ndarray:
         """(N, 2, 2): U^T U."""
-        p, r, s = self.whitening.T
+        p, r, s = self.conic_factor.T
         return np.moveaxis(np.array([[p * p, p * r], [p * r, r * r + s * s]]), -1, 0)
 
     @property
@@ -96,10 +96,10 @@ class FlatScene:
             d_colors.append(part["colors"])
             for name in ("means2d", "conics", "opacities"):
                 total[name] = total.get(name, 0) + part[name]
-        p, r, s = self.whitening.T
+        p, r, s = self.conic_factor.T
         G = total.pop("conics")
         # A = U^T U and dL = sum_ij G_ij dA_ij, G symmetric: dL/dU = 2 U G.
-        total["whitening"] = 2 * np.column_stack(
+        total["conic_factor"] = 2 * np.column_stack(
             [p * G[:, 0, 0] + r * G[:, 0, 1], p * G[:, 0, 1] + r * G[:, 1, 1], s * G[:, 1, 1]]
         )
         total["features"] = np.concatenate(d_colors, axis=-1)[:, : self.features.shape[1]]
@@ -131,7 +131,7 @@ class FlatScene:
         variances = np.column_stack([self.conics[:, 1, 1], self.conics[:, 0, 0]])
         return Splats2D(
             means2d=precision.vectors(self.means2d),
-            whitening=precision.vectors(self.whitening),
+            conic_factor=precision.vectors(self.conic_factor),
             depths=precision.array(self.depths),
             opacities=precision.array(self.opacities),
             colors=precision.vectors(np.zeros((len(self.depths), 3))),
@@ -173,7 +173,7 @@ class FlatScene:
 def as_arrays(gradients: SplatGradients) -> dict[str, np.ndarray]:
     return {
         "means2d": rows(gradients.means2d),
-        "whitening": rows(gradients.geometry[2:5]),
+        "conic_factor": rows(gradients.geometry[2:5]),
         "opacities": rows(gradients.opacities),
         "features": np.stack([rows(column) for column in gradients.features], axis=-1),
     }
@@ -194,7 +194,7 @@ def random_flat_scene(width, height, count, num_features=3, opaque=False, seed=0
             logits[::3] = 8.0
         scene = FlatScene(
             means2d=single(rng.uniform(-0.1, 1.1, (count, 2)) * [width, height]),
-            whitening=single(np.column_stack([p, s * rng.normal(0, 0.7, count), s])),
+            conic_factor=single(np.column_stack([p, s * rng.normal(0, 0.7, count), s])),
             opacities=single(1 / (1 + np.exp(-logits))),
             features=single(rng.normal(0.5, 0.5, (count, num_features))),
             depths=single(rng.uniform(1, 4, count)),
@@ -219,9 +219,9 @@ def check_gradients_equal_the_reference(precision, scene):
 
 def random_tangents(scene, seed=5) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
-    names = ("means2d", "whitening", "opacities", "features")
+    names = ("means2d", "conic_factor", "opacities", "features")
     # A direction that moves a splat of any size by a like part of itself.
-    size = {"whitening": scene.whitening[:, :1], "opacities": scene.opacities}
+    size = {"conic_factor": scene.conic_factor[:, :1], "opacities": scene.opacities}
     return {
         name: single(rng.normal(0, 1, getattr(scene, name).shape) * size.get(name, 1.0))
         for name in names
@@ -232,7 +232,7 @@ def kernel_tangents(scene, precision, tangents) -> dict[str, np.ndarray]:
     direction = SplatGradients(
         [
             *precision.vectors(tangents["means2d"]),
-            *precision.vectors(tangents["whitening"]),
+            *precision.vectors(tangents["conic_factor"]),
             precision.array(tangents["opacities"]),
         ],
         [precision.array(column) for column in tangents["features"].T],
@@ -260,7 +260,7 @@ def stack(opacities, width=1, height=1, sigma=10.0, offset=(0.0, 0.0)) -> FlatSc
     n = len(opacities)
     return FlatScene(
         means2d=np.tile(np.array([width / 2, height / 2]) + offset, (n, 1)),
-        whitening=single(np.tile([1 / sigma, 0, 1 / sigma], (n, 1))),
+        conic_factor=single(np.tile([1 / sigma, 0, 1 / sigma], (n, 1))),
         opacities=single(opacities),
         features=np.arange(1.0, n + 1)[:, None],
         depths=np.arange(1.0, n + 1),

@@ -106,14 +106,14 @@ def rounded_inputs(rng, gaussians, camera):
 
 
 def opacity_size(opacities) -> np.ndarray:
-    """What is rounded with an opacity: alpha's exponential, and T (1 - alpha), where it is one
+    """Return numbers that are rounded with an opacity: alpha's exponential, and T (1 - alpha), one
     rounding of T however small alpha is.
     """
     return np.maximum(EXP2 * opacities, opacities > reference.ALPHA_CUT)
 
 
 def color_share(opacities) -> np.ndarray:
-    """By which a rounding of the sum that a splat's light is added to becomes one of its colour."""
+    """Return the factor from a rounding of the sum of a splat's light to one of its colour."""
     return np.maximum(opacities, reference.ALPHA_CUT)
 
 

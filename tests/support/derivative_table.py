@@ -120,7 +120,7 @@ def mixed(*materials, **others):
 
 
 def cases() -> dict[str, Case]:
-    """By what the table calls the parameter."""
+    """Return cases by the parameter's name in the table."""
     bumps = np.random.default_rng(0).uniform(0, 1, (8, 8, 3)).astype(np.float32)
     texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(bumps)}
     only = {"sky": None, "lamp": None}
@@ -263,7 +263,7 @@ def load(case: Case, route: str) -> mi.Scene:
 
 
 class Derivative:
-    """That of a image's weighted mean with respect to theta, by a route."""
+    """The derivative of an image's weighted mean with respect to theta, by a route."""
 
     def __init__(self, case: Case, route: str) -> None:
         self.case, self.scene = case, load(case, route)
@@ -311,7 +311,7 @@ class Derivative:
 
 @dataclass(frozen=True)
 class Found:
-    """What there is in a cell."""
+    """The contents of a cell."""
 
     is_refused: bool
     error: float = 0.0  # of reverse mode, relative to the difference

@@ -33,13 +33,13 @@ class Detector:
 
 
 def detectors(checks: dict[str, Callable[[], None]]) -> list[Detector]:
-    """By name."""
+    """Return detectors by name."""
     return [Detector(*item) for item in checks.items()]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of each mutant."""
+    """The results of all mutants."""
 
     switchboard: Switchboard
     detectors: list[str]
@@ -69,7 +69,7 @@ class Outcome:
 
     @property
     def busy_detectors(self) -> set[str]:
-        """Those that notice a mutant."""
+        """Return detectors that notice a mutant."""
         return {name for names in self.noticed_by.values() for name in names}
 
     @property
@@ -103,7 +103,7 @@ def find_noticed(board: Switchboard, general: list[Detector], special: list[Dete
 
 
 class MutationChecks:
-    """What has to hold of an outcome: the tests of a module that has a fixture ``outcome``."""
+    """Checks of an outcome: the tests of a module that has a fixture ``outcome``."""
 
     equivalent: dict[MutantKey, str] = {}  # mutants that change no result, and why  # noqa: RUF012
     derivatives = ""  # functions that have mutants, at least these
@@ -126,7 +126,7 @@ class MutationChecks:
         assert outcome.busy_detectors == set(outcome.detectors)
 
     def test_derivatives_have_mutants(self, outcome):
-        """What belongs to a derivative is found by who calls whom."""
+        """The functions of a derivative are found by their callers."""
         scaled = {m.site.function for m in outcome.noticed_by if m.change == SCALED}
         assert set(self.derivatives.split()) <= scaled
 

@@ -1,4 +1,4 @@
-"""What folders hold."""
+"""Contents of folders."""
 
 from pathlib import Path
 

@@ -48,7 +48,7 @@ class Precision:
 
 
 def half_step(span: float, bits: int) -> float:
-    """Of the largest rounding when a span is divided into 2^bits - 1 steps, and of float32."""
+    """Return half the largest rounding of a span in 2^bits - 1 steps, and of float32."""
     return span / (2**bits - 1) / 2 + 4 * FLOAT32
 
 

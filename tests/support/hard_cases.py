@@ -464,7 +464,7 @@ def expected(name) -> tuple[dict, dict]:
 
 @cache
 def allowed(name) -> tuple[dict, dict]:
-    """What float32 may be off by: see the module's description."""
+    """Return the allowed error of float32: see the module's description."""
     case = FAMILIES[name]
     found = noise(case, cotangents_of(name), samples=SAMPLES if case.count < 1000 else 6)
 
@@ -476,7 +476,7 @@ def allowed(name) -> tuple[dict, dict]:
 
 
 def bound_of(case, noise, values) -> np.ndarray:
-    """Of one result with its noise: see the module's description."""
+    """Return the bound of one result with its noise: see the module's description."""
     size = np.abs(values)
     rounding = noise + U * np.sqrt(1 + len(case.gaussians.means) / ROUNDINGS) * size
     return BOUND * rounding + UNDERFLOW * size.max(initial=0)

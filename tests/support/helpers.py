@@ -195,7 +195,7 @@ class Case:
 
     @property
     def rendered(self) -> reference.RenderedImage:
-        """By the reference; marked pixels are those within ``threshold_width``."""
+        """Render by the reference; marked pixels are those within ``threshold_width``."""
         return _image(self)
 
     @property
@@ -268,7 +268,7 @@ def render(case: Case, precision: Precision, pipeline=None) -> tuple[Gaussians, 
 
 
 def frame_adjoint(gaussians, frame, d_features, d_transmittance) -> rendering.GaussianGradients:
-    """Of a loss with these derivatives with respect to the frame's planes."""
+    """Differentiate a loss with these derivatives with respect to the frame's planes."""
     return rendering.frames_adjoint(gaussians, [frame], [[d_transmittance, *d_features]])
 
 
@@ -288,7 +288,7 @@ def as_images(planes, camera) -> dict[str, np.ndarray]:
 
 
 def image_planes(frame, case) -> dict[str, np.ndarray]:
-    """What ``reference.RenderedImage`` holds, from a frame with colour and depth."""
+    """Return a frame with colour and depth as the fields of ``reference.RenderedImage``."""
     images = as_images(frame.planes(), case.camera)
     transmittance = images["transmittance"]
     return {

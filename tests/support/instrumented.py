@@ -23,7 +23,7 @@ from support.mutants import (
 
 @contextmanager
 def registered_classes_kept():
-    """What registers within the block, such as a copy of a module, is not found by its name."""
+    """Undo registrations of the block, such as those of a copied module."""
     before = [(each, dict(each._extensions)) for each in registry._registries]
     yield
     for each, extensions in before:

@@ -1,4 +1,4 @@
-"""What lenses are checked with: small scenes, planes and gradients of the kernels."""
+"""Checks of lenses: small scenes, planes and gradients of the kernels."""
 
 import numpy as np
 import pytest
@@ -81,7 +81,7 @@ def splats_of(gaussians, camera, lens, precision, shape=ewa, low_pass=0.3, degre
 
 def covariances(splats) -> np.ndarray:
     """(N, 2, 2), px^2."""
-    p, r, s = rows(splats.whitening).T
+    p, r, s = rows(splats.conic_factor).T
     factors = np.moveaxis(np.array([[p, r], [np.zeros_like(s), s]]), -1, 0)
     return np.linalg.inv(np.swapaxes(factors, 1, 2) @ factors)
 

@@ -134,7 +134,7 @@ class LensCase(Case):
         return _image(self)
 
     def reference_image(self, gaussians=None, threshold_width=0.0) -> reference.RenderedImage:
-        """Of other Gaussians."""
+        """Render other Gaussians."""
         return effects.render(
             gaussians or self.gaussians, self.camera, self.lens, self.background, self.antialiased,
             self.defocus, self.rendered_degree, threshold_width,
@@ -268,7 +268,8 @@ def moved(gaussians: reference.Gaussians, direction, step) -> reference.Gaussian
 
 
 def directions(gaussians: reference.Gaussians, seed: int) -> dict[str, reference.Gaussians]:
-    """By parameter: normal numbers in it, float32 values, and zeros in the others."""
+    """Return directions by parameter: normal numbers in it, float32 values, and zeros in the
+    others."""
     rng = np.random.default_rng(seed)
     zeros = {n: np.zeros_like(getattr(gaussians, n)) for n in PARAMETER_NAMES}
     return {

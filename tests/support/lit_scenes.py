@@ -81,7 +81,7 @@ def pixel_rays(sensor):
 
 
 def along_rays(scene, origins, directions):
-    """What the nested integrator finds with one path a ray."""
+    """Return the nested integrator's result with one path a ray."""
     mi.render(scene)  # it gets to know the splats
     nested, sampler = scene.integrator().state.nested, mi.load_dict({"type": "independent"})
     sampler.seed(0, len(origins))

@@ -64,7 +64,7 @@ _HAND_OVERS = {"accum_grad", "set_grad", "set_grad_in", "set_grad_out"}
 
 
 class _Switch:
-    """What the kernels read at one part of a site: a factor, or flags that force a condition."""
+    """The input of the kernels at one part of a site: a factor, or flags that force a condition."""
 
     def __init__(self) -> None:
         self.changes: list[str] = []
@@ -135,7 +135,7 @@ class Mutant:
 
 
 class Switchboard:
-    """What the instrumented code calls; knows the mutants of all that has been evaluated."""
+    """The functions that instrumented code calls; it knows the mutants of all evaluated code."""
 
     def __init__(self) -> None:
         self.sites: list[Site] = []
@@ -175,7 +175,7 @@ class Switchboard:
             mutant.switch.set(mutant.change)
 
     def record(self, function: Callable[[], Any]) -> tuple[Any, set[_Switch]]:
-        """What ``function`` returns, and the switches that it reads."""
+        """Return the result of ``function``, and the switches that it reads."""
         before = self._take_reached()
         result = function()
         reached = self._take_reached()
@@ -201,7 +201,7 @@ class Switchboard:
         return _scale(site, "", value, site.parts)
 
     def returned(self, function: str, value: Any) -> Any:
-        """What a function returns: unchanged."""
+        """Return a function's result unchanged."""
         found = _has_float(value)
         self._returns_numbers[function] = self._returns_numbers.get(function, False) or found
         return value

@@ -125,7 +125,7 @@ DATASETS = {"plain": _plain, "transparent": _transparent, "blurred": _blurred}
 
 
 def fitted(size: int, steps: int, changes: Mapping[str, Any], data: str = "plain") -> list:
-    """What :func:`found_by` gives of a small fit on so many processes; data: of DATASETS."""
+    """Return :func:`found_by` of a small fit on so many processes; data: of DATASETS."""
     task = json.dumps({"steps": steps, "changes": dict(changes), "data": data})
     status, output, errors = run(size, ["-m", "support.parallel_processes", task])
     assert status == 0, errors
@@ -133,7 +133,7 @@ def fitted(size: int, steps: int, changes: Mapping[str, Any], data: str = "plain
 
 
 def state_text(size: int, row: int) -> str:
-    """What :func:`spoiled` gives on so many processes."""
+    """Return :func:`spoiled` on so many processes."""
     task = json.dumps({"spoiled": row, "changes": {"optimizer.views_per_step": 4}, "data": "plain"})
     status, output, errors = run(size, ["-m", "support.parallel_processes", task])
     assert status == 0, errors
@@ -174,7 +174,7 @@ def main() -> None:
 
 
 def spoiled(trainer: Any, row: int) -> str:
-    """What a trainer says, everywhere, where a row has an opacity that is no number."""
+    """Return the trainer's error on all processes, when an opacity of a row is NaN."""
     import drjit as dr
     import numpy as np
 

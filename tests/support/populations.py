@@ -55,7 +55,7 @@ def rows_of(optimizer, seed=0, prefix=""):
 
 
 def values(optimizer):
-    """Of all parameters, on the host."""
+    """Return all parameters on the host."""
     return {name: np.array(dr.detach(value)) for name, value in optimizer.items()}
 
 

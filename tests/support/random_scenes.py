@@ -151,7 +151,7 @@ def uploaded(gaussians, precision) -> Gaussians:
 
 
 def result_of(case, precision, weights, gaussians=None, camera=None) -> Result:
-    """By the kernels. gaussians, camera (on the device): None for the case's."""
+    """Compute by the kernels. gaussians, camera (on the device): None for the case's."""
     gaussians = uploaded(gaussians or case.gaussians, precision)
     camera = camera or device_camera(case.camera, precision)
     frame = rendering.render(gaussians, camera, case.pipeline)
@@ -179,7 +179,7 @@ def image_planes(frame) -> dict[str, np.ndarray]:
 
 
 def assert_agree(actual, expected, quats, undecided, px) -> None:
-    """That no splat was displaced by more than ``px``, as far as images and gradients tell.
+    """Check that no splat was displaced by more than ``px``, as far as images and gradients tell.
 
     quats: (N, 4); undecided: (H, W), pixels at which decisions may flip, of which one at most may.
 

@@ -56,7 +56,8 @@ def expected_gradients(case) -> dict[str, np.ndarray]:
 
 
 def check_gradients_equal_the_reference(precision, case):
-    """Of the six parameters, the background (from the plane T) and the positions on the film."""
+    """Compare the six parameters, the background (from the plane T) and the positions on the
+    film."""
     case = clear(case)
     actual = kernel_gradients(case, precision, Cotangents.random(case))
     expected = expected_gradients(case)

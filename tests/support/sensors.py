@@ -16,7 +16,7 @@ def camera_of(sensor, near=0.01) -> Camera:
 
 
 def numbers(camera) -> dict[str, np.ndarray]:
-    """Of a Dr.Jit camera in float64."""
+    """Return the numbers of a Dr.Jit camera in float64."""
     names = ("rotation", "center", "focal", "principal", "near")
     return {n: np.array(getattr(camera, n)).astype(np.float64)[..., 0] for n in names}
 

@@ -51,7 +51,7 @@ def view(name: str, pose: np.ndarray, image: np.ndarray) -> View:
 
 
 def photograph(gaussians: Gaussians, camera, background) -> reference.RenderedImage:
-    """By the reference, as a View or a Viewpoint sees it; 0.2: the configuration's near plane."""
+    """Render a View or a Viewpoint by the reference; 0.2: the configuration's near plane."""
     pose = camera.camera_to_world
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
     fields = {name: getattr(gaussians, name).astype(np.float64) for name in PARAMETER_NAMES}

@@ -49,7 +49,7 @@ def photograph(
 
 @cache
 def true_blobs() -> Gaussians:
-    """What the photographs show: numpy float32, degree 1."""
+    """Return the photographed blobs: numpy float32, degree 1."""
     return capture.blobs(25)
 
 
@@ -94,7 +94,8 @@ def disturbed_blobs(amount=0.15, seed=4) -> Gaussians:
 
 
 def config_of(**changes) -> FitConfig:
-    """Of a fit whose population stays; changes: by names such as ``model.smoothing``."""
+    """Return the configuration of a fit with a constant population; changes: by names such as
+    ``model.smoothing``."""
     config = FitConfig(
         data={"path": "."},
         model={"sh_degree": 1, "sh_increase_every": 1, **VIEWER_RENDERING},
@@ -177,7 +178,7 @@ def end_view(effect: TrainingEffect, trainer: Trainer, view) -> None:
 
 
 def gradients_of_loss(trainer: Trainer, view) -> dict[str, np.ndarray]:
-    """Of the Gaussians' parameters, through what the effects do; no step is taken."""
+    """Return gradients of the Gaussians' parameters, through the effects; no step is taken."""
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
     _, loss, _ = trainer.compare(image, view)

@@ -1,4 +1,4 @@
-"""What tests of the ``splats`` integrator share: settings, tolerances, files and scenes."""
+"""Code that tests of the ``splats`` integrator share: settings, tolerances, files and scenes."""
 
 from dataclasses import replace
 

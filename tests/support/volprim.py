@@ -246,7 +246,7 @@ class Footprints:
 
 
 def footprints(gaussians, camera, covariance) -> Footprints:
-    """Of Gaussians with other covariances (N, 3, 3) world."""
+    """Return footprints of Gaussians with other covariances (N, 3, 3) world."""
     means = (gaussians.means - camera.center) @ camera.rotation.T
     z = means[:, 2]
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5

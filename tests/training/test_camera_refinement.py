@@ -123,7 +123,7 @@ def test_unmoved_cameras_give_the_plain_loss():
 
 
 def loss_in_numpy(gaussians, view, image) -> float:
-    """Of the reference's image and a photograph; float64."""
+    """Return the loss of the reference's image and a photograph; float64."""
     rendered = reference.render(gaussians, fits.reference_camera(view), np.ones(3))
     shown = np.clip(rendered.image, 0, 1)
     return 0.8 * np.abs(rendered.image - image).mean() + 0.2 * (1 - ssim(shown, image))
@@ -131,7 +131,7 @@ def loss_in_numpy(gaussians, view, image) -> float:
 
 @pytest.mark.parametrize("index", [1, 4])
 def test_derivatives_of_the_loss_are_differences_in_numpy(index):
-    """Of each of the ten numbers of a view, away from where the camera began."""
+    """Each of the ten numbers of a view, away from the camera's start."""
     numbers = random_numbers()
     start = fits.true_blobs()
     # Colours that no pixel clips: only then are both losses the same.
@@ -179,7 +179,7 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
 
 
 def test_rates_of_zero_leave_the_intrinsics_out():
-    """What is left out is not even computed: it has no number."""
+    """They have no number, and are not computed."""
     trainer = make_trainer()
     assert set(effect_of(trainer).parameters.numpy()) == {"turns", "moves"}
     fits.steps(trainer, 3)
@@ -319,7 +319,7 @@ def test_a_focal_length_and_a_principal_point_that_are_off_are_found():
 
 
 def test_refined_cameras_make_better_images():
-    """Of disturbed cameras: of the blobs as the held-out cameras, which are right, see them."""
+    """Training cameras are disturbed; held-out cameras, which see the blobs, are right."""
     rng = np.random.default_rng(6)
     dataset = fits.with_views(
         fits.plain_dataset(),
@@ -370,7 +370,7 @@ def test_the_refined_cameras_are_written_as_they_are_read(lens, tmp_path):
 
 
 def test_other_views_are_measured_through_the_lens_that_was_found():
-    """Where their cameras are is not touched."""
+    """Their poses are not changed."""
     trainer = with_numbers(make_trainer(**ALL_RATES), **random_numbers())
     lens = {name: random_numbers()[name][0] for name in ("log_focals", "shifts")}
     dataset = fits.plain_dataset()

@@ -95,7 +95,7 @@ def test_without_a_rate_there_is_no_effect():
 
 
 def numpy_loss(image, matrix, target, identity_weight) -> float:
-    """Of the transformed image, with the penalty; float64."""
+    """Return the loss of the transformed image, with the penalty; float64."""
     shown = np.einsum("ij,hwj->hwi", matrix[:, :3], image) + matrix[:, 3]
     loss = 0.8 * np.abs(shown - target).mean() + 0.2 * (1 - ssim(shown, target))
     return loss + identity_weight * np.square(matrix - IDENTITY).mean()
@@ -134,7 +134,7 @@ def test_loss_and_derivatives_of_a_transform_are_those_of_numpy():
 
 
 def test_the_penalty_pulls_to_the_identity():
-    """By itself: Adam's steps end there, and have its sign from the start."""
+    """Adam's steps by the penalty alone end there, and have its sign from the start."""
     trainer = with_matrices(make_trainer(colors__lr=0.01, **STILL), random_matrices())
     (effect,) = trainer.effects
     view, start = trainer.views[1], random_matrices()[1]
@@ -213,7 +213,7 @@ def test_the_mean_of_all_transforms_is_the_identity():
 
 
 def test_what_all_photographs_have_in_common_stays_with_the_splats():
-    """Of photographs that are all darker by the same factor, no transform knows.
+    """Photographs that are all darker by the same factor change no transform.
 
     Each photograph's own pull is down, by some 7 steps of the rate.
     """

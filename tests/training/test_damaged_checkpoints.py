@@ -45,7 +45,7 @@ def stopped(tmp_path_factory):
 
 @pytest.fixture
 def checkpoint(stopped, tmp_path):
-    """Of a copy of that folder."""
+    """The checkpoint of a copy of that folder."""
     shutil.copytree(stopped, tmp_path / "out")
     return tmp_path / "out" / "checkpoint.npz"
 

@@ -49,7 +49,7 @@ def checksum(data):
 
 
 def records(data):
-    """Of a file in TensorFlow's record format: a length, its checksum, the data, its checksum."""
+    """Return records of TensorFlow's format: a length, its checksum, the data, its checksum."""
     while data:
         (length, of_length), data = struct.unpack("<QI", data[:12]), data[12:]
         record, (of_record,) = data[:length], struct.unpack("<I", data[length : length + 4])

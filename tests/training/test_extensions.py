@@ -143,7 +143,7 @@ def test_an_effect_decides_by_the_dataset_whether_it_takes_part(examples, monkey
 
 
 def test_objects_give_the_bytes_of_names(examples):
-    """Of an effect, a strategy and a loss."""
+    """Objects: an effect, a strategy and a loss."""
     config = configured()
     named = drgs.train(config, fits.plain_dataset()).gaussians
     values = config.model_dump() | {"densify": {}, "loss": {}}

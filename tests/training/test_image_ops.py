@@ -143,7 +143,7 @@ def cotangents_of(operation):
 
 
 def gradients(operation, precision, cotangents) -> dict[str, np.ndarray]:
-    """Of sum(cotangents * outputs)."""
+    """Return gradients of sum(cotangents * outputs)."""
     inputs = operation.device(precision, grad=True)
     outputs = operation.outputs(inputs)
     for output, cotangent in zip(outputs, cotangents, strict=True):
@@ -157,7 +157,7 @@ def gradients(operation, precision, cotangents) -> dict[str, np.ndarray]:
 
 
 def tangents(operation, precision, directions) -> list[np.ndarray]:
-    """Of the outputs, along directions of the inputs."""
+    """Return tangents of the outputs, along directions of the inputs."""
     inputs = operation.device(precision, grad=True)
     for name, value in inputs.items():
         dr.set_grad(value, tensor(directions[name], precision))
@@ -199,7 +199,8 @@ def test_backward_derivatives_are_the_formulas(name, precision):
 
 @all_operations
 def test_backward_derivatives_are_central_differences(name):
-    """Of the value by numpy, at some of the numbers. At a kink of |x| both slopes average to 0."""
+    """Differences of the value by numpy, at some of the numbers. At a kink of |x| both slopes
+    average to 0."""
     operation = OPERATIONS[name]()
     cotangents = cotangents_of(operation)
     actual = gradients(operation, FLOAT64, cotangents)
@@ -262,7 +263,7 @@ def test_forward_and_backward_derivatives_are_transposed(name, precision):
 
 
 def test_the_comparisons_notice_one_percent(monkeypatch):
-    """Of an adjoint, and of a tangent."""
+    """Adjoints and tangents are scaled."""
     scale = 1.01
     for method in ("set_grad_in", "set_grad_out"):
         original = getattr(dr.CustomOp, method)
@@ -349,7 +350,7 @@ def test_derivatives_are_the_same_bytes_in_two_runs(name):
 @both_precisions
 @all_operations
 def test_no_derivative_is_added_in_memory(name, precision):
-    """Where Dr.Jit differentiates a gather, it would be."""
+    """Dr.Jit's derivative of a gather would be."""
     operation = OPERATIONS[name]()
     results = {}
     found, count = float_reductions(

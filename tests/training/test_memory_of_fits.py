@@ -1,4 +1,4 @@
-"""What a fit needs is estimated before it starts, and refused in words where it does not fit."""
+"""Memory of a fit is estimated before it starts; a fit that needs too much is refused."""
 
 import json
 import math
@@ -104,12 +104,12 @@ def test_entries_and_slots_at_the_start_are_those_of_a_rendering(monkeypatch):
         dr.backward(dr.mean(mi.render(scene, params, sensor=sensor, spp=1).array))
         frame = scene.integrator().state.cache.kept["frames 0"].value[0][0]
         entries.append(frame.bins.num_entries)
-    found = memory._at_start(dataset.train, gaussians, 0.2, 1.0)
+    found = memory._bytes_at_start(dataset.train, gaussians, 0.2, 1.0)
     assert found == pytest.approx((max(entries), max(slots)), rel=0.1)
 
 
 def test_photographs_count_as_they_are_kept():
-    """As bytes, and as numbers at a width where these take less."""
+    """They are kept as bytes, and as numbers at a width where these take less."""
     config, pixels = config_of(1000, 1000), 300 * 200 * 12
     dataset = dataset_of(300, 200, 10)
     assert estimated(config, dataset).photographs == 3 * pixels
@@ -197,7 +197,7 @@ def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
 
 
 def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
-    """What is advised is enough, and a quarter more are too many."""
+    """The advised number fits, and a quarter more does not."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
     available(GB)
     with pytest.raises(UserError) as error:

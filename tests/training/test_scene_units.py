@@ -13,7 +13,7 @@ from support import small_capture as capture
 from support.small_fits import double
 
 import drgs
-from drgs.core.origin import FAR, WORLD
+from drgs.core.origin import MAX_SCENE_SIZES, WORLD
 from drgs.datasets import Dataset, load_dataset
 from drgs.reference import splatting as reference
 
@@ -103,7 +103,7 @@ def test_a_fit_is_the_same_far_from_the_origin(case, tmp_path):
     near = write_and_load(tmp_path / "near", dataset)
     far = write_and_load(tmp_path / "far", moved_to(dataset, place))
     assert near.origin == WORLD
-    assert np.abs(np.array(far.origin) - place).max() < 10 < FAR
+    assert np.abs(np.array(far.origin) - place).max() < 10 < MAX_SCENE_SIZES
     assert "far from the origin: coordinates are relative to (42" in far.description
     expected, gaussians = images_and_result(case, near)
     images, found = images_and_result(case, far)

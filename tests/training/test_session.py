@@ -90,7 +90,7 @@ def test_other_trainers_of_a_session_get_copies_of_its_objects(tmp_path):
 
 
 class Revises:
-    """Of rank 0: another end after the second iteration, and the end there."""
+    """Rank 0 sets another end after the second iteration, and ends there."""
 
     def should_continue(self, trainer):
         if trainer.iteration == 2:

@@ -65,7 +65,7 @@ def test_the_kind_of_scene_follows_from_the_data_alone(request, kind, name):
 
 @pytest.mark.parametrize("name", FASTER_OR_BETTER)
 def test_faster_and_better_fits_differ_in_few_values_only(blender, name):
-    """What follows from the number of Gaussians differs with it."""
+    """Values that depend on the number of Gaussians differ with it."""
     config, _ = configured(name, blender[0])
     usual, _ = configured("lego", blender[0])
     for key in ("init.num_points", *FASTER_OR_BETTER[name]):
@@ -93,7 +93,7 @@ def instant_ngp(folder):
 
 
 def cameras_of_their_own(folder):
-    """As COLMAP finds them: the origin between the cameras, and another unit of length."""
+    """Return cameras as COLMAP finds them: the origin between them, and another unit of length."""
     return moved(SHARED_DATA / "fox", folder / "fox", scale=5)
 
 

@@ -103,7 +103,7 @@ def test_a_fit_renders_with_the_filter_that_it_found():
 
 
 def test_coarse_stages_have_wider_filters():
-    """Of cameras with larger pixels; found anew when a stage ends."""
+    """Their cameras have larger pixels; filters are computed anew when a stage ends."""
     trainer = make_trainer(coarse=[{"until": 2, "factor": 2}], densify={"start": 50, "stop": 60})
     widths = []
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""What is made of photographs stays on the device while there is room, else it is made again."""
+"""Prepared targets stay on the device while there is room, else they are prepared again."""
 
 import mitsuba as mi
 import numpy as np

@@ -57,7 +57,8 @@ def mask_of(index) -> np.ndarray:
 
 
 def masked_dataset(spoiled=True, masks=True):
-    """What a mask leaves out shows something else, if ``spoiled``. One view has no mask."""
+    """Return views whose masked pixels show something else, if ``spoiled``. One view has no
+    mask."""
     dataset = fits.plain_dataset()
     views = []
     for index, view in enumerate(dataset.train):
@@ -205,7 +206,7 @@ def penalty_in_numpy(depth, alpha, photo, extent) -> float:
 
 
 def rendered(trainer, view):
-    """What the integrator puts out for a view, with derivatives."""
+    """Return the integrator's output for a view, with derivatives."""
     trainer.params.update(trainer.optimizer)
     return mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
 
@@ -405,7 +406,7 @@ def color_of(trainer) -> np.ndarray:
 
 
 def colors(trainer, count):
-    """What is behind the splats in each of the coming iterations."""
+    """Return the backgrounds of the coming iterations."""
     found = []
     for effect in trainer.effects:
         original = effect.before_render

@@ -12,7 +12,7 @@ from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.integrator.scene import make_scene, render_views
 from drgs.viewer.frames import (
-    BACKDROP,
+    BACKDROP_GRAY,
     MOST_ACCURATE,
     SHOWN,
     VIEWER_LENSES,
@@ -72,7 +72,7 @@ def test_depths_are_colored_from_near_to_far(scene):
     opacity = scene.frame(replace(REQUEST, shows="opacity")).pixels
     empty = opacity.max(axis=2) == 0
     assert 0.3 < empty.mean() < 1
-    assert (frame.pixels[empty] == round(255 * BACKDROP)).all()
+    assert (frame.pixels[empty] == round(255 * BACKDROP_GRAY)).all()
     red, _, blue = frame.pixels[opacity.min(axis=2) > 200].astype(int).T
     assert (red > blue).any() and (blue > red).any()
 
@@ -124,7 +124,7 @@ def test_everything_is_shown_through_every_lens(scene, lens):
 
 
 def test_the_error_through_parallel_rays_is_that_of_the_order():
-    """Of ``ewa``, which is exact there: with the most accurate order there is none."""
+    """``ewa`` is exact there: with the most accurate order there is none."""
     scene = LiveScene(blobs(), ModelConfig(**MOST_ACCURATE), WHITE)
     parallel = replace(REQUEST, lens="orthographic", shows="error")
     assert (scene.frame(parallel).pixels == 128).all()

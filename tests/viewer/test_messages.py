@@ -1,4 +1,4 @@
-"""What browsers may send to a page: invalid messages change nothing, and print nothing."""
+"""Messages of browsers: invalid ones change nothing, and print nothing."""
 
 import contextlib
 import gc

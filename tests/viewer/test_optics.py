@@ -78,7 +78,8 @@ def speck(x, y, z):
 
 
 def place(rendered):
-    """Of what differs from the background: its middle (px), and its largest difference."""
+    """Return the middle (px) of pixels that differ from the background, and their largest
+    difference."""
     difference = np.abs(rendered[:, :, :3] - BACKGROUND).sum(axis=2)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     return (
@@ -97,7 +98,7 @@ def test_parallel_rays_show_a_thing_where_the_pinhole_does_at_the_distance_of_th
 
 
 def test_a_closed_aperture_is_a_pinhole(capfd):
-    """Of which Mitsuba says nothing, once a image."""
+    """Mitsuba's warning appears at most once an image."""
     dot = speck(0.8, -0.5, 2 * RADIUS)
     assert np.array_equal(seen(dot, "thin lens", aperture=0.0), seen(dot))
     assert "aperture" not in "".join(capfd.readouterr())

@@ -96,7 +96,7 @@ def assert_clean(page, address: str) -> None:
 
 
 def expected_view(run: Path, width: int, height: int) -> np.ndarray:
-    """What ``drgs.render`` shows of the camera that a page begins with."""
+    """Return the image by ``drgs.render`` of the camera that a page begins with."""
     mi.set_variant("llvm_ad_rgb")
     args = argparse.Namespace(what=run, up=None)
     model = load_model(run)

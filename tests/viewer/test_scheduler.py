@@ -1,4 +1,4 @@
-"""Whose image comes next, and how large: by a clock that the tests turn."""
+"""The next image to render, and its size: by a clock that the tests set."""
 
 from types import SimpleNamespace
 

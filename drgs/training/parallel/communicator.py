@@ -23,7 +23,7 @@ from drgs.training.finite_checks import NonFiniteError
 NUM_SPINS, MAX_PAUSE_S = 50, 1e-3
 """Polls without a pause, for messages that have nearly arrived; the longest pause between polls."""
 
-NEVER = 2**62
+NO_ITERATION = 2**62
 """Iteration of an error that did not occur."""
 
 T = TypeVar("T")
@@ -178,11 +178,11 @@ class Communicator:
             result = call()
         except UserError as caught:
             error = caught
-        iteration = NEVER if error is None else getattr(error, "iteration", 0)
+        iteration = NO_ITERATION if error is None else getattr(error, "iteration", 0)
         errors = self.all_gather(np.array([iteration, isinstance(error, NonFiniteError)]))
         first = int(errors[:, 0].argmin())
         iteration, is_non_finite = errors[first]
-        if iteration == NEVER:
+        if iteration == NO_ITERATION:
             return cast(T, result)
         text = self.broadcast_text("" if error is None else str(error), first)
         raise NonFiniteError(text, int(iteration)) if is_non_finite else UserError(text)

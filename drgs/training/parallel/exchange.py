@@ -40,13 +40,13 @@ from drgs.integrator.types import SplatsIntegrator
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
+    CameraGradients,
     Frame,
     GaussianGradients,
     Pipeline,
     Projected,
-    SeenSplats,
-    footprints_seen_by,
     gradients_by_row,
+    project_footprints,
     sum_of_gradients,
     sum_of_views,
     weighted_sums,
@@ -220,7 +220,7 @@ class _View:
         default_factory=dict
     )  # by name: see DensityStrategy.pixel_weights
     needs_camera: bool = False
-    first_fault: UInt32 = field(init=False)
+    first_nonfinite: UInt32 = field(init=False)
 
     def num_splats(self, rank: int, time: int) -> int:
         """Return the number of splats that a rank contributes to the rendered view."""
@@ -314,7 +314,7 @@ class ViewExchange:
                 each.means2d,
                 reduce(or_, (local.visible for local in each.local)),
                 each.sums,
-                each.first_fault,
+                each.first_nonfinite,
             )
             for each in self._views
         ]
@@ -344,9 +344,9 @@ class ViewExchange:
         Between two steps, those of this rank.
         """
         if (each := self._current) is None:
-            return footprints_seen_by(gaussians, camera, pipeline)
+            return project_footprints(gaussians, camera, pipeline)
         time = len(each.local)
-        own = footprints_seen_by(gaussians, camera, pipeline)
+        own = project_footprints(gaussians, camera, pipeline)
         local = LocalProjection.from_footprints(camera, pipeline, own)
         each.local.append(local)
         parts = []
@@ -386,7 +386,7 @@ class ViewExchange:
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             for camera in cameras:
                 of_camera = with_effects(pipeline, gaussians, camera)
-                found = footprints_seen_by(gaussians, camera, of_camera)
+                found = project_footprints(gaussians, camera, of_camera)
                 each.local.append(LocalProjection.from_footprints(camera, of_camera, found))
                 each.packed.append(PackedProjection.from_footprints(each.local[-1], found))
 
@@ -459,13 +459,13 @@ class ViewExchange:
         with dr.suspend_grad():
             gaussians = dr.detach(self.integrator.gaussians)
             seen = [
-                [SeenSplats(p.camera, p.pipeline, g) for p, g in zip(*pairs, strict=True)]
+                [CameraGradients(p.camera, p.pipeline, g) for p, g in zip(*pairs, strict=True)]
                 for pairs in ((each.local, each.gradients) for each in group)
             ]
             total, faults = sum_of_views(gaussians, seen)
         self._accumulate(total)
         for each, fault in zip(group, faults, strict=True):
-            each.first_fault = fault
+            each.first_nonfinite = fault
 
     def _add_with_camera(self, each: _View) -> None:
         """Add the derivatives of a view, and those of its camera, which its renderer sums.
@@ -487,7 +487,7 @@ class ViewExchange:
             total = reduce(sum_of_gradients, found)
         assert total.parameters is not None, "they are asked for"
         self._accumulate(total.parameters)
-        each.first_fault = total.first_fault
+        each.first_nonfinite = total.first_nonfinite
         if of_cameras:
             state = read_sensor(each.view.view.sensor, self.integrator.near)
             accumulate_in_sensor(self.integrator.ignore, state, of_cameras)

@@ -115,7 +115,7 @@ def check_views(comm: Communicator, dataset: Dataset, own: Collection[str], path
     here = fingerprint_of(replace(dataset, test=()), own.__contains__)
     first = Fingerprint.from_bytes(comm.broadcast_text("").encode())
     if found := first.other_files(dataset.train, here) or first.differences(here):
-        raise _not_the_same(path, found)
+        raise _differs_error(path, found)
 
 
 def check_scene(
@@ -136,11 +136,11 @@ def check_scene(
     first = json.loads(comm.broadcast_text(json.dumps(own)))
     check_versions({name: first[name] for name in versions()})
     if other := [name for name in {**first, **own} if first.get(name) != own.get(name)]:
-        raise _not_the_same(files.get(other[0].partition(".")[0]) or files["model"], other)
+        raise _differs_error(files.get(other[0].partition(".")[0]) or files["model"], other)
     comm.all_gather(np.array(True))
 
 
-def _not_the_same(file: object, differences: Sequence[object]) -> UserError:
+def _differs_error(file: object, differences: Sequence[object]) -> UserError:
     return UserError(
         f"{file}: not the same on {platform.node()} as for process 0: {format_names(differences)}; "
         "all processes must see the same files and options"

@@ -45,7 +45,7 @@ def local_gaussians(gaussians: Gaussians, comm: Communicator) -> Gaussians:
     return replace(gaussians, **rows, smoothing=smoothing)
 
 
-def check_can_be_shared(config: FitConfig, size: int, num_gaussians: int) -> None:
+def check_shardable(config: FitConfig, size: int, num_gaussians: int) -> None:
     """Raise ``UserError`` for a fit that ``size`` processes cannot share."""
     views = config.optimizer.views_per_step
     if views < size:

@@ -1,4 +1,4 @@
-"""What an attack is."""
+"""The type of an attack."""
 
 from __future__ import annotations
 

@@ -233,7 +233,7 @@ FOLDER = "folder"
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """By path relative to ``folder``, of everything below it: what it is, files by their digest."""
+    """Return type or digest of everything below ``folder``, by relative path."""
     start, found = len(str(folder)) + 1, {}
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):

@@ -41,7 +41,8 @@ SMALL_FILES = "small files"
 
 
 class Killed(BaseException):
-    """What stands for SIGKILL: from here on nothing that the program does has an effect."""
+    """An exception in place of SIGKILL: from here on nothing that the program does has an
+    effect."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Fault:
 
 @dataclass
 class Changes:
-    """What a trial did to files, in its order."""
+    """The changes of files by a trial, in order."""
 
     folder: Path  # of the attack folder
     fault: Fault | None = None

@@ -213,7 +213,7 @@ def _renamed_image(stem: str, folder: Path) -> None:
 
 
 def json_text(text: str) -> str:
-    """As it stands within quotes."""
+    """Return the text as it is written within quotes."""
     return json.dumps(text, ensure_ascii=False)[1:-1]
 
 
@@ -270,7 +270,7 @@ def name_attacks() -> Iterator[Attack]:
 
 
 def _tiny_images(folder: Path) -> None:
-    """Of one pixel."""
+    """Write images of one pixel."""
     for path in (folder / "lego").glob("*/*.png"):
         iio.imwrite(path, np.full((1, 1, 4), 200, np.uint8))
 

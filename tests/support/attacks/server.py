@@ -32,7 +32,7 @@ class Server:
         self._stop()
 
     def trial(self, name: str, seconds: float) -> list[str]:
-        """What is wrong with an attack; seconds: that it may take."""
+        """Return the faults of an attack; seconds: its time limit."""
         if self._process is None:
             self._start()
         process = self._process

@@ -56,7 +56,7 @@ class TooLong(BaseException):
 
 @dataclass
 class Outcome:
-    """What a process would leave."""
+    """Exit status and output of a process."""
 
     status: int | None = None  # None: another exception ended it
     out: str = ""
@@ -113,7 +113,7 @@ def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outc
 
 
 def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
-    """What is wrong with how it ended, and with what it said."""
+    """Return faults of its end and its output."""
     wrong = []
     expected = {0, 2}
     if attack.fault is not None:
@@ -159,7 +159,7 @@ def _wrong_refusal(attack: Attack, err: str) -> list[str]:
 def damage(
     attack: Attack, outcome: Outcome, before: dict[str, str], attack_folder: AttackFolder
 ) -> list[str]:
-    """What is wrong with the files that it left."""
+    """Return faults of the files that it left."""
     after, wrong = contents(attack_folder.folder), []
     own = os.path.normpath(attack.out) if "\0" not in attack.out else ""
 
@@ -188,7 +188,7 @@ def _cannot_tidy(attack: Attack) -> bool:
 
 
 def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
-    """What is wrong after the command was run again, as its user would."""
+    """Return faults after the command was run again, as its user would."""
     outcome = run(attack, attack.again, with_fault=False)
     if outcome.status != 0:
         return [f"again: ended with {outcome.status}: {_last_lines(outcome.err)}"]
@@ -208,7 +208,7 @@ _undisturbed: dict[tuple, dict[str, str]] = {}
 
 
 def undisturbed(attack: Attack, attack_folder: AttackFolder) -> dict[str, str]:
-    """What the command leaves in its folder when nothing happens; puts the attack folder back."""
+    """Return the command's files when nothing happens; puts the attack folder back."""
     key = str(attack_folder.folder), attack.command, attack.words
     if key not in _undisturbed:
         attack_folder.put_back()

@@ -179,7 +179,7 @@ def test_errors_are_gathered_in_the_iterations_that_say_so(variant):
 
 @pytest.mark.parametrize(("every", "stop", "error_every"), [(4, 26, 10), (2, 12, 5), (100, 30, 7)])
 def test_each_change_has_seen_errors(every, stop, error_every):
-    """Those of its own view, if there were none since the last one."""
+    """If there were none since the last change, errors of its own view are used."""
     budget = {"gaussians": 70, "error_every": error_every}
     config = DensifyConfig(start=1, stop=stop, every=every, budget=budget)
     growth, seen = GrowthToNumber(config), 0

@@ -27,7 +27,7 @@ def config_of(iterations=4000, grows_until=2000, **prune):
 
 
 class Step:
-    """What an importance may know of an iteration."""
+    """The information about an iteration that an importance may use."""
 
     def __init__(self, weights):
         self.weighted_sums = {"coverage": Float(weights)}
@@ -225,5 +225,5 @@ def test_the_phase_keeps_its_share_of_a_longer_fit():
     assert config.densify.prune_window(8000) == (5000, 6000)
     config = with_iterations(config_of(to=5), 8000)
     assert config.densify.prune_window(8000) == (4000, 6000)
-    assert config.densify.settled_from(8000) == 6001
-    assert config_of().densify.settled_from(4000) == 2001  # growth may end at 2000
+    assert config.densify.settled_iteration(8000) == 6001
+    assert config_of().densify.settled_iteration(4000) == 2001  # growth may end at 2000

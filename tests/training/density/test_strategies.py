@@ -1,4 +1,4 @@
-"""What the trainer does with any strategy, and strategies that follow one another."""
+"""The trainer with any strategy, and strategies that follow one another."""
 
 from dataclasses import dataclass, field
 
@@ -97,7 +97,7 @@ class Faint(DensityStrategy):
 
 
 def test_penalties_are_terms_of_the_loss(monkeypatch):
-    """Of such a weight, and Adam's first step is as long as the rate, with the gradient's sign."""
+    """Adam's first step is as long as the rate, with the sign of the weighted gradient."""
     plain = make_trainer()
     trainer = trainer_with(monkeypatch, Faint())
     logits = trainer.gaussians().logit_opacities
@@ -245,7 +245,7 @@ def test_each_strategy_of_the_configuration_is_made():
     ids=lambda densify: densify["strategy"],
 )
 def test_a_plan_that_was_revised_is_one_from_the_start(densify):
-    """Whose growth ends later, and then earlier; with the statistics of the views in between."""
+    """Growth ends later, then earlier; with the statistics of the views in between."""
     densify = {"start": 2, "stop": 20, "every": 4, **densify}
     revised = make_trainer(densify=densify, iterations=40)
     for iteration in range(1, 18):
@@ -268,7 +268,7 @@ def test_stops_that_a_plan_had_are_kept_for_the_iterations_that_saw_them():
     aims = revised_stops(config, 6, 36)
     densify = {"start": 2, "stop": 36, "stop_aims": aims}
     config = FitConfig(data={"path": "."}, densify=densify)
-    assert [config.densify.stop_seen_from(i) for i in (1, 6, 7, 30)] == [20, 20, 36, 36]
+    assert [config.densify.stop_at_iteration(i) for i in (1, 6, 7, 30)] == [20, 20, 36, 36]
     assert revised_stops(config, 6, 36) == revised_stops(config, 9, 36) == aims
     assert revised_stops(config, 6, 9) == [{"after": 0, "stop": 20}, {"after": 6, "stop": 9}]
     with pytest.raises(ValueError, match="must begin after iteration 0, with growing after"):

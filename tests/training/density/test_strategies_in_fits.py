@@ -40,7 +40,7 @@ def variant():
 
 
 def many_blobs(count=48) -> Gaussians:
-    """Where a fit begins whose population changes: half of them transparent."""
+    """Return the start of a fit whose population changes: half of the blobs are transparent."""
     blob = blobs(count, seed=5)
     logits = np.where(np.arange(count) % 2, -6.0, 0.0).astype(np.float32)
     return Gaussians(**{n: getattr(blob, n) for n in PARAMETER_NAMES} | {"logit_opacities": logits})
@@ -60,7 +60,7 @@ def make_trainer(name, **changes):
 
 
 def pauses():
-    """What shows most in one go; the others are slow."""
+    """Return the cases that show most in one run; the others are slow."""
     for name in STRATEGIES:
         is_quick = name in ("mcmc and selection", "importance")
         yield pytest.param(name, 16, marks=[] if is_quick else pytest.mark.slow)
@@ -109,7 +109,7 @@ def test_a_revised_plan_leaves_a_phase_that_has_begun_where_it_was():
 
 
 def test_a_revised_plan_is_one_from_the_start_with_a_phase_ahead():
-    """That was to begin earlier than the revision, had it been planned so."""
+    """The phase would have begun before the revision, had it been planned so."""
     window = {"densify__prune__start": 20, "densify__prune__stop": 26}
     revised = make_trainer("selection", **window)
     for iteration in range(1, 25):

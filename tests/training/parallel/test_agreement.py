@@ -1,4 +1,4 @@
-"""What processes read by themselves is what the first one reads, or refused."""
+"""Files that differ between processes are refused."""
 
 import shutil
 from dataclasses import replace
@@ -72,7 +72,7 @@ def test_another_photograph_of_one_process_is_refused(copies, tmp_path):
 
 
 def test_photographs_that_another_process_reads_may_differ(copies, tmp_path):
-    """Those to measure on, too, which the first process reads."""
+    """So may test photographs, which rank 0 reads."""
     for name in ("train/r_0.png", "train/r_2.png", "test/r_0.png", "test/r_1.png"):
         shutil.copy(copies[1] / "train" / "r_1.png", copies[1] / name)
     status, _, errors = fitted(copies, tmp_path / "two")
@@ -107,7 +107,7 @@ def test_views_are_compared_with_those_of_the_first_process(
 
 
 def test_images_of_other_files_are_refused(tmp_path):
-    """Of a background that is another one; then of a model, with the same background."""
+    """A different background is refused; then a different model with the same background."""
     here, there, out = (tmp_path / name for name in ("first", "second", "out"))
     knot = Gaussians.load(parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply")
     for folder, shade in ((here, 0), (there, 9)):

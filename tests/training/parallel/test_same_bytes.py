@@ -114,7 +114,7 @@ REFINED = {
 
 
 def test_cameras_that_are_refined():
-    """What Gaussians of all processes add to the derivatives of a camera is summed in one place."""
+    """Derivatives of a camera are summed over all processes in one place."""
     assert_the_same(settings(**REFINED), [3])
 
 
