@@ -132,14 +132,18 @@ def test_reverse_mode_is_the_transpose_of_forward_mode():
 
 
 derivatives, adjoint = GaussianFalloff.derivatives, CenterOrder.adjoint
-rotation, whiten = projection.quat_to_rotation, projection.apply_conic_factor
+rotation, factor_conic = projection.quat_to_rotation, projection.factor_conic
 
 MUTANTS = {
     "factor 1.01": (GaussianFalloff, "derivatives", lambda *a: [1.01 * d for d in derivatives(*a)]),
     "wrong sign": (GaussianFalloff, "derivatives", lambda *a: [-d for d in derivatives(*a)]),
     "no background term": (CenterOrder, "adjoint", lambda *a: adjoint(*a[:5], 0 * a[5], *a[6:])),
     "quaternion xyzw": (projection, "quat_to_rotation", lambda q: rotation(type(q)(q.yzwx))),
-    "no low-pass": (projection, "whiten", lambda mean, x, y, low: whiten(mean, x, y, 0 * low)),
+    "no low-pass": (
+        projection,
+        "factor_conic",
+        lambda mean, x, y, low: factor_conic(mean, x, y, 0 * low),
+    ),
 }
 
 

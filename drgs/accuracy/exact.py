@@ -69,7 +69,7 @@ from drgs.splatting.projection import (
     ProjectionModel,
     RayTerms,
     Splats2D,
-    apply_conic_factor,
+    factor_conic,
     ewa,
     film_axes,
 )
@@ -95,7 +95,7 @@ def exact_shape(
     where the anchor is, which makes no difference.
     """
     m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
-    film = apply_conic_factor(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
+    film = factor_conic(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     mean = dr.detach(film.means2d)
     anchor = closest_on_film(camera, *mean)
     slopes = list((anchor - camera.principal) / camera.focal)
@@ -136,7 +136,7 @@ def _seen_along(
 ) -> tuple[Array3f, tuple[Float, Float], Float]:
     """Return U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
-    film = apply_conic_factor(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
+    film = factor_conic(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     p, _, s = film.conic_factor
     # kappa and h by minors (Binet-Cauchy), free of the cancellation in p k_x + r k_y and in
     # w - |kappa|^2. The rows are scaled first, or giants overflow.

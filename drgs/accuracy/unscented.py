@@ -24,7 +24,7 @@ from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
     ProjectionModel,
-    apply_conic_factor,
+    factor_conic,
     ewa,
     film_axes,
     world_axes,
@@ -59,9 +59,7 @@ def unscented_shape(
     shift = types_of(type(position.z)).Array2f(points.mean)
     means2d = camera.lens.project_point(camera, position) + shift
     affine = ewa(rows, camera, position, low_pass)
-    return dr.select(
-        points.usable, apply_conic_factor(means2d, columns[0], columns[1], low_pass), affine
-    )
+    return dr.select(points.usable, factor_conic(means2d, columns[0], columns[1], low_pass), affine)
 
 
 @PROJECTIONS.register("unscented")

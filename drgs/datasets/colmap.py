@@ -202,8 +202,8 @@ def _size_as_calibrated(
 ) -> tuple[int, int]:
     """Return width and height of the photograph, px, for which the camera's numbers are.
 
-    COLMAP reads photographs as they are stored; one that was turned since, as EXIF says, is turned
-    here.
+    COLMAP reads photographs as they are stored; one that was turned since, by its EXIF orientation,
+    is turned here.
     """
     header = read_header(file)
     (width, height), seen = header.size, (camera.width, camera.height)

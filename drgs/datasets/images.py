@@ -284,7 +284,7 @@ def check_room(files: Sequence[Path], max_width: int | None) -> None:
 
 
 def threads_for(files: Sequence[Path]) -> int:
-    """Return how many photographs to read at a time, so that their numbers do not fill memory."""
+    """Return the number of photographs to read at a time, so that their pixels fit into memory."""
     width, height = image_size(files[0])
     return max(1, min(MAX_THREADS, MAX_PIXELS_AT_ONCE // (width * height)))
 

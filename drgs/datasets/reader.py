@@ -221,7 +221,7 @@ def in_parallel(
 
 
 def as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
-    """Return the pixels (H, W, C) of a photograph, turned as EXIF says if that is the frame's size.
+    """Return the pixels (H, W, C) of a photograph, turned by EXIF if that gives the frame's size.
 
     Viewers, OpenCV and Agisoft turn such a photograph; COLMAP, PyTorch's readers and the 3DGS
     reference do not. So the camera's size decides.

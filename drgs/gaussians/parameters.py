@@ -44,24 +44,17 @@ class Gaussians(Generic[Tensor]):
     logit_opacities: Tensor  # (N,)
     sh0: Tensor  # (N, 1, 3) degree-0 coefficients, display space
     shN: Tensor  # (N, K - 1, 3) coefficients of degree >= 1, K = (degree + 1)^2  # noqa: N815
-    smoothing: Tensor | None = (
-        None  # (N,) world units, not optimised: see drgs.effects.smoothing; None: there is none
-    )
-    features: Mapping[str, Tensor] | None = (
-        None  # by name, (N, C) each: whatever else is to be composited; None: nothing
-    )
-    rendered_with: Mapping[str, bool | int | float | str] | None = (
-        None  # by name: approximations that a file says, or is to say, they are made for
-    )
+    smoothing: Tensor | None = None  # (N,) world units, not optimised: drgs.effects.smoothing
+    features: Mapping[str, Tensor] | None = None  # (N, C) by name, composited besides colours
+    rendered_with: Mapping[str, bool | int | float | str] | None = None  # settings of a file
     origin: Origin = WORLD  # world: what the means are relative to
 
     @staticmethod
     def load(path: str | Path) -> Gaussians[np.ndarray]:
         """Read the Gaussians of a file, as numpy arrays: PLY, or another of ``drgs.io.formats``.
 
-        float32, with the values and the SH degree that the file holds, and with what it says they
-        are to be rendered with, as it stands there. Those of a format whose y axis is up are turned
-        so that z is, as it is in datasets.
+        float32, with the values, the SH degree and the recorded settings of the file. Gaussians of
+        a format whose y axis is up are turned so that z is, as it is in datasets.
 
         Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what is wrong.
         """

@@ -77,7 +77,7 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
     dataset names; else uniform in a box that follows from the layout and the cameras
     (``drgs.initialization.start_box``). Points on the hull, and those of a cloud without
     colours, are coloured from the images. Where masks contradict each other, the fit starts as
-    without them, and the description says so.
+    without them, and the description mentions it.
 
     Raises :class:`UserError` for points that the cameras do not see, and for masks or a point cloud
     that ``init.start`` requires and that are not there.

@@ -162,7 +162,7 @@ def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndar
 
 
 def num_views_facing(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
-    """Return how many cameras have one of the points (N, 3) in the middle of their image.
+    """Return the number of cameras that have one of the points (N, 3) in the middle of their image.
 
     Of very many points, which would take long, every n-th is considered.
     """

@@ -117,7 +117,7 @@ def _any_of(pixels: np.ndarray, scale: int) -> np.ndarray:
 
 
 def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
-    """Return how many are of images that are partly transparent."""
+    """Return the number of those of partly transparent images."""
     return sum(s.transparent >= LEAST_TRANSPARENT for s in silhouettes)
 
 

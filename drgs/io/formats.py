@@ -77,10 +77,10 @@ class FileFormat:
     """Numbers that are not finite are written as they are."""
 
     metadata: frozenset[str] | None = frozenset()
-    """Names of ``rendered_with`` that files hold; None: all. The user is told of others."""
+    """Names of ``rendered_with`` that files can record; None: all. Notes report the others."""
 
     def recognizes(self, path: Path) -> bool:
-        """Return whether the content is of this format; asked where several share a suffix."""
+        """Return whether the content is of this format, for formats that share a suffix."""
         return True
 
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:

@@ -76,9 +76,9 @@ EXTRAS_KEY = "drgs"
 
 def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     """Return a file of Gaussians; the origin becomes the translation of the node."""
-    attributes, said = _attributes(gaussians), dict(rendered_with)
-    origin = pop_origin("rendered_with", said)
-    document = _document(attributes, {EXTRAS_KEY: said} if said else None, origin)
+    attributes, settings = _attributes(gaussians), dict(rendered_with)
+    origin = pop_origin("rendered_with", settings)
+    document = _document(attributes, {EXTRAS_KEY: settings} if settings else None, origin)
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary = b"".join(values.tobytes() for values in attributes.values())
@@ -203,10 +203,13 @@ def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]
         "shN": harmonics[:, 1:],
     }
     arrays["means"], origin = near_means(means + document.translation)
-    said = document.rendered_with
+    settings = document.rendered_with
     if origin != WORLD:  # exactly what the file has, not what would do
-        arrays["means"], said = means, said | dict(zip(ORIGIN, document.translation, strict=True))
-    return arrays, said
+        arrays["means"], settings = (
+            means,
+            settings | dict(zip(ORIGIN, document.translation, strict=True)),
+        )
+    return arrays, settings
 
 
 def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:
@@ -315,16 +318,16 @@ class _Document:
     def rendered_with(self) -> dict[str, Scalar]:
         """Our values in the primitive's extras; none if another program wrote them."""
         extras = self.primitive.extras
-        said = extras.get(EXTRAS_KEY, {}) if isinstance(extras, dict) else {}
-        if not isinstance(said, dict) or not all(
+        settings = extras.get(EXTRAS_KEY, {}) if isinstance(extras, dict) else {}
+        if not isinstance(settings, dict) or not all(
             isinstance(value, Scalar) and STATEMENT.fullmatch(f"{EXTRAS_KEY} {name} {value}")
-            for name, value in said.items()
+            for name, value in settings.items()
         ):
             raise UserError(
                 f"{self.path}: {self.place}.extras.{EXTRAS_KEY}: must be an object of names and "
-                f"values of one word, got {one_line(repr(said), 60)}; correct it, or remove it"
+                f"values of one word, got {one_line(repr(settings), 60)}; correct it, or remove it"
             )
-        return said
+        return settings
 
     def accessor(self, name: str) -> _Accessor:
         """Return how an attribute's numbers lie in a part of the buffer."""

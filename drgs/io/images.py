@@ -91,7 +91,7 @@ GIF_WIDTH, NEAR_BACKGROUND = 300, 8
 colours of its palette become the background's."""
 
 
-# Reading: by Pillow itself, which tells an image's mode and size before it is decoded
+# Reading: by Pillow itself, which reads an image's mode and size before decoding it
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _orientation(image: Image.Image) -> int:
         return 1  # Pillow would decode the image to look behind it
     try:
         number = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except Exception:  # Pillow raises many types for broken EXIF, which says nothing
+    except Exception:  # Pillow raises many types for broken EXIF, which is ignored
         return 1
     return number if number in ORIENTATIONS else 1
 
@@ -181,7 +181,7 @@ def _colour_profile(profile: bytes | None) -> str:
         return ""
     try:
         name = one_line(ImageCms.getProfileDescription(io.BytesIO(profile)), 60)
-    except Exception:  # Pillow raises many types for a broken profile, which says nothing
+    except Exception:  # Pillow raises many types for a broken profile, which is ignored
         return ""
     return "" if "srgb" in name.lower() else name
 
@@ -197,7 +197,7 @@ def as_numbers(pixels: np.ndarray) -> np.ndarray:
 
 
 def check_readable(path: Path) -> None:
-    """Raise :class:`UserError` as :func:`read_pixels` does, as far as a header tells."""
+    """Raise :class:`UserError` as :func:`read_pixels` does, as far as the header shows it."""
     with _open_image(path) as image:
         _check(path, image)
 

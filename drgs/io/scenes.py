@@ -22,7 +22,7 @@ def openexr_threads() -> Iterator[None]:
     """Use two threads at least while OpenEXR files are read or written within the block.
 
     Mitsuba 3.9 has OpenEXR work in Dr.Jit's pool and sleeps until it is done: with a single thread,
-    nobody is left to do it.
+    no thread is left to do it.
     """
     threads = dr.thread_count()
     if threads >= 2:

@@ -32,7 +32,7 @@ MAX_BYTES = 1 << 33
 
 MAX_NUMBER = 1e12
 """Largest position or scale: letters, read as numbers, are larger. There is no other sign by
-which a file of another kind could be told."""
+that would distinguish a file of another kind."""
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 

@@ -85,7 +85,7 @@ def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
     """Return a file of Gaussians, version 3.
 
     Raises :class:`UserError` for positions of more than 2^23, or where most Gaussians are smaller
-    or larger than scales can be here; a :class:`UserNote` tells where some are.
+    or larger than scales can be here; a :class:`UserNote` reports these.
     """
     g = gaussians
     _check_scales(g["log_scales"])

@@ -417,14 +417,14 @@ class _Reconstruction:
 
 
 def _size_and_lens(file: Path) -> tuple[object, ...]:
-    """Return the same for photographs of one size and, as far as EXIF says, one lens."""
+    """Return the same for photographs of one size and, as far as EXIF shows, one lens."""
     tags = ExifTags.Base
     try:
         with Image.open(file) as image:
             exif = image.getexif()
             details = exif.get_ifd(ExifTags.IFD.Exif)
             lens = (exif.get(tags.Make), exif.get(tags.Model), details.get(tags.FocalLength))
-    except Exception:  # Pillow raises many types for broken EXIF, which says nothing
+    except Exception:  # Pillow raises many types for broken EXIF, which is ignored
         lens = ()
     return *image_size(file), *map(str, lens)
 

@@ -1,4 +1,4 @@
-"""The reference of the effects a scene may call for: lenses, defocus, moving cameras, smoothing.
+"""The reference of optional effects: lenses, defocus, moving cameras, smoothing.
 
 It imports nothing of this package but ``reference``, and is to be read after it. Each effect
 replaces one stage of ``reference.render``, or is the mean of many of its images::

@@ -142,7 +142,7 @@ class Projection:
     cov2d: np.ndarray  # (N, 2, 2) px^2, low-pass included
     conics: np.ndarray  # (N, 2, 2) px^-2, inverse of cov2d
     depths: np.ndarray  # (N,) camera z, world units; the true one for culled rows too
-    opacities: np.ndarray  # (N,) activated; after compensation where that was asked for
+    opacities: np.ndarray  # (N,) activated; after compensation, if requested
     visible: np.ndarray  # (N,) bool: depths >= near and opacities > ALPHA_CUT; may be off film
     cuts: np.ndarray | float | None = None  # (N,) or for all: smallest alphas; None: ALPHA_CUT
 
@@ -843,7 +843,7 @@ def render_gradients(
 
     d_image (H, W, 3); d_alpha and d_depth (H, W), None for zero; the rest as in ``render``. The
     result has the six fields of ``Gaussians`` in their shapes, ``background`` (3,), and
-    ``means2d`` (N, 2), per pixel of position on the film. What is not differentiated is said by
+    ``means2d`` (N, 2), per pixel of position on the film. Not differentiated: see
     ``composite_gradients`` and ``project_gradients``.
     """
     degree = gaussians.sh_degree if sh_degree is None else sh_degree

@@ -222,7 +222,7 @@ def ewa(
     """
     lens = camera.lens
     m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
-    return apply_conic_factor(lens.project_point(camera, position), [*m0], [*m1], low_pass)
+    return factor_conic(lens.project_point(camera, position), [*m0], [*m1], low_pass)
 
 
 @PROJECTIONS.register("ewa")
@@ -232,7 +232,7 @@ class Ewa(ProjectionModel):
     shape = staticmethod(ewa)
 
 
-def apply_conic_factor(
+def factor_conic(
     means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: Float | float
 ) -> FilmShape:
     """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.

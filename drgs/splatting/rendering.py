@@ -287,7 +287,7 @@ def frames_adjoint(
 
     gaussians: those that ``frames`` were rendered from; d_planes: of each frame, derivatives of the
     loss with respect to its planes (see :meth:`Frame.planes`); of_camera: whether those with
-    respect to the camera are asked for. All samples are added in their order.
+    respect to the camera are requested. All samples are added in their order.
 
     Raises NotImplementedError if they are, and the pipeline has none.
 

@@ -1,4 +1,4 @@
-"""A fit for a given time: what to choose, how many iterations, and when to end.
+"""A fit for a given time: strategy, number of iterations, and end.
 
 ``scenes/studies/training.py`` measures quality over time on the shipped scene: a curve for each
 :class:`Strategy`. Its time is counted in iterations as they are at the start of a fit, with full
@@ -317,7 +317,7 @@ def plan_fit(
         config = with_changes(config, {"output.report": False, "output.save_renders": False})
     else:
         end -= images
-    has_one_file = config.model.approximations.are_usual
+    has_one_file = config.model.approximations.is_default
     end -= results.measuring * (1 if has_one_file else 2)
     if not has_one_file:
         from drgs.training.viewers import TIME_SHARE

@@ -282,7 +282,7 @@ class FitSession:
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
         self.trainer.full_scene()  # gathered from all ranks
         for_viewers = None
-        if not self.trainer.config.model.approximations.are_usual:
+        if not self.trainer.config.model.approximations.is_default:
             for_viewers = self._fit_for_viewers(gaussians)
         if self.folder is not None:
             metrics = self.folder.write_results(

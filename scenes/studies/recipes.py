@@ -334,7 +334,7 @@ def fit_point(case: Case, scene: Scene, config: FitConfig, out: Path, threads: i
     words = re.findall(r"\w+", case.name.replace("'", ""))
     metrics = fit(config, out / scene.name / "_".join(words), threads)
     model = ModelConfig.model_validate(metrics["config"]["model"])
-    viewers = metrics["test"]["psnr"] if model.approximations.are_usual else None
+    viewers = metrics["test"]["psnr"] if model.approximations.is_default else None
     return Point(
         scene=scene.name,
         case=case.name,

@@ -298,7 +298,7 @@ def test_bytes_of_a_good_fit_are_those_without_guards(monkeypatch):
         return [getattr(trainer.gaussians(), name).tobytes() for name in PARAMETER_NAMES]
 
     guarded = result()
-    monkeypatch.setattr(rendering, "_faults", lambda d_rows, visible: mi.UInt32(0))
+    monkeypatch.setattr(rendering, "_nonfinite_flags", lambda d_rows, visible: mi.UInt32(0))
     monkeypatch.setattr(GradientWatch, "add", lambda *arguments: None)
     assert result() == guarded
 

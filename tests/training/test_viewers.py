@@ -106,6 +106,6 @@ def test_the_population_and_the_schedule_stay():
     config = with_changes(fits.config_of(iterations=400), {**OTHERWISE, "model.order": "pixel"})
     further = tuning(config)
     assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
-    assert further.model.approximations.are_usual and not config.model.approximations.are_usual
+    assert further.model.approximations.is_default and not config.model.approximations.is_default
     assert further.model.sh_degree == config.model.sh_degree
     assert further.loss == config.loss and further.data == config.data

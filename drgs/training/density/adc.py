@@ -1,7 +1,7 @@
 """Adaptive density control, the strategy ``adc``: clone, split, prune and the opacity reset.
 
 Section 5 of the 3DGS paper (Kerbl et al. 2023) with the details of its reference implementation,
-except where a docstring says otherwise. Rows are chosen on the host and moved by
+except where a docstring states otherwise. Rows are chosen on the host and moved by
 ``drgs.training.optimizer`` together with their moments. Equal inputs give equal bytes: no atomics,
 ties are broken by index, and random numbers depend on seed and iteration alone.
 """

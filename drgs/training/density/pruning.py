@@ -58,7 +58,7 @@ class PruneSchedule:
         return self.contains(iteration) and due
 
     def num_left(self, iteration: int, before: int) -> int:
-        """Return how many are to be left after an iteration: each change removes the same share.
+        """Return the number to be left after an iteration: each change removes the same share.
 
         ``before`` (to / before)^s, s being the share of the phase that is over, of ``before``
         Gaussians at the first change; ``to`` at its end.
@@ -154,11 +154,10 @@ class NaturalSelection(Pruning):
         return super().is_due(iteration) and not is_over
 
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
-        """Lower all logits, and remove what is then below the threshold.
+        """Lower all logits, and remove Gaussians that are then below the threshold.
 
-        By how much follows from how many are to be left now: so many are below, unless others are
-        so opaque that it would take more than ``MAX_PRESSURE``. The last time, the least opaque
-        go until few enough are left.
+        The shift follows from the number to be left now, up to ``MAX_PRESSURE``. The last time,
+        the least opaque are removed until few enough are left.
         """
         logits, phase = population.host("logit_opacities"), self.phase
         threshold = math.log(self.prune.opacity / (1 - self.prune.opacity))

@@ -176,7 +176,7 @@ def _concatenate(parts: Sequence[Footprints]) -> Footprints:
 
 
 class ViewMessages:
-    """Messages between ranks about the views of a step, told apart by place in the step and time.
+    """Messages between ranks about the views of a step, identified by place in the step and time.
 
     Messages about the same view and time arrive in the order in which they are sent.
     """
@@ -278,7 +278,7 @@ class ViewExchange:
                 self.messages.send(blocks, each.renderer, each.view.place, time)
 
     def own_views(self) -> Iterator[StepView]:
-        """Yield the views that this rank renders; each is rendered before the next is asked for."""
+        """Yield the views that this rank renders; each is rendered before the next is requested."""
         for each in self._views:
             if each.renderer == self.comm.rank:
                 self._current = each
@@ -485,7 +485,7 @@ class ViewExchange:
                     sums = [dr.sum(from_host(type(of_rows[0]), column)) for column in rows.T]
                     of_cameras.append(sums)
             total = reduce(sum_of_gradients, found)
-        assert total.parameters is not None, "they are asked for"
+        assert total.parameters is not None, "they are requested"
         self._accumulate(total.parameters)
         each.first_nonfinite = total.first_nonfinite
         if of_cameras:
