@@ -69,8 +69,8 @@ from drgs.splatting.projection import (
     ProjectionModel,
     RayTerms,
     Splats2D,
-    factor_conic,
     ewa,
+    factor_conic,
     film_axes,
 )
 

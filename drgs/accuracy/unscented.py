@@ -24,8 +24,8 @@ from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,
     ProjectionModel,
-    factor_conic,
     ewa,
+    factor_conic,
     film_axes,
     world_axes,
 )

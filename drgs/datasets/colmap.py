@@ -27,8 +27,7 @@ from drgs.datasets.transforms import LENS_OF_MODEL, FrameValues, TransformsFrame
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
 from drgs.io.images import MAX_SIDE, read_header
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Folders of COLMAP's models in datasets."""
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")  # folders of COLMAP's models in datasets
 
 WORKSPACES = ("", "dense/0", "dense")
 """Folders of that kind in COLMAP's automatic reconstruction, with their photographs."""
@@ -36,8 +35,7 @@ WORKSPACES = ("", "dense/0", "dense")
 FACTORS = {"images": 1, "images_2": 2, "images_4": 4, "images_8": 8}
 """Divisors of the size of photographs, by folder."""
 
-FIRST_TRANSPOSED_ORIENTATION = 5
-"""EXIF's orientations from this one exchange width and height."""
+FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange width and height
 
 PHOTOGRAPHS = FileKind("photographs", remedy="put the photographs there that COLMAP saw")
 

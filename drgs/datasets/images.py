@@ -29,11 +29,9 @@ from drgs.io.images import (
 MAX_PIXELS_AT_ONCE, MAX_THREADS = 1 << 25, 8
 """Pixels of photographs that are read at a time: of 40 bytes each, at most."""
 
-MIN_WHOLE_SHARE = 1 - 1e-4
-"""Share of a pixel's area that counts as all of it, up to rounding."""
+MIN_WHOLE_SHARE = 1 - 1e-4  # share of a pixel's area that counts as all of it, up to rounding
 
-DEPTH_BYTES = 24
-"""Memory for a depth of an ``.npy`` file while it is converted."""
+DEPTH_BYTES = 24  # memory for a depth of an ``.npy`` file while it is converted
 
 
 # Masks and depths

@@ -51,8 +51,7 @@ RIGID_TOLERANCE, LAST_ROW = 1e-4, (0, 0, 0, 1)
 """Largest entry of |R R^T - I|, eighty times that of files written with float32 (1.3e-6), and error
 of the last row."""
 
-MEMORY_RATIO = 30
-"""Memory that JSON takes as Python's objects, in bytes of the text."""
+MEMORY_RATIO = 30  # memory that JSON takes as Python's objects, in bytes of the text
 
 MAX_COORDINATE = 1e9
 """Scene units, of a camera's position: far beyond what float32 resolves within a scene."""
@@ -60,16 +59,14 @@ MAX_COORDINATE = 1e9
 FOCAL_RANGE = (1e-2, 1e4)
 """Focal lengths, in image sizes: full angles of view from 178 degrees down to 0.006."""
 
-MAX_OFFSET = 100
-"""Image sizes: how far the principal point may lie from the image."""
+MAX_OFFSET = 100  # image sizes: how far the principal point may lie from the image
 
 SMALLEST_ANGLE, LARGEST_ANGLE = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))
 """Radians: the same as full angles of view."""
 
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 
-RATIONAL_MODEL = "FULL_OPENCV"
-"""The model of a camera that has k4 to k6."""
+RATIONAL_MODEL = "FULL_OPENCV"  # the model of a camera that has k4 to k6
 
 PLANE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL_MODEL)
 FISHEYE_MODELS = (

@@ -44,8 +44,7 @@ class LazyImage:
         return self.shape[0]
 
 
-Pixels = np.ndarray | LazyImage
-"""An image of a view; ``np.asarray`` makes an array of either."""
+Pixels = np.ndarray | LazyImage  # an image of a view; ``np.asarray`` makes an array of either
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,7 @@ PARALLEL_AXES = 1e-3
 """Smallest eigenvalue of mean(I - d d^T), d the optical axes: about the mean squared sine of
 their angle to a common direction. Below this (1.8 degrees) their nearest point is noise."""
 
-FIELD_OF_VIEW = 40.0
-"""Degrees, horizontal: that of the NeRF-synthetic cameras, rounded."""
+FIELD_OF_VIEW = 40.0  # degrees, horizontal: that of the NeRF-synthetic cameras, rounded
 
 
 def pinhole(name: str, pose: np.ndarray, width: int, height: int, fov: float) -> Viewpoint:

@@ -17,8 +17,7 @@ NEAR_SHARE = 0.04
 gives the reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, as well as for
 distances of 4 to 6, which photographs often have in COLMAP's unit of length."""
 
-NEAR_RANGE = (1e-9, 1e9)
-"""Scene units that a configuration accepts."""
+NEAR_RANGE = (1e-9, 1e9)  # scene units that a configuration accepts
 
 MAX_NEAR_SHARE = 0.5
 """Share of that distance beyond which a near plane would cut into what is looked at."""
@@ -35,8 +34,7 @@ COARSE_SHARE = 0.35
 LEAST_COARSE_SIDE_PX = 100
 """Smallest side of photographs that are made smaller still. SSIM's window is 11 px wide."""
 
-NUM_ALPHA_VIEWS = 15
-"""Images, at most, by which a dataset is judged to be cut out."""
+NUM_ALPHA_VIEWS = 15  # images, at most, by which a dataset is judged to be cut out
 
 
 def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:

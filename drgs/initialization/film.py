@@ -15,8 +15,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import from_host, types_of
 from drgs.datasets.types import Viewpoint
 
-Columns = Sequence[np.ndarray]
-"""Coordinates x, y, z, each (N,)."""
+Columns = Sequence[np.ndarray]  # coordinates x, y, z, each (N,)
 
 
 def is_projectable(view: Viewpoint) -> bool:

@@ -20,18 +20,15 @@ from drgs.initialization.film import is_projectable, to_camera, to_film
 MAX_VIEWS, MIN_VIEWS = 60, 8
 """Numbers of views whose images are read: most points are seen by a third of them."""
 
-MAX_BYTES = 1 << 27
-"""Memory for colours: of a million points, fewer views are read."""
+MAX_BYTES = 1 << 27  # memory for colours: of a million points, fewer views are read
 
 PIXEL, BEHIND = 1.5, 1.5
 """Width of a pixel of the z-buffer, and distance behind its depth of points that are seen, in
 distances of the points. In smaller pixels, points are seen through gaps of a surface."""
 
-MIN_ALPHA = 0.5
-"""Least alpha: less opaque pixels have mostly the colour of what is behind them."""
+MIN_ALPHA = 0.5  # least alpha: less opaque pixels have mostly the colour of what is behind them
 
-SORTED_AT_ONCE = 1 << 13
-"""Points."""
+SORTED_AT_ONCE = 1 << 13  # points
 
 
 def colors_from_images(

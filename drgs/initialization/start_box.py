@@ -22,21 +22,17 @@ KEEP_OUT = 0.25
 FAR_SHARE, FARTHEST = 0.5, 10.0
 """Share of starting points behind what is looked at, and how far they go, in distances to it."""
 
-MAX_BATCHES = 200
-"""Batches of points to draw: enough where half a percent of the box is in view."""
+MAX_BATCHES = 200  # batches of points to draw: enough where half a percent of the box is in view
 
 REFERENCE_FILL = 0.9
 """Share of half of an image's width that the reference's box takes up where NeRF-synthetic's
 cameras look, 1.3 / (4.03 tan(0.69 / 2))."""
 
-FILL_RANGE = (0.5, 2.0)
-"""Shares of half of an image's width at which that box is taken as it is."""
+FILL_RANGE = (0.5, 2.0)  # shares of half of an image's width at which that box is taken as it is
 
-LEAST_LOOKING = 0.5
-"""Share of the cameras that must look at where a fit starts."""
+LEAST_LOOKING = 0.5  # share of the cameras that must look at where a fit starts
 
-CENTRAL_SHARE = 0.5
-"""Share of an image's width and height that contains what its camera looks at."""
+CENTRAL_SHARE = 0.5  # share of an image's width and height that contains what its camera looks at
 
 LEAST_COVERED = 0.005
 """Share of an image (the median) that a box must cover: what is around it starts without points."""
@@ -44,8 +40,7 @@ LEAST_COVERED = 0.005
 NUM_SAMPLES, NUM_CELLS = 2000, 32
 """Points that stand for a box, and the cells of an image, in each direction, that they cover."""
 
-MAX_CLOUD_POINTS = 20_000
-"""Points of a cloud that stand for all of it."""
+MAX_CLOUD_POINTS = 20_000  # points of a cloud that stand for all of it
 
 
 @dataclass(frozen=True, eq=False)

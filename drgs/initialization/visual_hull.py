@@ -24,8 +24,7 @@ from drgs.datasets.types import View
 from drgs.initialization.film import Columns, is_projectable, to_camera, to_film
 from drgs.initialization.start_box import Box
 
-MAX_EMPTY_ALPHA = 4 / 255
-"""Alpha up to which a pixel is empty. Mattes have noise."""
+MAX_EMPTY_ALPHA = 4 / 255  # alpha up to which a pixel is empty. Mattes have noise.
 
 MIN_POINT_ALPHA = 0.5
 """Least alpha of pixels that show points: others are mostly beside what there is. Parts that are
@@ -42,11 +41,9 @@ they see."""
 MAX_VIEWS, MAX_SIDE = 120, 512
 """Number of silhouettes, and pixels along their sides: of larger images, pixels are merged."""
 
-LEAST_SEEN = 0.5
-"""Share of the views that must see a cube: others cannot show it empty."""
+LEAST_SEEN = 0.5  # share of the views that must see a cube: others cannot show it empty
 
-ROOT_CUBES_PER_SIDE = 16
-"""Cubes along the longest side of the box that is divided first."""
+ROOT_CUBES_PER_SIDE = 16  # cubes along the longest side of the box that is divided first
 
 COARSE_CUBES, COARSE_LEVELS = 4000, 7
 """Cubes on the surface that are enough to know the hull's box, and its area to a few per cent; and

@@ -53,16 +53,13 @@ MODELS: Mapping[str, tuple[int, tuple[str, ...]]] = {
 
 MODEL_NAMES = {number: name for name, (number, _) in MODELS.items()}
 
-MAX_NUMBER = 1e12
-"""Largest magnitude of a parameter or a coordinate."""
+MAX_NUMBER = 1e12  # largest magnitude of a parameter or a coordinate
 
-QUATERNION_RANGE = (1e-6, 1e6)
-"""Lengths of accepted quaternions; COLMAP writes 1."""
+QUATERNION_RANGE = (1e-6, 1e6)  # lengths of accepted quaternions; COLMAP writes 1
 
 MAX_FILE_BYTES = 1 << 33
 
-BINARY_MEMORY_RATIO, TEXT_MEMORY_RATIO = 4, 8
-"""Memory that reading takes, in bytes of the file."""
+BINARY_MEMORY_RATIO, TEXT_MEMORY_RATIO = 4, 8  # memory that reading takes, in bytes of the file
 
 MAX_NAME_BYTES = 4096
 

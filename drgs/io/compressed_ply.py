@@ -38,8 +38,7 @@ from drgs.io.quantization import (
     sh0_from_colors,
 )
 
-CHUNK = 256
-"""Gaussians in a group; the last one may have fewer."""
+CHUNK = 256  # gaussians in a group; the last one may have fewer
 
 BITS = {
     "packed_position": (11, 10, 11),
@@ -56,8 +55,7 @@ BOUNDED = {
 }
 """Names of what has bounds in ``chunk``, by the word that it is in."""
 
-QUATERNION_RANGE = 1 / np.sqrt(2)
-"""No component but the largest is beyond it."""
+QUATERNION_RANGE = 1 / np.sqrt(2)  # no component but the largest is beyond it
 
 SH_RANGE = 4.0
 SH_LEVELS = 256

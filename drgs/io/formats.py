@@ -43,8 +43,7 @@ wxyz, ``log_scales`` (N, 3), ``logit_opacities`` (N,), ``sh0`` (N, 1, 3), ``shN`
 ORIGIN = ("origin_x", "origin_y", "origin_z")
 """Names in ``rendered_with``: world coordinates that the means are relative to."""
 
-MAX_ORIGIN = 1e12
-"""World units."""
+MAX_ORIGIN = 1e12  # world units
 
 Z_TO_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from our worlds, in which z is up, to files in which y is up: x' = R x."""
@@ -58,23 +57,18 @@ class FileFormat:
     not the world's.
     """
 
-    suffix: str
-    """End of file names, in small letters, such as ``.npz``."""
+    suffix: str  # end of file names, in small letters, such as ``.npz``
 
-    description: str
-    """One phrase, for help texts."""
+    description: str  # one phrase, for help texts
 
     up: str | None = None
     """Axis that the format defines as up, ``"y"`` or ``"z"``; None: it defines none."""
 
-    has_harmonics = True
-    """Harmonics above degree 0 are kept."""
+    has_harmonics = True  # harmonics above degree 0 are kept
 
-    has_smoothing = False
-    """The smoothing filter of each Gaussian is kept."""
+    has_smoothing = False  # the smoothing filter of each Gaussian is kept
 
-    allows_nonfinite = False
-    """Numbers that are not finite are written as they are."""
+    allows_nonfinite = False  # numbers that are not finite are written as they are
 
     metadata: frozenset[str] | None = frozenset()
     """Names of ``rendered_with`` that files can record; None: all. Notes report the others."""

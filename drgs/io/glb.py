@@ -45,19 +45,16 @@ from drgs.io.quantization import (
 EXTENSION = "KHR_gaussian_splatting"
 REQUIRED = ("POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")))
 
-MAX_JSON_BYTES = 1 << 24
-"""Limit of the JSON part, which takes up to 30 times as much memory."""
+MAX_JSON_BYTES = 1 << 24  # limit of the JSON part, which takes up to 30 times as much memory
 
-MAX_BYTES = (1 << 32) - 1
-"""Largest file: its length is a number of 32 bits."""
+MAX_BYTES = (1 << 32) - 1  # largest file: its length is a number of 32 bits
 
 HEADER = struct.Struct("<4sII")
 CHUNK = struct.Struct("<I4s")
 MAGIC, VERSION = b"glTF", 2
 JSON, BINARY = b"JSON", b"BIN\0"
 
-FLOAT, BYTE = 5126, 5121
-"""Types of components that are written."""
+FLOAT, BYTE = 5126, 5121  # types of components that are written
 
 ARRAY_BUFFER = 34962
 POINTS = 0
@@ -67,11 +64,9 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 
 NOT_NEGATIVE = "linear, so not negative (drafts of the extension had logarithms)"
 
-KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-"""Types of accessors, by number of components."""
+KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # types of accessors, by number of components
 
-EXTRAS_KEY = "drgs"
-"""Key of our values in ``extras``."""
+EXTRAS_KEY = "drgs"  # key of our values in ``extras``
 
 
 def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:

@@ -31,8 +31,7 @@ MAX_PIXELS, PIXEL_BYTES = 1 << 26, 16
 """Pixels of an image, as 8192 x 8192: 0.8 GB once decoded to float32; and memory for a pixel while
 it is decoded and copied."""
 
-MAX_SIDE = 2**24
-"""px: in a larger image, float32 does not resolve pixels."""
+MAX_SIDE = 2**24  # px: in a larger image, float32 does not resolve pixels
 
 MAX_BYTES = 1 << 30
 """Size of a file: twice what so many pixels of 64 bits take when they are not compressed."""
@@ -63,11 +62,9 @@ ORIENTATIONS = {
 }
 """Turns that make an image upright, by EXIF's orientation."""
 
-INVERSE_ORIENTATIONS = {6: 8, 8: 6}
-"""Other orientations are their own inverses."""
+INVERSE_ORIENTATIONS = {6: 8, 8: 6}  # other orientations are their own inverses
 
-MAX_WEBP_SIDE = 16_383
-"""px: the largest width and height that the format can express."""
+MAX_WEBP_SIDE = 16_383  # px: the largest width and height that the format can express
 
 MAX_FRAMES_BYTES = 2 << 30
 """Memory for all frames of an animation, which are held until it is written."""

@@ -27,8 +27,7 @@ from drgs.io.quantization import (
     sh0_from_colors,
 )
 
-MAX_BYTES = 1 << 33
-"""Largest file: 8.6 GB."""
+MAX_BYTES = 1 << 33  # largest file: 8.6 GB
 
 MAX_NUMBER = 1e12
 """Largest position or scale: letters, read as numbers, are larger. There is no other sign by

@@ -46,8 +46,7 @@ from drgs.io.quantization import (
     round_to_uint32,
 )
 
-MAX_BYTES = 1 << 32
-"""Largest file: 4.3 GB, more than 60 million Gaussians."""
+MAX_BYTES = 1 << 32  # largest file: 4.3 GB, more than 60 million Gaussians
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -56,8 +55,7 @@ HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 TABLE_ENTRY = struct.Struct("<QQ")
 
 WRITTEN_VERSION = 3
-ANTIALIASED, EXTENSIONS = 1, 2
-"""Flags."""
+ANTIALIASED, EXTENSIONS = 1, 2  # flags
 
 POSITION_BITS = 24
 FRACTIONAL_BITS = 12
@@ -74,11 +72,9 @@ SH_STEPS = (4, 8)
 implementation's are twice as wide: on ``scenes/lego_mini.yml``, they save 17 % of the file and cost
 0.2 dB more. No steps at all cost 44 % and save 0.1 dB."""
 
-GZIP_LEVEL = 6
-"""The reference implementation's: the highest takes nine times as long for 3 % less."""
+GZIP_LEVEL = 6  # the reference implementation's: the highest takes nine times as long for 3 % less
 
-XYZW = np.array([1, 2, 3, 0])
-"""Columns of a quaternion wxyz."""
+XYZW = np.array([1, 2, 3, 0])  # columns of a quaternion wxyz
 
 
 def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:

@@ -24,11 +24,9 @@ from drgs.io.quantization import normalize_quaternions, opacities_from_logits
 
 PRIM = "/Gaussians"
 
-COLOR_SPACE = "srgb_rec709_scene"
-"""OpenUSD's name of sRGB's primaries and transfer function."""
+COLOR_SPACE = "srgb_rec709_scene"  # openUSD's name of sRGB's primaries and transfer function
 
-EXTENT_STDS = 3.0
-"""Standard deviations of a Gaussian that count for the extent."""
+EXTENT_STDS = 3.0  # standard deviations of a Gaussian that count for the extent
 
 
 def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:

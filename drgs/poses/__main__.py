@@ -28,8 +28,7 @@ from drgs.poses.structure_from_motion import (
     place,
 )
 
-MAX_NAMES = 5
-"""Photographs without a camera, and cameras, that are named."""
+MAX_NAMES = 5  # photographs without a camera, and cameras, that are named
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -40,35 +40,30 @@ if TYPE_CHECKING:
 
 CAMERA_MODELS = tuple(LENS_OF_MODEL)
 
-SIMPLE = "SIMPLE_RADIAL"
-"""The model with the fewest parameters that suits photographs."""
+SIMPLE = "SIMPLE_RADIAL"  # the model with the fewest parameters that suits photographs
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """Suffixes of images that COLMAP reads and that can be fitted."""
 
-ALL_PAIRS = 100
-"""Most photographs of which every two are compared by default."""
+ALL_PAIRS = 100  # most photographs of which every two are compared by default
 
 NEIGHBOURS, STRIDE = 10, 8
 """Pairs of more photographs: each with so many that follow it by name and those at distances of
 powers of two, and every so many-th with each other."""
 
-PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64
-"""Per call of COLMAP, which uses all cores within one."""
+PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # per call of COLMAP, which uses all cores within one
 
 MAX_SIDE_PX = 3200
 """Features are extracted from photographs scaled down to this, which is COLMAP's default."""
 
-LEAST_PLACED = 3
-"""Photographs with which there is a model at all."""
+LEAST_PLACED = 3  # photographs with which there is a model at all
 
 COMMAND = "poses"
 
 MODEL_FILES = ("cameras.bin", "frames.bin", "points3D.bin", "rigs.bin", "images.bin")
 """Files in the order in which they are put in place: without the last there is no model."""
 
-TEMPORARY = ".drgs-poses-"
-"""Beginning of the names of temporary folders."""
+TEMPORARY = ".drgs-poses-"  # beginning of the names of temporary folders
 
 SEED = 0
 
