@@ -29,16 +29,15 @@ def load_dataset(
 ) -> Dataset:
     """Return all views of a dataset: photographs with their cameras, to train and to measure on.
 
-    source: the folder, in the layout of NeRF-synthetic, of nerfstudio / instant-ngp or of COLMAP,
-    or of a reader of another package, or the section ``data`` of a configuration; keeps: accepts,
-    by name, the views whose images are kept; sections: of extensions, by name; settings: other
-    values of the section ``data``, such as ``image_size=400`` (px) or ``background="black"``.
+    source: the folder (NeRF-synthetic, nerfstudio / instant-ngp, COLMAP, or the layout of an
+    extension), or the section ``data`` of a configuration; keeps: accepts, by name, the views whose
+    images are kept; sections: of extensions, by name; settings: other values of the section
+    ``data``, such as ``image_size=400`` (px) or ``background="black"``.
 
     Where the cameras are far from the world's origin, their positions are relative to the
     dataset's ``origin``, the middle of the training cameras.
 
-    Raises :class:`UserError` naming the file, the key, what was expected and what was got; where
-    the folder is missing, with where to get the data.
+    Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
     if settings or not isinstance(source, DataConfig):
         given = source.model_dump() if isinstance(source, DataConfig) else {"path": source}

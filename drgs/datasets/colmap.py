@@ -6,8 +6,8 @@ beside the model's folder) or, at a half, a quarter or an eighth of their size, 
 ``images_4``, ``images_8``; masks are in ``masks``, black where pixels do not count: see
 ``drgs.datasets.files``.
 
-Cameras are rendered with the lens that COLMAP found, without undistorting. Their numbers are for
-the size that COLMAP saw; the size of the photograph decides what they are for that.
+Cameras are rendered with the lens that COLMAP found, without undistorting. Their intrinsics are
+scaled from the size that COLMAP saw to that of the photograph.
 """
 
 from __future__ import annotations
@@ -137,10 +137,10 @@ def _images_and_files(
 
 
 def image_folder(config: DataConfig, model: ColmapModel) -> Path:
-    """Return the folder of the photographs that are to be read.
+    """Return the folder of the photographs to read.
 
-    That of ``data.downscale``; without it, the one whose photographs are the smallest that still
-    have the width of ``data.image_size``, or the largest ones there are.
+    ``data.downscale`` chooses it; by default, the smallest photographs that have at least the width
+    ``data.image_size``, or the largest ones.
     """
     root, _ = _root_and_model(config.path)
     folders = [path for path in sorted(root.iterdir()) if path.is_dir()]
@@ -198,11 +198,7 @@ def _values(
 def _size_as_calibrated(
     file: Path, camera: ColmapCamera, image: ColmapImage, folder: Path
 ) -> tuple[int, int]:
-    """Return width and height of the photograph, px, for which the camera's numbers are.
-
-    COLMAP reads photographs as they are stored; one that was turned since, by its EXIF orientation,
-    is turned here.
-    """
+    """Return width and height, px, of the photograph as COLMAP read it: not turned by EXIF."""
     header = read_header(file)
     (width, height), seen = header.size, (camera.width, camera.height)
     sizes = [(width, height)]

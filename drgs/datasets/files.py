@@ -1,4 +1,4 @@
-"""Names of a dataset's files: images that are almost called as they should be, and masks.
+"""Files of a dataset: images whose names differ a little from those recorded, and masks.
 
 Programs change the case of names, convert photographs to another format, put the folder's name or a
 whole path of another machine before them, and separate folders by backslashes.
@@ -87,11 +87,11 @@ def find_files(
     places: Sequence[str],
     notes: list[str],
 ) -> dict[str, Path]:
-    """Return the files below ``folder`` that are there, by their names.
+    """Return existing files below ``folder``, by their names.
 
     Each is the file of that name (or with ``.png`` added), or the only one of nearly that name; no
-    file is taken for two names. notes: one is added on names that differ, and one on missing files;
-    source: begins them; places: of the names in ``source``.
+    file has two names. notes: gets one on names that differ, and one on missing files, both
+    beginning with ``source``; places: of the names in ``source``.
 
     Raises :class:`UserError` where fewer than half were found, or only one of several.
     """

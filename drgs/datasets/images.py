@@ -1,7 +1,7 @@
 """Images of views: read, composited over a background, scaled, and kept in little memory.
 
-A photograph of three times 8 bits becomes four times as large as float32. So what the file contains
-is kept, and the numbers are computed at each access.
+A photograph of three times 8 bits becomes four times as large as float32, so the file's integers
+are kept, and floats computed at each access.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ DEPTH_BYTES = 24  # memory for a depth of an ``.npy`` file while it is converted
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Return a mask (H, W) float32: 1 where opaque and brighter than half, else 0; size: W, H.
 
-    A mask for a larger photograph of the same shape will do: a pixel counts where all that it
-    covers does.
+    The mask may be for a larger photograph of the same shape: a pixel counts if all of its area
+    does.
     """
     stored = image_size(path)
     is_larger = stored[0] > size[0] and is_scaled(size, stored)
@@ -223,8 +223,8 @@ def compact_photograph(
 ) -> tuple[Pixels, Pixels | None]:
     """Return ``image`` and ``alpha`` of a :class:`View` in a form that takes little memory.
 
-    The pixels of the file; numbers, where they take less; and where the photograph is scaled by no
-    whole factor, which takes long, numbers rounded to 16 bits.
+    That is the file's pixels, or floats where they take less; numbers of 16 bits where scaling is
+    by no whole factor, which takes long.
 
     pixels: of :func:`drgs.io.images.read_pixels`; background: behind transparent pixels, display
     space; max_width: see :func:`downscale`.

@@ -2,8 +2,8 @@
 
 Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle and one horizontal
 field of view, ``camera_angle_x``, for all frames that have none of their own; images of one size in
-a split, with straight alpha. An image without alpha is refused: what it shows behind the object
-would be fitted as part of it. Opaque photographs belong into the nerfstudio layout.
+a split, with straight alpha. An image without alpha is refused: its background would be fitted as
+part of the object. Opaque photographs need the nerfstudio layout.
 
 Frames may have a lens, a second pose, a mask and depths, as there.
 """
@@ -47,11 +47,7 @@ class NerfSyntheticReader(DatasetReader):
         return "transforms_train.json" in names
 
     def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
-        """Return split ``train`` and the split to measure on.
-
-        That is ``config.test_split``, by default ``test`` if its transforms file is there, else
-        ``val``.
-        """
+        """Return split ``train``, and ``config.test_split`` (default: ``test`` or ``val``)."""
         if config.background is None:
             config = config.model_copy(update={"background": "white"})
         test_split, notes, notices = _test_split(config), [], Notices(config.path)

@@ -224,9 +224,7 @@ def as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
     """Return the pixels (H, W, C) of a photograph, turned by EXIF if that gives the frame's size.
 
     Viewers, OpenCV and Agisoft turn such a photograph; COLMAP, PyTorch's readers and the 3DGS
-    reference do not. So the camera's size decides.
-
-    Raises :class:`UserError` where it does not tell.
+    reference do not. Raises :class:`UserError` where the camera's size does not decide it.
     """
     file, values = frame.files["image"], frame.values
     orientation = read_header(file).orientation
@@ -335,10 +333,9 @@ def _depth_unit(frame: TransformsFrame) -> float:
 def describe_extras(
     config: DataConfig, frames: Sequence[TransformsFrame]
 ) -> tuple[tuple[str, ...], str]:
-    """Return the names of what some frames have and ``data.ignore_*`` leaves out; and a text.
+    """Return the names of data that ``data.ignore_*`` leaves out, and a description of all.
 
-    Names: ``distortion``, ``motion``, ``masks``, ``depth``. The text, for a description, has what
-    is used as well.
+    Names: ``distortion``, ``motion``, ``masks``, ``depth``.
     """
     lenses = list(filter(None, map(lens_of, frames)))
     found = {

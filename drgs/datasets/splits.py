@@ -92,9 +92,9 @@ def unlisted_splits(
 ) -> Lists | None:
     """Return the splits of a layout without lists of its own, by files or by folders.
 
-    That of the first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt``; a file without
-    a name of a frame is another program's. Else each photograph must lie in a folder of a split,
-    not all in ``train``.
+    The first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt`` decides; a file without
+    a name of a frame is another program's. Otherwise each photograph must be in a folder of a
+    split, not all in ``train``.
     """
     for folder in folders:
         found = {}

@@ -348,8 +348,8 @@ def frames_with_files(
 ) -> list[TransformsFrame]:
     """Return the frames whose files are there, with the paths of those that are not ignored.
 
-    A frame without its depth stays. notes: on files that are taken under another name, and on
-    missing ones, are added here.
+    A frame without its depth stays. notes: gets one on files with another name, and one on missing
+    files.
 
     Raises :class:`UserError` where fewer than half of the files of a kind are there.
     """

@@ -156,8 +156,8 @@ class Dataset:
     def extent(self) -> float:
         """Scale of the scene: 1.1 x the largest distance of a train camera from their centroid.
 
-        As the 3DGS reference defines it (``getNerfppNorm``). Of all cameras where those of the
-        train views share a centre; 1 where all do.
+        Defined as in the 3DGS reference (``getNerfppNorm``); from all cameras if those of the train
+        views share a centre, and 1 if all do.
         """
         return _spread(self.train) or _spread((*self.train, *self.test)) or 1.0
 

@@ -1,13 +1,13 @@
 """A fit for a given time: strategy, number of iterations, and end.
 
 ``scenes/studies/training.py`` measures quality over time on the shipped scene: a curve for each
-:class:`Strategy`. Its time is counted in iterations as they are at the start of a fit, with full
-images and the first Gaussians. A few iterations of the fit that is to be planned turn these into
-seconds. The strategy is planned whose curve is highest where the time is up.
+:class:`Strategy`. Its unit of time is an iteration at the start of a fit, with full images and the
+first Gaussians; a few iterations of the planned fit convert it to seconds. The strategy whose curve
+is highest at the deadline is chosen.
 
-Curves of another scene predict a time to some ten or twenty per cent. So the clock has the last
-word (:class:`Deadline`): it revises what is ahead of the plan, and ends the fit. The configuration
-that results gives the same bytes without a clock.
+Curves of another scene predict a time to some ten or twenty per cent, so the clock revises the rest
+of the plan and ends the fit (:class:`Deadline`). The resulting configuration gives the same bytes
+without a clock.
 """
 
 from __future__ import annotations
@@ -46,17 +46,14 @@ if TYPE_CHECKING:
 CURVES = Path(__file__).parent / "training_curves.csv"
 """Curves that ``scenes/studies/training.py`` measured."""
 
-MIN_ITERATIONS = 50
-"""Fewer fit nothing."""
+MIN_ITERATIONS = 50  # fewer fit nothing
 
-MIN_SIDE_PX = 32
-"""Images of coarse stages are not smaller than SSIM's windows need."""
+MIN_SIDE_PX = 32  # images of coarse stages are not smaller than SSIM's windows need
 
 WARM_UP_ITERATIONS, TIMED_ITERATIONS, REHEARSAL_VIEWS = 6, 20, 8
 """Iterations of a rehearsal, the first of which compile kernels; and its views."""
 
-REVISION_SHARE = 0.1
-"""Share of the time between two revisions of a plan."""
+REVISION_SHARE = 0.1  # share of the time between two revisions of a plan
 
 MAX_IMAGES_SHARE = 0.33
 """Share of the time that ``--budget`` leaves: images that take more are left out."""
@@ -119,7 +116,7 @@ STRATEGIES = (
 class Curve:
     """Measured points of one strategy, by ascending number of iterations.
 
-    Between them, and beyond, time is a power of the number of iterations, and PSNR grows with its
+    Interpolated and extrapolated: time as a power of the number of iterations, PSNR in its
     logarithm.
     """
 
@@ -212,10 +209,10 @@ def make_plan(
 ) -> Plan:
     """Return the best plan for ``seconds`` of iterations, one of which takes ``start_s``.
 
-    config: completed. start_s: of the first iterations. num_points: Gaussians at the start. side:
-    px, the shortest of the training images.
+    config: without open values. start_s: of the first iterations. num_points: Gaussians at the
+    start. side: shortest side of the training images, px.
 
-    Raises :class:`UserError` if the time is too short for anything.
+    Raises :class:`UserError` if the time is too short for any plan.
     """
     candidates = []
     for strategy in STRATEGIES:
@@ -264,8 +261,8 @@ def rehearse(
 ) -> Rehearsal:
     """Time a few iterations on a few of the views.
 
-    comm: the processes that share the fit; others than rank 0 give no configuration and dataset;
-    objects: given to :class:`Trainer`, copies of which take part.
+    comm: the processes that share the fit; only rank 0 gives configuration and dataset; objects:
+    strategy, effects and loss of the fit, which are copied.
     """
     comm = comm or Communicator()
     if config is not None and dataset is not None:
@@ -332,9 +329,9 @@ def plan_fit(
 class Deadline:
     """Ends a fit when its time is up.
 
-    Ten times on the way, the curve is scaled to the time that the fit has taken so far, and the
-    trainer's configuration is revised: where the fit will end, and where changes of the population
-    are to end, which keep their share of the whole.
+    Ten times during the fit, the curve is scaled to the time taken so far, and the trainer's
+    configuration gets new last iterations of the fit and of changes of the population, which keep
+    their share of the fit.
     """
 
     def __init__(self, trainer: Trainer, end: float, curve: Curve) -> None:

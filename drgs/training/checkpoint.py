@@ -1,9 +1,9 @@
 """Checkpoints: a fit that was stopped continues to the bytes that it would have given.
 
-One file, ``checkpoint.npz``: the trainer's state, the history so far, the seconds spent, the
-configuration that it belongs to, and a fingerprint of the data. It is written whole or not at all.
-``config.yml`` follows it: a plan that is revised changes the configuration, and a process may end
-between the two files. So the checkpoint contains the configuration that stood there before, too.
+One file, ``checkpoint.npz``, contains the trainer's state, the history so far, the seconds spent,
+the configuration, and a fingerprint of the data. It is written atomically, and ``config.yml`` after
+it. Since a process may end between the two files, the checkpoint also contains the configuration
+before the last revision of the plan.
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ PATH_KEYS = ("data.path", "data.source", "init.point_cloud")
 """Values that say where something is: a project that was moved has others. The start point is
 needed no more; the data has a fingerprint."""
 
-MEANS_ARRAY = "means.value"
-"""The array that has a row for each Gaussian."""
+MEANS_ARRAY = "means.value"  # the array that has a row for each Gaussian
 
 SMOOTHING_ARRAY = "smoothing/filter"
 """The array of an effect that has a number for each Gaussian; a trainer has none at its start."""
@@ -77,7 +76,7 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
 def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     """Return the checkpoint of ``folder``, or None if there is none yet.
 
-    config: that of the run; where the plan had just been revised, the checkpoint's is the later.
+    config: the run's; the checkpoint's is newer if the plan had just been revised.
 
     Raises UserError if the file is damaged or belongs to another configuration.
     """
@@ -112,7 +111,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
 
 
 def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndarray]) -> None:
-    """Raise UserError where a trainer cannot go on from the checkpoint in ``folder``.
+    """Raise UserError if a trainer cannot continue from the checkpoint in ``folder``.
 
     start: ``Trainer.state()`` of that trainer before its first iteration.
     """
@@ -124,9 +123,9 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
 
 
 def check_same_data(folder: Path, where: Path, before: Fingerprint, now: Fingerprint) -> None:
-    """Raise UserError where the data of the checkpoint in ``folder`` is not what it is ``now``.
+    """Raise UserError if the fingerprint of the data is not that of the checkpoint.
 
-    where: the dataset's folder; before: of the checkpoint.
+    where: the dataset's folder; before: the checkpoint's fingerprint; now: the present one.
     """
     if differences := before.differences(now):
         raise UserError(
@@ -180,9 +179,9 @@ def _match_leaves(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
 def _check_state(
     state: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray], config: FitConfig
 ) -> None:
-    """Raise ValueError unless arrays are those of a trainer's start, but for their values.
+    """Raise ValueError unless names, types and shapes of arrays are those of a trainer's start.
 
-    The number of Gaussians may be another.
+    The number of Gaussians may differ.
     """
     if missing := [name for name in start if name not in state]:
         raise ValueError(f"{format_names(missing)} missing")

@@ -18,8 +18,7 @@ from drgs.results.history import HistoryRow
 from drgs.training.loop import History, Iteration
 from drgs.training.trainer import Trainer
 
-VERSION = "brain.Event:2"
-"""Version of the format, in the first record."""
+VERSION = "brain.Event:2"  # version of the format, in the first record
 
 TAGS = {
     "loss": "loss",
@@ -34,8 +33,7 @@ TAGS = {
 class EventLog:
     """Writes new rows of the history: see ``drgs.training.loop.Observer``.
 
-    The file begins with the rows that there are already, so that a fit that was stopped and resumed
-    is one curve.
+    The file begins with existing rows, so that a fit that was stopped and resumed is one curve.
     """
 
     def __init__(self, path: Path, history: History) -> None:

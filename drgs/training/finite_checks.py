@@ -1,8 +1,8 @@
 """Errors for a fit whose numbers are no longer finite, before it saves them.
 
-To ask the device is to wait for it. So the trainer notes what every iteration computed, and checks
-it when the host waits anyhow: before the state is saved, returned or changed row by row, and when
-the numbers of an iteration are read for the history. Errors name where the trouble began.
+A check waits for the device. So the trainer keeps the results of every iteration, and checks them
+when the host waits in any case: before the state is saved, returned or changed row by row, and when
+a row of the history is read. Errors name the first iteration with such a number.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ def check_values(
 ) -> None:
     """Raise :class:`NonFiniteError` for the first value that is not finite; waits for the device.
 
-    values: arrays by name, a row for each Gaussian; first_row: the number of the first row. Or, if
-    views are named, a row for each of these, or one for all. What is not finite may no longer be
-    seen, so that no gradient is at fault.
+    values: arrays by name, a row for each Gaussian (first_row: the number of the first), or, if
+    views are named, a row for each of these or one for all. Such a Gaussian may be invisible, and
+    have finite gradients.
     """
     for name, array in values.items():
         on_device = not isinstance(array, np.ndarray)

@@ -135,8 +135,8 @@ class FitFolder:
     ) -> FitMetrics:
         """Write the results of a finished fit, and measure them; return ``metrics.json``.
 
-        gaussians: what ``trainer.gaussians()`` returned; for_viewers: None where other viewers
-        render as the fit does; wall_s: spent on iterations.
+        gaussians: the trainer's; for_viewers: None if other viewers render as the fit does; wall_s:
+        time of iterations.
         """
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
         saved_gaussians(gaussians, config).save(out / GAUSSIANS)
@@ -200,10 +200,10 @@ class FitFolder:
 
 
 def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
-    """Return what ``point_cloud.ply`` contains: with ``output.bake_smoothing``, no filter.
+    """Return the Gaussians of ``point_cloud.ply``: with ``output.bake_smoothing``, without a
+    filter.
 
-    Its header records the approximations that are not the default. gaussians: what
-    ``trainer.gaussians()`` returned.
+    Its header records approximations that are not the default. gaussians: the trainer's.
     """
     others = config.model.approximations.non_default
     gaussians = replace(gaussians, rendered_with=others or None)
@@ -215,7 +215,7 @@ def gaussians_on_page(
 ) -> DisplaySettings:
     """Return the Gaussians of ``viewer.html``: the fit's own, if it renders their approximations.
 
-    for_viewers: shown otherwise; None: there are none.
+    for_viewers: the alternative, or None.
     """
     if for_viewers is not None and not shows_as_fitted(approximations):
         return DisplaySettings(for_viewers, Approximations())

@@ -26,8 +26,7 @@ from drgs.training.trainer import StepReport, Trainer
 PSNR_SMOOTHING = 0.9
 """Weight of the past in the PSNR of training views, each of which is another photograph."""
 
-MAX_MEASURED_VIEWS = 8
-"""Test views that are measured on the way, spread over all of them."""
+MAX_MEASURED_VIEWS = 8  # test views that are measured on the way, spread over all of them
 
 NUM_MEASUREMENTS, MIN_ITERATIONS_BETWEEN = 10, 100
 """About how often a fit is measured, and the fewest iterations between two measurements."""
@@ -167,7 +166,7 @@ class Observer(Protocol):
 
 
 def iterations(trainer: Trainer, history: History, criterion: StopCriterion) -> Iterator[Iteration]:
-    """Run the iterations that are left, one step each time that the next item is requested.
+    """Run the remaining iterations: a generator, one step an item.
 
     Rows are added to ``history`` every ``output.history_every`` iterations, and for the last one.
 

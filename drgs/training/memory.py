@@ -1,4 +1,4 @@
-"""The peak of memory of a fit, estimated before it starts; fits that would not fit are refused.
+"""Peak memory of a fit, estimated before it starts; fits that need too much are refused.
 
 The peak is that of an iteration with as many Gaussians as the configuration allows. Entries and
 slots of splats (see ``drgs.splatting``) are counted at the start, where splats are largest, for
@@ -24,8 +24,7 @@ from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.reduction import BAND_SLOTS
 from drgs.training.density.registry import density_strategy
 
-PROCESS_BYTES = 290_000_000
-"""Memory of interpreter, libraries, compiled kernels, and results."""
+PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results
 
 NUMBER_BYTES, GAUSSIAN_BYTES, GROWTH_BYTES = 28, 100, 500
 """Memory of each number of a Gaussian: itself, its gradient, two moments, and one successor at a
@@ -43,20 +42,15 @@ FITTED_REACH = 0.55
 have about N (1 + FITTED_REACH sqrt(P / N))^2 entries. Counted in fits of the shipped scene with
 23,000 and 114,000 Gaussians at 200 to 800 px: 0.42 to 0.57."""
 
-FITTED_SLOTS = 2.7
-"""Slots of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits."""
+FITTED_SLOTS = 2.7  # slots of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits
 
-COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000
-"""Enough to know entries and slots to a few per cent."""
+COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000  # enough to know entries and slots to a few per cent
 
-MAX_RADIUS_PX = 1e6
-"""A larger radius covers any film."""
+MAX_RADIUS_PX = 1e6  # A larger radius covers any film
 
-USABLE_SHARE = 0.9
-"""Share of the available memory that is used: estimates are about so exact."""
+USABLE_SHARE = 0.9  # share of the available memory that is used: estimates are about so exact
 
-MIN_WIDTH_PX = 16
-"""No smaller images are advised."""
+MIN_WIDTH_PX = 16  # no smaller images are advised
 
 
 @dataclass(frozen=True)
@@ -97,7 +91,7 @@ def estimate(
 ) -> FitMemory:
     """Estimate the peak, in one process, of a fit that starts with ``gaussians``.
 
-    view_bytes: of a pixel, what is made of a view's images; scale: of all images' width and height,
+    view_bytes: device memory of a view's images per pixel; scale: of all images' width and height,
     for another ``data.image_size``.
     """
     train, views = dataset.train, {*dataset.train, *dataset.test}

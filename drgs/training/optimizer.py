@@ -37,13 +37,12 @@ AdamState = tuple[
 ]
 """The optimizer's entry of a parameter: ``(value, promoted, rate, (t, m, v, v_max))``."""
 
-LARGE_WIDTH = 1 << 20
-"""Entries of an array from which on memory is worth saving."""
+LARGE_WIDTH = 1 << 20  # entries of an array from which on memory is worth saving
 
 
 @dataclass(frozen=True)
 class _Moments:
-    """The moments of a parameter, and what they are read as while they are overwritten.
+    """The moments of a parameter, and aliases by which they are read while they are overwritten.
 
     Dr.Jit copies an array before it scatters to it, if anything else refers to it, and the new
     moments do. The former ones are therefore read under a name that Dr.Jit takes for other memory.

@@ -101,9 +101,9 @@ def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
 
 
 def revised_plan(config: FitConfig, now: int, iterations: int, densify_stop: int) -> FitConfig:
-    """Return the configuration of a fit that ends, and whose population does, at other iterations.
+    """Return the configuration with other last iterations of the fit and of population changes.
 
-    ``now`` iterations are done, as they would be with the result from the start.
+    The ``now`` iterations so far are the same with the result from the start.
     """
     begun = [(after, end) for after, end in _rate_aims(config) if after < now]
     if now < iterations:
@@ -128,7 +128,7 @@ def _rate_aims(config: FitConfig) -> list[tuple[int, int]]:
 def _aim(config: FitConfig, after: int, end: int) -> tuple[int, int]:
     """Return the aim, (after, end), of a plan that is made, or revised, after an iteration.
 
-    Rates do not fall as long as images are coarse, where means have a long way to go
+    Rates do not fall while images are coarse, since means move far then
     (DashGaussian, Chen et al. 2025).
     """
     coarse_until = config.coarse[-1].until if config.coarse else 0
@@ -150,10 +150,8 @@ def revised_stops(config: FitConfig, now: int, stop: int) -> list[dict[str, int]
 def _prune_window(
     config: FitConfig, now: int, iterations: int, densify_stop: int
 ) -> dict[str, int | None]:
-    """Return the last phase of pruning, which stays if it has begun.
-
-    Else what is given of it keeps its share of the iterations that are ahead.
-    """
+    """Return the last phase of pruning: unchanged if it has begun, else with its share of the
+    rest."""
     prune, names = config.densify.prune, ("densify.prune.start", "densify.prune.stop")
     window = config.densify.prune_window(config.iterations)
     if prune.to is None:

@@ -210,7 +210,7 @@ class FitSession:
             self.folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
 
     def _initial_gaussians(self) -> Gaussians:
-        """Describe the data, the start and what is simulated; return the Gaussians to start from.
+        """Print data, start and simulated effects; return the initial Gaussians.
 
         Raises ``UserError`` for lenses that the projection cannot render.
         """
@@ -293,7 +293,7 @@ class FitSession:
     def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
         """Return Gaussians for other viewers.
 
-        The trainer is released by it, and goes on rendering what it has fitted.
+        The trainer is released, and continues to render the fit's own.
         """
         from drgs.training.viewers import for_viewers, num_iterations
 
@@ -337,14 +337,13 @@ def train(
 
     config: what to fit, and how: the path of a YAML file, or of the folder of a dataset, to have
     that chosen (``drgs.datasets.folders``); the same as nested mappings, or a
-    :class:`drgs.config.schema.FitConfig`; dataset: the photographs, whose background is that of
-    the splats, by default those of the configuration's section ``data``; callback: called after
-    each iteration with what it did, a :class:`drgs.training.trainer.StepReport`; the fit ends early
+    :class:`drgs.config.schema.FitConfig`; dataset: the photographs, whose background is that of the
+    splats, by default those of the configuration's section ``data``; callback: called after each
+    iteration with what it did, a :class:`drgs.training.trainer.StepReport`; the fit ends early
     where it returns True.
 
-    strategy: changes the population, instead of ``densify.strategy``; effects: take part in the
-    fit besides those of the configuration; loss: of an image and its photograph, instead of
-    ``loss``.
+    strategy: changes the population, instead of ``densify.strategy``; effects: take part in the fit
+    besides those of the configuration; loss: of an image and its photograph, instead of ``loss``.
 
     Where no Mitsuba variant is active, ``llvm_ad_rgb`` is made so. Nothing is written.
 

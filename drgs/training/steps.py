@@ -1,8 +1,8 @@
-"""Stages and steps of a fit: which views an iteration renders, in which size, and their gradients.
+"""Stages and steps of a fit: the views of an iteration, their size, and their gradients.
 
-A stage trains on images of one size. A step is what lies between two changes of the Gaussians. One
-of a single view has its gradients in the parameters after ``dr.backward``; those of several views
-use ``drgs.training.parallel.exchange``.
+A stage trains on images of one size. A step ends with one change of the Gaussians. With a single
+view, ``dr.backward`` leaves its gradients in the parameters; several views use
+``drgs.training.parallel.exchange``.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Stage:
     kept: set[int] = field(default_factory=set)  # indices of the views that have it
 
     def keep_or_free(self, view: TrainingView) -> None:
-        """Keep what was made of the images of a rendered view while there is room, else free it.
+        """Keep targets and uploads of a rendered view while there is room, else free them.
 
-        The first views that are drawn are kept. Each round draws all views, in another order: those
-        that were drawn last are no more likely to be drawn next than others.
+        The first views are kept: each round draws all views in another order, so recent views are
+        no more likely to be drawn next.
         """
         if view.index in self.kept:
             return
@@ -67,9 +67,9 @@ class Stage:
 def make_stages(
     views: tuple[View, ...], config: FitConfig, effects: Sequence[TrainingEffect], room: int
 ) -> list[Stage]:
-    """Return the configuration's coarse stages, and the last one, of images as they are.
+    """Return the configuration's coarse stages, and the last one with full images.
 
-    room: bytes of what is made of images that may stay on the device.
+    room: bytes of targets and uploads that may stay on the device.
     """
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
     view_bytes = bytes_on_device(effects)

@@ -68,8 +68,7 @@ from drgs.training.steps import (
 )
 from drgs.training.views import TrainingView
 
-PREFIX = "integrator."
-"""Precedes a parameter's name when the scene is traversed."""
+PREFIX = "integrator."  # precedes a parameter's name when the scene is traversed
 
 DENSITY = "density/"
 """Precedes the names of the strategy's state: a row for each Gaussian, or single numbers."""

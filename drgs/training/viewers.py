@@ -1,9 +1,9 @@
-"""Gaussians for other viewers: what ``point_cloud_viewers.ply`` holds beside the fit's own.
+"""Gaussians for other viewers: ``point_cloud_viewers.ply``.
 
 Viewers render with the defaults of ``drgs.config.approximations``. A copy of Gaussians that were
-fitted otherwise is changed in closed form (``drgs.effects.smoothing``) and then fitted for a few
-iterations more as viewers render it, with the number of Gaussians fixed and with the cameras and
-colours that the fit has found. The fit's own Gaussians do not depend on any of it.
+fitted with other settings is changed in closed form (``drgs.effects.smoothing``) and then fitted
+for a few more iterations with the viewers' settings, a fixed number of Gaussians, and the fit's
+cameras and colours. The fit's own Gaussians do not depend on it.
 """
 
 from __future__ import annotations
@@ -46,8 +46,7 @@ RATES = {
 }
 """High, as few iterations have to do, and those of colours most of all."""
 
-NEGLIGIBLE_RATE = 1e-9
-"""Rate of values that are to stay, where 0 is not a rate."""
+NEGLIGIBLE_RATE = 1e-9  # rate of values that are to stay, where 0 is not a rate
 
 
 @dataclass(frozen=True)
@@ -78,11 +77,10 @@ def for_viewers(
 ) -> ForViewers:
     """Fit a copy of a fit's Gaussians as viewers render; the same bytes in every run.
 
-    trainer: has ended, and is released: see :meth:`drgs.training.trainer.Trainer.release`.
-    gaussians: the result of ``trainer.gaussians()``. watch: is called after each iteration with
-    the number of iterations so far.
+    trainer: of the finished fit, released (:meth:`drgs.training.trainer.Trainer.release`).
+    gaussians: ``trainer.gaussians()``. watch: called after each iteration with their number.
 
-    Where that fails, as where a number is not finite, the closed form is returned, with a
+    If it fails, such as by a number that is not finite, the closed form is returned, with a
     :class:`UserNote`.
     """
     others = trainer.config.model.approximations.non_default

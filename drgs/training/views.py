@@ -1,7 +1,7 @@
 """A training photograph: its sensor, the target of its rendering, and effects' uploads.
 
-What depends on images is made when an iteration needs it, from what the dataset keeps, and stays on
-the device as long as there is room: see :class:`drgs.training.steps.Stage`.
+Targets and uploads are computed from the dataset when an iteration needs them, and stay on the
+device while there is room: see :class:`drgs.training.steps.Stage`.
 """
 
 from __future__ import annotations

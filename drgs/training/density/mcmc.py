@@ -35,11 +35,9 @@ MAX_COPIES = 51
 """Most copies of a Gaussian in its place at a time, as in the paper's code. Binomials up to here
 are exact in double precision."""
 
-MAX_OPACITY = 1 - 2.0**-23
-"""Largest opacity of copies: the largest in float32 that has a logit."""
+MAX_OPACITY = 1 - 2.0**-23  # largest opacity of copies: the largest in float32 that has a logit
 
-NOISE_STEEPNESS = 100.0
-"""Noise fades out over some 0.05 of opacity: the paper's equation 8."""
+NOISE_STEEPNESS = 100.0  # noise fades out over some 0.05 of opacity: the paper's equation 8
 
 
 _UNIT_OF_WORD = 2.0**-24

@@ -48,8 +48,7 @@ class StepInfo:
     weighted_sums: Mapping[str, Float]  # (N,): see DensityStrategy.pixel_weights
 
 
-NOT_BEGUN: Any = None
-"""Statistics before :meth:`DensityStrategy.begin`."""
+NOT_BEGUN: Any = None  # statistics before :meth:`DensityStrategy.begin`
 
 PixelWeight = Callable[[TensorXf, TensorXf], Float]
 """Computes a plane, Float (H W,), from the rendered image and the photograph: tensors (H, W, 3) in
@@ -199,8 +198,7 @@ class DensityStrategy(Protocol):
         make = cast("Callable[..., DensityStrategy]", cls)
         return make() if section is None else make(section)
 
-    by_row: Sequence[str] = ()
-    """Names in :meth:`state` of arrays with a row for each Gaussian."""
+    by_row: Sequence[str] = ()  # names in :meth:`state` of arrays with a row for each Gaussian
 
     start_share, stop_share, rate_decay = DEFAULT_SCHEDULE
     """Shares of the iterations, for schedules that are not given: ``densify.start`` is at most the

@@ -17,8 +17,7 @@ from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
 from drgs.training.losses import prepare_target
 from drgs.training.views import TrainingView
 
-RANDOM_STREAM = 71
-"""Tells the random numbers of backgrounds from others of the same seed."""
+RANDOM_STREAM = 71  # tells the random numbers of backgrounds from others of the same seed
 
 
 def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:

@@ -29,8 +29,7 @@ from drgs.training.effects.base import FitState, as_numbers, as_tensor
 from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
 from drgs.training.views import TrainingView
 
-IDENTITY = np.eye(3, 4).reshape(1, 12)
-"""The identity, row by row."""
+IDENTITY = np.eye(3, 4).reshape(1, 12)  # the identity, row by row
 
 
 @EFFECTS.register("colors")

@@ -23,8 +23,7 @@ from drgs.training.finite_checks import NonFiniteError
 NUM_SPINS, MAX_PAUSE_S = 50, 1e-3
 """Polls without a pause, for messages that have nearly arrived; the longest pause between polls."""
 
-NO_ITERATION = 2**62
-"""Iteration of an error that did not occur."""
+NO_ITERATION = 2**62  # iteration of an error that did not occur
 
 T = TypeVar("T")
 

@@ -63,8 +63,7 @@ VIEWS_AT_ONCE = 4
 Blocks = list[np.ndarray]
 """Rows of numbers as they travel: (M, columns) for each block of :class:`drgs.core.arrays.Rows`."""
 
-BOX_NUMBERS = 4
-"""Numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.Footprints`."""
+BOX_NUMBERS = 4  # numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.Footprints`
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,7 @@ from drgs.integrator.scene import render_views
 from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.inputs import check_scene
 
-Render = Callable[..., Iterator[np.ndarray]]
-"""Renders images (H, W, 3) of a scene and views."""
+Render = Callable[..., Iterator[np.ndarray]]  # renders images (H, W, 3) of a scene and views
 
 
 def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:
