@@ -100,7 +100,7 @@ class TrainingEffect(Protocol):
         yield from ()
 
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
-        """Return the optimised numbers of a view, with derivatives, as :meth:`before_render` has them.
+        """Return the optimised numbers of a view, attached, as :meth:`before_render` has them.
 
         Where several processes fit, each knows the numbers of all views.
         """
