@@ -56,7 +56,7 @@ FILM_SIZE_PX = 400
 CROP_SIZE_PX = 8
 """px: side of the crops on which every splat is evaluated at every pixel."""
 
-LEAST_ALPHA = 1e-6
+MIN_ALPHA = 1e-6
 """Smallest alpha of the most accurate form."""
 
 UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
@@ -163,7 +163,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"{machine()}")
     results = []
     for subject in subjects:
-        accurate = [most_accurate(subject, camera, LEAST_ALPHA) for camera in subject.cameras]
+        accurate = [most_accurate(subject, camera, MIN_ALPHA) for camera in subject.cameras]
         error = check_on_crops(subject, accurate[0])
         print(
             f"\n{subject.name}: {subject.gaussians.num_gaussians:,} Gaussians, "
@@ -292,13 +292,13 @@ class RungRenderer:
 def most_accurate(
     subject: Subject,
     camera: reference.Camera,
-    least_alpha: float,
+    min_alpha: float,
     region: tuple[slice, slice] | None = None,
 ) -> np.ndarray:
     """Return the image that errors are measured against, or a part of it: (rows, columns)."""
     gaussians = reference.Gaussians(*(getattr(subject.gaussians, n) for n in PARAMETER_NAMES))
     model = reference_rays.ImageModel(
-        projection="exact", order="pixel", alpha_cut=least_alpha, transmittance_stop=0.0
+        projection="exact", order="pixel", alpha_cut=min_alpha, transmittance_stop=0.0
     )
     return reference_rays.render(gaussians, camera, subject.background, model, region).image
 

@@ -43,7 +43,7 @@ NUM_GAUSSIANS = 100_000
 
 ROUNDS, QUICK_ROUNDS = 31, 3
 
-ENVIRONMENT = (64, 128)
+ENVIRONMENT_SHAPE = (64, 128)
 """Rows and columns of the environment, and of the image behind the splats."""
 
 
@@ -72,7 +72,7 @@ class FittingCase:
 
 
 @dataclass(frozen=True)
-class Price:
+class EffectCost:
     """Medians, ms, and operations in the kernels; against the case without an effect."""
 
     effect: str
@@ -100,10 +100,10 @@ def run(args: argparse.Namespace) -> None:
     print(f"{machine()}\nbench scene, {count:,} Gaussians, {SIZE}x{SIZE}")
     rendered = measure(rendering_cases(), lambda case: CaseRenderer(case, gaussians), rounds)
     print(f"\n{table(rendered, 'rendered', 'rendered + derivatives')}", flush=True)
-    fitted = measure(fitting_cases(), lambda case: Fitter(case, gaussians), rounds)
+    fitted = measure(fitting_cases(), lambda case: CaseTrainer(case, gaussians), rounds)
     print(f"\n{table(fitted, '', 'training iteration')}")
     fitted = [replace(p, forward_ms=math.nan, forward_ratio=math.nan) for p in fitted]
-    write_rows(args.out / "effects.csv", Price, [*rendered, *fitted])
+    write_rows(args.out / "effects.csv", EffectCost, [*rendered, *fitted])
     write_figure(args.out / "effects.png", plot(rendered, fitted))
 
 
@@ -116,7 +116,7 @@ def rendering_cases() -> list[RenderingCase]:
     rational = fox | {"k3": 0.01, "k4": 0.02, "k5": -0.01, "k6": 0.005}
     fisheye = {"k1": 0.03, "k2": -0.01}
     prism = fisheye | {"p1": 0.001, "p2": -0.002, "sx1": 0.003, "sy1": -0.001}
-    noise = np.random.default_rng(1).uniform(size=(*ENVIRONMENT, 3)).astype(np.float32)
+    noise = np.random.default_rng(1).uniform(size=(*ENVIRONMENT_SHAPE, 3)).astype(np.float32)
     sky = {"type": "envmap", "bitmap": mi.Bitmap(noise)}
     behind = {"type": "bitmap", "bitmap": mi.Bitmap(noise), "raw": True}
     # An orthographic film is 2 units wide: the camera is scaled to what the others see.
@@ -210,7 +210,7 @@ class CaseRenderer:
         return mi.render(self.scene, self.params, spp=1)
 
 
-class Fitter:
+class CaseTrainer:
     """Training iterations on the bench scene; the population stays."""
 
     def __init__(self, case: FittingCase, gaussians: Gaussians) -> None:
@@ -246,7 +246,7 @@ class TimedCase(Protocol):
 C = TypeVar("C", RenderingCase, FittingCase)
 
 
-def measure(cases: Sequence[C], make: Callable[[C], TimedCase], rounds: int) -> list[Price]:
+def measure(cases: Sequence[C], make: Callable[[C], TimedCase], rounds: int) -> list[EffectCost]:
     """Time each case and the first one in turns."""
     base, prices = make(cases[0]), []
     base_operations = operations(base)
@@ -264,7 +264,7 @@ def measure(cases: Sequence[C], make: Callable[[C], TimedCase], rounds: int) -> 
         forward, both = (1e3 * statistics.median(column) for column in times[:, 2:].T.tolist())
         forward_ratio, both_ratio = map(statistics.median, ratios.T.tolist())
         prices.append(
-            Price(
+            EffectCost(
                 case.effect,
                 case.variant,
                 forward,
@@ -287,7 +287,7 @@ def operations(subject: TimedCase) -> int:
     return count_operations(subject.forward_and_backward)
 
 
-def table(prices: list[Price], forward: str, both: str) -> str:
+def table(prices: list[EffectCost], forward: str, both: str) -> str:
     """Format times and operations; without a name for images, they have no column."""
     columns = [("effect", "{.effect}"), ("", "{.variant}")]
     if forward:
@@ -296,7 +296,7 @@ def table(prices: list[Price], forward: str, both: str) -> str:
     return columns_table([*columns, ("operations", "{.operations_more:+,}")], prices)
 
 
-def plot(rendered: list[Price], fitted: list[Price]) -> Figure:
+def plot(rendered: list[EffectCost], fitted: list[EffectCost]) -> Figure:
     """Draw a bar for what each effect adds to the time."""
     parts = {"image and derivatives": rendered[1:], "training iteration": fitted[1:]}
     heights = [len(prices) for prices in parts.values()]

@@ -39,7 +39,7 @@ NUM_GAUSSIANS = 60
 
 UNIT_ROUNDOFF = 2.0**-24
 
-MARKED_WITHIN = 3e-3
+THRESHOLD_WIDTH = 3e-3
 """Relative distance from a threshold within which a pixel is left out."""
 
 Scene = tuple[reference.Gaussians, reference.Camera]
@@ -200,7 +200,7 @@ def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
     """Measure errors and noise of one scene; both sides start from the same, rounded numbers."""
     exact = sweep.scene(value)
     gaussians, camera = _round_to_single(*exact)
-    rendered = reference.render(gaussians, camera, threshold_width=MARKED_WITHIN)
+    rendered = reference.render(gaussians, camera, threshold_width=THRESHOLD_WIDTH)
     kept = ~rendered.near_threshold
     cotangent = np.random.default_rng(5).normal(size=rendered.image.shape) * kept[..., None]
     image, gradients = _by_reference(gaussians, camera, cotangent)

@@ -40,7 +40,7 @@ STAGES = (
 COPIES = ("Memset", "Memcpy")
 """Entries of the kernel history that are no kernels."""
 
-WARM_UP = 3
+NUM_WARM_UP_STEPS = 3
 """Iterations before one is measured."""
 
 
@@ -132,7 +132,7 @@ def steps(trainer: Trainer, count: int) -> None:
 def warm_trainer(scene: Scene) -> Trainer:
     """Return a trainer whose kernels have been compiled."""
     trainer = trainer_of(scene)
-    steps(trainer, WARM_UP)
+    steps(trainer, NUM_WARM_UP_STEPS)
     return trainer
 
 

@@ -71,9 +71,7 @@ def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] =
         )
     record, differences = FolderRecord(folder, COMMAND), _differences_of_run(folder, config)
     is_run, is_config_alone = record.exists or CHECKPOINT in present, present == [CONFIG]
-    if not _is_written_by_fit(folder / CONFIG) and (
-        not is_run or (is_config_alone and differences)
-    ):
+    if not _is_unmodified(folder / CONFIG) and (not is_run or (is_config_alone and differences)):
         raise UserError(
             f"{folder / CONFIG}: would be replaced, and was not written by a fit, or changed "
             "since; choose another folder with --out"
@@ -116,7 +114,7 @@ def image_names(split: str, views: Sequence[str]) -> list[str]:
 def write_run_config(folder: Path, config: FitConfig) -> None:
     """Write ``config.yml``, unless it has these values, or the user has changed it."""
     path = folder / CONFIG
-    if _is_written_by_fit(path):
+    if _is_unmodified(path):
         dump_config(config, path)
         return
     try:
@@ -202,7 +200,7 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
     record, files = FolderRecord(folder, COMMAND), list(_files(folder))
     if names:
         load_run_config(folder)
-        _refuse_strangers(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, images)
+        _check_removable(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, images)
     elif not os.path.lexists(folder):
         return
     remove_stale_temporaries(folder)
@@ -217,7 +215,7 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
         raise UserError(f"{error.filename}: cannot be removed: {refusal_reason(error)}") from error
 
 
-def _refuse_strangers(
+def _check_removable(
     folder: Path,
     record: FolderRecord,
     strangers: list[str],
@@ -230,7 +228,7 @@ def _refuse_strangers(
     else:
         known = set(_file_names(images))
         strangers += [n for n in files if n not in known or not _is_file(folder / n)]
-    if not _is_written_by_fit(folder / CONFIG):
+    if not _is_unmodified(folder / CONFIG):
         strangers.append(CONFIG)
     if strangers:
         raise UserError(
@@ -276,7 +274,7 @@ def _is_file(path: Path) -> bool:
     return path.is_file() and not path.is_symlink()
 
 
-def _is_written_by_fit(path: Path) -> bool:
+def _is_unmodified(path: Path) -> bool:
     """Return whether a file is missing, empty, or just as :func:`dump_config` writes it."""
     if not os.path.lexists(path):
         return True

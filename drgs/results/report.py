@@ -55,12 +55,12 @@ IMAGE_GAP_PX = 4  # px between the images of a comparison, white
 
 ORBIT_FRAMES = 60
 
-PANEL_WIDTH = 360  # px: largest width of an image of a comparison in the page
+PANEL_WIDTH_PX = 360  # px: largest width of an image of a comparison in the page
 
-PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
+PANEL_ENCODING = {"lossless": True, "quality": 60, "method": 2}
 """Lossy coding leaves a haze around objects before a white background."""
 
-TRIED_SECONDS = 0.2
+MIN_TRIAL_SECONDS = 0.2
 """Least time for which a view is tried out: one image of a few milliseconds tells little."""
 
 FILES_SECONDS = 0.3  # time of the other files, measured with 50,000 Gaussians
@@ -139,7 +139,7 @@ def seconds_of_results(
     """
     _seconds_of_view(scene, dataset.test[0])  # loads kernels and libraries
     tried = [_seconds_of_view(scene, dataset.test[0])]
-    while sum(map(sum, tried)) < TRIED_SECONDS:
+    while sum(map(sum, tried)) < MIN_TRIAL_SECONDS:
         tried.append(_seconds_of_view(scene, dataset.test[0]))
     rendered, scored, written, compared, encoded = np.median(tried, axis=0).tolist()
     views = len(dataset.test)
@@ -162,7 +162,7 @@ def _seconds_of_view(scene: mi.Scene, view: View) -> tuple[float, ...]:
         lambda: score(image, view),
         lambda: encode(image, "png"),
         lambda: encode(side_by_side(image, view), "png"),
-        lambda: encode(image, "webp", **PANEL_QUALITY),
+        lambda: encode(image, "webp", **PANEL_ENCODING),
     ):
         step()
         clock.append(time.perf_counter())
@@ -313,7 +313,7 @@ def _comparison(dataset: Dataset, render: Render, label: str, index: int, score:
     panels = {"Fitted": image, _truth(dataset): view.image, "Difference": difference(image, view)}
     renders = "".join(
         f'<div><img alt="{name} {html.escape(view.name)}" '
-        f'src="{_data_uri(downscale(np.clip(rendered, 0, 1), PANEL_WIDTH), **PANEL_QUALITY)}">'
+        f'src="{_data_uri(downscale(np.clip(rendered, 0, 1), PANEL_WIDTH_PX), **PANEL_ENCODING)}">'
         f"<span>{name}</span></div>"
         for name, rendered in panels.items()
     )

@@ -57,7 +57,7 @@ bits from 6e-6 to 8e3 and the nearest that one can come is 0.01."""
 MIN_TARGET_DEPTH = 0.1  # least depth of the target in the first camera, in radii of the orbit
 GZIP_LEVEL = 4  # level 9 takes six times as long for 1.6 % less
 
-FILE_AXES = np.diag([-1.0, -1.0, 1.0])
+PAGE_TO_FILE_AXES = np.diag([-1.0, -1.0, 1.0])
 """Rotation from the page's axes (x right, y up, z backward) to those of its PLY."""
 
 
@@ -138,7 +138,9 @@ def viewer_page(
     Raises ``drgs.core.errors.UserError`` for Gaussians with numbers that are not finite.
     """
     move = initial_view.to_page
-    in_file = Similarity(move.scale, FILE_AXES @ move.rotation, FILE_AXES @ move.translation)
+    in_file = Similarity(
+        move.scale, PAGE_TO_FILE_AXES @ move.rotation, PAGE_TO_FILE_AXES @ move.translation
+    )
     gaussians = replace(shown.gaussians.numpy(), origin=WORLD)  # the page has no world
     splats = in_file.of_gaussians(gaussians).to_bytes("compressed-ply")
     files = resources.files("drgs.results")
@@ -148,22 +150,22 @@ def viewer_page(
         licence=program.joinpath("LICENSE").read_text("utf-8"),
         style=program.joinpath("viewer.css").read_text("utf-8"),
         scene=_in_script(_scene(shown.approximations, initial_view, background)),
-        code=_text(program.joinpath("viewer.js.gz").read_bytes()),
-        splats=_text(gzip.compress(splats, GZIP_LEVEL, mtime=0)),
+        code=_base64(program.joinpath("viewer.js.gz").read_bytes()),
+        splats=_base64(gzip.compress(splats, GZIP_LEVEL, mtime=0)),
     )
     return page.encode("utf-8", "backslashreplace")
 
 
-def least_bytes(num_gaussians: int, sh_degree: int) -> int:
+def min_page_bytes(num_gaussians: int, sh_degree: int) -> int:
     """Return the least size of a page: its Gaussians, in base64."""
-    return int(4 / 3 * MIN_GZIP_RATIO * _bytes_of_file(num_gaussians, sh_degree))
+    return int(4 / 3 * MIN_GZIP_RATIO * _file_bytes(num_gaussians, sh_degree))
 
 
 def seconds_of_page(num_gaussians: int, sh_degree: int) -> float:
     """Estimate the time of :func:`write_viewer`."""
-    if least_bytes(num_gaussians, sh_degree) > MAX_PAGE_BYTES:
+    if min_page_bytes(num_gaussians, sh_degree) > MAX_PAGE_BYTES:
         return 0.0
-    return SECONDS_PER_BYTE * _bytes_of_file(num_gaussians, sh_degree)
+    return SECONDS_PER_BYTE * _file_bytes(num_gaussians, sh_degree)
 
 
 def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
@@ -172,7 +174,7 @@ def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
     A ``UserNote`` tells where it would have more than :data:`MAX_PAGE_BYTES`.
     """
     gaussians = shown.gaussians
-    size, least = least_bytes(gaussians.num_gaussians, gaussians.sh_degree), "at least "
+    size, least = min_page_bytes(gaussians.num_gaussians, gaussians.sh_degree), "at least "
     page = b""
     if size <= MAX_PAGE_BYTES:
         views = refined_viewpoints(out, dataset.origin) or dataset.train
@@ -190,7 +192,7 @@ def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
         temporary.write_bytes(page)
 
 
-def _bytes_of_file(num_gaussians: int, sh_degree: int) -> int:
+def _file_bytes(num_gaussians: int, sh_degree: int) -> int:
     """Return the size of a compressed PLY without its header and the bounds of its groups."""
     return num_gaussians * (16 + 3 * ((sh_degree + 1) ** 2 - 1))
 
@@ -238,5 +240,5 @@ def _in_script(values: Mapping[str, object]) -> str:
     return json.dumps(values).replace("<", "\\u003c")
 
 
-def _text(data: bytes) -> str:
+def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
