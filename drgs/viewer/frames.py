@@ -31,12 +31,11 @@ MAX_SCENES = 2  # scenes kept, each with a copy of the Gaussians: ``error`` need
 BACKDROP_GRAY = 0.12  # grey behind depths, normals and opacities
 MIN_DEPTH_ALPHA = 0.5  # opacity from which a pixel's depth counts for the range of colours
 DEPTH_RANGE = (2, 98)  # percentiles of these depths at the ends of the colour map
-
 ERROR_GAIN = 5.0
 
 MOST_ACCURATE = {"order": "pixel", "order_window": 16, "alpha_cut": 0.0, "transmittance_stop": 0.0}
-"""Approximations of the image that ``error`` compares with, beside the projection that is the most
-accurate for the lens. Filter and harmonics are the model's own."""
+"""Approximations of the image that ``error`` compares with, besides the lens's most accurate
+projection; filter and harmonics are the model's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class FrameRequest:
     approximations: Approximations | None = None  # None: those of the fit
 
     def smaller(self, divisor: int) -> FrameRequest:
-        """Return the same request with both sides divided by ``divisor``."""
+        """Return the request with width and height divided by ``divisor``."""
         width, height = (max(1, round(side / divisor)) for side in (self.width, self.height))
         return replace(self, width=width, height=height)
 
@@ -97,14 +96,13 @@ class LiveScene:
         background: tuple[float, float, float] | Path,
         **settings: object,
     ) -> None:
-        """See :func:`drgs.integrator.scene.make_scene` for the arguments."""
+        """See :func:`drgs.integrator.scene.make_scene`."""
         self._gaussians, self._model, self._background = gaussians, model, background
         self._settings = settings
         self._scenes: dict[tuple[str, Approximations], mi.Scene] = {}
 
     @property
     def approximations(self) -> Approximations:
-        """The approximations of the fit."""
         return self._model.approximations
 
     def frame(self, request: FrameRequest) -> ViewerFrame:
@@ -159,9 +157,8 @@ def _depth(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     depth = depth / np.maximum(alpha, 1e-6)
     seen = depth[alpha >= MIN_DEPTH_ALPHA]
     if not len(seen):
-        return ViewerFrame(
-            to_bytes(np.full((*depth.shape, 3), BACKDROP_GRAY)), seconds, "nothing is seen"
-        )
+        backdrop = np.full((*depth.shape, 3), BACKDROP_GRAY)
+        return ViewerFrame(to_bytes(backdrop), seconds, "nothing is seen")
     near, far = (float(end) for end in np.percentile(seen, DEPTH_RANGE))
     place = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
     colors = colormaps["turbo"](place)[:, :, :3]
@@ -173,9 +170,8 @@ def _normals(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     normal, alpha = image[:, :, 3:6], image[:, :, 6]
     length = np.linalg.norm(normal, axis=2, keepdims=True)
     colors = 0.5 + 0.5 * normal / np.maximum(length, 1e-9)
-    return ViewerFrame(
-        over_backdrop(colors, alpha), seconds, "x, y, z of the world as red, green, blue"
-    )
+    note = "x, y, z of the world as red, green, blue"
+    return ViewerFrame(over_backdrop(colors, alpha), seconds, note)
 
 
 def _error(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
@@ -197,8 +193,7 @@ FRAME_CONTENTS: dict[str, Callable[[LiveScene, FrameRequest], ViewerFrame]] = {
     "opacity": _opacity,
     "error": _error,
 }
-"""Contents of a frame by name. ``error`` is 0.5 + 5 times the difference from the most accurate
-image, in display space."""
+"""By name; ``error`` is 0.5 + 5 x the difference from the most accurate image, display space."""
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
@@ -228,14 +223,12 @@ class ViewerLens:
 
 
 def _pinhole(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
-    (sensor,) = make_sensors([camera.viewpoint(width, height)])
-    return sensor
+    return make_sensors([camera.viewpoint(width, height)])[0]
 
 
 def _opencv(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
     lens = LENSES.get("opencv").value.from_coefficients(**coefficients)
-    (sensor,) = make_sensors([replace(camera.viewpoint(width, height), lens=lens)])
-    return sensor
+    return make_sensors([replace(camera.viewpoint(width, height), lens=lens)])[0]
 
 
 def _fisheye(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
@@ -243,8 +236,7 @@ def _fisheye(camera: ViewerCamera, width: int, height: int, **coefficients: floa
     lens = LENSES.get("fisheye").value.from_coefficients(**coefficients)
     focal = height / math.radians(camera.fov)
     view = replace(camera.viewpoint(width, height), fx=focal, fy=focal, lens=lens)
-    (sensor,) = make_sensors([view])
-    return sensor
+    return make_sensors([view])[0]
 
 
 def _orthographic(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
@@ -277,7 +269,7 @@ def _thin_lens(
 def _mitsuba_sensor(
     camera: ViewerCamera, width: int, height: int, scale: np.ndarray, **settings: object
 ) -> mi.Sensor:
-    """Return a Mitsuba sensor; scale: (4, 4), of its axes."""
+    """scale: (4, 4), of the sensor's axes."""
     to_world = camera.camera_to_world @ OPENCV_TO_MITSUBA @ scale
     return mi.load_dict(
         {

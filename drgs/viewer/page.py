@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 
 Control = TypeVar("Control", bound="viser.GuiInputHandle[Any]")
 
-EventHandler = Callable[[object], Coroutine[None, None, None]]
-"""Handles a viser event in its event loop."""
+EventHandler = Callable[[object], Coroutine[None, None, None]]  # runs in viser's event loop
 
 JPEG_QUALITY = {False: 70, True: 92}  # by "is full resolution"
 MAX_FRUSTUMS = 200  # number of training cameras drawn, evenly spaced
@@ -122,7 +121,7 @@ class CameraControls:
     def __init__(
         self, gui: viser.GuiApi, fitted: Approximations, fov: float, changed: Callable[[], None]
     ) -> None:
-        """fitted: the approximations of the fit; fov: initial, degrees."""
+        """fitted: the fit's approximations; fov: initial, degrees."""
         self._gui, self._fitted, self._changed = gui, fitted, event_handler(changed)
         first = round(min(MAX_FOV, fov), 1)
         self._angle = self._observe(gui.add_slider("Angle of view", 5.0, MAX_FOV, 0.5, first))
@@ -186,7 +185,6 @@ class CameraControls:
         return Approximations(**values)
 
     def _control(self, name: str) -> viser.GuiInputHandle[Any]:
-        """Return a viser input for an approximation."""
         declared, gui, value = DECLARED[name], self._gui, getattr(self._fitted, name)
         hint = declared.description
         if declared.words:
@@ -224,7 +222,6 @@ class Page:
         start: StartView,
         fitted: Approximations,
     ) -> None:
-        """fitted: the approximations of the fit."""
         self.server, self.requests = server, requests
         self._texts: dict[int, viser.GuiMarkdownHandle] = {}
         self._frustums: list[viser.CameraFrustumHandle] = []
@@ -268,7 +265,7 @@ class Page:
             self._frustums.append(frustum)
 
     def update(self) -> None:
-        """Queue a request for each client after a change of a control."""
+        """Queue a request for each client."""
         self._show_frustums()
         for client in self.server.get_clients().values():
             self._follow(client)
@@ -290,7 +287,6 @@ class Page:
         self._set_text(client, f"**No image:** {one_line(reason)}")
 
     def _describe(self, client: int, request: FrameRequest, frame: ViewerFrame) -> str:
-        """Describe an image's render time and colours."""
         took, size = 1e3 * frame.seconds, (request.width, request.height)
         text = f"**{took:.0f} ms** for {size[0]}×{size[1]}"
         pose = request.camera.camera_to_world.tobytes()
@@ -316,7 +312,6 @@ class Page:
         self._fitted_times.pop(client.client_id, None)
 
     def _follow(self, client: viser.ClientHandle) -> None:
-        """Queue a request for a client's camera."""
         client.camera.fov = self.controls.fov(client.camera)
         try:
             self.requests.put(client.client_id, self.controls.request(client.camera))

@@ -13,12 +13,8 @@ from dataclasses import dataclass, field
 from drgs.core.errors import UserError, reason_of_mitsuba
 from drgs.viewer.frames import FrameRequest, LiveScene, ViewerFrame
 
-MOVING_SECONDS = 0.08
-"""Maximum time of a frame while its camera moves: twelve a second look like a motion."""
-
-STILL_SECONDS = 0.15
-"""Time without a request after which a camera is still; browsers send one at least every 0.05 s."""
-
+MOVING_SECONDS = 0.08  # maximum time of a frame of a moving camera: 12 fps look like a motion
+STILL_SECONDS = 0.15  # from the last request; browsers send one every 0.05 s while a camera moves
 DIVISORS = (1, 2, 3, 4, 6, 8)  # divisors of width and height while the camera moves
 MIN_SIDE_PX = 64  # shorter side of a reduced frame
 
@@ -48,11 +44,9 @@ class RenderRequests:
         self._changed.set()
 
     def remove(self, client: int) -> None:
-        """Remove a disconnected client."""
         self._pending.pop(client, None)
 
     def pause(self, paused: bool) -> None:
-        """Pause or continue the fit."""
         self.paused = paused
         self._changed.set()
 
@@ -63,7 +57,6 @@ class RenderRequests:
 
     @property
     def pending(self) -> dict[int, PendingRequest]:
-        """The latest request of each client."""
         return dict(self._pending)
 
     def wait(self, seconds: float) -> None:
@@ -112,9 +105,7 @@ class RenderScheduler:
     requests: RenderRequests
     show: Callable[[int, FrameRequest, ViewerFrame, bool], None]  # client, ..., full resolution
     refuse: Callable[[int, str], None]  # client, reason
-    refresh_after: Callable[[float], float] | None = None
-    """Seconds until a full frame is rendered again, given its render time; None: never."""
-
+    refresh_after: Callable[[float], float] | None = None  # seconds, given the render time
     _clients: dict[int, _ClientState] = field(default_factory=dict)
 
     def serve(self, scene: Callable[[], LiveScene]) -> bool:
@@ -133,7 +124,6 @@ class RenderScheduler:
         return True
 
     def _due_divisor(self, pending: PendingRequest, state: _ClientState, now: float) -> int | None:
-        """Return the divisor of the due frame, or None."""
         if pending is not state.shown:
             return state.resolution.divisor(pending.request)
         if state.divisor > 1:

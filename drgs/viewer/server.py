@@ -30,22 +30,21 @@ from websockets.http11 import Request, Response
 
 from drgs.core.errors import UserError, UserNote, one_line
 
-ADDRESS = "127.0.0.1"  # only this machine reaches it
-
+ADDRESS = "127.0.0.1"
 LOOPBACK = (ADDRESS, "localhost", "::1")
-
 DEFAULT_PORTS = range(8080, 8100)  # tried in order
 
 
-FindControl = Callable[[str], "viser.GuiInputHandle[Any] | None"]
-"""Returns the shared input or button with a uuid, or None."""
+Control = viser.GuiInputHandle[Any] | viser.GuiButtonHandle
+
+FindControl = Callable[[str], Control | None]
+"""Returns the control with a uuid that all clients share, or None."""
 
 
 class LocalServer(viser.ViserServer):
     """A viser server that clients cannot publish."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Return None: there is no public address."""
         return None
 
 
@@ -59,8 +58,8 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
     """
     port = free_port(address, port, options)
 
-    def control(uuid: str) -> viser.GuiInputHandle[Any] | None:
-        return server.gui._gui_input_handle_from_uuid.get(uuid)
+    def control(uuid: str) -> Control | None:
+        return cast(Control | None, server.gui._gui_input_handle_from_uuid.get(uuid))
 
     with _silent(), _guard_servers(address, control):
         server = LocalServer(address, port, verbose=False)
@@ -190,11 +189,9 @@ def _silent() -> Iterator[None]:
 MAX_MESSAGE_BYTES = 1 << 16  # valid messages have less than 1 KB
 MAX_CONNECTIONS = 64  # simultaneous; leaves file descriptors for the command
 
+# Squares are finite in single precision; is_valid() rejects NaN.
 Coordinate = Annotated[float, Meta(ge=-1e15, le=1e15)]
-"""Squares are finite in single precision. :func:`is_valid` rejects NaN."""
-
 Side = Annotated[float, Meta(ge=0, le=100_000)]  # px
-
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -257,7 +254,7 @@ def is_valid(data: bytes | str, control: FindControl) -> bool:
     return True
 
 
-def accepts_value(control: viser.GuiInputHandle[Any] | None, value: bool | float | str) -> bool:
+def accepts_value(control: Control | None, value: bool | float | str) -> bool:
     """Return whether a control (None: a button in one client's dialog) accepts a value."""
     if control is None or isinstance(control.value, bool):
         return isinstance(value, bool)
@@ -279,7 +276,6 @@ class PageConnection(ServerConnection):
         connections: set[PageConnection],
         **settings: Any,
     ) -> None:
-        """connections: those open on the server."""
         super().__init__(*arguments, **settings)
         self._control, self._connections = control, connections
 
@@ -292,7 +288,6 @@ class PageConnection(ServerConnection):
             super().connection_made(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Remove the connection from the server's set."""
         if self in self._connections:
             self._connections.remove(self)
             super().connection_lost(exc)
@@ -300,7 +295,6 @@ class PageConnection(ServerConnection):
     async def recv(  # pyright: ignore[reportIncompatibleMethodOverride]  # overloads
         self, decode: bool | None = None
     ) -> bytes | str:
-        """Return the next valid message."""
         while not is_valid(message := await super().recv(decode), self._control):
             pass
         return message

@@ -32,17 +32,14 @@ MAX_POINTS = 300  # points of a curve
 CURVE_ROOM = 1.1
 """Length of the curves' axis in expected iterations, when these have changed."""
 
-START_DISTANCE_FACTOR = 1.25
-"""Distance of the initial camera, relative to a training camera's, so that these are visible."""
+START_DISTANCE_FACTOR = 1.25  # moves back until the training cameras are visible
 
-Curve = tuple[np.ndarray, np.ndarray]
-"""Iterations and values, each (n,)."""
+Curve = tuple[np.ndarray, np.ndarray]  # iterations (n,), values (n,)
 
 CURVES: dict[str, uplot.Series] = {
     "training views": {"stroke": "#7fb0ff", "width": 2, "points": {"show": False}},
     "test views": {"stroke": "#f0937b", "width": 2, "points": {"show": True}},
-}
-"""Lines by title."""
+}  # by title
 
 
 class EarlyStop:
@@ -52,7 +49,6 @@ class EarlyStop:
         self._criterion, self._requests = criterion, requests
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """See :class:`StopCriterion`; a requested end revises the configuration."""
         done = trainer.iteration
         if self._requests.ended and 0 < done < trainer.config.iterations:
             stop = trainer.config.densify.stop
@@ -77,7 +73,9 @@ class TrainingViewer:
     ) -> None:
         self._requests, self._page, self._criterion = requests, page, criterion
         self._background = dataset.background
-        self._scheduler = RenderScheduler(requests, page.show, page.refuse, _refresh_after)
+        self._scheduler = RenderScheduler(
+            requests, page.show, page.refuse, lambda s: max(REFRESH_SECONDS, s / REFRESH_SHARE)
+        )
         self._scene: LiveScene | None = None
         self._progress_at = 0.0  # by time.monotonic
         self._fit_s = 0.0  # seconds that the fit's own kernels took here
@@ -121,7 +119,6 @@ class TrainingPage(Page):
     """The page of a fit."""
 
     def add_controls(self) -> None:
-        """Add progress, buttons and a curve."""
         from viser import Icon
 
         gui = self.server.gui
@@ -222,7 +219,3 @@ def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:
     measured = [(row.iteration, row.test_psnr) for row in rows if row.test_psnr is not None]
     test = np.array(measured, np.float64).reshape(-1, 2).T
     return [(iterations[kept], training[kept]), (test[0], test[1])]
-
-
-def _refresh_after(seconds: float) -> float:
-    return max(REFRESH_SECONDS, seconds / REFRESH_SHARE)
