@@ -224,7 +224,10 @@ def _check_removable(
         strangers += record.strangers(files)
     else:
         known = set(_file_names(images))
-        strangers += [n for n in files if n not in known or not _is_file(folder / n)]
+        for name in files:
+            path = folder / name
+            if name not in known or path.is_symlink() or not path.is_file():
+                strangers.append(name)
     if not _is_unmodified(folder / CONFIG):
         strangers.append(CONFIG)
     if strangers:
@@ -265,10 +268,6 @@ def _visible_names(folder: Path) -> list[str]:
 
 def _unusable(folder: Path, error: OSError) -> UserError:
     return UserError(f"{folder}: cannot be the output folder: {refusal_reason(error)} (--out)")
-
-
-def _is_file(path: Path) -> bool:
-    return path.is_file() and not path.is_symlink()
 
 
 def _is_unmodified(path: Path) -> bool:

@@ -92,9 +92,8 @@ class InitialView:
         forward = self.camera.camera_to_world[:3, 2]
         depth = (self.orbit.focus - self.camera.center) @ forward
         radius = self.orbit.radius or 1.0
-        return (
-            self.camera.center + (depth if depth > MIN_TARGET_DEPTH * radius else radius) * forward
-        )
+        distance = depth if depth > MIN_TARGET_DEPTH * radius else radius
+        return self.camera.center + distance * forward
 
     @property
     def to_page(self) -> Similarity:
@@ -191,9 +190,7 @@ def _file_bytes(num_gaussians: int, sh_degree: int) -> int:
 
 
 def _scene(
-    approximations: Approximations,
-    view: InitialView,
-    background: tuple[float, float, float],
+    approximations: Approximations, view: InitialView, background: tuple[float, float, float]
 ) -> Mapping[str, object]:
     """Return the input of the page's script."""
     camera, move = view.camera, view.to_page

@@ -49,7 +49,7 @@ class LocalServer(viser.ViserServer):
 
 
 @contextmanager
-def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterator[LocalServer]:
+def run_server(address: str, port: int | None, options: tuple[str, str]) -> Iterator[LocalServer]:
     """Run a server with an empty page within the block.
 
     port: None for a free one. options: names of address and port on the command line.

@@ -35,7 +35,13 @@ from drgs.config.approximations import Approximations
 from drgs.training.loop import AllIterations, History, iterations
 from drgs.viewer.page import StartView
 from drgs.viewer.scheduler import RenderRequests
-from drgs.viewer.server import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, accepts_value, is_valid, serving
+from drgs.viewer.server import (
+    MAX_CONNECTIONS,
+    MAX_MESSAGE_BYTES,
+    accepts_value,
+    is_valid,
+    run_server,
+)
 from drgs.viewer.training_viewer import TrainingPage, watch
 
 STOPPING = ("Pause", "End and write results")
@@ -51,7 +57,7 @@ def variant():
 
 @pytest.fixture
 def server():
-    with serving("127.0.0.1", None, ("", "")) as server:
+    with run_server("127.0.0.1", None, ("", "")) as server:
         yield server
 
 

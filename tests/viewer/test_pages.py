@@ -21,7 +21,7 @@ from drgs.training.loop import History, HistoryRow
 from drgs.viewer.frames import FRAME_CONTENTS, VIEWER_LENSES, ViewerFrame
 from drgs.viewer.page import ADJUSTABLE_APPROXIMATIONS, Page, StartView
 from drgs.viewer.scheduler import RenderRequests
-from drgs.viewer.server import free_port, is_same_origin, serving, url
+from drgs.viewer.server import free_port, is_same_origin, run_server, url
 from drgs.viewer.training_viewer import MAX_POINTS, TrainingPage, psnr_curves
 
 FITTED = Approximations(low_pass=0.1, antialiased=True, extent=3.5)
@@ -34,7 +34,7 @@ def variant():
 
 @pytest.fixture
 def server():
-    with serving("127.0.0.1", None, ("--address", "--port")) as server:
+    with run_server("127.0.0.1", None, ("--address", "--port")) as server:
         yield server
 
 
@@ -150,7 +150,7 @@ def test_the_server_is_at_the_address_that_is_printed_and_prints_nothing(server,
     assert url(server) == f"http://127.0.0.1:{server.get_port()}"
     second = free_port("127.0.0.1", None, ("", ""))
     assert second != server.get_port()
-    with serving("127.0.0.1", None, ("", "")) as other:
+    with run_server("127.0.0.1", None, ("", "")) as other:
         assert other.get_port() == second
         assert other.request_share_url() is None
     assert capfd.readouterr().out == ""
@@ -186,7 +186,7 @@ def test_a_page_from_elsewhere_cannot_connect(server):
 def test_nothing_is_said_of_images_for_a_browser_that_was_closed():
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        with serving("127.0.0.1", None, ("", "")) as server:
+        with run_server("127.0.0.1", None, ("", "")) as server:
             server._websock_server._broadcast_buffer.set_done()
             server.gui.add_markdown("late")
     assert not said
