@@ -185,10 +185,10 @@ def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer 
                 raise UserError(f"--view-{name}: needs --view")
         return nullcontext()
     require_module("viser", "viewer", "--view")
-    from drgs.viewer.server import ADDRESS, serving
+    from drgs.viewer.server import ADDRESS, run_server
 
     options = ("--view-address", "--view-port")
-    return serving(args.view_address or ADDRESS, args.view_port, options)
+    return run_server(args.view_address or ADDRESS, args.view_port, options)
 
 
 def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:

@@ -69,7 +69,7 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     require_module("viser", "viewer", "drgs view")
-    from drgs.viewer.server import ADDRESS, serving, url
+    from drgs.viewer.server import ADDRESS, run_server, url
 
     if not args.what.exists():
         raise UserError(f"{args.what}: there is no such file or folder")
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> None:
         scene = LiveScene(model.gaussians, model.settings, model.background)
         requests, start = RenderRequests(), start_of(args, model, views)
         options = ("--address", "--port")
-        with serving(args.address or ADDRESS, args.port, options) as server:
+        with run_server(args.address or ADDRESS, args.port, options) as server:
             page = Page(server, requests, start, scene.approximations)
             if len(views) > 1:
                 page.add_cameras(views, visible=False)

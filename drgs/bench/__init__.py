@@ -1,4 +1,4 @@
-"""Measurements that the documents show, each made by a command: ``drgs bench NAME``.
+"""Measurements shown in the documents, each a command: ``drgs bench NAME``.
 
 May import everything.
 """

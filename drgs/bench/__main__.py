@@ -8,12 +8,11 @@ from drgs.cli.commands import CommandParser, Subcommand, run_command
 
 COMMANDS = {
     "speed": "times of drgs and of other renderers on the same scene, in one run",
-    "accuracy": "the error of each approximation against the time that it saves",
-    "effects": "what each effect costs: time and operations with and without it",
+    "accuracy": "error of each approximation against the time that it saves",
+    "effects": "cost of each effect: time and operations with and without it",
     "scaling": "time and memory of a training iteration against the size of the problem",
     "stability": "error of float32 against float64 as scenes become harder",
-}
-"""Descriptions by name; a command is the module of its name."""
+}  # descriptions by module
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,11 +1,10 @@
-"""``python -m drgs.bench accuracy SCENE``: what each approximation costs, and what it saves.
+"""``python -m drgs.bench accuracy SCENE``: error and time of each approximation.
 
-A trained scene and a stress scene (wide lens, large splats near the camera, layers that
-interpenetrate) are rendered along a ladder of approximations. Each is compared with the most
-accurate form, the float64 numpy reference with splats evaluated along each pixel's ray, all sorted
-at each pixel, to the last transmittance and down to an alpha of a millionth. A fit's images are
-also compared with the photographs. Other images (another low-pass, samples per pixel, other SH) are
-in brackets in the tables: their distance from the most accurate form is no error.
+Compares renderings of a trained and a stress scene (wide lens, large splats near the camera,
+interpenetrating layers) with the most accurate form: the float64 numpy reference that evaluates
+splats along each pixel's ray, sorts all of them at each pixel, and cuts only alphas below a
+millionth. A fit's images are also compared with the photographs. Tables have other images (another
+low-pass, samples per pixel, other SH) in brackets: their distance is not an error.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import drjit.llvm.ad as llvm
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.bench.output import add_out, columns_table, machine, write_rows
+from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
 from drgs.bench.timing import count_operations, seconds
 from drgs.cameras.camera import Camera
@@ -47,17 +46,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROUNDS, QUICK_ROUNDS = 9, 3
-SLOW_S, SLOW_ROUNDS = 1.0, 2
-"""Rungs that take longer than this are timed in so many rounds."""
-
-FILM_SIZE_PX = 400
-"""px: film of scenes that have no cameras of their own."""
-
-CROP_SIZE_PX = 8
-"""px: side of the crops on which every splat is evaluated at every pixel."""
-
-LEAST_ALPHA = 1e-6
-"""Smallest alpha of the most accurate form."""
+SLOW_S, SLOW_ROUNDS = 1.0, 2  # slower rungs are timed in SLOW_ROUNDS
+FILM_SIZE_PX = 400  # film of scenes without cameras
+CROP_SIZE_PX = 8  # side of the crops on which every pixel evaluates every splat
+MIN_ALPHA = 1e-6  # alpha cut of the most accurate form
 
 UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
 EXACT_PIXEL = {"projection": "exact", "order": "pixel"}
@@ -65,7 +57,7 @@ EXACT_PIXEL = {"projection": "exact", "order": "pixel"}
 
 @dataclass(frozen=True)
 class Rung:
-    """A way to render."""
+    """A choice of approximations."""
 
     name: str
     approximations: Mapping[str, Any] = field(default_factory=dict)
@@ -109,13 +101,13 @@ class Subject:
     name: str
     gaussians: Gaussians  # numpy
     cameras: list[reference.Camera]
-    photographs: list[View]  # none if there are none
+    photographs: list[View]  # may be empty
     background: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class AccuracyMeasurement:
-    """Measurement of a rung on a subject: means over views, and the largest error of all."""
+    """Means over views, and the largest error, of a rung on a subject."""
 
     scene: str
     rung: str
@@ -130,7 +122,6 @@ class AccuracyMeasurement:
 
     @property
     def root_mean_square(self) -> float:
-        """The error against the most accurate form."""
         return 10 ** (-self.psnr / 20)
 
 
@@ -163,7 +154,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"{machine()}")
     results = []
     for subject in subjects:
-        accurate = [most_accurate(subject, camera, LEAST_ALPHA) for camera in subject.cameras]
+        accurate = [most_accurate(subject, camera, MIN_ALPHA) for camera in subject.cameras]
         error = check_on_crops(subject, accurate[0])
         print(
             f"\n{subject.name}: {subject.gaussians.num_gaussians:,} Gaussians, "
@@ -179,12 +170,10 @@ def run(args: argparse.Namespace) -> None:
 
 
 def load_subject(path: Path, num_views: int) -> Subject:
-    """Load a fit's folder with evenly spaced test views, or a PLY file seen by the bench camera.
+    """Load a fit's folder with evenly spaced test views, or a PLY file with the bench camera.
 
-    The Gaussians of a folder are those for viewers if it has them: they are fitted to the defaults.
-    A 3D smoothing filter becomes part of the Gaussians.
-
-    Raises UserError for views that are not those of pinholes at rest.
+    A folder's Gaussians for viewers, fitted to the defaults, come first. A 3D smoothing filter is
+    baked into the Gaussians. Raises UserError for views other than pinholes at rest.
     """
     if not path.is_dir():
         camera = bench_camera(FILM_SIZE_PX)
@@ -245,7 +234,6 @@ class RungRenderer:
 
     @staticmethod
     def from_rung(rung: Rung, subject: Subject, camera: reference.Camera) -> RungRenderer:
-        """Upload the subject."""
         Float = llvm.Float64 if rung.float64 else llvm.Float
         gaussians = subject.gaussians.to(llvm.TensorXf64 if rung.float64 else llvm.TensorXf)
         points = positions(rung.samples, camera, Float)
@@ -254,7 +242,7 @@ class RungRenderer:
         )
 
     def frames(self) -> list[rendering.Frame]:
-        """Render; returns when the planes are in memory."""
+        """Render and synchronize."""
         stored = self.gaussians.sh_degree
         degree = stored if self.rung.sh_degree is None else min(stored, self.rung.sh_degree)
         pipeline = pipeline_of(Approximations(**self.rung.approximations), degree)
@@ -268,7 +256,7 @@ class RungRenderer:
         return frames
 
     def image(self) -> np.ndarray:
-        """(H, W, 3) float64, display space, not clamped."""
+        """Return (H, W, 3) float64, display space, not clamped."""
         shape = self.camera.height, self.camera.width
         images = []
         for frame in self.frames():
@@ -277,7 +265,7 @@ class RungRenderer:
         return np.mean(images, axis=0)
 
     def forward_backward(self) -> None:
-        """Render and differentiate the sum of all planes."""
+        """Differentiate the sum of all planes."""
         frames = self.frames()
         ones = dr.ones(type(self.camera.near), self.camera.width * self.camera.height)
         gradients = rendering.frames_adjoint(self.gaussians, frames, [[ones] * 4] * len(frames))
@@ -292,26 +280,23 @@ class RungRenderer:
 def most_accurate(
     subject: Subject,
     camera: reference.Camera,
-    least_alpha: float,
+    min_alpha: float,
     region: tuple[slice, slice] | None = None,
 ) -> np.ndarray:
-    """Return the image that errors are measured against, or a part of it: (rows, columns)."""
+    """Return the most accurate image, or its region (rows, columns)."""
     gaussians = reference.Gaussians(*(getattr(subject.gaussians, n) for n in PARAMETER_NAMES))
     model = reference_rays.ImageModel(
-        projection="exact", order="pixel", alpha_cut=least_alpha, transmittance_stop=0.0
+        projection="exact", order="pixel", alpha_cut=min_alpha, transmittance_stop=0.0
     )
     return reference_rays.render(gaussians, camera, subject.background, model, region).image
 
 
 def check_on_crops(subject: Subject, accurate: np.ndarray) -> float:
-    """Return the largest difference of three crops from ones in which pixels have every splat."""
-    camera, errors = subject.cameras[0], []
+    """Return the largest difference of three crops from uncut ones."""
+    camera, size, errors = subject.cameras[0], CROP_SIZE_PX, []
     for x, y in ((0.5, 0.5), (0.35, 0.6), (0.6, 0.35)):
-        column, row = (
-            int(x * (camera.width - CROP_SIZE_PX)),
-            int(y * (camera.height - CROP_SIZE_PX)),
-        )
-        region = slice(row, row + CROP_SIZE_PX), slice(column, column + CROP_SIZE_PX)
+        column, row = int(x * (camera.width - size)), int(y * (camera.height - size))
+        region = slice(row, row + size), slice(column, column + size)
         uncut = most_accurate(subject, camera, 0.0, region)
         errors.append(np.abs(uncut - accurate[region]).max())
     return max(errors)
@@ -329,7 +314,7 @@ def measure(
     times: list[list[tuple[float, float]]] = [[] for _ in rungs]
     rng = np.random.default_rng(0)
     for turn in range(rounds):
-        # In another order each time: what ran before leaves the caches to the next.
+        # In random order: caches depend on the previous call.
         for k in rng.permutation(len(rungs)):
             if turn < SLOW_ROUNDS or not slow[k]:
                 renderer = renderers[k]
@@ -361,7 +346,7 @@ def measure(
 
 
 def pareto_front(results: Sequence[AccuracyMeasurement]) -> list[AccuracyMeasurement]:
-    """Return approximations that none is both faster and closer than, fastest first."""
+    """Return the Pareto-optimal approximations in time and PSNR, fastest first."""
     candidates = sorted(
         (m for m in results if m.is_approximation), key=lambda m: (m.milliseconds, -m.psnr)
     )
@@ -375,34 +360,27 @@ def pareto_front(results: Sequence[AccuracyMeasurement]) -> list[AccuracyMeasure
 def table(results: Sequence[AccuracyMeasurement]) -> str:
     """Format all rungs; times relative to the first."""
     first, front = results[0], pareto_front(results)
-    rows = []
-    for m in results:
-        mark = " *" if m in front else ""
-        rows.append(
-            {
-                "m": m,
-                "name": m.rung + mark if m.is_approximation else f"({m.rung})",
-                "ratio": m.milliseconds / first.milliseconds,
-                "both_ratio": m.both_milliseconds / first.both_milliseconds,
-                "photographs": "" if m.photo_psnr is None else f"{m.photo_psnr:.2f} dB",
-            }
-        )
-    columns = [
-        (first.scene, "{0[name]}"),
-        ("forward", "{0[m].milliseconds:.0f} ms, {0[ratio]:.2f}x"),
-        ("forward + backward", "{0[m].both_milliseconds:.0f} ms, {0[both_ratio]:.2f}x"),
-        ("operations", "{0[m].operations:,}"),
-        ("PSNR", "{0[m].psnr:.1f} dB"),
-        ("SSIM", "{0[m].ssim:.5f}"),
-        ("largest error", "{0[m].largest_error:.2g}"),
-        ("PSNR, photographs", "{0[photographs]}"),
+    header = [first.scene, "forward", "forward + backward", "operations", "PSNR", "SSIM"]
+    rows = [
+        [
+            f"{m.rung}{' *' if m in front else ''}" if m.is_approximation else f"({m.rung})",
+            f"{m.milliseconds:.0f} ms, {m.milliseconds / first.milliseconds:.2f}x",
+            f"{m.both_milliseconds:.0f} ms, {m.both_milliseconds / first.both_milliseconds:.2f}x",
+            f"{m.operations:,}",
+            f"{m.psnr:.1f} dB",
+            f"{m.ssim:.5f}",
+            f"{m.largest_error:.2g}",
+            "" if m.photo_psnr is None else f"{m.photo_psnr:.2f} dB",
+        ]
+        for m in results
     ]
     note = "* on the Pareto front of the approximations; (in brackets) other images"
-    return f"{columns_table(columns, rows)}\n\n{note}"
+    table = markdown_table([*header, "largest error", "PSNR, photographs"], rows)
+    return f"{table}\n\n{note}"
 
 
 def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
-    """Error over time for each scene, the Pareto front drawn as a line."""
+    """Plot error over time for each scene, the Pareto front as a line."""
     scenes = list(dict.fromkeys(m.scene for m in results))
     figure = new_figure(4.6 * len(scenes) + 2.6, 4.6)
     axes_of = dict(zip(scenes, figure.subplots(1, len(scenes), squeeze=False)[0], strict=True))

@@ -1,19 +1,17 @@
-"""``python -m drgs.bench effects``: what each effect costs, on the bench scene.
+"""``python -m drgs.bench effects``: the cost of each effect, on the bench scene.
 
-Two tables: an image and its derivatives with an effect that the integrator simulates, and training
-iterations with one that takes part in a fit; both against the same without it. The two are timed in
-turns, so that other load on the machine meets both; medians are reported, and the number of
-operations in their kernels.
+Two tables, each relative to the case without an effect: images and derivatives with the
+integrator's effects, and training iterations with a fit's. Both cases are timed in turns, so that
+other load affects both. Medians and the kernels' numbers of operations are reported.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -36,44 +34,39 @@ from drgs.io.figures import new_figure, write_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SIZE = 400
-"""px: width and height of all images."""
-
+SIZE = 400  # px: width and height of all images
 NUM_GAUSSIANS = 100_000
-
 ROUNDS, QUICK_ROUNDS = 31, 3
-
-ENVIRONMENT = (64, 128)
-"""Rows and columns of the environment, and of the image behind the splats."""
+ENVIRONMENT_SHAPE = (64, 128)  # (height, width) px of environment and background image
 
 
 @dataclass(frozen=True)
 class RenderingCase:
-    """An image with an effect, or without any."""
+    """A rendering with at most one effect."""
 
     effect: str
     variant: str
-    sensor: Mapping[str, object] = field(default_factory=dict)  # instead of a perspective one
+    sensor: Mapping[str, object] = field(default_factory=dict)  # empty: perspective
     integrator: Mapping[str, object] = field(default_factory=dict)
     scene: Mapping[str, object] = field(default_factory=dict)
     sh_degree: int = 3
     smoothing: bool = False
-    of_camera: bool = False  # whether there are derivatives of the pose and the lens
+    of_camera: bool = False  # differentiate pose and lens
 
 
 @dataclass(frozen=True)
 class FittingCase:
-    """A training iteration with an effect, or without any."""
+    """A training iteration with at most one effect."""
 
     effect: str
     variant: str
     changes: dict[str, object] = field(default_factory=dict)  # of the configuration
-    view: tuple[str, ...] = ()  # what the data has besides colours
+    view: tuple[str, ...] = ()  # the view's data besides colours
 
 
 @dataclass(frozen=True)
-class Price:
-    """Medians, ms, and operations in the kernels; against the case without an effect."""
+class EffectCost:
+    """Median times (ms) and operations of a case; ratios to the case without an effect."""
 
     effect: str
     variant: str
@@ -100,15 +93,15 @@ def run(args: argparse.Namespace) -> None:
     print(f"{machine()}\nbench scene, {count:,} Gaussians, {SIZE}x{SIZE}")
     rendered = measure(rendering_cases(), lambda case: CaseRenderer(case, gaussians), rounds)
     print(f"\n{table(rendered, 'rendered', 'rendered + derivatives')}", flush=True)
-    fitted = measure(fitting_cases(), lambda case: Fitter(case, gaussians), rounds)
+    fitted = measure(fitting_cases(), lambda case: CaseTrainer(case, gaussians), rounds)
     print(f"\n{table(fitted, '', 'training iteration')}")
     fitted = [replace(p, forward_ms=math.nan, forward_ratio=math.nan) for p in fitted]
-    write_rows(args.out / "effects.csv", Price, [*rendered, *fitted])
+    write_rows(args.out / "effects.csv", EffectCost, [*rendered, *fitted])
     write_figure(args.out / "effects.png", plot(rendered, fitted))
 
 
 def rendering_cases() -> list[RenderingCase]:
-    """Return the cases of the integrator; the others are compared with the first."""
+    """Return the integrator's cases, the first without an effect."""
     camera = bench_camera(SIZE)
     calibrated = {"type": "calibrated", "fx": camera.fx, "fy": camera.fx}
     moving = calibrated | {"to_world_close": mitsuba_pose(camera, 0.02)}
@@ -116,10 +109,10 @@ def rendering_cases() -> list[RenderingCase]:
     rational = fox | {"k3": 0.01, "k4": 0.02, "k5": -0.01, "k6": 0.005}
     fisheye = {"k1": 0.03, "k2": -0.01}
     prism = fisheye | {"p1": 0.001, "p2": -0.002, "sx1": 0.003, "sy1": -0.001}
-    noise = np.random.default_rng(1).uniform(size=(*ENVIRONMENT, 3)).astype(np.float32)
+    noise = np.random.default_rng(1).uniform(size=(*ENVIRONMENT_SHAPE, 3)).astype(np.float32)
     sky = {"type": "envmap", "bitmap": mi.Bitmap(noise)}
     behind = {"type": "bitmap", "bitmap": mi.Bitmap(noise), "raw": True}
-    # An orthographic film is 2 units wide: the camera is scaled to what the others see.
+    # An orthographic film is 2 units wide: the scale matches the other cameras.
     wide = mitsuba_pose(camera) @ mi.ScalarTransform4f().scale([1.4, 1.4, 1])
     focused = {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 3.2}
 
@@ -146,7 +139,7 @@ def rendering_cases() -> list[RenderingCase]:
 
 
 def fitting_cases() -> list[FittingCase]:
-    """Return the cases of a fit; the others are compared with the first."""
+    """Return the cases of a fit, the first without an effect."""
     return [
         FittingCase("none", "none"),
         FittingCase("background", "random", {"data.random_background": True}, ("alpha",)),
@@ -159,7 +152,7 @@ def fitting_cases() -> list[FittingCase]:
 
 
 class CaseRenderer:
-    """Images of the bench scene, and their derivatives in all parameters."""
+    """Renders the bench scene and its derivatives with respect to all parameters."""
 
     def __init__(self, case: RenderingCase, gaussians: Gaussians) -> None:
         """gaussians: numpy, SH of degree 3."""
@@ -190,13 +183,11 @@ class CaseRenderer:
         self.weights = mi.TensorXf(weights)
 
     def forward(self) -> None:
-        """Render an image."""
         with dr.suspend_grad():
             dr.eval(self._render())
         dr.sync_thread()
 
     def forward_and_backward(self) -> None:
-        """Render an image and its derivatives."""
         for name in self.differentiated:
             dr.clear_grad(self.params[name])
         dr.backward(dr.sum(self._render() * self.weights, axis=None))
@@ -204,79 +195,51 @@ class CaseRenderer:
         dr.sync_thread()
 
     def _render(self) -> mi.TensorXf:
-        # Nothing of the last image may be used again.
+        # Clears the render cache.
         self.params.set_dirty("integrator.means")
         self.params.update()
         return mi.render(self.scene, self.params, spp=1)
 
 
-class Fitter:
-    """Training iterations on the bench scene; the population stays."""
+class CaseTrainer:
+    """Runs training iterations on the bench scene with a fixed population."""
 
     def __init__(self, case: FittingCase, gaussians: Gaussians) -> None:
         """gaussians: numpy."""
         scene = Scene("bench", gaussians, bench_camera(SIZE))
-        left_out = np.ones((SIZE, SIZE), np.float32)
-        left_out[:, : SIZE // 4] = 0
+        mask = np.ones((SIZE, SIZE), np.float32)
+        mask[:, : SIZE // 4] = 0
         depth = np.full((SIZE, SIZE), 4, np.float32)  # of the box's middle
-        extras = {name: depth if name == "depth" else left_out for name in case.view}
+        extras = {name: depth if name == "depth" else mask for name in case.view}
         self.trainer = trainer_of(scene, case.changes, extras)
 
     def forward(self) -> None:
-        """Do nothing: there is no half iteration."""
+        """Do nothing: an iteration cannot be split."""
 
     def forward_and_backward(self) -> None:
-        """Run one iteration."""
         self.trainer.step()
         dr.sync_thread()
 
 
-class TimedCase(Protocol):
-    """A case that is ready to be timed."""
-
-    def forward(self) -> None:
-        """Render an image."""
-        ...
-
-    def forward_and_backward(self) -> None:
-        """Render an image and its derivatives, or run an iteration."""
-        ...
-
-
 C = TypeVar("C", RenderingCase, FittingCase)
+TimedCase = CaseRenderer | CaseTrainer
 
 
-def measure(cases: Sequence[C], make: Callable[[C], TimedCase], rounds: int) -> list[Price]:
+def measure(cases: Sequence[C], make: Callable[[C], TimedCase], rounds: int) -> list[EffectCost]:
     """Time each case and the first one in turns."""
-    base, prices = make(cases[0]), []
+    base, costs = make(cases[0]), []
     base_operations = operations(base)
     for case in cases:
         subject = make(case)
         count = operations(subject)
-        calls = (
-            base.forward,
-            base.forward_and_backward,
-            subject.forward,
-            subject.forward_and_backward,
-        )
+        calls = [f for s in (base, subject) for f in (s.forward, s.forward_and_backward)]
         times = np.array([[seconds(call) for call in calls] for _ in range(rounds)])
-        ratios = times[:, 2:] / times[:, :2]  # those of a round were taken one after the other
-        forward, both = (1e3 * statistics.median(column) for column in times[:, 2:].T.tolist())
-        forward_ratio, both_ratio = map(statistics.median, ratios.T.tolist())
-        prices.append(
-            Price(
-                case.effect,
-                case.variant,
-                forward,
-                both,
-                forward_ratio,
-                both_ratio,
-                count,
-                count - base_operations,
-            )
-        )
-        print(f"{case.effect}, {case.variant}: x{both_ratio:.2f}", flush=True)
-    return prices
+        milliseconds = 1e3 * np.median(times[:, 2:], axis=0)
+        ratios = np.median(times[:, 2:] / times[:, :2], axis=0)
+        numbers = *milliseconds.tolist(), *ratios.tolist(), count, count - base_operations
+        costs.append(EffectCost(case.effect, case.variant, *numbers))
+        print(f"{case.effect}, {case.variant}: x{ratios[1]:.2f}", flush=True)
+    return costs
 
 
 def operations(subject: TimedCase) -> int:
@@ -287,8 +250,8 @@ def operations(subject: TimedCase) -> int:
     return count_operations(subject.forward_and_backward)
 
 
-def table(prices: list[Price], forward: str, both: str) -> str:
-    """Format times and operations; without a name for images, they have no column."""
+def table(prices: list[EffectCost], forward: str, both: str) -> str:
+    """Format times and operations; an empty name ``forward`` omits the images' columns."""
     columns = [("effect", "{.effect}"), ("", "{.variant}")]
     if forward:
         columns += [(forward, "{.forward_ms:.1f} ms"), ("ratio", "{.forward_ratio:.2f}")]
@@ -296,8 +259,8 @@ def table(prices: list[Price], forward: str, both: str) -> str:
     return columns_table([*columns, ("operations", "{.operations_more:+,}")], prices)
 
 
-def plot(rendered: list[Price], fitted: list[Price]) -> Figure:
-    """Draw a bar for what each effect adds to the time."""
+def plot(rendered: list[EffectCost], fitted: list[EffectCost]) -> Figure:
+    """Plot a bar per effect: its additional time."""
     parts = {"image and derivatives": rendered[1:], "training iteration": fitted[1:]}
     heights = [len(prices) for prices in parts.values()]
     figure = new_figure(8, 0.28 * sum(heights) + 1.5)

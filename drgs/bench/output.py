@@ -1,9 +1,8 @@
-"""Output of every measurement: a table on the screen and in Markdown, CSV, a plot."""
+"""Output of measurements: Markdown tables and CSV files."""
 
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import TYPE_CHECKING, TypeVar
 import drjit as dr
 
 from drgs.core.environment import processor
-from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
 from drgs.core.private import llvm_version
+from drgs.results.history import write_csv
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -29,7 +28,7 @@ def add_out(
 ) -> None:
     """Add ``--out``; ``run`` writes the files ``names`` of that folder.
 
-    A file that no measurement has written is not replaced: UserError before anything is measured.
+    Raises UserError before measuring if a file there was not written by a measurement.
     """
     parser.add_argument(
         "--out",
@@ -56,23 +55,14 @@ def machine() -> str:
     return f"{processor()}, {dr.thread_count()} threads, LLVM {version}"
 
 
-def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write rows of numbers and words."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows(rows)
-
-
 def write_rows(path: Path, row_type: type[Row], rows: Iterable[Row]) -> None:
-    """Write instances of the dataclass ``row_type``, a column for each field."""
+    """Write instances of the dataclass ``row_type``, a column per field."""
     names = [field.name for field in fields(row_type)]
     write_csv(path, names, [[getattr(row, name) for name in names] for row in rows])
 
 
 def columns_table(columns: Sequence[tuple[str, str]], items: Iterable[object]) -> str:
-    """Format a row for each item; columns: header, and format such as ``{.seconds:.1f} s``."""
+    """Format a row per item; columns: header and format, such as ``{.seconds:.1f} s``."""
     headers, formats = zip(*columns, strict=True)
     return markdown_table(headers, [[each.format(item) for each in formats] for item in items])
 

@@ -1,7 +1,7 @@
 """``python -m drgs.bench scaling``: time and memory against Gaussians, pixels and threads.
 
-Each point is a training iteration (render, loss, gradients, optimizer) on a scene of its own,
-measured in a fresh process, so that its peak of memory is its own.
+Each point is a training iteration (render, loss, gradients, optimizer) on one scene, measured in a
+fresh process for its peak of memory.
 """
 
 from __future__ import annotations
@@ -21,20 +21,13 @@ import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
-from drgs.bench.output import add_out, columns_table, machine, markdown_table, write_csv
+from drgs.bench.output import add_out, columns_table, machine, markdown_table
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of
-from drgs.bench.timing import (
-    STAGES,
-    Work,
-    clocked_step,
-    count_work,
-    seconds,
-    steps,
-    warm_trainer,
-)
+from drgs.bench.timing import STAGES, Work, clocked_step, count_work, seconds, steps, warm_trainer
 from drgs.cli.commands import CommandParser
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
+from drgs.results.history import write_csv
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,9 +35,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEPS, QUICK_STEPS = 12, 4
-
-GAUSSIANS_PER_PIXEL = 100_000 / 400**2
-"""Gaussians per pixel of the bench scene, which the sweep over N keeps."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +49,12 @@ class Point:
 
     @property
     def varied_number(self) -> int:
-        """The number that the sweep varies."""
         return {"pixels": self.size**2, "threads": self.threads}.get(self.sweep, self.count)
 
 
 @dataclass(frozen=True)
 class Result:
-    """The measurement of one process."""
+    """Time and memory of a problem."""
 
     point: Point
     milliseconds: float  # of an iteration, median
@@ -76,17 +65,14 @@ class Result:
 
     @property
     def device_mib(self) -> float:
-        """The peak of Dr.Jit's allocations in MiB."""
         return self.device_bytes / 2**20
 
     @property
     def process_mib(self) -> float:
-        """The peak of the process in MiB."""
         return self.process_bytes / 2**20
 
     @property
     def bytes_per_gaussian(self) -> float:
-        """The peak of Dr.Jit's allocations for each Gaussian."""
         return self.device_bytes / self.point.count
 
 
@@ -101,7 +87,6 @@ COLUMNS = [
     ("entries", "{.work.entries:,}"),
     ("useful pairs", "{.work.useful:,}"),
 ]
-"""Columns of the tables: header and format."""
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -154,23 +139,17 @@ def _write(out: Path, results: dict[str, list[Result]]) -> None:
 def points(quick: bool) -> list[Point]:
     """Return the points of all sweeps.
 
-    In the first, film and Gaussians are scaled so that each pixel keeps its number of Gaussians,
-    and each Gaussian its number of pixels.
+    The first scales film and Gaussians: Gaussians per pixel and pixels per Gaussian are constant.
     """
     threads = os.cpu_count() or 1
     counts = (10_000, 30_000) if quick else (10_000, 30_000, 100_000, 300_000, 1_000_000)
     sizes = (100, 200) if quick else (200, 400, 800, 1600)
     base = 30_000 if quick else 100_000
     scales = {n: math.sqrt(100_000 / n) for n in counts}
+    density = 100_000 / 400**2  # Gaussians per pixel of the bench scene
     found = [
-        Point(
-            "constant entries per Gaussian",
-            n,
-            round(math.sqrt(n / GAUSSIANS_PER_PIXEL)),
-            threads,
-            scales[n],
-        )
-        for n in counts
+        Point("constant entries per Gaussian", n, round(math.sqrt(n / density)), threads, scale)
+        for n, scale in scales.items()
     ]
     found += [Point("bench scene as it is", n, 400, threads) for n in counts]
     found += [Point("pixels", base, size, threads) for size in sizes]
@@ -179,13 +158,13 @@ def points(quick: bool) -> list[Point]:
 
 
 def measure_in_new_process(point: Point, num_steps: int) -> Result:
-    """Measure a point where nothing else was ever allocated."""
+    """Measure a point in a fresh process."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measure, point, num_steps).result()
 
 
 def measure(point: Point, num_steps: int) -> Result:
-    """Time ``num_steps`` iterations of one problem, after a few to warm up."""
+    """Time ``num_steps`` iterations after warm-up."""
     dr.set_thread_count(point.threads)
     mi.set_variant("llvm_ad_rgb")
     gaussians = bench_gaussians(point.count)
@@ -208,14 +187,14 @@ def measure(point: Point, num_steps: int) -> Result:
 
 
 def exponent(results: list[Result], what: str) -> float:
-    """Return e of the best fit value = c x^e: the slope of a line through the logarithms."""
+    """Return e of the least-squares fit value = c x^e in logarithms."""
     x = np.log([result.point.varied_number for result in results])
     y = np.log([getattr(result, what) for result in results])
     return float(np.polyfit(x, y, 1)[0])
 
 
 def _stage_table(results: list[Result]) -> str:
-    """Format stages by threads: milliseconds, and how many times faster than with one."""
+    """Format stages by threads: milliseconds, and the speedup over one thread."""
     counts = [result.point.threads for result in results]
     header = ["", *("1 thread" if n == 1 else f"{n} threads" for n in counts)]
     rows = [["a training iteration", *_times_of([r.milliseconds for r in results])]]

@@ -1,4 +1,4 @@
-"""Scenes, cameras and trainers that measurements share; cameras are those of the reference."""
+"""Scenes, cameras and trainers of the measurements; cameras are the reference's."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.scene import film_description
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 from drgs.training.trainer import Trainer
@@ -28,14 +29,13 @@ BENCH_TO_WORLD = np.array(
 )
 """Camera to world in OpenGL axes: the first test camera of the NeRF-synthetic Lego."""
 
-BENCH_FIELD_OF_VIEW = 0.691111
-"""rad, horizontal."""
+BENCH_FIELD_OF_VIEW = 0.691111  # rad, horizontal
 
 
 def bench_gaussians(count: int, seed: int = 0) -> Gaussians:
-    """``count`` Gaussians in and on the box [-1, 1]^3, as numpy arrays.
+    """Return ``count`` Gaussians in and on the box [-1, 1]^3, as numpy arrays.
 
-    80 % lie on a random face, moved inwards by |N(0, 0.05)|, the others uniformly inside. Scales
+    80 % are on a random face, moved inwards by |N(0, 0.05)|, the others uniform inside. Scales
     are log-normal around 0.01, rotations uniform, opacities uniform in [0.1, 0.95]; SH of degree
     3, with base colours uniform in [0, 1].
     """
@@ -58,7 +58,7 @@ def bench_gaussians(count: int, seed: int = 0) -> Gaussians:
 
 
 def bench_camera(size: int) -> reference.Camera:
-    """The bench scene's camera with a square film of ``size`` px."""
+    """Return the bench scene's camera with a square film of ``size`` px."""
     focal = float(np.float32(size / (2 * np.tan(BENCH_FIELD_OF_VIEW / 2))))
     rotation = (BENCH_TO_WORLD[:, :3] * OPENCV_TO_OPENGL.diagonal()[:3]).T.astype(np.float32)
     center = BENCH_TO_WORLD[:, 3].astype(np.float32)
@@ -80,14 +80,7 @@ def mitsuba_sensor(camera: reference.Camera) -> dict[str, object]:
         "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
         "fov_axis": "x",
         "to_world": mitsuba_pose(camera),
-        "film": {
-            "type": "hdrfilm",
-            "width": camera.width,
-            "height": camera.height,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
+        "film": film_description(camera.width, camera.height),
         "sampler": {"type": "independent", "sample_count": 1},
     }
 
@@ -102,7 +95,7 @@ def device_camera(camera: reference.Camera, float_type: type) -> Camera:
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians, camera, and what they are called."""
+    """Gaussians and a camera."""
 
     name: str
     gaussians: Gaussians  # numpy
@@ -110,14 +103,14 @@ class Scene:
 
 
 def frame_of(scene: Scene) -> rendering.Frame:
-    """Render the scene by the kernels in single precision."""
+    """Render the scene in single precision."""
     pipeline = rendering.Pipeline(scene.gaussians.sh_degree)
     camera = device_camera(scene.camera, llvm.Float)
     return rendering.render(scene.gaussians.to(llvm.TensorXf), camera, pipeline)
 
 
 def view_of(scene: Scene) -> View:
-    """Return the scene's own image, moved by a pixel: derivatives of realistic size."""
+    """Return the scene's image shifted by a pixel, for derivatives of realistic size."""
     camera = scene.camera
     _, *planes = frame_of(scene).planes()
     image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
@@ -133,7 +126,7 @@ def view_of(scene: Scene) -> View:
 def trainer_of(
     scene: Scene, changes: Mapping[str, object] = {}, extras: Mapping[str, np.ndarray] = {}
 ) -> Trainer:
-    """Return a trainer on one view; the population stays, though statistics are gathered.
+    """Return a trainer on one view, with a fixed population whose statistics are gathered.
 
     changes: of :func:`bench_config`; extras: of the view, besides colours.
     """
@@ -163,16 +156,16 @@ def bench_config(gaussians: Gaussians) -> FitConfig:
 
 
 def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:
-    """Return a scene that is hard for the affine approximation and one order for all pixels.
+    """Return a scene that is hard for the affine approximation and a global depth order.
 
-    A lens of 110 degrees; two layers of flat discs that cross in the middle of the image; large,
-    faint splats before the camera; a shell of splats around everything.
+    A 110 degree lens; two layers of flat discs that cross in the image's middle; large, faint
+    splats close to the camera; a shell of splats around the scene.
     """
     rng = np.random.default_rng(seed)
     layer, near, shell = 700, 60, 1500
 
     def crossing(angle: float) -> tuple[np.ndarray, np.ndarray]:
-        """Discs on a plane through (0, 0, 3) that is turned about the vertical axis."""
+        """Return discs on a plane through (0, 0, 3), rotated about the vertical axis."""
         u, v = rng.uniform(-3, 3, layer), rng.uniform(-2, 2, layer)
         means = np.stack([u * np.cos(angle), v, 3 + u * np.sin(angle)], axis=-1)
         # About y by -angle: the disc's thin axis, z, becomes the plane's normal.

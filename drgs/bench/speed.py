@@ -1,10 +1,8 @@
 """``drgs bench speed``: drgs and other renderers side by side, and the stages of an iteration.
 
-Everything is measured in one process, on the same Gaussians and camera, with the same loss, in
-turns: each round times every implementation once, so that other load on the machine slows all of
-them. Medians are reported, and ratios of medians.
-
-``--without-avx512`` measures kernels compiled for AVX2.
+One process measures all implementations with the same Gaussians, camera and loss. Each round times
+every implementation once, so that other load affects all of them. Medians and their ratios are
+reported. ``--without-avx512`` measures kernels compiled for AVX2.
 """
 
 from __future__ import annotations
@@ -23,15 +21,7 @@ import numpy as np
 
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, mitsuba_sensor
-from drgs.bench.timing import (
-    STAGES,
-    Work,
-    clocked_step,
-    count_work,
-    seconds,
-    steps,
-    warm_trainer,
-)
+from drgs.bench.timing import STAGES, Work, clocked_step, count_work, seconds, steps, warm_trainer
 from drgs.cli.commands import CommandParser
 from drgs.config.schema import ModelConfig
 from drgs.core.files import atomic_path
@@ -46,15 +36,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 IMAGE_SIZE_PX = 400
-
-SHELL_STDS = 3.0
-"""Standard deviations at which Mitsuba's ellipsoids end (its default, and 3DGS's extent)."""
-
+SHELL_STDS = 3.0  # extent of Mitsuba's ellipsoids, standard deviations (its default, and 3DGS's)
 ROUNDS, QUICK_ROUNDS = 15, 5
-
 SLOW_S, SLOW_ROUNDS = 0.5, 3
-VERY_SLOW_S = 15.0
-"""An implementation that takes longer is measured once."""
+VERY_SLOW_S = 15.0  # slower implementations are measured once
 
 
 @dataclass(frozen=True)
@@ -80,7 +65,6 @@ class IterationReport:
 
     @property
     def kernel_ms(self) -> float:
-        """The sum over all stages."""
         return sum(self.stage_ms.values())
 
     @property
@@ -140,7 +124,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def make_scenes(trained: Path, quick: bool) -> list[Scene]:
-    """Return the bench scene at one or two sizes, and a trained one if there is one."""
+    """Return the bench scene at one or two sizes, and the trained one if it exists."""
     camera = bench_camera(IMAGE_SIZE_PX)
     counts = (10_000,) if quick else (10_000, 100_000)
     scenes = [Scene(f"bench scene, {n:,}", bench_gaussians(n), camera) for n in counts]
@@ -154,16 +138,12 @@ def make_scenes(trained: Path, quick: bool) -> list[Scene]:
 
 @dataclass(frozen=True)
 class TimedRenderer:
-    """An implementation with a scene loaded.
-
-    ``forward`` renders a frame; ``forward_backward`` also differentiates sum(weights * image) /
-    pixels with respect to all parameters. Both return when the device has finished.
-    """
+    """An implementation with a loaded scene; its functions return when the device has finished."""
 
     name: str
     forward: Callable[[], None]
-    forward_backward: Callable[[], None]
-    seconds: float  # roughly, for both: how often it can be repeated
+    forward_backward: Callable[[], None]  # d sum(weights * image) / pixels by all parameters
+    seconds: float  # estimate, for both
 
 
 @dataclass(frozen=True)
@@ -176,7 +156,7 @@ class Problem:
 
 
 def drgs_renderer(problem: Problem) -> TimedRenderer:
-    """Return the ``splats`` integrator through ``mi.render``, as a user of Mitsuba calls it."""
+    """Return the ``splats`` integrator, called by ``mi.render``."""
     scene = make_scene(problem.gaussians, ModelConfig().of_file(), (1.0, 1.0, 1.0))
     return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
 
@@ -220,7 +200,7 @@ def _mitsuba_renderer(
     integrator = scene.integrator()
 
     def forward() -> None:
-        integrator.parameters_changed([])  # no frame of an earlier call may be used again
+        integrator.parameters_changed([])  # clears the render cache
         with dr.suspend_grad():
             dr.eval(mi.render(scene, sensor=sensor, spp=1))
         dr.sync_thread()
@@ -257,7 +237,7 @@ def reference_renderer(problem: Problem) -> TimedRenderer:
 
 
 def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
-    """Time every implementation in turns."""
+    """Time all implementations, interleaved."""
     rng = np.random.default_rng(0)
     weights = rng.normal(size=(scene.camera.height, scene.camera.width, 3))
     problem = Problem(scene.gaussians, scene.camera, weights)
@@ -296,9 +276,9 @@ def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
 
 
 def profile_training(scene: Scene, rounds: int) -> IterationReport:
-    """Train on one view of the scene itself, with all SH degrees and no change of population.
+    """Profile training on one view of the scene with all SH degrees and a fixed population.
 
-    Each round times four iterations without a clock, and one stage by stage.
+    Each round times four iterations without a clock, and one by stage.
     """
     trainer, walls, clocks = warm_trainer(scene), [], []
     for _ in range(rounds):
@@ -314,7 +294,7 @@ def profile_training(scene: Scene, rounds: int) -> IterationReport:
 
 
 def comparison_table(timings: list[Timing]) -> str:
-    """Format times of all implementations, and their ratios to the first one's."""
+    """Format times of all implementations, and their ratios to the first."""
     ours = timings[0]
     header = ["400x400", "forward", "forward + backward", "ratio", "ratio, both", "rounds"]
     rows: list[list[object]] = []

@@ -1,12 +1,10 @@
-"""``python -m drgs.bench stability``: what single precision costs in accuracy, and why.
+"""``python -m drgs.bench stability``: errors of single precision, and their causes.
 
-Four families of scenes become harder step by step. For each step the float32 kernels are compared
-with the float64 reference, and their error is set beside the *noise*: how much the reference's own
-result changes when every input is moved by one rounding of single precision. That is the
-conditioning of the problem; an error that grows faster would be the kernels' own fault.
-
-Pixels at which a decision (cut, clamp, stop) may fall either way in single precision are left out;
-the reference marks them.
+Four families of scenes become harder step by step. Each step compares the float32 kernels with the
+float64 reference, and their error with the *noise*: the change of the reference's result when every
+input is perturbed by one rounding of single precision. An error that grows faster than this
+conditioning is the kernels' own. Pixels near a threshold (cut, clamp, stop), which the reference
+marks, are excluded.
 """
 
 from __future__ import annotations
@@ -19,45 +17,40 @@ from typing import TYPE_CHECKING, cast
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs.bench.output import add_out, columns_table, machine, write_csv
+from drgs.bench.output import add_out, columns_table, machine
 from drgs.bench.scenes import device_camera
 from drgs.cli.commands import CommandParser
 from drgs.core.types import Float
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
+from drgs.results.history import write_csv
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
-"""px: small images, since the reference draws each of them many times."""
-
-NUM_GAUSSIANS = 60
-"""Gaussians in a scene, but for the stacks."""
-
+WIDTH, HEIGHT, FOCAL = 48, 40, 60.0  # px
+NUM_GAUSSIANS = 60  # except in stacks
 UNIT_ROUNDOFF = 2.0**-24
-
-MARKED_WITHIN = 3e-3
-"""Relative distance from a threshold within which a pixel is left out."""
+THRESHOLD_WIDTH = 3e-3  # relative distance from a threshold within which pixels are excluded
 
 Scene = tuple[reference.Gaussians, reference.Camera]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A family of scenes that one number makes harder."""
+    """A family of scenes with one parameter of difficulty."""
 
     name: str
     axis: str
     values: tuple[float, ...]
-    scene: Callable[[float], Scene]  # in float64, not yet rounded
+    scene: Callable[[float], Scene]  # float64, not rounded
 
 
 @dataclass(frozen=True)
 class StabilityMeasurement:
-    """Errors at one step of a sweep, relative to the largest value of each array."""
+    """Errors at one step of a sweep, relative to each array's largest value."""
 
     value: float
     image: float  # largest error of any pixel
@@ -65,7 +58,7 @@ class StabilityMeasurement:
     gradient: float  # largest error of any derivative, over the five parameters
     gradient_noise: float
     storage: float  # largest change of any pixel by storing the scene in float32
-    left_out: float  # part of the pixels
+    left_out: float  # fraction of the pixels
 
 
 ERRORS = [
@@ -75,7 +68,6 @@ ERRORS = [
     ("their noise", "{.gradient_noise:.1e}"),
     ("stored in float32", "{.storage:.1e}"),
 ]
-"""Columns of the tables: header and format."""
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -86,7 +78,7 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure, print the table, write CSV and plot."""
+    """Measure all sweeps; print tables, write CSV and plot."""
     samples = 4 if args.quick else 12
     results = {}
     print(f"float32 kernels against the float64 reference; {machine()}")
@@ -116,7 +108,7 @@ def _decades(first: int, last: int) -> tuple[float, ...]:
 
 
 def _camera(center: np.ndarray) -> reference.Camera:
-    """Return a camera turned about all axes, so that no coordinate is exact by chance."""
+    """Return a camera rotated about all axes, so that no coordinate is exact by chance."""
     rotation = reference.quat_to_rotation(np.array([[0.9, 0.2, -0.3, 0.1]]))[0]
     intrinsics = FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT
     return reference.Camera(rotation, center, *intrinsics)
@@ -185,22 +177,22 @@ def _needles(ratio: float) -> Scene:
 
 
 def _distant(distance: float) -> Scene:
-    """A scene one unit deep, seen through a lens that keeps its size on the film."""
+    """Return a scene one unit deep, with a focal length that keeps its projected size."""
     camera = replace(_camera(np.zeros(3)), fx=FOCAL * distance, fy=FOCAL * distance)
     return _ordinary(camera, distance, distance + 1), camera
 
 
 def _offset(offset: float) -> Scene:
-    """Scene and camera together, away from the origin."""
+    """Return scene and camera, translated together."""
     camera = _camera(offset * np.array([1.0, -0.7, 0.4]))
     return _ordinary(camera, 1, 4), camera
 
 
 def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
-    """Measure errors and noise of one scene; both sides start from the same, rounded numbers."""
+    """Measure errors and noise of one scene; kernels and reference have the same rounded input."""
     exact = sweep.scene(value)
     gaussians, camera = _round_to_single(*exact)
-    rendered = reference.render(gaussians, camera, threshold_width=MARKED_WITHIN)
+    rendered = reference.render(gaussians, camera, threshold_width=THRESHOLD_WIDTH)
     kept = ~rendered.near_threshold
     cotangent = np.random.default_rng(5).normal(size=rendered.image.shape) * kept[..., None]
     image, gradients = _by_reference(gaussians, camera, cotangent)
@@ -217,8 +209,8 @@ def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
 
     errors = []
     for sample in range(samples):
-        perturb = _by_reference(*_perturb(gaussians, camera, sample), cotangent)
-        errors.append([image_error(perturb[0]), gradient_error(perturb[1])])
+        perturbed = _by_reference(*_perturb(gaussians, camera, sample), cotangent)
+        errors.append([image_error(perturbed[0]), gradient_error(perturbed[1])])
     image_noise, gradient_noise = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
     return StabilityMeasurement(
         value=value,
@@ -243,7 +235,7 @@ def _round_to_single(gaussians: reference.Gaussians, camera: reference.Camera) -
 
 
 def _perturb(gaussians: reference.Gaussians, camera: reference.Camera, seed: int) -> Scene:
-    """Move every number by up to one rounding; means and camera relative to each other."""
+    """Perturb every number by up to one rounding; means relative to the camera."""
     rng = np.random.default_rng([6, seed])
 
     def perturb(values: np.ndarray) -> np.ndarray:
@@ -282,7 +274,7 @@ def _by_kernels(
 
 
 def plot(results: dict[str, list[StabilityMeasurement]]) -> Figure:
-    """Draw a panel for each sweep: errors as lines, their noise dashed in the same colour."""
+    """Plot a panel per sweep: errors as lines, their noise dashed in the same colour."""
     figure = new_figure(11, 6)
     axes = figure.subplots(2, 2, sharey=True).ravel()
     for panel, sweep in zip(axes, sweeps(), strict=True):

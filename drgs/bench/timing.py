@@ -1,10 +1,9 @@
 """Measure computations: seconds, the stages of a training iteration, and its work.
 
-Dr.Jit's kernel history names no stages. :class:`StageClock` waits for the device at the borders of
-the stages and reads the history there, so that whatever ran since the last border belongs to the
-stage that ends. Stages end where functions of the product are called, which are wrapped for as long
-as the clock runs; the computation itself is untouched. Waiting costs overlap: the sum of the stages
-is a little more than the computation takes without a clock.
+:class:`StageClock` synchronizes with the device at the stages' borders and assigns Dr.Jit's kernel
+history since the last border to the stage that ends. Borders are calls of functions that are
+patched while the clock runs. Synchronization prevents overlap: the sum of the stages slightly
+exceeds the time without a clock.
 """
 
 from __future__ import annotations
@@ -37,11 +36,8 @@ STAGES = (
     "optimizer and statistics",
 )
 
-COPIES = ("Memset", "Memcpy")
-"""Entries of the kernel history that are no kernels."""
-
-WARM_UP = 3
-"""Iterations before one is measured."""
+COPIES = ("Memset", "Memcpy")  # entries of the kernel history that are not kernels
+NUM_WARM_UP_STEPS = 3
 
 
 def seconds(function: Callable[[], object]) -> float:
@@ -71,25 +67,22 @@ class StageClock:
     def end(self, stage: str) -> None:
         """Assign all kernels since the last call to ``stage``."""
         dr.sync_thread()
-        passed = 1e3 * (time.perf_counter() - self.started)
+        wall_ms = 1e3 * (time.perf_counter() - self.started)
         entries = dr.kernel_history()
         self.history += [(stage, entry) for entry in entries]
         spent = sum(entry["execution_time"] for entry in entries)
         self.kernel_ms[stage] = self.kernel_ms.get(stage, 0.0) + spent
-        self.wall_ms[stage] = self.wall_ms.get(stage, 0.0) + passed
-        self.started = time.perf_counter()  # reading the history does not count
+        self.wall_ms[stage] = self.wall_ms.get(stage, 0.0) + wall_ms
+        self.started = time.perf_counter()  # excludes reading the history
 
     def num_kernels(self, stage: str) -> int:
-        """Count the kernels that were launched."""
+        """Count the launched kernels of a stage."""
         return sum(s == stage and e["type"].name not in COPIES for s, e in self.history)
 
 
 @contextmanager
 def stage_clock() -> Iterator[StageClock]:
-    """Run a clock that ends stages wherever the renderer's own stages do.
-
-    The caller ends what precedes the first stage, and what follows the last.
-    """
+    """Run a clock that ends the renderer's stages; the caller ends the last one."""
     clock = StageClock()
 
     def wrap(function: Callable, before: str | None, after: str | None) -> Callable:
@@ -123,21 +116,21 @@ def stage_clock() -> Iterator[StageClock]:
 
 
 def steps(trainer: Trainer, count: int) -> None:
-    """Run ``count`` training iterations; returns when the device has finished."""
+    """Run ``count`` training iterations and synchronize."""
     for _ in range(count):
         trainer.step()
     dr.sync_thread()
 
 
 def warm_trainer(scene: Scene) -> Trainer:
-    """Return a trainer whose kernels have been compiled."""
+    """Return a trainer with compiled kernels."""
     trainer = trainer_of(scene)
-    steps(trainer, WARM_UP)
+    steps(trainer, NUM_WARM_UP_STEPS)
     return trainer
 
 
 def clocked_step(trainer: Trainer) -> StageClock:
-    """Run a training iteration, stage by stage."""
+    """Time a training iteration by stage."""
     with stage_clock() as clock:
         report = trainer.step()
         dr.eval([(view.loss, view.squared_error) for view in report.views])
@@ -147,16 +140,16 @@ def clocked_step(trainer: Trainer) -> StageClock:
 
 @dataclass(frozen=True)
 class Work:
-    """The pairs that the compositing kernels visit, and how many of them contribute."""
+    """Numbers of pairs that the compositing kernels visit."""
 
     entries: int  # (Gaussian, tile)
     micro_entries: int  # (Gaussian, micro-tile)
     evaluated: int  # (pixel, Gaussian) pairs whose alpha compositing computes
-    useful: int  # pairs with alpha >= 1/255 at a pixel that is not finished
+    useful: int  # pairs with alpha >= 1/255 at an unfinished pixel
 
 
 def count_work(frame: rendering.Frame) -> Work:
-    """Walk the entries once more and count them."""
+    """Count the frame's entries and pairs."""
     bins, layers = frame.bins, frame.layers
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)

@@ -1,7 +1,4 @@
-"""Curves of a fit: loss, PSNR, population and rate over the iterations, test PSNR over time.
-
-The panel of the population also shows how many Gaussians were added and removed so far.
-"""
+"""Curves of a fit: loss, PSNR, population and rate over the iterations, test PSNR over time."""
 
 from __future__ import annotations
 
@@ -20,11 +17,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SMOOTHING_PARTS = 50  # the smooth line of a curve is a running mean over this part of all rows
-
+SMOOTHING_PARTS = 50  # a running mean averages this fraction of all rows
 NUM_PANELS = 6
-
-PAGE_DPI = 160  # resolution of a curve in the page, 3.7 inches wide, for fine screens
+PAGE_DPI = 160  # of a curve in the page, 3.7 inches wide
 
 
 @dataclass(frozen=True)
@@ -42,11 +37,9 @@ class Theme:
 LIGHT = Theme(
     "#ffffff", "#1d2330", "#e3e6ec", "#b9cdf0", "#1f5fd0", ("#2b8a57", "#c2543a", "#8b5cb8")
 )
-
 DARK = Theme(
     "#1a1e27", "#d8dde8", "#333a48", "#34507f", "#7fb0ff", ("#6fca98", "#f0937b", "#c3a2ea")
 )
-
 THEMES = (LIGHT, DARK)
 
 
@@ -59,10 +52,10 @@ class Panel:
     y: np.ndarray  # (n,)
     x_label: str = "iteration"
     scale: str = "linear"  # of y: "linear" or "log"
-    bottom: float | None = None  # of y's range; None: as the values have it
-    noisy: bool = False  # drawn with its running mean
-    marked: bool = False  # with a dot for each value, of which there are few
-    thousands: bool = False  # y's labels are whole numbers, with separators
+    bottom: float | None = None  # of y's range; None: automatic
+    noisy: bool = False  # with running mean
+    marked: bool = False  # with a dot per value
+    thousands: bool = False  # y labels are integers with separators
     others: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # steps
 
 
@@ -73,7 +66,7 @@ def panels_of(history: FitHistory) -> list[Panel]:
         return np.array([getattr(row, name) for row in history.rows], np.float64)
 
     x, wall_s = column("iteration"), column("wall_s")
-    # Two rows may carry one time: the clock's resolution, or a run that was resumed.
+    # Two rows may have equal times: the clock's resolution, or a resumed run.
     speed = np.diff(x) / np.maximum(np.diff(wall_s), 1e-3)
     measured = [row for row in history.rows if row.test_psnr is not None]
     minutes = np.array([row.wall_s / 60 for row in measured])
@@ -91,7 +84,7 @@ def panels_of(history: FitHistory) -> list[Panel]:
 
 
 def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return iterations and sums of the changes so far, by kind of change, if there are any."""
+    """Return iterations and cumulative numbers of changes by kind, without those of zero."""
     changes, curves = history.density, {}
     x = [0, *(change.iteration for change in changes)]
     x.append(history.rows[-1].iteration if history.rows else x[-1])

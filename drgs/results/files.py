@@ -1,4 +1,4 @@
-"""Names of the files and folders that a fit writes into its output folder."""
+"""Names of the files and folders in a fit's output folder."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ CURVES = "curves.png"
 ORBIT = "orbit.webp"
 ORBIT_GIF = "orbit.gif"
 REPORT = "report.html"
-VIEWER = "viewer.html"  # the Gaussians, to walk around in, unless it would be too large
+VIEWER = "viewer.html"  # interactive page of the Gaussians, unless too large
 RENDERS = "renders"  # a folder for each split, with an image of each view
 SIDE_BY_SIDE = "side_by_side"  # the same, with the photograph and the difference beside the image
 CAMERAS = "cameras.json"  # refined cameras of the training views
-VIEWS = "views.json"  # cameras of the training views as the data has them, for orbits
+VIEWS = "views.json"  # the dataset's cameras of the training views, for orbits
 COLORS = "colors.json"  # colour transforms of the training views
 BUDGET_PLAN = "plan.txt"  # the plan for a budget of time, with reasons
 TENSORBOARD = "tensorboard"  # a folder, with ``--tensorboard``

@@ -1,8 +1,8 @@
-"""The output folder of a fit: one folder, one run, and no result is lost by accident.
+"""The output folder of a fit.
 
-A folder belongs to the run whose ``config.yml`` it contains. A fit takes a folder that is missing
-or empty, or that contains an unfinished run of the same configuration, which it continues. It never
-writes over results, nor over anything else that no fit has written.
+A folder belongs to the run whose ``config.yml`` it contains. A fit accepts a missing or empty
+folder, or an unfinished run of the same configuration, which it continues. It never overwrites
+results, nor files that no fit has written.
 """
 
 from __future__ import annotations
@@ -32,25 +32,22 @@ from drgs.results.files import (
 )
 
 COMMAND = "fit"
-
 MAX_CONFIG_BYTES = 1 << 28
-
-FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)  # results that are folders; the others are files
+FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)  # results that are folders
 
 SECTIONS = {"data", "init", "model", "optimizer", "loss", "densify", "output", "iterations", "seed"}
 """Keys of every ``config.yml`` that a fit has written."""
 
-DATA_PATHS = ("data.path", "init.point_cloud")
-"""Values that are also recorded relative to the folder."""
+DATA_PATHS = ("data.path", "init.point_cloud")  # also recorded relative to the folder
 
 
 def claim_output_folder(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
-    """Make ``folder`` (absolute or relative to the current one) the output folder of a run.
+    """Make ``folder`` the output folder of a run.
 
-    Creates it, with its parents, and writes ``config.yml``; what else it contains stays as it is.
-    images: names from :func:`image_names`.
+    Creates it, with its parents, and writes ``config.yml``; other files are unchanged. images:
+    names from :func:`image_names`.
 
-    Raises :class:`UserError` as :func:`check_output_folder`, and where it cannot be written.
+    Raises :class:`UserError` as :func:`check_output_folder`, and if it is not writable.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +58,7 @@ def claim_output_folder(folder: Path, config: FitConfig, images: Sequence[str] =
 
 
 def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
-    """Raise :class:`UserError` for a folder with results of another run, or files of others."""
+    """Raise :class:`UserError` for a folder with another run or foreign files."""
     if not (present := _visible_names(folder)):
         return
     if CONFIG not in present:
@@ -71,9 +68,7 @@ def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] =
         )
     record, differences = FolderRecord(folder, COMMAND), _differences_of_run(folder, config)
     is_run, is_config_alone = record.exists or CHECKPOINT in present, present == [CONFIG]
-    if not _is_written_by_fit(folder / CONFIG) and (
-        not is_run or (is_config_alone and differences)
-    ):
+    if not _is_unmodified(folder / CONFIG) and (not is_run or (is_config_alone and differences)):
         raise UserError(
             f"{folder / CONFIG}: would be replaced, and was not written by a fit, or changed "
             "since; choose another folder with --out"
@@ -87,9 +82,9 @@ def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] =
 
 
 def continue_run(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
-    """Continue the run in ``folder``; config: its own, with the present paths of its data.
+    """Continue the run in ``folder``; config: its own, with the data's current paths.
 
-    Raises :class:`UserError` where files of others would be replaced.
+    Raises :class:`UserError` if foreign files would be replaced.
     """
     record, names = FolderRecord(folder, COMMAND), _file_names(images)
     record.check(names, earlier=names)
@@ -104,7 +99,7 @@ def continue_run(folder: Path, config: FitConfig, images: Sequence[str] = ()) ->
 
 
 def seal_run(folder: Path) -> None:
-    """Record that all results are written."""
+    """Record that the results are complete."""
     FolderRecord(folder, COMMAND).seal()
 
 
@@ -114,9 +109,9 @@ def image_names(split: str, views: Sequence[str]) -> list[str]:
 
 
 def write_run_config(folder: Path, config: FitConfig) -> None:
-    """Write ``config.yml``, unless it has these values, or the user has changed it."""
+    """Write ``config.yml`` unless the user has changed it."""
     path = folder / CONFIG
-    if _is_written_by_fit(path):
+    if _is_unmodified(path):
         dump_config(config, path)
         return
     try:
@@ -129,7 +124,7 @@ def write_run_config(folder: Path, config: FitConfig) -> None:
 
 
 def require_no_run(folder: Path) -> None:
-    """Raise :class:`UserError` for a folder with a run, where that cannot be continued."""
+    """Raise :class:`UserError` for a folder that is not empty."""
     if names := _visible_names(folder):
         raise UserError(
             f"{folder}: must be new or empty for a fit with --budget, got one that holds "
@@ -139,19 +134,19 @@ def require_no_run(folder: Path) -> None:
 
 
 def has_results(folder: Path) -> bool:
-    """Return whether the run in ``folder`` has ended, with all of its results."""
+    """Return whether the run in ``folder`` is complete."""
     return (folder / METRICS).is_file()
 
 
 def is_finished(folder: Path, config: FitConfig) -> bool:
-    """Return whether ``folder`` contains the whole result of this very configuration."""
+    """Return whether ``folder`` contains a complete run of this configuration."""
     return has_results(folder) and not _differences_of_run(folder, config)
 
 
 def load_run_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
     """Load the configuration of the run in ``folder``; overrides: see :func:`load_config`.
 
-    Raises :class:`UserError` where there is none.
+    Raises :class:`UserError` if there is none.
     """
     if not os.path.isfile(folder / CONFIG):
         what = "has no" if os.path.isdir(folder) else "does not exist, and so has no"
@@ -160,9 +155,9 @@ def load_run_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
 
 
 def load_moved_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
-    """Load the configuration of the run in ``folder``, with the present paths of its data.
+    """Load the configuration of the run in ``folder`` with the data's current paths.
 
-    overrides: see :func:`load_config`; a start point within the data has moved with it.
+    overrides: see :func:`load_config`. A point cloud within the data is relocated with it.
     """
     before = load_run_config(folder)
     config = relocate_data(folder, load_run_config(folder, overrides))
@@ -173,10 +168,10 @@ def load_moved_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
 
 
 def relocate_data(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PATHS) -> FitConfig:
-    """Return a run's configuration with the present paths of its data; keys: of DATA_PATHS.
+    """Return a run's configuration with the data's current paths; keys: of DATA_PATHS.
 
-    A path that does not exist is looked for at its recorded place relative to the folder, as both
-    may have been moved together. A :class:`UserNote` names what is found; the rest stays.
+    A missing path is replaced by its recorded path relative to the folder if that exists, with a
+    :class:`UserNote`: both may have been moved together.
     """
     changes, recorded = {}, FolderRecord(folder, COMMAND).paths
     for key, path in _data_paths(config).items():
@@ -191,18 +186,18 @@ def relocate_data(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PA
 
 
 def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
-    """Remove the run in ``folder``, if any, to make room for another.
+    """Remove the run in ``folder``, if any.
 
-    ``metrics.json`` goes first and ``config.yml`` last: an interrupted removal leaves the folder of
-    an unfinished run. images: of the coming run.
+    ``metrics.json`` is removed first and ``config.yml`` last: an interrupted removal leaves an
+    unfinished run. images: of the next run.
 
-    Raises :class:`UserError`, with nothing removed, where ``folder`` contains more than a run.
+    Raises :class:`UserError`, with nothing removed, if ``folder`` contains foreign files.
     """
     names = _visible_names(folder)
     record, files = FolderRecord(folder, COMMAND), list(_files(folder))
     if names:
         load_run_config(folder)
-        _refuse_strangers(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, images)
+        _check_removable(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, images)
     elif not os.path.lexists(folder):
         return
     remove_stale_temporaries(folder)
@@ -217,20 +212,23 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
         raise UserError(f"{error.filename}: cannot be removed: {refusal_reason(error)}") from error
 
 
-def _refuse_strangers(
+def _check_removable(
     folder: Path,
     record: FolderRecord,
     strangers: list[str],
     files: list[str],
     images: Sequence[str],
 ) -> None:
-    """Raise :class:`UserError` for files that no fit has written, and the names ``strangers``."""
+    """Raise :class:`UserError` for the names ``strangers`` and files that no fit has written."""
     if record.exists:
         strangers += record.strangers(files)
     else:
         known = set(_file_names(images))
-        strangers += [n for n in files if n not in known or not _is_file(folder / n)]
-    if not _is_written_by_fit(folder / CONFIG):
+        for name in files:
+            path = folder / name
+            if name not in known or path.is_symlink() or not path.is_file():
+                strangers.append(name)
+    if not _is_unmodified(folder / CONFIG):
         strangers.append(CONFIG)
     if strangers:
         raise UserError(
@@ -254,12 +252,12 @@ def _files(folder: Path) -> Iterator[str]:
 
 
 def _file_names(images: Sequence[str]) -> list[str]:
-    """Return the files that a fit writes, but for ``config.yml``: its content tells its writer."""
+    """Return the files that a fit writes, except ``config.yml``, whose content is checked."""
     return [*(name for name in RESULTS if name not in FOLDERS), EVENTS, *images]
 
 
 def _visible_names(folder: Path) -> list[str]:
-    """Return the content of a folder without hidden files: a desktop's, or temporary ones."""
+    """Return the names in a folder without hidden files."""
     if not os.path.lexists(folder):
         return []
     try:
@@ -272,18 +270,14 @@ def _unusable(folder: Path, error: OSError) -> UserError:
     return UserError(f"{folder}: cannot be the output folder: {refusal_reason(error)} (--out)")
 
 
-def _is_file(path: Path) -> bool:
-    return path.is_file() and not path.is_symlink()
-
-
-def _is_written_by_fit(path: Path) -> bool:
-    """Return whether a file is missing, empty, or just as :func:`dump_config` writes it."""
+def _is_unmodified(path: Path) -> bool:
+    """Return whether a file is missing, empty, or exactly as :func:`dump_config` writes it."""
     if not os.path.lexists(path):
         return True
     try:
         if path.stat().st_size == 0:
             return True
-        load_config(path)  # of a bounded size, without aliases
+        load_config(path)  # limits size and aliases
         text = read_text(path, "configuration", MAX_CONFIG_BYTES)
     except (UserError, OSError):
         return False
@@ -296,9 +290,9 @@ def _data_paths(config: FitConfig) -> dict[str, Path | None]:
 
 
 def _differences_of_run(folder: Path, config: FitConfig) -> str:
-    """Return in words how the run in ``folder`` differs from that of ``config``; empty: it is it.
+    """Describe the differences between the run in ``folder`` and ``config``; empty: none.
 
-    Values that one of them leaves to the dataset are taken from the other.
+    Values that one leaves to the dataset are taken from the other.
     """
     try:
         with warnings.catch_warnings():

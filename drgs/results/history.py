@@ -25,15 +25,15 @@ class HistoryRow:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """Changes that one call of a strategy of density made to the rows."""
+    """Changes of the rows by one call of a density strategy."""
 
     num_gaussians: int  # afterwards
-    num_added: int = 0  # rows on top of those before, parents of a split not counted
-    cloned: int = 0  # Gaussians that were copied
-    split: int = 0  # Gaussians that were replaced by several
-    relocated: int = 0  # rows that became copies of others
-    pruned: int = 0  # rows that were removed, parents of a split not counted
-    refused: int = 0  # Gaussians that were to be cloned or split, but there was no room
+    num_added: int = 0  # new rows, without split parents
+    cloned: int = 0  # copied Gaussians
+    split: int = 0  # Gaussians replaced by several
+    relocated: int = 0  # rows replaced by copies of others
+    pruned: int = 0  # removed rows, without split parents
+    refused: int = 0  # Gaussians not cloned or split because of the limit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,6 @@ class DensityRow(DensityReport):
 
 
 DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport)))
-"""Columns of ``density.csv``."""
 
 
 @dataclass(eq=False)
@@ -60,17 +59,18 @@ def write_history(path: Path, history: Sequence[HistoryRow]) -> None:
     rows = [
         [f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()] for row in history
     ]
-    _write_table(path, HistoryRow.__dataclass_fields__, rows)
+    write_csv(path, HistoryRow.__dataclass_fields__, rows)
 
 
 def write_density(path: Path, changes: Sequence[DensityRow]) -> None:
     """Write ``density.csv`` if there are changes."""
     if changes:
         rows = [[getattr(change, name) for name in DENSITY_COLUMNS] for change in changes]
-        _write_table(path, DENSITY_COLUMNS, rows)
+        write_csv(path, DENSITY_COLUMNS, rows)
 
 
-def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a table; missing parent folders are created."""
     with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
@@ -78,10 +78,7 @@ def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[obj
 
 
 def summarize_density(strategy: str, changes: Sequence[DensityRow]) -> str | None:
-    """Return in one line how the population changed; None: it has not.
-
-    strategy: ``densify.strategy``.
-    """
+    """Summarize the changes of ``densify.strategy`` in one line; None without changes."""
     if not changes:
         return None
     first, end = changes[0], changes[-1].num_gaussians

@@ -1,7 +1,6 @@
-"""Image quality as papers report it: PSNR and SSIM in float64 numpy.
+"""Image quality: PSNR and SSIM of (H, W, 3) images in display space, float64 numpy.
 
-Reads finished images on the host, (H, W, 3) in display space, and shares no code with
-``drgs.training.losses``: one checks the other. Not differentiated.
+Shares no code with ``drgs.training.losses``: one checks the other. Not differentiated.
 """
 
 from __future__ import annotations
@@ -41,13 +40,13 @@ class SplitMetrics(TypedDict):
 
 
 class Circumstances(TypedDict):
-    """The entries of ``metrics.json`` about the machine, the time and the software."""
+    """Entries of ``metrics.json`` about machine, time and software."""
 
     versions: dict[str, str]
     variant: str
     threads: int
     processor: str
-    date: str  # when the results were written: ISO 8601, local time
+    date: str  # of the results: ISO 8601, local time
 
 
 class FitMetrics(Circumstances):
@@ -55,12 +54,12 @@ class FitMetrics(Circumstances):
 
     iterations: int
     num_gaussians: int
-    wall_s: float  # spent on iterations
+    wall_s: float  # of the iterations
     test: SplitMetrics
-    viewers: NotRequired[SplitMetrics]  # of the file for viewers, rendered as these do
+    viewers: NotRequired[SplitMetrics]  # of the file for viewers, in their rendering
     seed: int
-    command: str  # the line that was typed
-    config: dict[str, Any]  # as YAML has it
+    command: str  # command line
+    config: dict[str, Any]  # YAML values
 
 
 def psnr(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -83,7 +82,7 @@ def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
     """
     x, y = _prepare("ssim()", image, target)
     similarity = np.empty_like(x)
-    for channel in range(3):  # one at a time: temporaries are what takes memory
+    for channel in range(3):  # one at a time: temporaries take memory
         similarity[:, :, channel] = _ssim_map(x[:, :, channel], y[:, :, channel], mask)
     return float(_mean(similarity, mask))
 
@@ -104,16 +103,15 @@ def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarra
 def mean_quality(
     pairs: Iterable[tuple[ArrayLike, ArrayLike] | tuple[ArrayLike, ArrayLike, ArrayLike | None]],
 ) -> Quality:
-    """Return the means over views of PSNR and SSIM, each view weighing the same.
+    """Return unweighted means over views of PSNR and SSIM.
 
-    pairs: (image, target) of each view, perhaps its mask; may be a generator, one view is held at a
-    time.
+    pairs: (image, target[, mask]) of each view; may be a generator.
     """
     return mean_of([(psnr(x, y, *mask), ssim(x, y, *mask)) for x, y, *mask in pairs])
 
 
 def mean_of(scores: Sequence[tuple[float, float]]) -> Quality:
-    """Return the means over views of (PSNR, SSIM); of at least one view."""
+    """Return the means of at least one view's (PSNR, SSIM)."""
     if not scores:
         raise ValueError("mean_quality(): needs at least one view, got none")
     mean_psnr, mean_ssim = np.mean(scores, axis=0)

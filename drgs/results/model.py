@@ -1,4 +1,4 @@
-"""Gaussians with the settings to render them, and the folder into which they are rendered."""
+"""Gaussians with their rendering settings, and the output folder of their images."""
 
 from __future__ import annotations
 
@@ -30,32 +30,29 @@ from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
 from drgs.results.folder import relocate_data
 from drgs.results.refined_cameras import refined_dataset
 
-Background = tuple[float, float, float] | Path
-"""Display space; or a file with an image."""
+Background = tuple[float, float, float] | Path  # display space, or an image file
 
 Render = Callable[..., Iterator[np.ndarray]]
 """Yields images (H, W, 3) of a scene and views: ``render_views``, or several processes."""
 
 COMMAND = "render"
-
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
-"""Suffixes, in small letters, of a dataset's files."""
 
 Image = TypeVar("Image")
 
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """The folder that a command renders into; see :func:`open_image_folder`."""
+    """An output folder of images; see :func:`open_image_folder`."""
 
     path: Path
     keep: Callable[[], object]  # see :func:`drgs.core.folders.sole_writer`
 
     def claim(self, names: Iterable[str], images: Iterable[Image]) -> Iterator[Image]:
-        """Yield the images after the files ``names`` were claimed for them.
+        """Yield the images after claiming the files ``names``.
 
-        Raises :class:`UserError`, before the first image is made, where one of these files is there
-        and was not rendered.
+        Raises :class:`UserError` before the first image if one of the files exists and was not
+        rendered.
         """
         names, record = list(names), FolderRecord(self.path, COMMAND)
         record.check(names)
@@ -66,7 +63,7 @@ class ImageFolder:
             yield image
 
     def check_no_photographs(self, dataset: Path) -> None:
-        """Raise :class:`UserError` where the folder contains images of the folder ``dataset``."""
+        """Raise :class:`UserError` if the folder contains images of the folder ``dataset``."""
         if not self.path.is_dir() or not self.path.resolve().is_relative_to(dataset.resolve()):
             return
         images = [n for n in sorted(os.listdir(self.path)) if n.lower().endswith(PHOTOGRAPHS)]
@@ -84,7 +81,7 @@ def open_image_folder(path: Path) -> Iterator[ImageFolder]:
         try:
             yield ImageFolder(path, keep)
         finally:
-            with suppress(UserError):  # a full disk: all are still known to be ours
+            with suppress(UserError):  # on a full disk, the claims remain
                 record = FolderRecord(path, COMMAND)
                 if record.exists:
                     keep()  # or it is another command's
@@ -93,15 +90,15 @@ def open_image_folder(path: Path) -> Iterator[ImageFolder]:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Gaussians, and how they are rendered."""
+    """Gaussians and their rendering settings."""
 
     gaussians: Gaussians
     settings: ModelConfig
     background: Background
     config: FitConfig | None  # names the dataset
-    ignored: str = ""  # effects that are not simulated: see the plugin
-    folder: Path | None = None  # of the file, perhaps with refined cameras
-    from_header: Collection[str] = ()  # names of the settings that the file has decided
+    ignored: str = ""  # effects not simulated: see the plugin
+    folder: Path | None = None  # of the file, with optional refined cameras
+    from_header: Collection[str] = ()  # names of settings from the file's header
     render: Render = render_views
 
     def scene(self) -> mi.Scene:
@@ -112,10 +109,9 @@ class Model:
     def images(
         self, views: Sequence[Viewpoint], folder: ImageFolder, others: Sequence[str], remedy: str
     ) -> Iterator[np.ndarray]:
-        """Return images (H, W, 3) of the views, after a summary of what is simulated in them.
+        """Print a summary of the simulated effects; return images (H, W, 3) of the views.
 
-        A PNG file for each, and ``others``, may be written into ``folder``. remedy: for images that
-        are too large.
+        Claims a PNG file per view, and ``others``, in ``folder``. remedy: for too large images.
         """
         check_sizes(views, remedy)
         if "distortion" not in self.ignored:
@@ -129,7 +125,7 @@ class Model:
         return folder.claim(names, self.render(scene, views))
 
     def dataset(self, option: str) -> Dataset:
-        """Return the photographs, without which ``option`` is impossible."""
+        """Return the photographs that ``option`` requires."""
         if self.config is None:
             raise UserError(
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
@@ -158,8 +154,8 @@ def load_model(
 ) -> Model:
     """Load a file of Gaussians or the output folder of a fit.
 
-    scene: a configuration file; None: that of the folder, if it is one. overrides: of its values,
-    KEY=VALUE. background: None: the configuration's; black without one.
+    scene: a configuration file; None: the folder's. overrides: KEY=VALUE. background: None: the
+    configuration's, or black.
     """
     path, config_path = what, scene
     if what.is_dir():
@@ -179,7 +175,7 @@ def load_model(
     else:
         settings = ModelConfig(near=near_plane_of(gaussians)).of_file()
         default_background = NAMED_COLORS["black"]
-    # The user decides first; a configuration may only name the photographs.
+    # Precedence: overrides, the file's header, the configuration.
     given = {override.partition("=")[0].strip() for override in overrides}
     header = (gaussians.rendered_with or {}).items()
     values = from_ply_header(
@@ -200,9 +196,9 @@ def load_model(
 def load_open_config(
     path: Path, overrides: Sequence[str], background: Background | None
 ) -> FitConfig:
-    """Load a configuration, and complete one that leaves values to the data."""
+    """Load a configuration, and resolve its defaults from the data."""
     if background is not None and not isinstance(background, Path):
-        # Photographs with alpha are composited over it as well.
+        # Also composites photographs with alpha.
         overrides = [*overrides, f"data.background={list(background)}"]
     config = load_config(path, overrides)
     config = config.model_copy(update={"model": config.model.of_file()})

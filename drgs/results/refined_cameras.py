@@ -1,4 +1,4 @@
-"""Cameras in a fit's folder: refined ones, and those of the data; both as ``transforms.json``."""
+"""Refined and original cameras in a fit's folder, in the layout of ``transforms.json``."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ MODELS = {
     "fisheye": "OPENCV_FISHEYE",
     "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
 }
-"""COLMAP's names of lenses; others have the name under which they are registered."""
+"""COLMAP's lens names; other lenses have their registered names."""
 
 
 @dataclass(frozen=True)
 class LensChange:
-    """The refinement of the lens that all cameras share."""
+    """A refinement of the lens shared by all cameras."""
 
     focal: tuple[float, float] = (1.0, 1.0)  # factors of fx and fy
-    principal: tuple[float, float] = (0.0, 0.0)  # shift, in widths and heights of the image
+    principal: tuple[float, float] = (0.0, 0.0)  # shift in image widths and heights
 
     def apply(self, view: View) -> View:
         """Return the view with this lens."""
@@ -46,7 +46,7 @@ class LensChange:
 
 
 def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
-    """Return a dataset with the refined cameras in ``folder``; unchanged if there are none."""
+    """Return a dataset with the refined cameras in ``folder``, if any."""
     path = folder / CAMERAS
     if not path.is_file():
         return dataset
@@ -66,7 +66,7 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
 
 
 def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
-    """Return the training cameras as the fit in ``folder`` has refined them; None: it has not.
+    """Return the refined training cameras of the fit in ``folder``, or None.
 
     origin: of their positions, world. Raises :class:`UserError` as ``read_viewpoints``.
     """
@@ -77,10 +77,7 @@ def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
 
 
 def training_cameras(folder: Path, origin: Origin) -> list[Viewpoint] | None:
-    """Return the training cameras of the fit in ``folder``, refined or not; None: there are none.
-
-    See :func:`refined_viewpoints`.
-    """
+    """Return the training cameras, refined if possible; see :func:`refined_viewpoints`."""
     if (refined := refined_viewpoints(folder, origin)) is not None:
         return refined
     return _read_relative(folder / VIEWS, origin) if (folder / VIEWS).is_file() else None
@@ -95,7 +92,7 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
 
 
 def _with_pose(view: View, camera_to_world: np.ndarray) -> View:
-    """Return the view with another pose; both poses of a moving camera are moved alike."""
+    """Return the view with another pose; both poses of a moving camera change alike."""
     motion = view.motion
     if motion is not None:
         between = np.linalg.solve(view.camera_to_world, motion.close_to_world)
@@ -106,7 +103,7 @@ def _with_pose(view: View, camera_to_world: np.ndarray) -> View:
 def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
     """Return cameras in the layout of ``transforms.json``, in world coordinates.
 
-    origin: of the views' positions, world; recorded where it is not the world's.
+    origin: of the views' positions, world; recorded if not zero.
     """
     recorded = {"origin": list(origin)} if origin != WORLD else {}
     frames = [
@@ -123,7 +120,7 @@ def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
 
 
 def write_views(path: Path, dataset: Dataset) -> None:
-    """Write the cameras of the training views as the data has them."""
+    """Write the dataset's cameras of the training views."""
     with atomic_path(path) as temporary:
         content = cameras_json(dataset.train, dataset.origin)
         temporary.write_text(json.dumps(content, indent=1) + "\n")

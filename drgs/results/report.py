@@ -1,7 +1,4 @@
-"""The report of a fit: comparisons, curves, an orbit, and a page with all of it.
-
-A fit calls :func:`write_images` and :func:`write_results` at its end.
-"""
+"""The report of a fit: comparisons, curves, an orbit, and one page with all of them."""
 
 from __future__ import annotations
 
@@ -51,18 +48,14 @@ from drgs.results.viewer import DisplaySettings, seconds_of_page, write_viewer
 DIFFERENCE_GAIN = 5.0
 """Gain of difference images, 0.5 + gain (fitted - truth): they saturate at 10 % of the range."""
 
-IMAGE_GAP_PX = 4  # px between the images of a comparison, white
-
+IMAGE_GAP_PX = 4  # white, between the images of a comparison
 ORBIT_FRAMES = 60
+PANEL_WIDTH_PX = 360  # maximum width of an image in the page's comparisons
 
-PANEL_WIDTH = 360  # px: largest width of an image of a comparison in the page
-
-PANEL_QUALITY = {"lossless": True, "quality": 60, "method": 2}
+PANEL_ENCODING = {"lossless": True, "quality": 60, "method": 2}
 """Lossy coding leaves a haze around objects before a white background."""
 
-TRIED_SECONDS = 0.2
-"""Least time for which a view is tried out: one image of a few milliseconds tells little."""
-
+MIN_TRIAL_SECONDS = 0.2  # for averaging renders of a few milliseconds
 FILES_SECONDS = 0.3  # time of the other files, measured with 50,000 Gaussians
 
 Render = Callable[[tuple[View, ...]], Iterable[np.ndarray]]
@@ -79,7 +72,7 @@ class Score(NamedTuple):
 def write_images(
     out: Path, dataset: Dataset, render: Render, with_renders: bool, with_comparisons: bool
 ) -> list[Score]:
-    """Score the test views, and write ``renders/`` and ``side_by_side/`` if wanted."""
+    """Score the test views, and write ``renders/`` and ``side_by_side/`` if requested."""
     scores, split = [], dataset.test_split
     for view, image in zip(dataset.test, render(dataset.test), strict=True):
         if with_renders:
@@ -92,7 +85,7 @@ def write_images(
 
 @dataclass(frozen=True, eq=False)
 class FitImages:
-    """The result of a fit."""
+    """Renderer inputs of a finished fit."""
 
     scene: mi.Scene  # renders ``gaussians``, in display space
     gaussians: Gaussians
@@ -110,7 +103,7 @@ def write_results(
 ) -> None:
     """Write ``curves.png``, ``orbit.webp`` and ``.gif``, ``viewer.html``, ``report.html``.
 
-    scores: of the test views, in their order.
+    scores: of the test views, in order.
     """
     write_curves(out / CURVES, history)
     orbit = orbit_of_views(dataset.train, fitted.gaussians)
@@ -133,13 +126,13 @@ class Seconds(NamedTuple):
 def seconds_of_results(
     scene: mi.Scene, dataset: Dataset, num_gaussians: int, sh_degree: int
 ) -> Seconds:
-    """Estimate the time of the results without curves by trying out one test view.
+    """Estimate the time of the results without curves by timing one test view.
 
     num_gaussians, sh_degree: of the final Gaussians.
     """
     _seconds_of_view(scene, dataset.test[0])  # loads kernels and libraries
     tried = [_seconds_of_view(scene, dataset.test[0])]
-    while sum(map(sum, tried)) < TRIED_SECONDS:
+    while sum(map(sum, tried)) < MIN_TRIAL_SECONDS:
         tried.append(_seconds_of_view(scene, dataset.test[0]))
     rendered, scored, written, compared, encoded = np.median(tried, axis=0).tolist()
     views = len(dataset.test)
@@ -162,7 +155,7 @@ def _seconds_of_view(scene: mi.Scene, view: View) -> tuple[float, ...]:
         lambda: score(image, view),
         lambda: encode(image, "png"),
         lambda: encode(side_by_side(image, view), "png"),
-        lambda: encode(image, "webp", **PANEL_QUALITY),
+        lambda: encode(image, "webp", **PANEL_ENCODING),
     ):
         step()
         clock.append(time.perf_counter())
@@ -170,11 +163,11 @@ def _seconds_of_view(scene: mi.Scene, view: View) -> tuple[float, ...]:
 
 
 def seconds_of_curves() -> float:
-    """Estimate the time of all curves, in the page and in ``curves.png``, by trying out two."""
+    """Estimate the time of all curves, in the page and in ``curves.png``, by timing two."""
     x = np.linspace(1.0, 100.0, 1000)
     log, linear = (Panel("", x, x, scale=scale, noisy=True) for scale in ("log", "linear"))
     _seconds_of_curve(log)  # loads libraries and fonts
-    # A third of the curves are logarithmic, whose labels take longer.
+    # A third of the curves are logarithmic, with slower labels.
     mean = (_seconds_of_curve(log) + 2 * _seconds_of_curve(linear)) / 3
     return NUM_PANELS * mean * (1 + len(THEMES))
 
@@ -192,7 +185,7 @@ def side_by_side(image: np.ndarray, view: View) -> np.ndarray:
 
 
 def difference(image: np.ndarray, view: View) -> np.ndarray:
-    """Return 0.5 + 5 (fitted - truth), clipped; 0.5 where pixels do not count."""
+    """Return 0.5 + 5 (fitted - truth), clipped; 0.5 in masked pixels."""
     values = image - view.image
     if view.mask is not None:
         values = values * view.mask[..., None]
@@ -215,9 +208,9 @@ def write_report(
     metrics: FitMetrics,
     orbit: bytes,
 ) -> None:
-    """Write one HTML file, which needs no network; only its links lead to files beside it.
+    """Write a self-contained HTML file; only its links refer to files beside it.
 
-    scores: of the test views, in their order; orbit: the bytes of an animated WebP.
+    scores: of the test views, in order; orbit: the bytes of an animated WebP.
     """
     chosen, has_viewer = choose_views([s.psnr for s in scores]), path.with_name(VIEWER).is_file()
     template = resources.files("drgs.results").joinpath("page.html").read_text("utf-8")
@@ -250,7 +243,7 @@ def write_report(
 
 
 def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
-    """Return (label, index) of the best, the median and the worst view; of all if they are few."""
+    """Return (label, index) of the best, median and worst view; of all if fewer than three."""
     order = sorted(range(len(scores)), key=lambda index: -scores[index])
     if len(order) < 3:
         return [("View", index) for index in order]
@@ -258,7 +251,7 @@ def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
 
 
 def _headline(metrics: FitMetrics) -> list[tuple[str, str, str]]:
-    """Return (value, unit, label) of the four numbers at the top."""
+    """Return (value, unit, label) of the headline numbers."""
     test = metrics["test"]
     return [
         (f"{test['psnr']:.2f}", "dB", f"PSNR, mean of {test['num_views']} {test['split']} views"),
@@ -288,7 +281,7 @@ def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[t
 
 
 def _viewers(metrics: FitMetrics) -> str:
-    """Return which file splat viewers can open, as HTML."""
+    """Return HTML about the file for splat viewers."""
     if "viewers" not in metrics:
         return "splat viewers read it"
     link = f'<a href="{GAUSSIANS_FOR_VIEWERS}" download>{GAUSSIANS_FOR_VIEWERS}</a>'
@@ -313,7 +306,7 @@ def _comparison(dataset: Dataset, render: Render, label: str, index: int, score:
     panels = {"Fitted": image, _truth(dataset): view.image, "Difference": difference(image, view)}
     renders = "".join(
         f'<div><img alt="{name} {html.escape(view.name)}" '
-        f'src="{_data_uri(downscale(np.clip(rendered, 0, 1), PANEL_WIDTH), **PANEL_QUALITY)}">'
+        f'src="{_data_uri(downscale(np.clip(rendered, 0, 1), PANEL_WIDTH_PX), **PANEL_ENCODING)}">'
         f"<span>{name}</span></div>"
         for name, rendered in panels.items()
     )
@@ -327,7 +320,7 @@ def _truth(dataset: Dataset) -> str:
 
 
 def _curve(panel: Panel) -> str:
-    """Return a curve for a light and a dark page."""
+    """Return HTML of a curve in light and dark themes."""
     light, dark = (
         _data_uri(pixels_of(draw_curve(panel, theme)), lossless=True) for theme in THEMES
     )

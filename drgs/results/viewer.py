@@ -1,12 +1,9 @@
-"""``viewer.html``: Gaussians to walk around in, on one page that opens from disk.
+"""``viewer.html``: an interactive page of Gaussians that opens from disk.
 
-The page contains PlayCanvas's supersplat-viewer, whose files lie in ``supersplat_viewer/`` with
-their licence (``.ci/viewer.py`` fetches them for releases), and the Gaussians as a compressed PLY.
-It renders by WebGL 2, and its security policy lets it open no connection.
-
-It renders with the low-pass filter of the fit, and its compensation of opacities, for which
-``supersplat_viewer/MANIFEST.json`` lists the changes in the viewer; :func:`shows_as_fitted` tells
-whether Gaussians need more.
+The page contains the Gaussians as a compressed PLY and PlayCanvas's supersplat-viewer, whose files
+and licence are in ``supersplat_viewer/`` (``.ci/viewer.py`` fetches them for releases). It renders
+by WebGL 2 with the fit's low-pass filter and opacity compensation, for which ``MANIFEST.json``
+there lists the changes in the viewer. Its security policy forbids connections.
 """
 
 from __future__ import annotations
@@ -38,17 +35,14 @@ from drgs.results.files import VIEWER
 from drgs.results.refined_cameras import refined_viewpoints
 
 MAX_PAGE_BYTES = 25_000_000
-"""Largest page that is written without being asked for, as mail services take it: half a million
-Gaussians of degree 3. Chromium opens a million in 5 s on two cores without a graphics card."""
+"""Maximum size of a fit's page, a usual limit of mail attachments: half a million Gaussians of
+degree 3. Chromium opens a million in 5 s on two cores without a graphics card."""
 
-MIN_GZIP_RATIO = 0.5
-"""Part of a compressed PLY that gzip leaves at least: 0.55 to 0.61 of fits' Gaussians."""
-
-SECONDS_PER_BYTE = 0.2e-6
-"""Time to make the page, per byte of a compressed PLY: 0.15e-6 to 0.2e-6 on two cores (Zen 4)."""
+MIN_GZIP_RATIO = 0.5  # of a compressed PLY; measured: 0.55 to 0.61 for fits
+SECONDS_PER_BYTE = 0.2e-6  # of a compressed PLY; measured: 0.15e-6 to 0.2e-6 on two cores (Zen 4)
 
 HONOURED = frozenset({"low_pass", "antialiased"})
-"""Approximations that the page renders with; of the others it has its own."""
+"""Approximations that the page supports."""
 
 PAGE_DISTANCE = 3.0
 """Distance from the first camera to its target in units of the page, where scales are kept in 8
@@ -57,22 +51,22 @@ bits from 6e-6 to 8e3 and the nearest that one can come is 0.01."""
 MIN_TARGET_DEPTH = 0.1  # least depth of the target in the first camera, in radii of the orbit
 GZIP_LEVEL = 4  # level 9 takes six times as long for 1.6 % less
 
-FILE_AXES = np.diag([-1.0, -1.0, 1.0])
+PAGE_TO_FILE_AXES = np.diag([-1.0, -1.0, 1.0])
 """Rotation from the page's axes (x right, y up, z backward) to those of its PLY."""
 
 
 @dataclass(frozen=True, eq=False)
 class InitialView:
-    """The first camera of the page, and the orbit around which one walks."""
+    """The initial camera of the page and its orbit."""
 
     camera: Viewpoint
     orbit: Orbit
 
     @staticmethod
     def from_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> InitialView:
-        """Return the training camera that is the nearest in direction to where orbits start.
+        """Return the training camera nearest in direction to the orbit's start.
 
-        gaussians: tell the middle, where no cameras do.
+        gaussians: define the orbit's centre if the cameras do not.
         """
         orbit = orbit_of_views(views, gaussians)
         level, height = math.cos(orbit.elevation), math.sin(orbit.elevation)
@@ -84,23 +78,22 @@ class InitialView:
 
     @staticmethod
     def from_gaussians(gaussians: Gaussians, up: np.ndarray) -> InitialView:
-        """Return a camera with all but outliers in a square window; up: (3,) world, any length."""
+        """Return a camera that frames all but outliers; up: (3,) world, any length."""
         orbit = orbit_of_gaussians(gaussians, up, FIELD_OF_VIEW)
         (camera,) = orbit.viewpoints(1, 1, 1, FIELD_OF_VIEW)
         return InitialView(camera, orbit)
 
     @property
     def target(self) -> np.ndarray:
-        """Point (3,), world, on the camera's optical axis that is nearest to the focus.
+        """The point (3,) of the optical axis nearest to the focus, world.
 
-        Where that is behind the camera or next to it: the point at the orbit's radius.
+        If that is behind or near the camera, the point at the orbit's radius.
         """
         forward = self.camera.camera_to_world[:3, 2]
         depth = (self.orbit.focus - self.camera.center) @ forward
         radius = self.orbit.radius or 1.0
-        return (
-            self.camera.center + (depth if depth > MIN_TARGET_DEPTH * radius else radius) * forward
-        )
+        distance = depth if depth > MIN_TARGET_DEPTH * radius else radius
+        return self.camera.center + distance * forward
 
     @property
     def to_page(self) -> Similarity:
@@ -113,14 +106,14 @@ class InitialView:
 
 @dataclass(frozen=True, eq=False)
 class DisplaySettings:
-    """Gaussians on the page, and how they are rendered."""
+    """Gaussians on the page and their approximations."""
 
     gaussians: Gaussians  # numpy or Dr.Jit, without a smoothing filter
     approximations: Approximations  # those of HONOURED count
 
 
 def shows_as_fitted(approximations: Approximations) -> bool:
-    """Return whether the page renders with all of them that are not the default."""
+    """Return whether the page supports all non-default approximations."""
     return approximations.non_default.keys() <= HONOURED
 
 
@@ -132,13 +125,14 @@ def viewer_page(
 ) -> bytes:
     """Return the page, UTF-8; equal arguments give equal bytes.
 
-    background: display space. The camera's roll about the optical axis, principal point and lens
-    are not shown.
+    background: display space. The camera's roll, principal point and lens are ignored.
 
-    Raises ``drgs.core.errors.UserError`` for Gaussians with numbers that are not finite.
+    Raises ``drgs.core.errors.UserError`` for non-finite Gaussians.
     """
     move = initial_view.to_page
-    in_file = Similarity(move.scale, FILE_AXES @ move.rotation, FILE_AXES @ move.translation)
+    in_file = Similarity(
+        move.scale, PAGE_TO_FILE_AXES @ move.rotation, PAGE_TO_FILE_AXES @ move.translation
+    )
     gaussians = replace(shown.gaussians.numpy(), origin=WORLD)  # the page has no world
     splats = in_file.of_gaussians(gaussians).to_bytes("compressed-ply")
     files = resources.files("drgs.results")
@@ -148,31 +142,31 @@ def viewer_page(
         licence=program.joinpath("LICENSE").read_text("utf-8"),
         style=program.joinpath("viewer.css").read_text("utf-8"),
         scene=_in_script(_scene(shown.approximations, initial_view, background)),
-        code=_text(program.joinpath("viewer.js.gz").read_bytes()),
-        splats=_text(gzip.compress(splats, GZIP_LEVEL, mtime=0)),
+        code=_base64(program.joinpath("viewer.js.gz").read_bytes()),
+        splats=_base64(gzip.compress(splats, GZIP_LEVEL, mtime=0)),
     )
     return page.encode("utf-8", "backslashreplace")
 
 
-def least_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Return the least size of a page: its Gaussians, in base64."""
-    return int(4 / 3 * MIN_GZIP_RATIO * _bytes_of_file(num_gaussians, sh_degree))
+def min_page_bytes(num_gaussians: int, sh_degree: int) -> int:
+    """Return a lower bound of a page's size: its Gaussians in base64."""
+    return int(4 / 3 * MIN_GZIP_RATIO * _file_bytes(num_gaussians, sh_degree))
 
 
 def seconds_of_page(num_gaussians: int, sh_degree: int) -> float:
     """Estimate the time of :func:`write_viewer`."""
-    if least_bytes(num_gaussians, sh_degree) > MAX_PAGE_BYTES:
+    if min_page_bytes(num_gaussians, sh_degree) > MAX_PAGE_BYTES:
         return 0.0
-    return SECONDS_PER_BYTE * _bytes_of_file(num_gaussians, sh_degree)
+    return SECONDS_PER_BYTE * _file_bytes(num_gaussians, sh_degree)
 
 
 def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
     """Write the page of a fit into its folder, atomically; it starts at a refined camera, if any.
 
-    A ``UserNote`` tells where it would have more than :data:`MAX_PAGE_BYTES`.
+    Warns with a ``UserNote`` instead if the page would exceed :data:`MAX_PAGE_BYTES`.
     """
     gaussians = shown.gaussians
-    size, least = least_bytes(gaussians.num_gaussians, gaussians.sh_degree), "at least "
+    size, least = min_page_bytes(gaussians.num_gaussians, gaussians.sh_degree), "at least "
     page = b""
     if size <= MAX_PAGE_BYTES:
         views = refined_viewpoints(out, dataset.origin) or dataset.train
@@ -190,17 +184,15 @@ def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
         temporary.write_bytes(page)
 
 
-def _bytes_of_file(num_gaussians: int, sh_degree: int) -> int:
-    """Return the size of a compressed PLY without its header and the bounds of its groups."""
+def _file_bytes(num_gaussians: int, sh_degree: int) -> int:
+    """Return the size of a compressed PLY without header and group bounds."""
     return num_gaussians * (16 + 3 * ((sh_degree + 1) ** 2 - 1))
 
 
 def _scene(
-    approximations: Approximations,
-    view: InitialView,
-    background: tuple[float, float, float],
+    approximations: Approximations, view: InitialView, background: tuple[float, float, float]
 ) -> Mapping[str, object]:
-    """Return the data that the page's script reads."""
+    """Return the input of the page's script."""
     camera, move = view.camera, view.to_page
     position = move.scale * move.rotation @ camera.center + move.translation
     return {
@@ -212,7 +204,7 @@ def _scene(
 
 
 def _settings(position: np.ndarray, background: tuple[float, float, float]) -> Mapping[str, object]:
-    """Return the viewer's settings, version 2, but for the field of view, which windows decide."""
+    """Return the viewer's settings, version 2, without the field of view."""
     off = {"enabled": False}
     return {
         "version": 2,
@@ -234,9 +226,9 @@ def _settings(position: np.ndarray, background: tuple[float, float, float]) -> M
 
 
 def _in_script(values: Mapping[str, object]) -> str:
-    """Return JSON in which no value ends the script element."""
+    """Return JSON that cannot end the script element."""
     return json.dumps(values).replace("<", "\\u003c")
 
 
-def _text(data: bytes) -> str:
+def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")

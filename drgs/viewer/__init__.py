@@ -1,6 +1,5 @@
-"""Pages in a browser that show Gaussians, or a fit that runs, rendered live by this process.
+"""Browser pages that show Gaussians, or a running fit, rendered live by this process.
 
-May import ``training`` and what that may import. ``frames`` renders, ``scheduler`` decides when and
-how large; neither knows a browser. ``page`` and ``training_viewer`` are the pages, which ``server``
-serves with viser.
+May import ``training`` and its dependencies. ``frames`` renders and ``scheduler`` chooses times and
+sizes, both without a browser. ``server`` serves ``page`` and ``training_viewer`` with viser.
 """

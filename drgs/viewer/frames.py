@@ -1,7 +1,7 @@
-"""Frames for viewer clients: what one shows, through which lens, and how it is rendered.
+"""Frames for viewer clients: their contents, lenses and rendering.
 
-A :class:`FrameRequest` is plain data, which any thread may make. :class:`LiveScene` renders it with
-the integrator ``splats``; only the thread that Dr.Jit runs in may call it.
+Any thread may make a :class:`FrameRequest`. Only the Dr.Jit thread may call :class:`LiveScene`,
+which renders it with the integrator ``splats``.
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ MAX_SCENES = 2  # scenes kept, each with a copy of the Gaussians: ``error`` need
 BACKDROP_GRAY = 0.12  # grey behind depths, normals and opacities
 MIN_DEPTH_ALPHA = 0.5  # opacity from which a pixel's depth counts for the range of colours
 DEPTH_RANGE = (2, 98)  # percentiles of these depths at the ends of the colour map
-
 ERROR_GAIN = 5.0
 
 MOST_ACCURATE = {"order": "pixel", "order_window": 16, "alpha_cut": 0.0, "transmittance_stop": 0.0}
-"""Approximations of the image that ``error`` compares with, beside the projection that is the most
-accurate for the lens. Filter and harmonics are the model's own."""
+"""Approximations of the image that ``error`` compares with, besides the lens's most accurate
+projection; filter and harmonics are the model's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ class ViewerCamera:
 
     camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
     fov: float  # degrees, vertical
-    distance: float  # scene units, along the axis, to what the camera turns about
+    distance: float  # scene units, along the axis, to the orbit centre
 
     def viewpoint(self, width: int, height: int) -> Viewpoint:
         """Return the pinhole camera of this field of view, with an image of this size (px)."""
@@ -63,19 +62,19 @@ class FrameRequest:
     width: int  # px
     height: int  # px
     lens: str = "pinhole"  # name in VIEWER_LENSES
-    lens_numbers: Mapping[str, float] = field(default_factory=dict)
-    shows: str = "color"  # name in SHOWN
-    approximations: Approximations | None = None  # None: those that the Gaussians were fitted with
+    lens_parameters: Mapping[str, float] = field(default_factory=dict)
+    content: str = "color"  # name in SHOWN
+    approximations: Approximations | None = None  # None: those of the fit
 
     def smaller(self, divisor: int) -> FrameRequest:
-        """Return the same request with both sides divided by ``divisor``."""
+        """Return the request with width and height divided by ``divisor``."""
         width, height = (max(1, round(side / divisor)) for side in (self.width, self.height))
         return replace(self, width=width, height=height)
 
     def sensor(self) -> mi.Sensor:
         """Return Mitsuba's sensor, whose film is RGB with a box filter."""
         make_sensor = VIEWER_LENSES[self.lens].make_sensor
-        return make_sensor(self.camera, self.width, self.height, **self.lens_numbers)
+        return make_sensor(self.camera, self.width, self.height, **self.lens_parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +83,11 @@ class ViewerFrame:
 
     pixels: np.ndarray  # (H, W, 3) uint8, display space
     seconds: float  # of rendering and the transfer to the host
-    note: str = ""  # meaning of the colours, where they are not those of the scene
+    note: str = ""  # meaning of false colours
 
 
 class LiveScene:
-    """Gaussians that are shown with changing approximations."""
+    """Gaussians rendered with changing approximations."""
 
     def __init__(
         self,
@@ -97,30 +96,29 @@ class LiveScene:
         background: tuple[float, float, float] | Path,
         **settings: object,
     ) -> None:
-        """Take the arguments of :func:`drgs.integrator.scene.make_scene`."""
+        """See :func:`drgs.integrator.scene.make_scene`."""
         self._gaussians, self._model, self._background = gaussians, model, background
         self._settings = settings
         self._scenes: dict[tuple[str, Approximations], mi.Scene] = {}
 
     @property
     def approximations(self) -> Approximations:
-        """The approximations that the Gaussians were fitted with."""
         return self._model.approximations
 
     def frame(self, request: FrameRequest) -> ViewerFrame:
         """Render a frame.
 
-        Raises :class:`drgs.core.errors.UserError` for settings that do not go together, such as an
-        exact projection through a lens that bends rays.
+        Raises :class:`drgs.core.errors.UserError` for incompatible settings, such as an exact
+        projection through a distorting lens.
         """
-        return SHOWN[request.shows](self, request)
+        return FRAME_CONTENTS[request.content](self, request)
 
     def image(self, request: FrameRequest, aovs: str = "") -> tuple[np.ndarray, float]:
         """Return (H, W, 3 + channels of ``aovs``) float32, display space, and the seconds taken."""
         scene = self._scene(aovs, request.approximations or self.approximations)
         start = time.perf_counter()
         with dr.suspend_grad():
-            # mi.render would hide the reason of an error.
+            # mi.render hides the cause of an error.
             image = np.array(scene.integrator().render(scene, request.sensor(), spp=1))
         return image, time.perf_counter() - start
 
@@ -139,7 +137,7 @@ class LiveScene:
 
 
 # ----------------------------------------------------------------------------------------------
-# What a frame shows
+# Frame contents
 # ----------------------------------------------------------------------------------------------
 
 
@@ -159,9 +157,8 @@ def _depth(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     depth = depth / np.maximum(alpha, 1e-6)
     seen = depth[alpha >= MIN_DEPTH_ALPHA]
     if not len(seen):
-        return ViewerFrame(
-            to_bytes(np.full((*depth.shape, 3), BACKDROP_GRAY)), seconds, "nothing is seen"
-        )
+        backdrop = np.full((*depth.shape, 3), BACKDROP_GRAY)
+        return ViewerFrame(to_bytes(backdrop), seconds, "nothing is seen")
     near, far = (float(end) for end in np.percentile(seen, DEPTH_RANGE))
     place = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
     colors = colormaps["turbo"](place)[:, :, :3]
@@ -173,9 +170,8 @@ def _normals(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     normal, alpha = image[:, :, 3:6], image[:, :, 6]
     length = np.linalg.norm(normal, axis=2, keepdims=True)
     colors = 0.5 + 0.5 * normal / np.maximum(length, 1e-9)
-    return ViewerFrame(
-        over_backdrop(colors, alpha), seconds, "x, y, z of the world as red, green, blue"
-    )
+    note = "x, y, z of the world as red, green, blue"
+    return ViewerFrame(over_backdrop(colors, alpha), seconds, note)
 
 
 def _error(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
@@ -184,21 +180,20 @@ def _error(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     projection = VIEWER_LENSES[request.lens].most_accurate
     best = replace(given, projection=projection, **MOST_ACCURATE)
     accurate, accurate_seconds = scene.image(replace(request, approximations=best))
-    distance = psnr(image, accurate)
-    compared = "the same as" if math.isinf(distance) else f"PSNR {distance:.1f} dB to"
-    note = f"{compared} the most accurate image, which took {1e3 * accurate_seconds:.0f} ms"
+    quality = psnr(image, accurate)
+    comparison = "the same as" if math.isinf(quality) else f"PSNR {quality:.1f} dB to"
+    note = f"{comparison} the most accurate image, which took {1e3 * accurate_seconds:.0f} ms"
     return ViewerFrame(to_bytes(0.5 + ERROR_GAIN * (image - accurate)), seconds, note)
 
 
-SHOWN: dict[str, Callable[[LiveScene, FrameRequest], ViewerFrame]] = {
+FRAME_CONTENTS: dict[str, Callable[[LiveScene, FrameRequest], ViewerFrame]] = {
     "color": _color,
     "depth": _depth,
     "normals": _normals,
     "opacity": _opacity,
     "error": _error,
 }
-"""Contents of a frame by name. ``error`` is 0.5 + 5 times the difference from the most accurate
-image, in display space."""
+"""By name; ``error`` is 0.5 + 5 x the difference from the most accurate image, display space."""
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
@@ -222,35 +217,32 @@ def over_backdrop(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 class ViewerLens:
     """A lens that viewer clients can choose."""
 
-    make_sensor: Callable[..., mi.Sensor]  # of a ViewerCamera, width, height (px) and the numbers
-    numbers: tuple[str, ...] = ()  # names of those that have a control
-    most_accurate: str = "exact"  # projection: ``exact`` needs straight rays through one point
+    make_sensor: Callable[..., mi.Sensor]  # (ViewerCamera, width, height (px), **parameters)
+    parameters: tuple[str, ...] = ()  # names of those with a slider
+    most_accurate: str = "exact"  # projection; ``exact`` needs undistorted rays through one point
 
 
 def _pinhole(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
-    (sensor,) = make_sensors([camera.viewpoint(width, height)])
-    return sensor
+    return make_sensors([camera.viewpoint(width, height)])[0]
 
 
 def _opencv(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
     lens = LENSES.get("opencv").value.from_coefficients(**coefficients)
-    (sensor,) = make_sensors([replace(camera.viewpoint(width, height), lens=lens)])
-    return sensor
+    return make_sensors([replace(camera.viewpoint(width, height), lens=lens)])[0]
 
 
 def _fisheye(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
-    """Return a sensor whose film is as high as the field of view, where nothing is distorted."""
+    """Return a sensor whose undistorted film height spans the field of view."""
     lens = LENSES.get("fisheye").value.from_coefficients(**coefficients)
     focal = height / math.radians(camera.fov)
     view = replace(camera.viewpoint(width, height), fx=focal, fy=focal, lens=lens)
-    (sensor,) = make_sensors([view])
-    return sensor
+    return make_sensors([view])[0]
 
 
 def _orthographic(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
     half_height = camera.distance * math.tan(math.radians(camera.fov) / 2)
     half_width = half_height * width / height
-    # Mitsuba's film is two units of the sensor's own wide.
+    # Mitsuba's film is two sensor units wide.
     scale = np.diag([half_width, half_width, 1.0, 1.0])
     return _mitsuba_sensor(camera, width, height, scale, type="orthographic")
 
@@ -258,8 +250,8 @@ def _orthographic(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
 def _thin_lens(
     camera: ViewerCamera, width: int, height: int, aperture: float, focus: float = 1.0
 ) -> mi.Sensor:
-    """Return a thin lens; aperture: radius; both in units of the distance to the target."""
-    if aperture == 0:  # Mitsuba would warn of each frame
+    """Return a thin lens; aperture (radius) and focus are in units of the target's distance."""
+    if aperture == 0:  # Mitsuba warns at every frame
         return _pinhole(camera, width, height)
     return _mitsuba_sensor(
         camera,
@@ -277,7 +269,7 @@ def _thin_lens(
 def _mitsuba_sensor(
     camera: ViewerCamera, width: int, height: int, scale: np.ndarray, **settings: object
 ) -> mi.Sensor:
-    """Return a sensor of Mitsuba's; scale: (4, 4), of its axes."""
+    """scale: (4, 4), of the sensor's axes."""
     to_world = camera.camera_to_world @ OPENCV_TO_MITSUBA @ scale
     return mi.load_dict(
         {

@@ -1,6 +1,6 @@
-"""A page with an image that follows the camera of each client, and controls for what it shows.
+"""A page with an image rendered for each client's camera, and its controls.
 
-Server threads read the controls and queue requests; images come from the thread that renders.
+Server threads read the controls and queue requests; the render thread sends images.
 """
 
 from __future__ import annotations
@@ -18,7 +18,13 @@ from drgs.core.errors import UserError, one_line
 from drgs.datasets.orbits import up_of
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import focus_of, look_at
-from drgs.viewer.frames import SHOWN, VIEWER_LENSES, FrameRequest, ViewerCamera, ViewerFrame
+from drgs.viewer.frames import (
+    FRAME_CONTENTS,
+    VIEWER_LENSES,
+    FrameRequest,
+    ViewerCamera,
+    ViewerFrame,
+)
 from drgs.viewer.scheduler import RenderRequests
 
 if TYPE_CHECKING:
@@ -28,36 +34,35 @@ if TYPE_CHECKING:
 
 Control = TypeVar("Control", bound="viser.GuiInputHandle[Any]")
 
-EventHandler = Callable[[object], Coroutine[None, None, None]]
-"""Handles an event of viser's in its event loop."""
+EventHandler = Callable[[object], Coroutine[None, None, None]]  # runs in viser's event loop
 
-JPEG_QUALITY = {False: 70, True: 92}  # quality of images of a moving camera, and of whole ones
-MAX_FRUSTUMS = 200  # training cameras that are drawn, spread over all of them
-FRUSTUM_SIZE = 0.04  # size of a frustum in distances from the first camera to its target
+JPEG_QUALITY = {False: 70, True: 92}  # by "is full resolution"
+MAX_FRUSTUMS = 200  # number of training cameras drawn, evenly spaced
+FRUSTUM_SIZE = 0.04  # in distances from the first camera to its target
 
-CONTROLLED = (
+ADJUSTABLE_APPROXIMATIONS = (
     *("projection", "order", "order_window", "sh_direction"),
     *("alpha_cut", "transmittance_stop", "low_pass", "antialiased"),
 )
-"""Approximations with a control. ``extent`` may be infinite, which no field of numbers takes, and
-``alpha_max`` is a part of the model rather than of how it is approximated."""
+"""Approximations with a control. No number field accepts an infinite ``extent``, and ``alpha_max``
+is a part of the model."""
 
-SLIDERS = {
+LENS_SLIDERS = {
     "angle": (30.0, 220.0, 1.0, 90.0),
     "k1": (-0.5, 0.5, 0.01, 0.0),
     "k2": (-0.5, 0.5, 0.01, 0.0),
     "aperture": (0.0, 0.2, 0.002, 0.03),
     "focus": (0.3, 3.0, 0.01, 1.0),
 }
-"""Least, largest, step and first value of a lens's numbers. The angle is a fisheye's, in degrees,
-vertical; k1 and k2 are OpenCV's; the rest is in units of the distance to the camera's target."""
+"""Minimum, maximum, step and initial value of lens parameters: a fisheye's vertical angle
+(degrees), OpenCV's k1 and k2, aperture and focus (distances to the camera's target)."""
 
 MAX_SIDES_PX = ("640", "960", "1280", "1920")  # choices for the longer side of an image
 MAX_FOV = 150.0  # degrees, vertical
 
-MAX_NUMBER = 100.0
-"""The largest value of an approximation without an upper limit: of ``low_pass``, a standard
-deviation of 10 px. With more, each splat soon covers the whole film, for which memory runs out."""
+MAX_CONTROL_VALUE = 100.0
+"""Maximum of an approximation without an upper limit: a standard deviation of 10 px for
+``low_pass``. Beyond it, splats soon cover the whole film and exhaust memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +74,9 @@ class StartView:
 
     @staticmethod
     def from_views(views: Sequence[Viewpoint], middle: np.ndarray | None = None) -> StartView:
-        """Return the first camera of a capture, which turns about what all of them look at.
+        """Return the first camera of a capture; it orbits the point that all cameras face.
 
-        middle: (3,) world, the target of cameras whose axes meet nowhere; None: not known.
+        middle: (3,) world, the orbit centre of cameras whose axes do not meet; None: unknown.
         """
         first = views[0]
         try:
@@ -85,8 +90,8 @@ class StartView:
         fov = 2 * math.degrees(math.atan(0.5 * first.height / first.fy))
         return StartView(ViewerCamera(first.camera_to_world, fov, distance), up_of(views))
 
-    def from_farther(self, factor: float) -> StartView:
-        """Return the view from behind, at ``factor`` times the distance."""
+    def move_back(self, factor: float) -> StartView:
+        """Return the view moved back along its axis to ``factor`` times the distance."""
         camera, pose = self.camera, self.camera.camera_to_world.copy()
         pose[:3, 3] -= (factor - 1) * camera.distance * pose[:3, 2]
         return replace(self, camera=ViewerCamera(pose, camera.fov, factor * camera.distance))
@@ -102,7 +107,7 @@ class StartView:
 
 
 def event_handler(function: Callable[[], None]) -> EventHandler:
-    """Return a handler of any event of viser's, which its event loop runs."""
+    """Return a handler of any viser event that calls ``function`` in the event loop."""
 
     async def handle(event: object) -> None:
         function()
@@ -111,25 +116,27 @@ def event_handler(function: Callable[[], None]) -> EventHandler:
 
 
 class CameraControls:
-    """Controls in viser's panel; ``changed`` is called, by a thread of the server, when one is."""
+    """Controls in viser's panel; a server thread calls ``changed`` after each change."""
 
     def __init__(
         self, gui: viser.GuiApi, fitted: Approximations, fov: float, changed: Callable[[], None]
     ) -> None:
-        """fitted: the approximations of the fit; fov: degrees, at first."""
+        """fitted: the fit's approximations; fov: initial, degrees."""
         self._gui, self._fitted, self._changed = gui, fitted, event_handler(changed)
         first = round(min(MAX_FOV, fov), 1)
         self._angle = self._observe(gui.add_slider("Angle of view", 5.0, MAX_FOV, 0.5, first))
-        self._shows = self._observe(gui.add_dropdown("Show", tuple(SHOWN)))
+        self._content = self._observe(gui.add_dropdown("Show", tuple(FRAME_CONTENTS)))
         self._side = self._observe(gui.add_dropdown("Size", MAX_SIDES_PX, initial_value="1280"))
         self._lens = self._observe(gui.add_dropdown("Lens", tuple(VIEWER_LENSES)))
-        self._numbers = {
+        self._lens_sliders = {
             name: self._observe(gui.add_slider(name, low, high, step, first, visible=False))
-            for name, (low, high, step, first) in SLIDERS.items()
+            for name, (low, high, step, first) in LENS_SLIDERS.items()
         }
-        self._lens.on_update(event_handler(self._show_numbers))
+        self._lens.on_update(event_handler(self._show_lens_sliders))
         with gui.add_folder("Accuracy", expand_by_default=False):
-            self._values = {name: self._observe(self._control(name)) for name in CONTROLLED}
+            self._values = {
+                name: self._observe(self._control(name)) for name in ADJUSTABLE_APPROXIMATIONS
+            }
             button = gui.add_button("As fitted")
         button.on_click(event_handler(self._reset))
         button.on_click(self._changed)
@@ -146,16 +153,16 @@ class CameraControls:
         return min(2 * math.atan(half), math.radians(MAX_FOV))
 
     def request(self, camera: viser.CameraHandle) -> FrameRequest:
-        """Return the request for what a client's camera sees, with the values of all controls.
+        """Return the request for a client's camera with the values of all controls.
 
-        Raises ValueError for an approximation outside of its limits.
+        Raises ValueError for an approximation outside its limits.
         """
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
         pose[:3, 3] = camera.position
         lens, fov = self._lens.value, math.degrees(camera.fov)
         if lens == "fisheye":
-            fov = float(self._numbers["angle"].value)
+            fov = float(self._lens_sliders["angle"].value)
         distance = float(np.linalg.norm(camera.look_at - camera.position))
         size = max(1, camera.image_width), max(1, camera.image_height)
         scale = min(1.0, int(self._side.value) / max(size))
@@ -165,8 +172,10 @@ class CameraControls:
             width=width,
             height=height,
             lens=lens,
-            lens_numbers={n: float(self._numbers[n].value) for n in VIEWER_LENSES[lens].numbers},
-            shows=self._shows.value,
+            lens_parameters={
+                n: float(self._lens_sliders[n].value) for n in VIEWER_LENSES[lens].parameters
+            },
+            content=self._content.value,
             approximations=self._approximations(),
         )
 
@@ -176,7 +185,6 @@ class CameraControls:
         return Approximations(**values)
 
     def _control(self, name: str) -> viser.GuiInputHandle[Any]:
-        """Return an input of viser's for an approximation."""
         declared, gui, value = DECLARED[name], self._gui, getattr(self._fitted, name)
         hint = declared.description
         if declared.words:
@@ -186,17 +194,17 @@ class CameraControls:
         limits = declared.limits
         assert limits is not None, "numbers have limits"
         step = 1 if declared.kind is int else 1e-4
-        largest = max(MAX_NUMBER, value) if limits.le is None else limits.le
+        largest = max(MAX_CONTROL_VALUE, value) if limits.le is None else limits.le
         return gui.add_number(name, value, min=limits.ge, max=largest, step=step, hint=hint)
 
     def _observe(self, control: Control) -> Control:
         control.on_update(self._changed)
         return control
 
-    def _show_numbers(self) -> None:
+    def _show_lens_sliders(self) -> None:
         lens = self._lens.value
-        shown = {*VIEWER_LENSES[lens].numbers, *(("angle",) if lens == "fisheye" else ())}
-        for name, slider in self._numbers.items():
+        shown = {*VIEWER_LENSES[lens].parameters, *(("angle",) if lens == "fisheye" else ())}
+        for name, slider in self._lens_sliders.items():
             slider.visible = name in shown
 
     def _reset(self) -> None:
@@ -205,7 +213,7 @@ class CameraControls:
 
 
 class Page:
-    """A page that shows Gaussians; the base of a fit's."""
+    """A page that shows Gaussians."""
 
     def __init__(
         self,
@@ -214,11 +222,10 @@ class Page:
         start: StartView,
         fitted: Approximations,
     ) -> None:
-        """fitted: the approximations that the Gaussians were fitted with."""
         self.server, self.requests = server, requests
         self._texts: dict[int, viser.GuiMarkdownHandle] = {}
         self._frustums: list[viser.CameraFrustumHandle] = []
-        self._as_fitted: dict[int, tuple[object, float]] = {}  # what each client saw, and ms
+        self._fitted_times: dict[int, tuple[object, float]] = {}  # each client's view, ms
         self._fitted, self._distance = fitted, start.camera.distance
         pose, camera = start.camera.camera_to_world, server.initial_camera
         server.scene.set_up_direction(tuple(start.up))
@@ -234,10 +241,10 @@ class Page:
         server.on_client_disconnect(self._disconnect)
 
     def add_controls(self) -> None:
-        """Add what a page has above the controls of its camera."""
+        """Add controls above those of the camera."""
 
     def add_cameras(self, views: Sequence[Viewpoint], visible: bool) -> None:
-        """Draw cameras, through which a click looks, and a box that hides them."""
+        """Draw camera frustums and a checkbox that hides them; a click moves to a camera."""
         chosen = np.linspace(0, len(views) - 1, min(MAX_FRUSTUMS, len(views))).round().astype(int)
         self._cameras = self.server.gui.add_checkbox("Cameras", visible)
         self._cameras.on_update(event_handler(self._show_frustums))
@@ -258,13 +265,13 @@ class Page:
             self._frustums.append(frustum)
 
     def update(self) -> None:
-        """Queue a request for each client, after a control has changed."""
+        """Queue a request for each client."""
         self._show_frustums()
         for client in self.server.get_clients().values():
             self._follow(client)
 
     def show(self, client: int, request: FrameRequest, frame: ViewerFrame, is_whole: bool) -> None:
-        """Show a frame to a client, unless it has gone; is_whole: it is as large as requested."""
+        """Show a frame to a client if it is connected; is_whole: at full resolution."""
         handle = self.server.get_clients().get(client)
         if handle is None:
             return
@@ -276,19 +283,18 @@ class Page:
             self._set_text(client, self._describe(client, request, frame))
 
     def refuse(self, client: int, reason: str) -> None:
-        """Show in one line why there is no frame."""
+        """Show the reason of a missing frame in one line."""
         self._set_text(client, f"**No image:** {one_line(reason)}")
 
     def _describe(self, client: int, request: FrameRequest, frame: ViewerFrame) -> str:
-        """Return how long an image took, and what its colours mean."""
         took, size = 1e3 * frame.seconds, (request.width, request.height)
         text = f"**{took:.0f} ms** for {size[0]}×{size[1]}"
         pose = request.camera.camera_to_world.tobytes()
-        shown = (*size, request.shows, request.lens, request.lens_numbers, pose)
+        shown = (*size, request.content, request.lens, request.lens_parameters, pose)
         if request.approximations in (None, self._fitted):
-            self._as_fitted[client] = shown, took
-        elif self._as_fitted.get(client, (None, 0.0))[0] == shown:
-            text += f"; as fitted {self._as_fitted[client][1]:.0f} ms"
+            self._fitted_times[client] = shown, took
+        elif self._fitted_times.get(client, (None, 0.0))[0] == shown:
+            text += f"; as fitted {self._fitted_times[client][1]:.0f} ms"
         return f"{text}\n\n{frame.note}" if frame.note else text
 
     def _set_text(self, client: int, text: str) -> None:
@@ -303,10 +309,9 @@ class Page:
     async def _disconnect(self, client: viser.ClientHandle) -> None:
         self.requests.remove(client.client_id)
         self._texts.pop(client.client_id, None)
-        self._as_fitted.pop(client.client_id, None)
+        self._fitted_times.pop(client.client_id, None)
 
     def _follow(self, client: viser.ClientHandle) -> None:
-        """Queue a request for what a client's camera sees."""
         client.camera.fov = self.controls.fov(client.camera)
         try:
             self.requests.put(client.client_id, self.controls.request(client.camera))
@@ -314,7 +319,7 @@ class Page:
             self.refuse(client.client_id, str(error))
 
     def _show_frustums(self) -> None:
-        """Show the frustums where they lie on the image: browsers draw them through a pinhole."""
+        """Show the frustums if they align with the image: browsers draw them by a pinhole."""
         for frustum in self._frustums:
             frustum.visible = self._cameras.value and self.controls.is_straight
 

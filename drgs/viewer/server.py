@@ -1,7 +1,7 @@
-"""The web server of a page, on this machine: viser, silenced and kept from the network.
+"""The local web server of a page: viser, without console output and network access.
 
-Imported for a page only; viser is of the extra ``viewer``. All but valid requests and messages are
-dropped: each class of a message has the name and the fields of one of viser's protocol.
+Imported only for a page; the extra ``viewer`` installs viser. Invalid requests and messages are
+dropped: each message class mirrors the name and fields of one in viser's protocol.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Any, Protocol, cast
+from typing import Annotated, Any, cast
 from urllib.parse import unquote, urlsplit
 
 import msgspec
@@ -30,45 +30,36 @@ from websockets.http11 import Request, Response
 
 from drgs.core.errors import UserError, UserNote, one_line
 
-ADDRESS = "127.0.0.1"  # only this machine reaches it
-
+ADDRESS = "127.0.0.1"
 LOOPBACK = (ADDRESS, "localhost", "::1")
-
-FIRST_PORTS = range(8080, 8100)  # tried one after the other, unless a port is given
-
-
-class ValueControl(Protocol):
-    """A control of viser's: an input or a button."""
-
-    @property
-    def value(self) -> object:
-        """The value that a browser may set."""
+DEFAULT_PORTS = range(8080, 8100)  # tried in order
 
 
-ControlOf = Callable[[str], ValueControl | None]
-"""Returns the control with a uuid, among those that all clients share, or None."""
+Control = viser.GuiInputHandle[Any] | viser.GuiButtonHandle
+
+FindControl = Callable[[str], Control | None]
+"""Returns the control with a uuid that all clients share, or None."""
 
 
 class LocalServer(viser.ViserServer):
-    """viser's server, which clients cannot ask to publish what it shows."""
+    """A viser server that clients cannot publish."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Return None: there is no address outside of this machine."""
         return None
 
 
 @contextmanager
-def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterator[LocalServer]:
+def run_server(address: str, port: int | None, options: tuple[str, str]) -> Iterator[LocalServer]:
     """Run a server with an empty page within the block.
 
     port: None for a free one. options: names of address and port on the command line.
 
-    Raises :class:`UserError` where it cannot listen there.
+    Raises :class:`UserError` if it cannot listen there.
     """
     port = free_port(address, port, options)
 
-    def control(uuid: str) -> ValueControl | None:
-        return server.gui._gui_input_handle_from_uuid.get(uuid)
+    def control(uuid: str) -> Control | None:
+        return cast(Control | None, server.gui._gui_input_handle_from_uuid.get(uuid))
 
     with _silent(), _guard_servers(address, control):
         server = LocalServer(address, port, verbose=False)
@@ -76,7 +67,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     try:
         with warnings.catch_warnings():
-            # A browser may be closed while its image is being sent.
+            # A browser may close while receiving an image.
             warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
             yield server
     finally:
@@ -85,7 +76,7 @@ def serving(address: str, port: int | None, options: tuple[str, str]) -> Iterato
 
 
 def url(server: LocalServer) -> str:
-    """Return the address to open in a browser."""
+    """Return the page's URL."""
     host, port = server.get_host(), server.get_port()
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname()
@@ -93,13 +84,13 @@ def url(server: LocalServer) -> str:
 
 
 def free_port(address: str, port: int | None, options: tuple[str, str]) -> int:
-    """Return ``port``, or a free one if that is None; see :func:`serving`.
+    """Return ``port``, or a free one if None; see :func:`serving`.
 
-    viser itself would wait for ever at an address that is not there.
+    viser itself waits forever at an address that does not exist.
     """
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     reason = ""
-    for candidate in [port] if port is not None else [*FIRST_PORTS, 0]:
+    for candidate in [port] if port is not None else [*DEFAULT_PORTS, 0]:
         try:
             with socket.create_server((address, candidate), family=family) as probe:
                 return probe.getsockname()[1]
@@ -109,12 +100,11 @@ def free_port(address: str, port: int | None, options: tuple[str, str]) -> int:
     raise UserError(f"{named}: cannot listen at {address}: {reason}; choose another")
 
 
-def is_own(headers: Mapping[str, str], address: str) -> bool:
-    """Return whether a request (RFC 6455, section 4.1) comes from the page of this server.
+def is_same_origin(headers: Mapping[str, str], address: str) -> bool:
+    """Return whether a request (RFC 6455, section 4.1) comes from this server's page.
 
-    Browsers let any page connect to a WebSocket of this machine; ``Origin`` is that page. ``Host``
-    contains a foreign name that leads to this machine: a server that only this machine reaches has
-    none.
+    Browsers let any page connect to a local WebSocket and send that page's ``Origin``. A foreign
+    name in ``Host`` that resolves to this machine (DNS rebinding) is rejected on loopback.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     name = urlsplit(f"//{host}").hostname
@@ -123,24 +113,23 @@ def is_own(headers: Mapping[str, str], address: str) -> bool:
 
 
 def _refusal(request: Request, address: str) -> str:
-    """Return why a request is refused; empty: it is not."""
+    """Return the reason for refusing a request; empty: valid."""
     headers = request.headers
-    if not is_own(headers, address):
+    if not is_same_origin(headers, address):
         return "Open the address that was printed.\n"
     if ":" in unquote(request.path.partition("?")[0]):
-        return "There is no such file.\n"  # Windows: a path with a drive leaves viser's folder
+        return "There is no such file.\n"  # on Windows, a drive letter escapes viser's folder
     protocols = headers.get_all("Sec-WebSocket-Protocol")
     if "Upgrade" in headers and protocols != [f"viser-v{viser.__version__}"]:
-        return "Reload the page.\n"  # viser would print a line for each of them
+        return "Reload the page.\n"  # viser prints a line for each
     return ""
 
 
 @contextmanager
-def _guard_servers(address: str, control: ControlOf) -> Iterator[None]:
-    """Let servers that viser starts within the block serve only valid requests and messages.
+def _guard_servers(address: str, control: FindControl) -> Iterator[None]:
+    """Restrict servers that viser starts within the block to valid requests and messages.
 
-    viser has no setting for it. The logger is silent: websockets would print a traceback for each
-    connection that breaks.
+    The logger is silent: websockets prints a traceback for each broken connection.
     """
     serve = websockets.asyncio.server.serve
     connection_type = partial(PageConnection, control=control, connections=set())
@@ -168,7 +157,7 @@ def _guard_servers(address: str, control: ControlOf) -> Iterator[None]:
 
 
 def _note_errors_once() -> Callable[[asyncio.AbstractEventLoop, dict[str, object]], None]:
-    """Return an event loop's exception handler that notes each type of error in one line."""
+    """Return an exception handler for an event loop that warns once of each type of error."""
     noted = set()
 
     def handle(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
@@ -184,7 +173,7 @@ def _note_errors_once() -> Callable[[asyncio.AbstractEventLoop, dict[str, object
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Silence rich within the block: viser prints its address and its end."""
+    """Silence rich within the block: viser prints on start and stop."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:
@@ -197,14 +186,12 @@ def _silent() -> Iterator[None]:
 # Messages
 # ----------------------------------------------------------------------------------------------
 
-MAX_MESSAGE_BYTES = 1 << 16  # a page's own messages have less than 1 KB
-MAX_CONNECTIONS = 64  # at a time: file descriptors remain for the command itself
+MAX_MESSAGE_BYTES = 1 << 16  # valid messages have less than 1 KB
+MAX_CONNECTIONS = 64  # simultaneous; leaves file descriptors for the command
 
+# Squares are finite in single precision; is_valid() rejects NaN.
 Coordinate = Annotated[float, Meta(ge=-1e15, le=1e15)]
-"""Squares are finite in single precision. A NaN passes, and is checked for below."""
-
 Side = Annotated[float, Meta(ge=0, le=100_000)]  # px
-
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -235,13 +222,13 @@ class SceneNodeClickMessage(msgspec.Struct, tag=True, tag_field="type"):
 
 
 class NewValue(msgspec.Struct, forbid_unknown_fields=True):
-    """The only property of a control that a browser may set."""
+    """The property of a control that a browser may set."""
 
     value: bool | int | float | str
 
 
 class GuiUpdateMessage(msgspec.Struct, tag=True, tag_field="type"):
-    """The value of a control, or a pressed button."""
+    """A changed control or a pressed button."""
 
     uuid: str
     updates: NewValue
@@ -250,25 +237,25 @@ class GuiUpdateMessage(msgspec.Struct, tag=True, tag_field="type"):
 DECODER = msgspec.msgpack.Decoder(ViewerCameraMessage | SceneNodeClickMessage | GuiUpdateMessage)
 
 
-def is_valid(data: bytes | str, control: ControlOf) -> bool:
-    """Return whether a message is one that a page sends, with values that the page offers."""
+def is_valid(data: bytes | str, control: FindControl) -> bool:
+    """Return whether the page can send a message with these values."""
     if not isinstance(data, bytes):
         return False
     try:
         message = DECODER.decode(data)
-        infra.Message.deserialize(data)  # where it raises, viser would end the connection
+        infra.Message.deserialize(data)  # an error in viser would end the connection
     except (msgspec.MsgspecError, ValueError, RecursionError, KeyError, TypeError):
         return False
     if isinstance(message, GuiUpdateMessage):
-        return offers(control(message.uuid), message.updates.value)
+        return accepts_value(control(message.uuid), message.updates.value)
     if isinstance(message, ViewerCameraMessage):
         numbers = np.hstack(msgspec.structs.astuple(message))
         return bool(np.isfinite(numbers).all()) and 0.9 < math.hypot(*message.wxyz) < 1.1
     return True
 
 
-def offers(control: ValueControl | None, value: bool | float | str) -> bool:
-    """Return whether a control (None: a button of one client's dialog) has a value."""
+def accepts_value(control: Control | None, value: bool | float | str) -> bool:
+    """Return whether a control (None: a button in one client's dialog) accepts a value."""
     if control is None or isinstance(control.value, bool):
         return isinstance(value, bool)
     if (options := getattr(control, "options", None)) is not None:
@@ -285,16 +272,15 @@ class PageConnection(ServerConnection):
     def __init__(
         self,
         *arguments: Any,
-        control: ControlOf,
+        control: FindControl,
         connections: set[PageConnection],
         **settings: Any,
     ) -> None:
-        """connections: the open ones of the server."""
         super().__init__(*arguments, **settings)
         self._control, self._connections = control, connections
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Close the connection at once if there are :data:`MAX_CONNECTIONS`."""
+        """Abort connections beyond :data:`MAX_CONNECTIONS`."""
         if len(self._connections) >= MAX_CONNECTIONS:
             cast(asyncio.Transport, transport).abort()
         else:
@@ -302,7 +288,6 @@ class PageConnection(ServerConnection):
             super().connection_made(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Make room for another connection."""
         if self in self._connections:
             self._connections.remove(self)
             super().connection_lost(exc)
@@ -310,7 +295,6 @@ class PageConnection(ServerConnection):
     async def recv(  # pyright: ignore[reportIncompatibleMethodOverride]  # overloads
         self, decode: bool | None = None
     ) -> bytes | str:
-        """Return the next valid message."""
         while not is_valid(message := await super().recv(decode), self._control):
             pass
         return message

@@ -1,7 +1,6 @@
-"""A page that shows a fit while it runs: frames, progress, pause and end, between two iterations.
+"""A page of a running fit: frames, progress, pause and end, between two iterations.
 
-What is rendered changes nothing that the coming iterations depend on: a fit that was watched has
-the bytes of one that was not.
+Rendering for clients does not affect the fit: its bytes are the same with and without a viewer.
 """
 
 from __future__ import annotations
@@ -25,35 +24,31 @@ if TYPE_CHECKING:
     import viser
     from viser import uplot
 
-REFRESH_SECONDS = 1.0  # shortest time between two frames of a camera that is still
-REFRESH_SHARE = 0.05  # largest part of the time for frames of a camera that is still
-PROGRESS_SECONDS = 0.5  # time between two reports of progress, where a client reads them
-WAIT_SECONDS = 0.1  # time until a pause notices Ctrl-C
+REFRESH_SECONDS = 1.0  # minimum time between two frames of a still camera
+REFRESH_SHARE = 0.05  # maximum share of the time for frames of a still camera
+PROGRESS_SECONDS = 0.5  # minimum time between two updates of the progress
+WAIT_SECONDS = 0.1  # response time to Ctrl-C in a pause
 MAX_POINTS = 300  # points of a curve
 CURVE_ROOM = 1.1
 """Length of the curves' axis in expected iterations, when these have changed."""
 
-STEP_BACK = 1.25
-"""Distance of the first camera in that of a training camera, so that these are in the image."""
+START_DISTANCE_FACTOR = 1.25  # moves back until the training cameras are visible
 
-Curve = tuple[np.ndarray, np.ndarray]
-"""Iterations and values, each (n,)."""
+Curve = tuple[np.ndarray, np.ndarray]  # iterations (n,), values (n,)
 
 CURVES: dict[str, uplot.Series] = {
     "training views": {"stroke": "#7fb0ff", "width": 2, "points": {"show": False}},
     "test views": {"stroke": "#f0937b", "width": 2, "points": {"show": True}},
-}
-"""Lines by title."""
+}  # by title
 
 
 class EarlyStop:
-    """Ends a fit as ``criterion`` decides, or when a viewer client ends it."""
+    """The stop criterion ``criterion``, or a viewer client's request to end."""
 
     def __init__(self, criterion: StopCriterion, requests: RenderRequests) -> None:
         self._criterion, self._requests = criterion, requests
 
     def should_continue(self, trainer: Trainer) -> bool:
-        """See :class:`StopCriterion`; an end by request revises the configuration."""
         done = trainer.iteration
         if self._requests.ended and 0 < done < trainer.config.iterations:
             stop = trainer.config.densify.stop
@@ -78,15 +73,17 @@ class TrainingViewer:
     ) -> None:
         self._requests, self._page, self._criterion = requests, page, criterion
         self._background = dataset.background
-        self._scheduler = RenderScheduler(requests, page.show, page.refuse, _refresh_after)
+        self._scheduler = RenderScheduler(
+            requests, page.show, page.refuse, lambda s: max(REFRESH_SECONDS, s / REFRESH_SHARE)
+        )
         self._scene: LiveScene | None = None
         self._progress_at = 0.0  # by time.monotonic
-        self._fit_s = 0.0  # seconds of the fit's own, waited for here
+        self._fit_s = 0.0  # seconds that the fit's own kernels took here
 
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Render what is due, and wait while the fit is paused; its clock stands still."""
+        """Render due frames, and wait while the fit is paused; its clock stops meanwhile."""
         start, self._fit_s = time.perf_counter(), 0.0
         now = time.monotonic()
         is_due = self._requests.pending and now - self._progress_at >= PROGRESS_SECONDS
@@ -97,7 +94,7 @@ class TrainingViewer:
         while self._requests.paused and not (self._requests.ended or done.is_last or stops()):
             if not self._serve(trainer):
                 self._requests.wait(WAIT_SECONDS)
-        self._scene = None  # what it keeps of the Gaussians would keep memory
+        self._scene = None  # frees its copy of the Gaussians
         history.leave_out(time.perf_counter() - start - self._fit_s)
         if done.is_last:
             self._page.show_end(trainer.iteration)
@@ -106,7 +103,7 @@ class TrainingViewer:
         return self._scheduler.serve(lambda: self._live_scene(trainer))
 
     def _live_scene(self, trainer: Trainer) -> LiveScene:
-        """Return a scene with the Gaussians as they are after the last iteration."""
+        """Return a scene with the Gaussians after the last iteration."""
         if self._scene is None:
             start = time.perf_counter()
             dr.sync_thread()  # the iteration's kernels may still be running
@@ -122,7 +119,6 @@ class TrainingPage(Page):
     """The page of a fit."""
 
     def add_controls(self) -> None:
-        """Add progress, buttons and a curve."""
         from viser import Icon
 
         gui = self.server.gui
@@ -134,11 +130,11 @@ class TrainingPage(Page):
         self._pause.on_click(event_handler(self._toggle_pause))
         self._end.on_click(self._confirm_end)
         self._charts: list[viser.GuiUplotHandle] = []
-        self._room = 0  # iterations that they have room for
+        self._room = 0  # range of their x axis, iterations
         self._folder = gui.add_folder("PSNR [dB]")
 
     def show_progress(self, trainer: Trainer, history: History, total: int) -> None:
-        """Show the progress without waiting for anything; total: iterations in all."""
+        """Show the progress without synchronizing; total: number of iterations."""
         last, done = history.rows[-1], trainer.iteration
         psnr = exponential_mean([row.psnr for row in history.rows])
         self._status.content = (
@@ -149,20 +145,20 @@ class TrainingPage(Page):
         self._bar.value = min(100.0, 100.0 * done / max(total, 1))
         curves = psnr_curves(history.rows)
         if not self._room / CURVE_ROOM**2 <= total <= self._room:
-            # A plan may revise the total twice a second: not each time are the charts drawn again.
+            # A budget plan may revise the total twice a second; redraw charts only if needed.
             self._room = round(CURVE_ROOM * total) if self._charts else total
             self._draw(curves)
         for chart, curve in zip(self._charts, curves, strict=True):
             chart.data, chart.visible = curve, len(curve[0]) > 0
 
     def show_end(self, iterations: int) -> None:
-        """Show that there are no more iterations, and that results are being written."""
+        """Show that the iterations are done and results are being written."""
         self._status.content = f"**{iterations:,} iterations are done;** results are being written."
         self._bar.value = 100.0
         self._pause.disabled = self._end.disabled = True
 
     def _draw(self, curves: list[Curve]) -> None:
-        """Draw charts anew: viser's own range follows what was shown, and it knows no gaps."""
+        """Redraw the charts with a range of our own: viser's follows earlier data."""
         for chart in self._charts:
             chart.remove()
         with self._folder:
@@ -205,7 +201,10 @@ def watch(
     server: viser.ViserServer, trainer: Trainer, dataset: Dataset, criterion: StopCriterion
 ) -> tuple[TrainingViewer, StopCriterion]:
     """Show a fit on the server's page; return the observer that serves it, and its criterion."""
-    requests, start = RenderRequests(), StartView.from_views(dataset.train).from_farther(STEP_BACK)
+    requests, start = (
+        RenderRequests(),
+        StartView.from_views(dataset.train).move_back(START_DISTANCE_FACTOR),
+    )
     criterion = EarlyStop(criterion, requests)
     page = TrainingPage(server, requests, start, trainer.config.model.approximations)
     page.add_cameras(dataset.train, visible=True)
@@ -213,14 +212,10 @@ def watch(
 
 
 def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:
-    """Return the PSNR of training views, smoothed, and of test views, where it was measured."""
+    """Return the smoothed PSNR of training views, and the measured one of test views."""
     kept = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).round().astype(int))
     iterations = np.array([row.iteration for row in rows], np.float64)
     training = exponential_mean([row.psnr for row in rows])
     measured = [(row.iteration, row.test_psnr) for row in rows if row.test_psnr is not None]
     test = np.array(measured, np.float64).reshape(-1, 2).T
     return [(iterations[kept], training[kept]), (test[0], test[1])]
-
-
-def _refresh_after(seconds: float) -> float:
-    return max(REFRESH_SECONDS, seconds / REFRESH_SHARE)

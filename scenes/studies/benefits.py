@@ -1,4 +1,4 @@
-"""Fit spoiled images with the effect that is made for it, and without.
+"""Fit degraded images with and without the corresponding effect.
 
 The shipped scene is fitted at a small size to images that were spoiled in a known way, with the
 effect that is made for it and without: other exposures, something before the lens that a mask
@@ -42,20 +42,11 @@ if TYPE_CHECKING:
 GENERATOR = SCENES / "brick_crane.py"
 
 SCENE = LEGO
-"""The shipped scene, at a smaller size."""
-
-SIZE = 100
-"""px: width and height of the images that are fitted."""
-
+SIZE = 100  # px: width and height of the fitted images
 ITERATIONS = 3000
-
 NUM_POINTS = 20_000
-
-DARK = 0.65
-"""Factor of all colours, where exposures are to vary."""
-
-FEW = 8
-"""Images, where depth is to help."""
+DARKENING_FACTOR = 0.65  # of all colours, before exposures vary
+NUM_FEW_VIEWS = 8  # of fits with depth
 
 SIZES = {"2x": 2.0, "1x": 1.0, "1/2": 0.5, "1/4": 0.25}
 """Sizes of renderings, relative to that of the fit."""
@@ -76,7 +67,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """A quantity that was measured of a fit."""
+    """A measured quantity of a fit."""
 
     effect: str
     name: str
@@ -119,13 +110,13 @@ def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
     del rng
 
     def dark(view: View) -> View:
-        return _with_image(view, DARK * np.asarray(view.image))
+        return _with_image(view, DARKENING_FACTOR * np.asarray(view.image))
 
     return replace(_each_train(dataset, dark), test=tuple(map(dark, dataset.test)))
 
 
 def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Give each training image its own gain for each colour; their mean is 1."""
+    """Multiply each training image by random gains per channel with mean 1."""
     gains = rng.uniform(0.6, 1.4, (len(dataset.train), 3))
     gains = iter(gains / gains.mean(axis=0))
     return _each_train(
@@ -148,16 +139,16 @@ def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def few_views(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """:data:`FEW` training images are left, with the depth of the scene that they show."""
+    """Keep :data:`NUM_FEW_VIEWS` training images, with depth."""
     del rng
     scene = load_scene(GENERATOR)
-    step = len(dataset.train) // FEW
-    kept = dataset.train[::step][:FEW]
+    step = len(dataset.train) // NUM_FEW_VIEWS
+    kept = dataset.train[::step][:NUM_FEW_VIEWS]
     return replace(dataset, train=tuple(replace(v, depth=depth_of(scene, v)) for v in kept))
 
 
 def depth_of(scene: mi.Scene, view: View) -> np.ndarray:
-    """(H, W) float32: depth of the surface at each pixel's centre, 0 where there is none."""
+    """Return (H, W) float32: depth of the surface at each pixel's centre, 0 without one."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     local = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], axis=-1)
     rotation = view.camera_to_world[:3, :3]
@@ -180,7 +171,7 @@ def move_cameras(dataset: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def stretch_lenses(dataset: Dataset, rng: np.random.Generator) -> Dataset:
-    """Make focal lengths 4 % longer than they are."""
+    """Increase focal lengths by 4 %."""
     del rng
     return _each_train(dataset, lambda view: replace(view, fx=1.04 * view.fx, fy=1.04 * view.fy))
 
@@ -216,7 +207,7 @@ def quality_as_exposed(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> 
 
 
 def fitted_colors(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """A image (H, W, 3) after the affine map of colours that brings it closest to another."""
+    """Return an image (H, W, 3) after the least-squares affine colour map to another."""
     colors = np.concatenate([image, np.ones_like(image[:, :, :1])], axis=2).reshape(-1, 4)
     matrix, *_ = np.linalg.lstsq(colors, target.reshape(-1, 3), rcond=None)
     return np.clip(colors @ matrix, 0, 1).reshape(image.shape)
@@ -230,7 +221,7 @@ def at_sizes(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, 
 
 
 def views_at_sizes(config: FitConfig) -> dict[str, list[View]]:
-    """The test views, each with its photograph at that size."""
+    """Return the test views with their photographs at a size."""
     views = load_dataset(with_changes(config, {"data.image_size": None}).data).test
     return {
         name: [smaller_view(view, view.width / (SIZE * factor)) for view in views]
@@ -239,18 +230,18 @@ def views_at_sizes(config: FitConfig) -> dict[str, list[View]]:
 
 
 def seen_at_sizes(trainer: Trainer) -> list[np.ndarray]:
-    """The first test view."""
+    """Render the first test view at all sizes."""
     views = views_at_sizes(trainer.config).values()
     return [next(iter(render_views(trainer.scene, of_size[:1]))) for of_size in views]
 
 
 def photographs_at_sizes(config: FitConfig) -> list[np.ndarray]:
-    """The same of the data."""
+    """Return the data's images of the first test view at all sizes."""
     return [np.asarray(of_size[0].image) for of_size in views_at_sizes(config).values()]
 
 
 def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
-    """Compare the training cameras with the true ones, and what they see with their images.
+    """Compare the training cameras with the true ones, and renderings with their images.
 
     What all have in common (a similarity) is undone first. *Shift* is how far the image of a
     point at the middle of the scene, or a tenth of the distance around it, is from its place.
@@ -284,7 +275,7 @@ def cameras(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, f
 def similarity(
     points: Sequence[np.ndarray], targets: Sequence[np.ndarray]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and translation that bring points closest to targets (Umeyama 1991)."""
+    """Return the least-squares similarity from points to targets (Umeyama 1991)."""
     a, b = np.array(points), np.array(targets)
     a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
     u, s, vt = np.linalg.svd(b0.T @ a0)
@@ -295,7 +286,7 @@ def similarity(
 
 
 def _pixels(view: View) -> np.ndarray:
-    """(27, 2) px: where a view sees a grid of points in the middle of the scene."""
+    """Project a grid of 27 points in the scene's middle; return (27, 2) px."""
     grid = np.stack(np.meshgrid(*[[-0.4, 0.0, 0.4]] * 3), axis=-1).reshape(-1, 3)
     x, y, z = view.camera_to_world[:3, :3].T @ (grid - view.center).T
     return np.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], axis=-1)
@@ -367,7 +358,7 @@ def table(results: Sequence[Result]) -> str:
 
 
 def plot(rows: dict[str, list[np.ndarray]]) -> Figure:
-    """Images, a row for each name, a column for each of :data:`SIZES`."""
+    """Plot images: a row per name, a column per size."""
     figure = new_figure(2 * len(SIZES) + 0.4, 2 * len(rows))
     grid = figure.subplots(len(rows), len(SIZES), squeeze=False)
     for name, renders, of_row in zip(rows, rows.values(), grid, strict=True):

@@ -1,6 +1,6 @@
-"""Fits of the studies: each is a run of ``drgs fit`` in a process of its own.
+"""Fits of the studies: each is a separate ``drgs fit`` process.
 
-Interrupted fits go on, finished ones are not repeated.
+Interrupted fits are resumed, finished ones are not repeated.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ from drgs.splatting.grid import PIXELS
 
 ROUNDS = 15
 
-NEEDED = {"compositing": 22.0, "adjoint": 42.0}
+MIN_INSTRUCTIONS = {"compositing": 22.0, "adjoint": 42.0}
 """Vector instructions that one (pixel, Gaussian) pair needs with three colours, counted by hand in
 ``rasterize.composite`` and ``composite_adjoint``. Loads of a record, loop control and what the 16
 pixels of a micro-tile share do not count as useful.
@@ -67,7 +67,7 @@ slots (7)."""
 # Limits of the machine
 # ----------------------------------------------------------------------------------------------
 
-CHAINS = 10
+NUM_CHAINS = 10
 """Independent multiply-adds in flight: more than the latency of one times those started a cycle."""
 
 LANES, TRIPS = 1 << 15, 2000
@@ -114,7 +114,7 @@ def _multiply_adds() -> float:
     """Time chains that live in registers; the factors keep the values bounded, not denormal."""
     start = dr.linspace(llvm.Float, 0.1, 0.9, LANES)
     factor, addend = dr.opaque(llvm.Float, 0.999), dr.opaque(llvm.Float, 1e-3)
-    values = [start * (1 + k / CHAINS) for k in range(CHAINS)]
+    values = [start * (1 + k / NUM_CHAINS) for k in range(NUM_CHAINS)]
     dr.eval(values)
 
     def four_times(value: llvm.Float) -> llvm.Float:
@@ -131,7 +131,7 @@ def _multiply_adds() -> float:
             labels=("trip", "values"),
         )
         dr.eval(values)
-        return LANES * TRIPS * CHAINS / _longest_kernel_seconds()
+        return LANES * TRIPS * NUM_CHAINS / _longest_kernel_seconds()
 
 
 def _bytes_moved() -> float:
@@ -303,8 +303,8 @@ class LoopCost:
     """Instructions of the loop over (pixel, Gaussian) pairs, from its machine code.
 
     The instructions in the loop's body are divided by the pixels of a lane: a vector instruction
-    counts as one for each of the pairs that it serves, as in ``NEEDED``. Paths that are hardly ever
-    taken count too. The stack has state of pixels for which there are no registers.
+    counts once per pair that it serves, as in ``MIN_INSTRUCTIONS``. Rarely taken paths count too.
+    The stack holds pixel state that does not fit into registers.
     """
 
     a_pair: dict[str, float]  # by the names of OPERATIONS
@@ -365,10 +365,10 @@ def loop_table(
     ]
     for name, title in OPERATIONS.items():
         rows.append([title, *(f"{cost.a_pair[name]:.1f}" for cost in loops.values())])
-    rows.append(["vector instructions needed", *(f"{NEEDED[s]:.0f}" for s in loops)])
+    rows.append(["vector instructions needed", *(f"{MIN_INSTRUCTIONS[s]:.0f}" for s in loops)])
     executed = [c.instructions / limit / stage_ms[s] for s, c in loops.items()]
     rows.append(["executed, of the vector limit", *(f"{share:.0%}" for share in executed)])
-    needed = [work.useful * NEEDED[s] / limits.width / limit / stage_ms[s] for s in loops]
+    needed = [work.useful * MIN_INSTRUCTIONS[s] / limits.width / limit / stage_ms[s] for s in loops]
     rows.append(["needed by useful pairs, of it", *(f"{share:.0%}" for share in needed)])
     return markdown_table(["a (pixel, Gaussian) pair", *loops], rows)
 
@@ -397,7 +397,7 @@ def main() -> None:
     launches = counted_launches(lambda: partial(clocked_step, warm_trainer(scene)))
     print(stage_table(launches, stage_ms, wall_ms, limits.bytes_moved))
     try:
-        loops = {stage: loop_cost(launches[stage], limits.width) for stage in NEEDED}
+        loops = {stage: loop_cost(launches[stage], limits.width) for stage in MIN_INSTRUCTIONS}
         print(f"\n{loop_table(loops, count_work(frame_of(scene)), stage_ms, limits)}")
     except MachineCodeError as error:
         print(f"\nno machine code: {error}")

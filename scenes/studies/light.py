@@ -2,9 +2,9 @@
 
 A fitted model is rendered with a mirror ball behind it, a glossy ring there, and a white plinth
 under it that lies in its shadow, each alone; and in the scene of a file, ``scenes/hybrid.xml``.
-Every way of passing light is compared with the rays' image of many paths, over the pixels that
-show the object and no splats before it. So an error is the sum of what is approximated and of the
-noise of the paths; that of as many paths as the compared image has is nearly free of noise.
+Each light mode is compared with a reference of many paths by rays, over the object's pixels that no
+splats cover. An error is the sum of approximation and noise; with as many paths as the reference,
+it is nearly free of noise.
 """
 
 from __future__ import annotations
@@ -35,39 +35,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PATHS, QUICK_PATHS = (1, 4, 16, 64), (1,)
-"""Per pixel."""
+"""Paths per pixel."""
 
-MANY, QUICK_MANY = 512, 4
-"""Paths of the images that are compared."""
+REFERENCE_PATHS, QUICK_REFERENCE_PATHS = 512, 4
+"""Paths per pixel of the reference images."""
 
-AT_ONCE = 64
-"""Paths of one image; more are means of several."""
-
-SIZE = (300, 200)
-"""px: width, height."""
+MAX_PATHS = 64  # per pixel; more paths are means of several images
+SIZE = (300, 200)  # px: width, height
 
 ROUNDS, QUICK_ROUNDS = 5, 1
 
-RING = Path("shapes/ring.ply")
-"""Beside the scene file."""
-
-LIT = 0.98
-"""Smallest transmittance of the splats before a pixel that counts as showing an object."""
+RING_FILE = Path("shapes/ring.ply")  # relative to the scene file
+MIN_TRANSMITTANCE = 0.98  # of splats in front of an object's pixel
 
 
 @dataclass(frozen=True)
-class Way:
+class LightMode:
     """Settings of ``light``."""
 
     name: str
     settings: dict[str, str]
 
 
-WAYS = (
-    Way("none", {"light": "none"}),
-    Way("probe", {"light": "probe"}),
-    Way("probe, unseen by rays", {"light": "probe", "unseen": "rays"}),
-    Way("rays", {"light": "rays"}),
+LIGHT_MODES = (
+    LightMode("none", {"light": "none"}),
+    LightMode("probe", {"light": "probe"}),
+    LightMode("probe, unseen by rays", {"light": "probe", "unseen": "rays"}),
+    LightMode("rays", {"light": "rays"}),
 )
 
 
@@ -100,7 +94,7 @@ class Measurement:
 
 
 def stages(ply: Path, file: Path) -> list[Stage]:
-    """A model with one object at a time, and the scene of a file, beside which a ring is."""
+    """Return a model with one object each, and the scene of a file with its ring."""
     means = np.asarray(Gaussians.load(ply).means)
     low, high = np.quantile(means, [0.02, 0.98], axis=0)
     center, radius = ((low + high) / 2).tolist(), float((high - low).max() / 2)
@@ -114,7 +108,7 @@ def stages(ply: Path, file: Path) -> list[Stage]:
         },
         "glossy ring": {
             "type": "ply",
-            "filename": str(file.parent / RING),
+            "filename": str(file.parent / RING_FILE),
             "to_world": place @ T().translate([-1.15, 0.9, 0.15]).rotate([1, 1, 0], 75).scale(0.6),
             "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.1},
         },
@@ -143,7 +137,7 @@ def stages(ply: Path, file: Path) -> list[Stage]:
 
 
 def _stage(place: mi.ScalarTransform4f, integrator: dict[str, object]) -> dict[str, object]:
-    """All but the object: splats, camera, a lamp and the sky."""
+    """Return the scene without an object: splats, camera, a lamp and the sky."""
     T = mi.ScalarTransform4f
     view = mi.ScalarPoint3f(1.7, -4, 1.7), mi.ScalarPoint3f(0, 0, -0.1)
     film = {"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "rfilter": {"type": "box"}}
@@ -172,7 +166,7 @@ def _stage(place: mi.ScalarTransform4f, integrator: dict[str, object]) -> dict[s
 
 
 def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
-    """(H, W) bool: pixels whose middle shows a shape of a scene, and no splats before it."""
+    """Return (H, W) bool: pixels whose centre shows a shape that no splats cover."""
     from drgs.integrator.rays import PathSegment
     from drgs.integrator.splat_transport import RayTransport
 
@@ -191,7 +185,7 @@ def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
     T = RayTransport.from_splats(integrator.state).transmittance(
         segment, mi.Float(0), mi.Bool(True)
     )
-    shows = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (T > LIT)
+    shows = hit.is_valid() & (hit.shape == mi.ShapePtr(shape)) & (T > MIN_TRANSMITTANCE)
     return np.array(shows).reshape(height, width)
 
 
@@ -203,11 +197,11 @@ def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
 def measure(
     stage: Stage, paths: Sequence[int], many: int, rounds: int
 ) -> tuple[list[Measurement], list[tuple[str, list[np.ndarray]]]]:
-    """All ways and numbers of paths, in turns; and by object, its images of many paths.
+    """Measure all light modes and numbers of paths in turns; return also each object's images.
 
-    The last number of paths is the many, with other random numbers than what is compared.
+    The last number of paths is the reference's, with a different seed.
     """
-    scenes = {way.name: stage.load(**way.settings) for way in WAYS}
+    scenes = {way.name: stage.load(**way.settings) for way in LIGHT_MODES}
     accurate = _mean(scenes["rays"], many, first=1000)
     masks = {name: mask_of(scenes["none"], name) for name in stage.subjects}
     results, shown = [], {name: [] for name in stage.subjects}
@@ -222,37 +216,40 @@ def measure(
                     Measurement(stage.name, name, mask.mean(), way, n, seconds[way], factor, error)
                 )
                 if n == many:
-                    shown[name].append(_cropped(image, mask))
+                    shown[name].append(_crop(image, mask))
     return results, [(f"{stage.name}: {name}", images) for name, images in shown.items()]
 
 
 def _image(scene: mi.Scene, paths: int, seed: int) -> mi.TensorXf:
-    """(H, W, 3) linear."""
+    """Render (H, W, 3), linear."""
     scene.integrator().nested_spp = paths
     return mi.render(scene, seed=seed)
 
 
 def _mean(scene: mi.Scene, paths: int, first: int) -> np.ndarray:
-    """(H, W, 3) display space, of as many images as have ``paths`` together."""
-    seeds, each = range(first, first + max(1, paths // AT_ONCE)), min(paths, AT_ONCE)
+    """Return the mean (H, W, 3) of images with ``paths`` in total, display space."""
+    seeds, each = (
+        range(first, first + max(1, paths // MAX_PATHS)),
+        min(paths, MAX_PATHS),
+    )
     linear = np.mean([np.array(_image(scene, each, seed)) for seed in seeds], axis=0)
     return np.array(mi.math.linear_to_srgb(mi.Float(linear.ravel()))).reshape(linear.shape)
 
 
 def _times(scenes: dict[str, mi.Scene], paths: int, rounds: int) -> dict[str, float]:
-    """Seconds of a image, medians; in turns. Of many paths: of as many images as it takes."""
-    each, spent = min(paths, AT_ONCE), {name: [] for name in scenes}
+    """Return median seconds of an image by light mode, timed in turns."""
+    each, spent = min(paths, MAX_PATHS), {name: [] for name in scenes}
     for scene in scenes.values():
         for _ in range(2):  # compiles the kernels of the first image, and of others
             _seconds(scene, each)
-    for _ in range(rounds if each < AT_ONCE else 1):
+    for _ in range(rounds if each < MAX_PATHS else 1):
         for name, scene in scenes.items():
             spent[name].append(_seconds(scene, each))
     return {name: statistics.median(s) * max(1, paths // each) for name, s in spent.items()}
 
 
 def _seconds(scene: mi.Scene, paths: int) -> float:
-    """Time a image from another place, so that no splats are known."""
+    """Time an image after a camera update, which clears the render cache."""
     params = mi.traverse(scene.sensors()[0])
     params["to_world"] = mi.Transform4f(params["to_world"].matrix + dr.opaque(mi.Float, 0))
     params.update()
@@ -264,7 +261,7 @@ def _seconds(scene: mi.Scene, paths: int) -> float:
     return time.perf_counter() - started
 
 
-def _cropped(image: np.ndarray, mask: np.ndarray, border: int = 8) -> np.ndarray:
+def _crop(image: np.ndarray, mask: np.ndarray, border: int = 8) -> np.ndarray:
     """To what surrounds a mask."""
     rows, columns = (np.nonzero(mask.any(axis=axis))[0] for axis in (1, 0))
     return image[
@@ -284,7 +281,7 @@ def table(results: Sequence[Measurement]) -> str:
     header = ["object, pixels", "light", *(f"{n} paths" for n in counts)]
     rows = []
     for subject in dict.fromkeys(m.subject for m in results):
-        for way in WAYS:
+        for way in LIGHT_MODES:
             found = {m.paths: m for m in results if (m.subject, m.light) == (subject, way.name)}
             cells = [
                 f"{m.factor:.2f}x, {m.psnr:.1f} dB"
@@ -302,12 +299,12 @@ def plot(results: Sequence[Measurement]) -> Figure:
     figure = new_figure(11, 3.2 * -(-len(panels) // 4))
     axes = figure.subplots(-(-len(panels) // 4), 4, squeeze=False).ravel()
     for axis, panel in zip(axes, panels, strict=False):
-        for way in WAYS:
+        for way in LIGHT_MODES:
             found = [m for m in results if (m.stage, m.subject) == panel and m.light == way.name]
             axis.plot([m.seconds for m in found], [m.psnr for m in found], ".-", label=way.name)
         axis.set_xscale("log")
         axis.set_title(": ".join(panel), fontsize=9)
-        axis.set_xlabel("seconds a image")
+        axis.set_xlabel("seconds per image")
         axis.grid(alpha=0.3)
     for axis in axes[len(panels) :]:
         axis.axis("off")
@@ -318,7 +315,7 @@ def plot(results: Sequence[Measurement]) -> Figure:
 
 def show(images: Sequence[tuple[str, list[np.ndarray]]]) -> Figure:
     """A row an object: by each way, and four times the error of all but the last."""
-    names = [way.name for way in WAYS]
+    names = [way.name for way in LIGHT_MODES]
     titles = [*names, *(f"error x4: {name}" for name in names[:-1])]
     figure = new_figure(2 * len(titles), 1.6 * len(images))
     axes = figure.subplots(len(images), len(titles), squeeze=False)
@@ -344,7 +341,11 @@ def main() -> None:
     mi.set_variant("llvm_ad_rgb")
     path = Path(args.scene)
     ply = path / GAUSSIANS if path.is_dir() else path
-    counts = (QUICK_PATHS, QUICK_MANY, QUICK_ROUNDS) if args.quick else (PATHS, MANY, ROUNDS)
+    counts = (
+        (QUICK_PATHS, QUICK_REFERENCE_PATHS, QUICK_ROUNDS)
+        if args.quick
+        else (PATHS, REFERENCE_PATHS, ROUNDS)
+    )
     results: list[Measurement] = []
     images: list[tuple[str, list[np.ndarray]]] = []
     for stage in stages(ply, SCENES / "hybrid.xml"):

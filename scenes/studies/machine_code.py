@@ -31,7 +31,7 @@ AGGRESSIVE, POSITION_INDEPENDENT, SMALL = 3, 2, 3
 
 PASSES = b"default<O2>"
 
-LEFT_OUT = ("LoopUnrolling", "LoopVectorization", "SLPVectorization")
+DISABLED_PASSES = ("LoopUnrolling", "LoopVectorization", "SLPVectorization")
 """Passes that Dr.Jit switches off: its code consists of vectors already."""
 
 
@@ -129,7 +129,7 @@ def _target_machine(llvm: Any) -> Iterator[_Pointer]:
 
 def _optimize(llvm: Any, module: _Pointer, machine: _Pointer) -> None:
     options = llvm("CreatePassBuilderOptions", _Pointer)()
-    for name in LEFT_OUT:
+    for name in DISABLED_PASSES:
         llvm(f"PassBuilderOptionsSet{name}", None)(options, 0)
     error = llvm("RunPasses", _Pointer)(module, PASSES, machine, options)
     llvm("DisposePassBuilderOptions", None)(options)

@@ -47,7 +47,7 @@ JPEG_QUALITY = 95
 
 @dataclass(frozen=True)
 class Case:
-    """Photographs of a fit and their cameras."""
+    """A treatment of a dataset's cameras."""
 
     name: str
     prepare: Callable[[FitConfig, Path], Path] = lambda config, folder: config.data.path
@@ -56,7 +56,7 @@ class Case:
     has_own_world: bool = False  # and not that of the folder
 
 
-def undistorted(config: FitConfig, folder: Path) -> Path:
+def undistort(config: FitConfig, folder: Path) -> Path:
     """Write the same photographs to ``folder``, at their size, without distortion.
 
     It has no masks: COLMAP undistorts photographs alone.
@@ -80,8 +80,8 @@ def undistorted(config: FitConfig, folder: Path) -> Path:
     return folder
 
 
-def placed_again(config: FitConfig, folder: Path) -> Path:
-    """Write the same photographs to ``folder``, and find their cameras from them alone."""
+def find_cameras(config: FitConfig, folder: Path) -> Path:
+    """Copy the photographs to ``folder``, and estimate their cameras with ``drgs poses``."""
     dataset = load_dataset(config.data)
     found = [view.files for view in (*dataset.train, *dataset.test)]
     common = os.path.commonpath([files["image"].parent for files in found])
@@ -103,9 +103,9 @@ def placed_again(config: FitConfig, folder: Path) -> Path:
 CASES = (
     Case("as they are"),
     Case("distortion ignored", overrides=("data.ignore_distortion=true",)),
-    Case("undistorted beforehand", undistorted, needs_model=True),
+    Case("undistorted beforehand", undistort, needs_model=True),
     Case("from random points", overrides=("init.start=random",)),
-    Case("cameras found by drgs poses", placed_again, has_own_world=True),
+    Case("cameras found by drgs poses", find_cameras, has_own_world=True),
 )
 
 
@@ -115,7 +115,7 @@ CASES = (
 
 
 def psnr_as_taken(fitted: Path, config: FitConfig) -> float:
-    """Return the PSNR of the dataset's test views by the Gaussians of a fit."""
+    """Return the PSNR of a fit's Gaussians on the dataset's test views."""
     run_config = load_run_config(fitted)
     gaussians = Gaussians.load(fitted / GAUSSIANS)
     dataset = load_dataset(config.data).relative_to(gaussians.origin)
@@ -127,7 +127,7 @@ def psnr_as_taken(fitted: Path, config: FitConfig) -> float:
 
 
 def main() -> None:
-    """Fit each case; a table."""
+    """Fit each case; print a table."""
     parser = make_parser(__doc__, "photographs")
     parser.add_argument("data", type=Path, metavar="DIR", help="photographs and their cameras")
     parser.add_argument(

@@ -48,7 +48,7 @@ SMALL, MEDIUM, LARGE = 200, 400, 800
 
 @contextmanager
 def prune_added_rows_at_once() -> Iterator[None]:
-    """Let the prune of a step meet the rows that the step has added, as the reference's code."""
+    """Apply a step's prune also to rows that the step has added, as in the reference code."""
 
     def densify_and_prune(
         strategy: AdaptiveDensityControl, rows: Population, iteration: int
@@ -71,7 +71,7 @@ def prune_added_rows_at_once() -> Iterator[None]:
 
 @contextmanager
 def reset_until_the_end() -> Iterator[None]:
-    """Go on lowering opacities when the population no longer changes, but for the last iteration.
+    """Continue opacity resets after densification, except in the last iteration.
 
     A reset in the last iteration would leave nothing to see.
     """
@@ -87,7 +87,7 @@ def reset_until_the_end() -> Iterator[None]:
 
 
 def unscaled_means_rate(config: FitConfig, extent: float) -> dict[str, object]:
-    """Undo that the rate of the means is multiplied by the scene's extent."""
+    """Use a rate of the means that is not multiplied by the scene's extent."""
     rates = config.optimizer
     return {
         "optimizer.means_lr": rates.means_lr / extent,
@@ -96,7 +96,7 @@ def unscaled_means_rate(config: FitConfig, extent: float) -> dict[str, object]:
 
 
 def threshold_in_pixels(config: FitConfig, extent: float) -> dict[str, object]:
-    """Compare gradients per pixel: those in NDC divided by half the film's size."""
+    """Apply the threshold to gradients per pixel: NDC gradients divided by half the film size."""
     return {"densify.adc.grad_threshold": config.densify.adc.grad_threshold * SMALL / 2}
 
 

@@ -70,7 +70,7 @@ before a link keeps to its rate, and the words of the command. Namespaces end wi
 BURST_S, MIN_BURST_BYTES = 2e-3, 16_384
 """Kernels hand over 64 KB at a time: with a smaller burst, a fast link is slower than its rate."""
 
-BY_TCP = {"MPIR_CVAR_NOLOCAL": "1", "MPIR_CVAR_CH4_NETMOD": "ofi", "FI_PROVIDER": "tcp"}
+TCP_ENVIRONMENT = {"MPIR_CVAR_NOLOCAL": "1", "MPIR_CVAR_CH4_NETMOD": "ofi", "FI_PROVIDER": "tcp"}
 """Environment with which MPICH sends everything by TCP, also within one machine."""
 
 
@@ -156,7 +156,7 @@ def run_processes(args: argparse.Namespace, processes: int, threads: int) -> lis
         burst = max(MIN_BURST_BYTES, round(BURST_S * args.gbit * 1e9 / 8))
         private = ["unshare", "--net", "--mount", "sh", "-c", NETWORK, "-", launcher]
         words = [*private, processes, f"{args.gbit * 1e9:.0f}bit", burst, *words]
-        environment |= BY_TCP
+        environment |= TCP_ENVIRONMENT
     elif processes:
         words = [launcher, "-n", processes, *words]
     done = subprocess.run(

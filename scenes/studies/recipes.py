@@ -21,11 +21,12 @@ from pathlib import Path
 from fits import SCENES as SCENES_FOLDER
 from fits import add_only, fit, make_parser
 
-from drgs.bench.output import machine, markdown_table, write_csv
+from drgs.bench.output import machine, markdown_table
 from drgs.config.changes import with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.io.figures import new_figure, write_figure
+from drgs.results.history import write_csv
 
 Values = Mapping[str, object]
 """Values of a configuration, by names such as ``densify.every``."""
@@ -127,8 +128,8 @@ SCENES = (LEGO, FOX)
 """The paper's values there have the shortened schedule of fits before there was another recipe."""
 
 
-def paper_of(scene: Scene) -> dict[str, object]:
-    """Every value of the paper's recipe on a scene."""
+def paper_config(scene: Scene) -> dict[str, object]:
+    """Return all values of the paper's recipe on a scene."""
     numbers = {
         "densify.budget.gaussians": scene.gaussians,
         "densify.mcmc.gaussians": scene.gaussians,
@@ -222,7 +223,7 @@ class Case:
     reference: str | None = None  # the case that it is compared with
     varied: Ingredient | None = None  # what makes the difference to that; None: everything
 
-    def concerns(self, scene: Scene) -> bool:
+    def differs_on(self, scene: Scene) -> bool:
         """Return whether it is another recipe than the one it is compared with."""
         return self.varied is None or bool(self.varied.changes(scene))
 
@@ -244,7 +245,7 @@ CASES = (
 
 
 def config_of(case: Case, scene: Scene, data: Path | None = None) -> FitConfig:
-    """The configuration of a recipe on a scene; data: its folder, if not the configuration's."""
+    """Return a recipe's configuration on a scene; data: a folder instead of the default."""
     overrides = [] if data is None else [f"data.path={data}"]
     images = load_config(scene.config, overrides).data
     config = FitConfig.model_validate(
@@ -254,7 +255,7 @@ def config_of(case: Case, scene: Scene, data: Path | None = None) -> FitConfig:
             "output": {"save_renders": False},
         }
     )
-    values = paper_of(scene)
+    values = paper_config(scene)
     for ingredient in case.ingredients:
         values.update(ingredient.changes(scene))
     return with_changes(config, values)
@@ -411,7 +412,7 @@ def main() -> None:
         if not config_of(PAPERS, scene, data).data.path.is_dir():
             print(f"{scene.name} is left out; give its folder with --data DIR")
             continue
-        for case in (case for case in cases if case.concerns(scene)):
+        for case in (case for case in cases if case.differs_on(scene)):
             config = config_of(case, scene, data)
             found = fit_point(case, scene, config, args.out, args.threads)
             points.setdefault(scene.title, {})[case.name] = found

@@ -70,8 +70,8 @@ class Row:
     largest_error: float
 
 
-def enlarged(subject: Subject, factor: int) -> Subject:
-    """The same scene with all lengths multiplied by ``factor``."""
+def enlarge(subject: Subject, factor: int) -> Subject:
+    """Multiply all lengths of the scene by ``factor``."""
     gaussians = subject.gaussians
     return replace(
         subject,
@@ -87,7 +87,7 @@ def enlarged(subject: Subject, factor: int) -> Subject:
 
 
 def compare(subject: Subject, factor: int) -> list[Row]:
-    """All changes of the reference, against Mitsuba's image of the first view."""
+    """Compare all changes of the reference with Mitsuba's image of the first view."""
     camera = subject.cameras[0]
     image = volprim_image(subject.gaussians, camera)
     gaussians = reference.Gaussians(
@@ -106,7 +106,7 @@ def _row(factor: int, what: str, image: np.ndarray, other: np.ndarray) -> Row:
 
 
 def volprim_image(gaussians: Gaussians, camera: reference.Camera) -> np.ndarray:
-    """(H, W, 3) display space, on black, each pixel at its centre; fx and fy must agree."""
+    """Render (H, W, 3), display space, on black, one sample at pixel centres; requires fx = fy."""
     sensor = mitsuba_sensor(camera) | {
         "near_clip": camera.near,
         "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
@@ -118,7 +118,7 @@ def volprim_image(gaussians: Gaussians, camera: reference.Camera) -> np.ndarray:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """PSNR of each change, a column for each factor."""
+    """Format the PSNR of each change, a column per factor."""
     factors = list(dict.fromkeys(row.factor for row in rows))
     header = ["PSNR against volprim_rf_basic", *(f"lengths x {factor}" for factor in factors)]
     lines = []
@@ -135,7 +135,7 @@ def main() -> None:
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     subject = load_subject(Path(args.scene), 1)
-    rows = [row for f in FACTORS for row in compare(enlarged(subject, f), f)]
+    rows = [row for f in FACTORS for row in compare(enlarge(subject, f), f)]
     print(table(rows))
 
 

@@ -43,7 +43,7 @@ def image_of(subject, **approximations):
 
 def test_the_ladder_leads_to_the_most_accurate_form(subject):
     """The most accurate kernels agree with it; each step on the way comes closer."""
-    accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
+    accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
     steps = [
         {},
         {"projection": "exact"},
@@ -57,7 +57,7 @@ def test_the_ladder_leads_to_the_most_accurate_form(subject):
 
 
 def test_the_most_accurate_form_is_close_to_one_without_any_cut(subject):
-    accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
+    accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
     # Three hundred alphas of less than a millionth.
     assert 0 < accuracy.check_on_crops(subject, accurate) < 3e-4
     rough = accuracy.most_accurate(subject, subject.cameras[0], 1e-2)
@@ -65,7 +65,7 @@ def test_the_most_accurate_form_is_close_to_one_without_any_cut(subject):
 
 
 def test_a_measurement_is_what_its_columns_say(subject):
-    accurate = [accuracy.most_accurate(subject, c, accuracy.LEAST_ALPHA) for c in subject.cameras]
+    accurate = [accuracy.most_accurate(subject, c, accuracy.MIN_ALPHA) for c in subject.cameras]
     rungs = [accuracy.RUNGS[0], accuracy.Rung("4 samples", {"low_pass": 0.0}, False, samples=4)]
     default, sampled = accuracy.measure(subject, accurate, rungs, 1)
     image = image_of(subject)
@@ -136,7 +136,7 @@ def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monke
 
 def test_pixels_that_do_not_count_are_left_out(subject):
     """The mask is the photograph's."""
-    accurate = [accuracy.most_accurate(subject, c, accuracy.LEAST_ALPHA) for c in subject.cameras]
+    accurate = [accuracy.most_accurate(subject, c, accuracy.MIN_ALPHA) for c in subject.cameras]
     (view,), mask = subject.photographs, np.ones((24, 24), np.float32)
     mask[:, 5:] = 0
     masked = replace(subject, photographs=[replace(view, mask=mask)])
@@ -154,8 +154,8 @@ def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
     found = accuracy.load_subject(tmp_path / "smooth.ply", 1)
     assert (found.gaussians.log_scales > gaussians.log_scales).all()
     found = replace(found, cameras=subject.cameras, background=subject.background)
-    accurate = accuracy.most_accurate(found, found.cameras[0], accuracy.LEAST_ALPHA)
-    without = accuracy.most_accurate(subject, subject.cameras[0], accuracy.LEAST_ALPHA)
+    accurate = accuracy.most_accurate(found, found.cameras[0], accuracy.MIN_ALPHA)
+    without = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
     image = image_of(found, projection="exact", order="pixel", order_window=16, **accuracy.UNCUT)
     # What the ladder's last step leaves; the filter is as wide as the splats, and changes far more.
     assert np.abs(image - accurate).mean() < 1e-4 < 0.01 < np.abs(accurate - without).mean()

@@ -23,7 +23,7 @@ def small(monkeypatch):
     monkeypatch.setattr(effects, "SIZE", 32)
     monkeypatch.setattr(effects, "NUM_GAUSSIANS", 150)
     monkeypatch.setattr(effects, "ROUNDS", 1)
-    monkeypatch.setattr(effects, "ENVIRONMENT", (4, 8))
+    monkeypatch.setattr(effects, "ENVIRONMENT_SHAPE", (4, 8))
 
 
 @pytest.mark.slow

@@ -53,11 +53,11 @@ def looked_on(monkeypatch):
     """Makes ``--view`` a page for the screen above, without a server."""
 
     @contextmanager
-    def serving(*arguments):
+    def run_server(*arguments):
         yield "server"
 
     server = ModuleType("drgs.viewer.server")
-    server.serving, server.url, server.ADDRESS = serving, lambda _: "http://here", "127.0.0.1"
+    server.run_server, server.url, server.ADDRESS = run_server, lambda _: "http://here", "127.0.0.1"
     monkeypatch.setitem(sys.modules, "drgs.viewer.server", server)
     monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
     monkeypatch.setattr("drgs.viewer.training_viewer.PROGRESS_SECONDS", 0.0)

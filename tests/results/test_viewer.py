@@ -228,7 +228,7 @@ def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
 
 def test_what_is_too_large_by_its_number_alone_is_not_built(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "viewer_page", None)
-    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.least_bytes(30, blobs().sh_degree) - 1)
+    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.min_page_bytes(30, blobs().sh_degree) - 1)
     with pytest.warns(UserNote, match=r"not written, as it would have at least 0 MB"):
         viewer.write_viewer(tmp_path, make_dataset(), DisplaySettings(blobs(), OWN))
     assert list(tmp_path.iterdir()) == []
@@ -242,7 +242,7 @@ def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(initial_
     one, twelve = (
         len(page_of(gaussians_within_ranges(n, sh_degree), initial_view)) for n in counts
     )
-    least = viewer.least_bytes(counts[1] - counts[0], sh_degree)
+    least = viewer.min_page_bytes(counts[1] - counts[0], sh_degree)
     assert least <= twelve - one <= 1.01 * (least / viewer.MIN_GZIP_RATIO + 11 * 72 * 4 / 3)
 
 

@@ -13,8 +13,8 @@ from drgs.core.errors import UserError
 from drgs.integrator.scene import make_scene, render_views
 from drgs.viewer.frames import (
     BACKDROP_GRAY,
+    FRAME_CONTENTS,
     MOST_ACCURATE,
-    SHOWN,
     VIEWER_LENSES,
     FrameRequest,
     LiveScene,
@@ -66,10 +66,10 @@ def test_smaller_images_show_the_same(scene):
 
 
 def test_depths_are_colored_from_near_to_far(scene):
-    frame = scene.frame(replace(REQUEST, shows="depth"))
+    frame = scene.frame(replace(REQUEST, content="depth"))
     near, far = (float(word) for word in frame.note.split() if word[0].isdigit())
     assert RADIUS - 1.1 < near < far < RADIUS + 1.1  # the blobs are within a unit of the focus
-    opacity = scene.frame(replace(REQUEST, shows="opacity")).pixels
+    opacity = scene.frame(replace(REQUEST, content="opacity")).pixels
     empty = opacity.max(axis=2) == 0
     assert 0.3 < empty.mean() < 1
     assert (frame.pixels[empty] == round(255 * BACKDROP_GRAY)).all()
@@ -78,8 +78,8 @@ def test_depths_are_colored_from_near_to_far(scene):
 
 
 def test_normals_point_to_the_camera(scene):
-    pixels = scene.frame(replace(REQUEST, shows="normals")).pixels
-    opaque = scene.frame(replace(REQUEST, shows="opacity")).pixels.min(axis=2) > 250
+    pixels = scene.frame(replace(REQUEST, content="normals")).pixels
+    opaque = scene.frame(replace(REQUEST, content="opacity")).pixels.min(axis=2) > 250
     normals = pixels[opaque] / 255 * 2 - 1
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=0.05)  # eight bits, alpha
     # A sum of unit vectors that point to the camera, seen at most 30 degrees from the axis.
@@ -89,13 +89,13 @@ def test_normals_point_to_the_camera(scene):
 def test_the_error_is_the_difference_from_the_most_accurate_image(scene):
     best = {"projection": "exact", **MOST_ACCURATE}
     shown, accurate = reference_image(), reference_image(**best)
-    frame = scene.frame(replace(REQUEST, shows="error"))
+    frame = scene.frame(replace(REQUEST, content="error"))
     expected = np.round(255 * np.clip(0.5 + 5 * (shown - accurate), 0, 1))
     assert np.abs(frame.pixels - expected).max() <= 1  # halves are rounded in single precision
     psnr = -10 * np.log10(np.mean((shown - accurate) ** 2))
     assert f"{psnr:.1f} dB" in frame.note
     values = Approximations(**{**vars(scene.approximations), **best})
-    frame = scene.frame(replace(REQUEST, shows="error", approximations=values))
+    frame = scene.frame(replace(REQUEST, content="error", approximations=values))
     assert (frame.pixels == 128).all() and "the same as" in frame.note
 
 
@@ -114,8 +114,8 @@ def test_everything_is_shown_through_every_lens(scene, lens):
     numbers, refused = NUMBERS.get(lens, {}), set()
     for projection, order in (("ewa", "center"), ("unscented", "pixel"), ("exact", "pixel")):
         approximations = replace(scene.approximations, projection=projection, order=order)
-        for shows in SHOWN:
-            request = FrameRequest(EYE, 12, 8, lens, numbers, shows, approximations)
+        for content in FRAME_CONTENTS:
+            request = FrameRequest(EYE, 12, 8, lens, numbers, content, approximations)
             try:
                 assert scene.frame(request).pixels.shape == (8, 12, 3)
             except UserError:
@@ -126,12 +126,12 @@ def test_everything_is_shown_through_every_lens(scene, lens):
 def test_the_error_through_parallel_rays_is_that_of_the_order():
     """``ewa`` is exact there: with the most accurate order there is none."""
     scene = LiveScene(blobs(), ModelConfig(**MOST_ACCURATE), WHITE)
-    parallel = replace(REQUEST, lens="orthographic", shows="error")
+    parallel = replace(REQUEST, lens="orthographic", content="error")
     assert (scene.frame(parallel).pixels == 128).all()
     assert (scene.frame(replace(parallel, lens="pinhole")).pixels != 128).any()
 
 
 def test_nothing_to_see_has_no_depth(scene):
     away = ViewerCamera(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
-    frame = scene.frame(replace(REQUEST, camera=away, shows="depth"))
+    frame = scene.frame(replace(REQUEST, camera=away, content="depth"))
     assert frame.note == "nothing is seen" and np.ptp(frame.pixels) == 0

@@ -35,7 +35,13 @@ from drgs.config.approximations import Approximations
 from drgs.training.loop import AllIterations, History, iterations
 from drgs.viewer.page import StartView
 from drgs.viewer.scheduler import RenderRequests
-from drgs.viewer.server import MAX_CONNECTIONS, MAX_MESSAGE_BYTES, is_valid, offers, serving
+from drgs.viewer.server import (
+    MAX_CONNECTIONS,
+    MAX_MESSAGE_BYTES,
+    accepts_value,
+    is_valid,
+    run_server,
+)
 from drgs.viewer.training_viewer import TrainingPage, watch
 
 STOPPING = ("Pause", "End and write results")
@@ -51,7 +57,7 @@ def variant():
 
 @pytest.fixture
 def server():
-    with serving("127.0.0.1", None, ("", "")) as server:
+    with run_server("127.0.0.1", None, ("", "")) as server:
         yield server
 
 
@@ -82,8 +88,8 @@ def wait_until(condition, seconds=10):
 )
 def test_a_control_has_the_values_that_it_offers(control, accepted, rejected):
     control = SimpleNamespace(**control)
-    assert all(offers(control, value) for value in accepted)
-    assert not any(offers(control, value) for value in rejected)
+    assert all(accepts_value(control, value) for value in accepted)
+    assert not any(accepts_value(control, value) for value in rejected)
 
 
 def test_a_camera_has_finite_numbers_and_a_direction():
@@ -111,7 +117,7 @@ def test_a_thousand_invalid_messages_change_nothing_and_print_nothing(server, ca
     send_all(server.get_port(), hostile_messages(1, 1000, uuids))
     assert {uuid: len(c._impl.update_cb) for uuid, c in controls_of(server).items()} == callbacks
     for uuid, control in controls_of(server).items():
-        assert control.value == before[uuid] or offers(control, control.value)
+        assert control.value == before[uuid] or accepts_value(control, control.value)
     label = next(c for c in controls_of(server).values() if getattr(c, "label", "") == "Show")
     seen = []
 

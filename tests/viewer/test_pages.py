@@ -18,10 +18,10 @@ from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.training.loop import History, HistoryRow
-from drgs.viewer.frames import SHOWN, VIEWER_LENSES, ViewerFrame
-from drgs.viewer.page import CONTROLLED, Page, StartView
+from drgs.viewer.frames import FRAME_CONTENTS, VIEWER_LENSES, ViewerFrame
+from drgs.viewer.page import ADJUSTABLE_APPROXIMATIONS, Page, StartView
 from drgs.viewer.scheduler import RenderRequests
-from drgs.viewer.server import free_port, is_own, serving, url
+from drgs.viewer.server import free_port, is_same_origin, run_server, url
 from drgs.viewer.training_viewer import MAX_POINTS, TrainingPage, psnr_curves
 
 FITTED = Approximations(low_pass=0.1, antialiased=True, extent=3.5)
@@ -34,7 +34,7 @@ def variant():
 
 @pytest.fixture
 def server():
-    with serving("127.0.0.1", None, ("--address", "--port")) as server:
+    with run_server("127.0.0.1", None, ("--address", "--port")) as server:
         yield server
 
 
@@ -74,7 +74,7 @@ def test_the_first_look_is_that_of_the_first_training_camera_at_what_all_look_at
     assert start.up == pytest.approx([0, 0, 1], abs=1e-9)
     seen = start.camera.viewpoint(32, 24)
     assert pytest.approx(views[0].K) == seen.K
-    farther = start.from_farther(1.5).camera
+    farther = start.move_back(1.5).camera
     pose = farther.camera_to_world
     assert farther.distance == pytest.approx(1.5 * RADIUS)
     assert pose[:3, 3] + farther.distance * pose[:3, 2] == pytest.approx(FOCUS)
@@ -87,7 +87,7 @@ def test_a_browsers_camera_becomes_a_request(page):
     assert request.camera.camera_to_world == pytest.approx(pose_around(0.7, 0.2))
     assert request.camera.fov == pytest.approx(50) and request.camera.distance == pytest.approx(2.5)
     assert (request.width, request.height) == (1280, 720)  # of 1600 x 900, at most 1280
-    assert request.shows == "color" and request.lens == "pinhole"
+    assert request.content == "color" and request.lens == "pinhole"
     assert request.approximations == FITTED
     request = asked(page, width=300, height=200)
     assert (request.width, request.height) == (300, 200)
@@ -95,10 +95,10 @@ def test_a_browsers_camera_becomes_a_request(page):
 
 def test_every_control_is_in_the_request(page):
     controls = page.controls
-    controls._shows.value, controls._side.value = "depth", "640"
+    controls._content.value, controls._side.value = "depth", "640"
     request = asked(page)
-    assert request.shows == "depth" and (request.width, request.height) == (640, 360)
-    controls._numbers["k1"].value = -0.2
+    assert request.content == "depth" and (request.width, request.height) == (640, 360)
+    controls._lens_sliders["k1"].value = -0.2
     lenses = {
         "opencv": {"k1": -0.2, "k2": 0.0},
         "fisheye": {"k1": -0.2, "k2": 0.0},
@@ -110,9 +110,9 @@ def test_every_control_is_in_the_request(page):
     for name, numbers in lenses.items():
         controls._lens.value = name
         request = asked(page)
-        assert (request.lens, request.lens_numbers) == (name, numbers)
+        assert (request.lens, request.lens_parameters) == (name, numbers)
         assert request.camera.fov == pytest.approx(90 if name == "fisheye" else 50)
-    for name in CONTROLLED:
+    for name in ADJUSTABLE_APPROXIMATIONS:
         declared, value = DECLARED[name], getattr(FITTED, name)
         other = not value if declared.kind is bool else 2
         other = next((word for word in declared.words if word != value), other)
@@ -134,7 +134,7 @@ def test_times_are_compared_with_those_of_the_same_image_as_fitted(page):
     assert page._describe(7, other, frames[1]).startswith("**50 ms** for 1280×720; as fitted 20 ms")
     assert page._describe(7, other, frames[1]).endswith("\n\nx")
     elsewhere = replace(other, camera=replace(other.camera, camera_to_world=pose_around(0.1, 0.1)))
-    for changed in (replace(other, width=640), replace(other, shows="depth"), elsewhere):
+    for changed in (replace(other, width=640), replace(other, content="depth"), elsewhere):
         assert "as fitted" not in page._describe(7, changed, frames[1])
 
 
@@ -150,7 +150,7 @@ def test_the_server_is_at_the_address_that_is_printed_and_prints_nothing(server,
     assert url(server) == f"http://127.0.0.1:{server.get_port()}"
     second = free_port("127.0.0.1", None, ("", ""))
     assert second != server.get_port()
-    with serving("127.0.0.1", None, ("", "")) as other:
+    with run_server("127.0.0.1", None, ("", "")) as other:
         assert other.get_port() == second
         assert other.request_share_url() is None
     assert capfd.readouterr().out == ""
@@ -172,7 +172,7 @@ def test_the_server_is_at_the_address_that_is_printed_and_prints_nothing(server,
 )
 def test_only_the_page_itself_is_served(host, origin, address, expected):
     headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
-    assert is_own(headers, address) == expected
+    assert is_same_origin(headers, address) == expected
 
 
 def test_a_page_from_elsewhere_cannot_connect(server):
@@ -186,7 +186,7 @@ def test_a_page_from_elsewhere_cannot_connect(server):
 def test_nothing_is_said_of_images_for_a_browser_that_was_closed():
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        with serving("127.0.0.1", None, ("", "")) as server:
+        with run_server("127.0.0.1", None, ("", "")) as server:
             server._websock_server._broadcast_buffer.set_done()
             server.gui.add_markdown("late")
     assert not said
@@ -234,4 +234,4 @@ def test_curves_have_few_points_their_ends_and_the_measurements():
 
 
 def test_everything_that_can_be_shown_is_offered(page):
-    assert tuple(page.controls._shows.options) == tuple(SHOWN)
+    assert tuple(page.controls._content.options) == tuple(FRAME_CONTENTS)

@@ -43,7 +43,7 @@ class Stage:
         self.shown, self.refused = [], []
 
     def frame(self, request):
-        if request.shows == "nonsense":
+        if request.content == "nonsense":
             raise UserError("that cannot be seen")
         seconds = self.seconds_a_pixel * request.width * request.height
         self.clock.now += seconds
@@ -147,7 +147,7 @@ def test_everybody_is_served_in_turn_and_who_has_left_is_not(clock):
 
 def test_what_cannot_be_rendered_is_said_once(clock):
     stage, left, them = make(clock)
-    left.put(1, FrameRequest(REQUEST.camera, 800, 600, shows="nonsense"))
+    left.put(1, FrameRequest(REQUEST.camera, 800, 600, content="nonsense"))
     assert served(them, stage)
     clock.now += 10
     assert not served(them, stage)

@@ -19,7 +19,7 @@ from drgs.config.approximations import Approximations
 from drgs.integrator.scene import make_scene, render_views
 from drgs.training.loop import AllIterations, History, iterations
 from drgs.training.trainer import Trainer
-from drgs.viewer.frames import SHOWN, FrameRequest, ViewerCamera
+from drgs.viewer.frames import FRAME_CONTENTS, FrameRequest, ViewerCamera
 from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.training_viewer import EarlyStop, TrainingViewer
 
@@ -83,11 +83,11 @@ def requests():
     """One for each iteration: everything that can be shown, through several lenses."""
     for k in range(100):
         eye = ViewerCamera(pose_around(0.1 * k, 0.3), 40.0, 4.0)
-        lenses = {"lens": "fisheye"}, {"lens": "thin lens", "lens_numbers": {"aperture": 0.05}}
+        lenses = {"lens": "fisheye"}, {"lens": "thin lens", "lens_parameters": {"aperture": 0.05}}
         lens = lenses[k % 2] if k % 3 == 2 else {}
         approximations = Approximations(order="pixel") if k % 4 == 3 else None
-        shows = list(SHOWN)[k % len(SHOWN)]
-        yield FrameRequest(eye, 40, 30, shows=shows, approximations=approximations, **lens)
+        content = list(FRAME_CONTENTS)[k % len(FRAME_CONTENTS)]
+        yield FrameRequest(eye, 40, 30, content=content, approximations=approximations, **lens)
 
 
 def test_a_watched_fit_has_the_bytes_of_one_that_is_not():
