@@ -247,7 +247,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
         shows_own = False
         if honoured is not None:
             fitted = load_run_config(what).model.approximations
-            shows_own = fitted.others_than_default.keys() <= honoured(fitted)
+            shows_own = fitted.non_default.keys() <= honoured(fitted)
         path = what / (names[-1] if shows_own else names[0])
     gaussians = Gaussians.load(path)
     said = from_ply_header(str(path), gaussians.rendered_with or {})

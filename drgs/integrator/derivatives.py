@@ -23,17 +23,17 @@ DIFFERENTIATED_BY_PATH = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor"),
     *("SmoothDielectric", "RoughDielectric", "ThinDielectric", "TwoSidedBRDF"),
 )
-"""Classes of BSDFs that do not choose between parts with a probability that parameters change."""
+"""Classes of BSDFs that sample no parts with probabilities that depend on parameters."""
 
 COVERAGE = {"MaskBSDF": ("opacity",), "ThinDielectric": ("eta", "specular_transmittance")}
-"""Parameters that change how much of a pixel a surface covers, by the class of the BSDF."""
+"""Parameters that change a surface's coverage of pixels, by the class of the BSDF."""
 
 WRONG_IN_MITSUBA = {
     "RoughPlastic": ("alpha", "eta"),  # tables of its transmittance are not differentiated
     "RoughDielectric": ("eta",),
     "NormalMap": ("normalmap",),
 }
-"""Parameters of which the derivative of Mitsuba's own ``eval`` is not that of its values."""
+"""Parameters by which Mitsuba's own derivative of ``eval`` is wrong."""
 
 SPLATPATH = "splatpath"
 
@@ -42,13 +42,13 @@ TO_SPLATPATH = f"nest {SPLATPATH}, which does"
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a scene or sensor, derivatives with respect to which are asked for."""
+    """An attached parameter of a scene or sensor."""
 
-    name: str  # as mi.traverse has it
-    key: str  # the same within its object
-    owners: list[mi.Object]  # its object, the one that this belongs to, and so on
+    name: str  # in mi.traverse
+    key: str  # its name within its object
+    owners: list[mi.Object]  # its object, the parent of that, and so on
     value: object  # attached
-    has_nested: bool  # whether the material that it belongs to has others in it
+    has_nested: bool  # whether its material contains other materials
 
     @property
     def is_geometry(self) -> bool:
@@ -59,20 +59,20 @@ class Parameter:
 
     @property
     def bsdfs(self) -> list[mi.BSDF]:
-        """The material that it belongs to, and those around that."""
+        """Its material and those around it, from the inside out."""
         return [owner for owner in self.owners if isinstance(owner, mi.BSDF)]
 
     def name_in(self, bsdf: mi.BSDF) -> str:
-        """Return the material's name of the parameter, or of the texture that it belongs to."""
-        depth = self.owners.index(bsdf)
-        return self.name.split(".")[-1 - depth]
+        """Return the material's name of the parameter or of its texture."""
+        return self.name.split(".")[-1 - self.owners.index(bsdf)]
 
 
 def check_derivatives(
     splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong."""
-    if (splats.light != "none" or splats.shadows) and _has_attached_gaussians(splats, scene):
+    parts = splats.parts(ellipsoids_in(scene)) if splats.light != "none" or splats.shadows else []
+    if any(dr.grad_enabled(value) for part in parts for value in part.values.values()):
         raise UnsupportedError(
             f"splats: with light '{splats.light}' and shadows "
             f"'{', '.join(splats.shadows)}', the Gaussians are not differentiated, as surfaces "
@@ -88,7 +88,10 @@ def check_derivatives(
     parameters, reasons = list(attached_parameters(scene)), {}
     for parameter in parameters:
         reason = _refusal(parameter, splats)
-        if reason is None and mode == dr.ADMode.Forward and _is_padded(parameter):
+        # Mitsuba renders a padded copy of an environment map's texels.
+        node = parameter.owners[0].class_name(), parameter.key
+        is_padded = node == ("EnvironmentMapEmitter", "data")
+        if reason is None and mode == dr.ADMode.Forward and is_padded:
             reason = "forward mode does not reach its texels; use dr.backward"
         if reason is not None:
             reasons.setdefault(reason, []).append(parameter.name)
@@ -98,12 +101,6 @@ def check_derivatives(
             f"splats: {format_names(names)} {are} not differentiated, as {reason}; or detach "
             f"{'it' if are == 'is' else 'them'}"
         )
-
-
-def _has_attached_gaussians(splats: SplatsState, scene: mi.Scene) -> bool:
-    parts = splats.parts(ellipsoids_in(scene))
-    values = [value for part in parts for value in part.values.values()]
-    return any(dr.grad_enabled(value) for value in values)
 
 
 def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
@@ -133,16 +130,11 @@ def parameter_value(params: mi.SceneParameters, name: str) -> object:
 
 
 def type_of(integrator: mi.Integrator) -> str:
-    """Return the name of its class; those that are written in Python have one name for Mitsuba."""
+    """Return the name of its class; Mitsuba has one name for all that are written in Python."""
     if isinstance(integrator, TransportIntegrator):
         return SPLATPATH
     name = integrator.class_name()
     return type(integrator).__name__ if name == "SamplingIntegrator" else name
-
-
-def _is_padded(parameter: Parameter) -> bool:
-    """True where Mitsuba renders another array than the parameter, made from the same values."""
-    return parameter.owners[0].class_name() == "EnvironmentMapEmitter" and parameter.key == "data"
 
 
 def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
@@ -201,7 +193,7 @@ def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
 
 
 def _is_mirror(bsdf: mi.BSDF) -> bool:
-    """True where a part of it has one direction, and not straight on."""
+    """Return whether a part of it is a delta function, other than straight on."""
     return _has_flag(bsdf, mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
 
 

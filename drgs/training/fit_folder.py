@@ -205,7 +205,7 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
     Its header records the approximations that are not the default. gaussians: what
     ``trainer.gaussians()`` returned.
     """
-    others = config.model.approximations.others_than_default
+    others = config.model.approximations.non_default
     gaussians = replace(gaussians, rendered_with=others or None)
     return _remove_filter(gaussians) if config.output.bake_smoothing else gaussians
 

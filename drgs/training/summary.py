@@ -79,7 +79,7 @@ def _extensions(config: FitConfig) -> list[SimulatedEffect]:
 
 def _approximations(config: FitConfig) -> list[SimulatedEffect]:
     """Return the approximations that are chosen by name and not the default, if there are any."""
-    chosen = config.model.approximations.others_than_default
+    chosen = config.model.approximations.non_default
     values = {f"model.{k}": chosen[k] for k in chosen if k in ("projection", "falloff", "order")}
     words, keys = ", ".join(values.values()), ", ".join(values)
     return [SimulatedEffect("approximations", words, keys)] if values else []

@@ -85,7 +85,7 @@ def for_viewers(
     Where that fails, as where a number is not finite, the closed form is returned, with a
     :class:`UserNote`.
     """
-    others = trainer.config.model.approximations.others_than_default
+    others = trainer.config.model.approximations.non_default
     start, further = _closed_form(trainer, gaussians), tuning(trainer.config)
     trainer.release()
     try:

@@ -77,7 +77,7 @@ def renders(kind: type[Config], thetas: Sequence[float]) -> list[np.ndarray]:
 
 @contextmanager
 def attached(kind: type[Config]) -> Iterator[tuple[mi.Float, mi.TensorXf]]:
-    """Theta, and a image that depends on it, whose derivative is that of :func:`images`."""
+    """Theta, and an image that depends on it, whose derivative is that of :func:`images`."""
     theta = mi.Float(0)
     dr.enable_grad(theta)
     with initialized(kind) as config:

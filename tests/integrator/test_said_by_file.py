@@ -60,7 +60,7 @@ def test_the_default_can_be_asked_for(file):
 def test_gaussians_that_are_moved_are_rendered_as_the_file_says(file):
     still = mi.ScalarTransform4f().translate([0, 0, 0])
     integrator = scene_of({"filename": str(file)}, to_world=still).integrator()
-    assert integrator.state.approximations.others_than_default == SAID
+    assert integrator.state.approximations.non_default == SAID
 
 
 def test_the_summary_says_what_the_file_has_decided(file):
@@ -99,4 +99,4 @@ def test_shapes_of_gaussians_ignore_the_header(file):
     )
     mi.render(scene)
     assert scene.integrator().gaussians.num_gaussians == 40
-    assert scene.integrator().state.approximations.others_than_default == {}
+    assert scene.integrator().state.approximations.non_default == {}
