@@ -32,8 +32,7 @@ PROPERTIES = {
     "hide_emitters": flag(False),
 }
 
-MAX_SURVIVAL_PROBABILITY = 0.95
-"""Largest probability of Russian roulette, as in Mitsuba's ``path``."""
+MAX_SURVIVAL_PROBABILITY = 0.95  # largest probability of Russian roulette, as in Mitsuba's ``path``
 
 
 class SplatPathIntegrator(RBIntegrator):

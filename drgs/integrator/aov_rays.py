@@ -25,14 +25,9 @@ from drgs.integrator.state import SplatsState
 if TYPE_CHECKING:  # imported where a scene has surfaces
     from drgs.integrator.surfaces import Hybrid
 
-NESTED_VIEW = -1
-"""Index of the view in the cache."""
-
-PIXEL_MARGIN_PX = 1 / 16
-"""Largest distance of a ray from its pixel; single precision finds it to 1e-3 px."""
-
-MAX_CENTER_ERROR = 1e-5
-"""Largest distance of a ray from the camera's centre, relative to their coordinates."""
+NESTED_VIEW = -1  # index of the view in the cache
+PIXEL_MARGIN_PX = 1 / 16  # largest distance of a ray from its pixel; float32 finds it to 1e-3 px
+MAX_CENTER_ERROR = 1e-5  # distance of a ray from the camera's centre, relative to coordinates
 
 
 @dataclass(frozen=True, eq=False)

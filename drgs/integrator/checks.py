@@ -12,11 +12,8 @@ from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_large_reason
 from drgs.gaussians.parameters import Gaussians
 
-MAX_SAMPLES = 4096
-"""Most samples of a pixel times poses of motion blur; a frame takes 0.15 MB at least."""
-
-NESTED_SAMPLE_BYTES = 64
-"""Least memory of a path tracer's sample, about: its ray, sampler and radiance."""
+MAX_SAMPLES = 4096  # samples of a pixel times poses of motion blur; a frame takes 0.15 MB at least
+NESTED_SAMPLE_BYTES = 64  # at least, for a path tracer's sample: its ray, sampler and radiance
 
 
 def check_shapes(gaussians: Gaussians) -> None:

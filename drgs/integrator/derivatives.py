@@ -13,11 +13,8 @@ from drgs.integrator.checks import ellipsoids_in
 from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.state import SplatsState
 
-ATTACHED = ("PathIntegrator", "DirectIntegrator")
-"""Classes of Mitsuba's integrators whose samples move with parameters."""
-
-REPLAYED = ("PRBIntegrator", "BasicPRBIntegrator")
-"""Classes of Mitsuba's integrators whose samples stay where they are."""
+ATTACHED_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")  # samples move with parameters
+REPLAYED_INTEGRATORS = ("PRBIntegrator", "BasicPRBIntegrator")  # samples stay in place
 
 DIFFERENTIATED_BY_PATH = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor"),
@@ -148,11 +145,11 @@ def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
     if (
         isinstance(owner, mi.Shape)
         and parameter.is_geometry
-        and kind in (SPLATPATH, *ATTACHED, *REPLAYED)
+        and kind in (SPLATPATH, *ATTACHED_INTEGRATORS, *REPLAYED_INTEGRATORS)
     ):
         return _geometry_refusal(owner, kind)
     if isinstance(owner, mi.Emitter) and parameter.key in ("position", "to_world"):
-        if kind in (ATTACHED if owner.is_environment() else REPLAYED):
+        if kind in (ATTACHED_INTEGRATORS if owner.is_environment() else REPLAYED_INTEGRATORS):
             return f"{kind} does not follow a lamp that moves; {TO_SPLATPATH}"
         if splats.light != "none" and not owner.is_environment():
             return "the shadows that splats throw move with it; set light to 'none'"
@@ -160,7 +157,7 @@ def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
 
 
 def _geometry_refusal(shape: mi.Shape, kind: str) -> str | None:
-    if kind in ATTACHED:
+    if kind in ATTACHED_INTEGRATORS:
         return f"{kind} does not differentiate where paths hit surfaces; {TO_SPLATPATH}"
     if shape.is_emitter():
         return "the edge of a lamp that moves is not; optimise the lamp's radiance"
@@ -183,9 +180,9 @@ def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
         is_mixed = _has_flag(bsdf, mi.BSDFFlags.Smooth, mi.BSDFFlags.Null)
         if name != "BlendBSDF" or is_mixed:
             return f"{name} is around a perfect mirror or glass; use a rough one"
-    if kind in REPLAYED and _is_mirror(outer):
+    if kind in REPLAYED_INTEGRATORS and _is_mirror(outer):
         return f"{kind} leaves out what perfect mirrors and glass reflect; {TO_SPLATPATH}"
-    if kind in ATTACHED and any(
+    if kind in ATTACHED_INTEGRATORS and any(
         b.class_name() not in DIFFERENTIATED_BY_PATH for b in parameter.bsdfs
     ):
         return f"{kind} does not differentiate which part of a {name} it samples; {TO_SPLATPATH}"

@@ -24,8 +24,7 @@ from drgs.splatting.footprint import PixelCenters, SamplePositions, flat_columns
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 
-Channels = list[Float]
-"""Channels of one pass, each (samples * H * W,): red, green, blue, perhaps alpha, AOVs."""
+Channels = list[Float]  # by pass, each (samples * H * W,): red, green, blue, perhaps alpha, AOVs
 
 
 def num_colors(film: mi.Film) -> int:
@@ -136,8 +135,7 @@ def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) ->
     return matrix
 
 
-PIXELS_PER_PASS = 1 << 17
-"""Most pixels in a pass of several samples: launching fewer costs more than computing them."""
+PIXELS_PER_PASS = 1 << 17  # most pixels in a pass of several samples: larger launches gain nothing
 
 SAMPLES_PER_KERNEL = 16
 """Samples per pixel after which a box filter's sums are evaluated: compile time is superlinear.

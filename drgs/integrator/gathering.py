@@ -59,11 +59,8 @@ from drgs.gaussians.rotation import (
 from drgs.gaussians.sh import num_coefficients
 from drgs.gaussians.similarity import Similarity
 
-ParameterArrays = dict[str, Any]
-"""Arrays by name: a TensorXf or Float for each parameter, a Matrix4f for ``to_world``."""
-
-ParameterColumns = dict[str, list[Float]]
-"""Columns of parameters by name."""
+ParameterArrays = dict[str, Any]  # TensorXf or Float by name; a Matrix4f for ``to_world``
+ParameterColumns = dict[str, list[Float]]  # columns of parameters by name
 
 TO_WORLD = "to_world"
 
@@ -386,14 +383,12 @@ def _columns_of(tensor: mi.TensorXf) -> list[Float]:
     return columns(tensor.array, math.prod(tensor.shape[1:]))
 
 
-ELLIPSOID_DATA_WIDTH = 10
-"""Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""
+ELLIPSOID_DATA_WIDTH = 10  # numbers per row: centre, standard deviations, quaternion xyzw
 
 OPACITY_RANGE = (2.0**-64, 1 - 2.0**-24)
 """An invisible opacity, which has a reciprocal in float32; the largest float32 below 1."""
 
-TRANSPARENT_LOGIT = -1e4
-"""Logit with a sigmoid of exactly zero."""
+TRANSPARENT_LOGIT = -1e4  # logit with a sigmoid of exactly zero
 
 
 def read(shape: mi.Shape) -> ParameterArrays:

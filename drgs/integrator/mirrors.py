@@ -31,29 +31,20 @@ from drgs.integrator.sensors import SensorState, camera_from_sensor
 from drgs.light.probe import LOW_PASS, ProbeHit, bilinear_texels
 from drgs.splatting import rendering
 
-TEXELS_PER_PIXEL = 2
-"""Texels per pixel of a small film, along either axis."""
+TEXELS_PER_PIXEL = 2  # texels per pixel of a small film, along either axis
 
 FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
 """Texels of all images, 20 bytes each, from which on a pixel has fewer; and fewer than one."""
 
-BORDER_TEXELS = 8
-"""Texels around an image: filters of the film reach beyond its edge."""
-
-MAX_RELATIVE_DEPARTURE = 1e-5
-"""Largest distance of a vertex from the plane of a flat shape, relative to the shape's size."""
-
-MAX_ROUNDING_DEPARTURE = 1e-6
-"""The same, relative to the coordinates: both are allowed."""
-
-MAX_RAY_OFFSET = 1e-3
-"""Largest distance between a ray and the camera's, relative to the distance from the camera."""
+BORDER_TEXELS = 8  # texels around an image: filters of the film reach beyond its edge
+MAX_RELATIVE_DEPARTURE = 1e-5  # of vertices from the plane of a flat shape, relative to its size
+MAX_ROUNDING_DEPARTURE = 1e-6  # the same, relative to the coordinates: both are allowed
+MAX_RAY_OFFSET = 1e-3  # distance between a ray and the camera's, relative to that from the camera
 
 MAX_ROUNDING_OFFSET = 2e-4
 """The same, relative to the coordinates: twice as far as Mitsuba starts rays off a surface."""
 
-MIN_TEXEL_WEIGHT = 1e-3
-"""Smallest weight, of 1, of the texels around a ray that end where it does."""
+MIN_TEXEL_WEIGHT = 1e-3  # smallest weight, of 1, of the texels around a ray that end where it does
 
 MAX_END_DISTANCES = (0.1, 0.01)
 """Largest distance between equal ends of rays, relative to their length from the mirror on, and

@@ -126,11 +126,8 @@ APPROXIMATIONS = {
     for name, one in DECLARED.items()
 }
 
-FEATURE = "feature_"
-"""Prefix of the names of the user's own features."""
-
-SHAPES_TO_WORLD = "shapes_to_world"
-"""Prefix of the names of properties with the ``to_world`` of shapes."""
+FEATURE = "feature_"  # prefix of the names of the user's own features
+SHAPES_TO_WORLD = "shapes_to_world"  # prefix of properties with the ``to_world`` of shapes
 
 OBJECT_PROPERTIES = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
 """Properties of a ``splats`` that is nested in another, besides :data:`FEATURE`."""
@@ -141,8 +138,7 @@ KNOWN = (
 )
 """Properties of ``splats``, besides nested objects and names with a prefix."""
 
-UNNAMED = "_arg_"
-"""Prefix of Mitsuba's names for nested objects without one."""
+UNNAMED = "_arg_"  # prefix of Mitsuba's names for nested objects without one
 
 
 def read_state(

@@ -23,8 +23,7 @@ Ray = TypeVar("Ray", bound="mi.Ray3f")
 MAX_INVISIBLE_OPACITY = 1e-6
 """Largest opacity of an invisible surface; rounding leaves up to 2e-7 where there is none."""
 
-UNBOUNDED_DEPTH = 0xFFFFFFFF
-"""``max_depth`` of Mitsuba's integrators where paths have no limit."""
+UNBOUNDED_DEPTH = 0xFFFFFFFF  # ``max_depth`` of Mitsuba's integrators where paths have no limit
 
 
 def has_transparent_parts(scene: mi.Scene) -> bool:

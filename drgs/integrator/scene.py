@@ -17,11 +17,8 @@ from drgs.core.memory import too_large_reason
 from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
-NEAR_CLIP = 1e-9
-"""Scene units: the smallest near plane of a configuration, so that the integrator's applies."""
-
-SQUARE_PIXEL_TOLERANCE = 0.01
-"""px: largest shift at the image's border from treating pixels as square."""
+NEAR_CLIP = 1e-9  # scene units: the smallest near plane, so that the integrator's applies
+SQUARE_PIXEL_TOLERANCE = 0.01  # px: largest shift at the border from treating pixels as square
 
 
 def make_scene(

@@ -32,14 +32,9 @@ if TYPE_CHECKING:  # imported where a scene has surfaces
     from drgs.integrator.visible_surfaces import SurfaceLayers
 
 
-Passes = list[Channels]
-"""Channels by pass: one sample per pixel or, on a small film, several."""
-
-Planes = list[list[list[Float]]]
-"""Planes of frames, each (samples * H * W,), by time and by pass."""
-
-PASSES_PER_KERNEL = 16
-"""Passes or times after which planes and sums are evaluated: compile time is superlinear."""
+Passes = list[Channels]  # channels by pass: one sample per pixel or, on a small film, several
+Planes = list[list[list[Float]]]  # planes of frames, each (samples * H * W,), by time and by pass
+PASSES_PER_KERNEL = 16  # passes or times between evaluations: compile time is superlinear
 
 
 @dataclass(frozen=True, eq=False)

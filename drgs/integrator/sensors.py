@@ -16,8 +16,7 @@ from drgs.core.types import Array3f, Float, Matrix3f, Matrix4f
 from drgs.integrator.film import Channels, SamplePoints
 from drgs.splatting.footprint import SamplePositions
 
-Pair = tuple[Float, Float]
-"""Numbers along the two sides of the film."""
+Pair = tuple[Float, Float]  # numbers along the two sides of the film
 
 
 @dataclass(frozen=True)

@@ -31,17 +31,10 @@ from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
-GAMMA = 2.2
-"""Exponent of radiance as a function of display values."""
-
-MIN_SHADOW_TRANSMITTANCE = 1 / 64
-"""Smallest transmittance of splats."""
-
-EMITTER_SAMPLES = 64
-"""Samples of the scene's emitters for each splat; a pixel averages many splats."""
-
-MIN_SHADED_SHARE = 1 / 64
-"""Smallest part of a splat's light, without other splats, that objects block to shade it."""
+GAMMA = 2.2  # exponent of radiance as a function of display values
+MIN_SHADOW_TRANSMITTANCE = 1 / 64  # smallest transmittance of splats
+EMITTER_SAMPLES = 64  # samples of the scene's emitters for each splat; a pixel averages many splats
+MIN_SHADED_SHARE = 1 / 64  # least share of a splat's unoccluded light that objects block
 
 SHADOW_OFFSET_STDS = 3.0
 """Standard deviations along a splat's shortest axis from its mean to the shadow ray's start, so

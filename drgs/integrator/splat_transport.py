@@ -60,11 +60,8 @@ DECODING = (0.012522878, 0.682171111, 0.305306011)
 """Factors of the first three powers of an encoded colour, whose sum is its linear radiance to
 within 2e-3 (Chapman, "sRGB approximations for HLSL", 2012)."""
 
-MIN_DRAWN_SPLATS = 3
-"""Least splats that a ray draws: the third power needs three."""
-
-ROULETTE_TRANSMITTANCE = 0.25
-"""Transmittance to an emitter below which Russian roulette decides whether to search on."""
+MIN_DRAWN_SPLATS = 3  # least splats that a ray draws: the third power needs three
+ROULETTE_TRANSMITTANCE = 0.25  # to an emitter: below it, Russian roulette ends the search
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,11 +159,8 @@ def _segment(ray: mi.Ray3f, active: mi.Bool) -> Segment:
     return Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Bool(active))
 
 
-MIN_PROBE_DISTANCE = 1.25
-"""Smallest distance of splats from an object's middle without a warning, in halves of its size."""
-
-NO_PROBE = 0xFFFFFFFF
-"""Number of a missing probe."""
+MIN_PROBE_DISTANCE = 1.25  # of splats without a warning, in halves of the object's size
+NO_PROBE = 0xFFFFFFFF  # number of a missing probe
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,14 +20,9 @@ from drgs.effects.occlusion import Surface
 from drgs.integrator.film import num_samples, pixel_corners
 from drgs.integrator.rays import MAX_INVISIBLE_OPACITY, StraightRays
 
-EDGE_GRID = 4
-"""Rays along each axis of a pixel in which a surface ends."""
-
-MAX_SURFACES = 4
-"""Surfaces that are seen one through the other; the last one stands for all that follow."""
-
-MISSING_SURFACE_DEPTH = 1e30
-"""Depth of a missing surface: behind all splats, and 0 times it is 0."""
+EDGE_GRID = 4  # rays along each axis of a pixel in which a surface ends
+MAX_SURFACES = 4  # seen one through the other; the last one stands for all that follow
+MISSING_SURFACE_DEPTH = 1e30  # depth of a missing surface: behind all splats, and 0 times it is 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +51,7 @@ class VisibleSurface(Surface):
         return None
 
 
-SurfaceLayers = list[VisibleSurface]
-"""The surfaces of each pixel, nearest first."""
+SurfaceLayers = list[VisibleSurface]  # the surfaces of each pixel, nearest first
 
 
 def transmittance_behind(surfaces: Sequence[Surface]) -> mi.Float:

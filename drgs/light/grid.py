@@ -18,28 +18,16 @@ from drgs.core.arrays import from_host, reinterpret, types_of
 from drgs.core.types import Array3f, Array3u, Bool, Float, UInt32
 from drgs.splatting.tiles import lower_bounds
 
-CELLS_PER_GAUSSIAN = 2.0
-"""Cells of the innermost cube per Gaussian. More shorten the lists and lengthen the walk."""
-
-RESOLUTION_RANGE = (8, 128)
-"""Least and most cells along an edge, multiples of 4: the middle half is a finer cube."""
-
-INNER_CUBE_SHARE = 0.9
-"""Share of the means in the innermost cube."""
-
-MAX_LEVELS = 24
-"""Most cubes; Gaussians beyond 2^23 times the innermost one's size are in no list."""
-
-MAX_ENTRIES_PER_GAUSSIAN = 32
-"""Most entries, besides :data:`FREE_ENTRIES`; cells grow until there are no more."""
+CELLS_PER_GAUSSIAN = 2.0  # of the innermost cube; more shorten lists and lengthen the walk
+RESOLUTION_RANGE = (8, 128)  # cells along an edge, multiples of 4: the middle half is finer
+INNER_CUBE_SHARE = 0.9  # share of the means in the innermost cube
+MAX_LEVELS = 24  # most cubes; Gaussians beyond 2^23 times the innermost one's size are in no list
+MAX_ENTRIES_PER_GAUSSIAN = 32  # besides FREE_ENTRIES; cells grow until there are no more
 
 FREE_ENTRIES = 1 << 20
 
-CELL_MARGIN = 1 / 64
-"""Margin in cells that extends Gaussians: far more than rounding and :data:`CELL_STEP`."""
-
-CELL_STEP = 1 / 1024
-"""Step in cells after which a ray looks up its cell."""
+CELL_MARGIN = 1 / 64  # cells by which Gaussians are extended: far more than rounding and CELL_STEP
+CELL_STEP = 1 / 1024  # step in cells after which a ray looks up its cell
 
 
 @dataclass(frozen=True)

@@ -27,35 +27,16 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.splatting import rendering
 from drgs.splatting.projection import GaussianRows
 
-CUBE_SIZE_TEXELS = 256
-"""Texels of an edge of the largest cube."""
-
-NUM_LEVELS = 7
-"""Cubes of a probe, each with half the edge of the one before."""
-
-LOW_PASS = 0.03
-"""Low-pass filter of the images, px^2: rays have none."""
-
-LAST_DISTANCE_LEVEL = 2
-"""The last level whose distances are searched: means over larger angles are no surface."""
-
-MAX_RAY_STEPS = 8
-"""Most steps of a search along a ray."""
-
-STEP_HALVINGS = 4
-"""Halvings of the step in which a ray meets splats."""
-
-MIN_SOLID_COVERAGE = 0.5
-"""Smallest coverage that ends a ray."""
-
-BORDER_TEXELS = 1
-"""Texels around each image that repeat the neighbours', for interpolation."""
-
-MIN_FIRST_STEP = 0.1
-"""First step of a ray from the centre, relative to the distance of the nearest splats."""
-
-HIT_DISTANCE_SHARE = 0.98
-"""Smallest distance of splats that a step meets, relative to the distance before the step."""
+CUBE_SIZE_TEXELS = 256  # texels of an edge of the largest cube
+NUM_LEVELS = 7  # cubes of a probe, each with half the edge of the one before
+LOW_PASS = 0.03  # low-pass filter of the images, px^2: rays have none
+LAST_DISTANCE_LEVEL = 2  # whose distances are searched: means over larger angles are no surface
+MAX_RAY_STEPS = 8  # most steps of a search along a ray
+STEP_HALVINGS = 4  # halvings of the step in which a ray meets splats
+MIN_SOLID_COVERAGE = 0.5  # smallest coverage that ends a ray
+BORDER_TEXELS = 1  # texels around each image that repeat the neighbours', for interpolation
+MIN_FIRST_STEP = 0.1  # of a ray from the centre, relative to the distance of the nearest splats
+HIT_DISTANCE_SHARE = 0.98  # least distance of splats that a step meets, relative to that before it
 
 
 @dataclass(frozen=True)

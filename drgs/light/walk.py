@@ -33,20 +33,11 @@ from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import GaussianRows
 from drgs.splatting.rasterize import composite_step
 
-WINDOW_PEAKS = 8
-"""Peaks that a ray sorts before it composites them."""
-
-ENTRIES_PER_TURN = 16
-"""Entries after which a ray waits for others of its vector to find their next cell."""
-
-MAX_RANDOM_WORD = 2.0**32 - 2**8
-"""Bound of random numbers for the probability 1: the largest float32 of 32 bits."""
-
-MAX_DISTANCE = 1e18
-"""Largest distance of Gaussians from the origin, world units: squares of larger ones overflow."""
-
-SHAPE_WIDTH = 13
-"""Numbers of a record: mean, rows of W, base-2 logarithm of the opacity."""
+WINDOW_PEAKS = 8  # peaks that a ray sorts before it composites them
+ENTRIES_PER_TURN = 16  # after which a ray waits for others of its vector to find their next cell
+MAX_RANDOM_WORD = 2.0**32 - 2**8  # bound for the probability 1: the largest float32 of 32 bits
+MAX_DISTANCE = 1e18  # of Gaussians from the origin, world units: larger squares overflow
+SHAPE_WIDTH = 13  # numbers of a record: mean, rows of W, base-2 logarithm of the opacity
 
 
 @dataclass(frozen=True)
