@@ -100,9 +100,8 @@ class CalibratedSensor(mi.Sensor):
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
         cb.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
-        for name in ("fx", "fy", "cx", "cy"):
-            cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
-        for name, value in self.coefficients.items():
+        intrinsics = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
+        for name, value in (intrinsics | self.coefficients).items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
         if self.to_world_close is not None:
             cb.put("to_world_close", self.to_world_close, mi.ParamFlags.NonDifferentiable)
@@ -152,13 +151,9 @@ class CalibratedSensor(mi.Sensor):
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
 
     def sample_ray(
-        self,
-        time: Float,
-        sample1: Float,
-        sample2: mi.Point2f,
-        sample3: mi.Point2f,
+        self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
         active: Bool | bool = True,
-    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
         del sample3
         place = sample2 * mi.Vector2f(self.film().crop_size())
         state = read_sensor(self, 0.0)
@@ -193,13 +188,9 @@ class CalibratedSensor(mi.Sensor):
         return (mi.Float(time) - self.shutter_open()) / self.shutter_open_time()
 
     def sample_ray_differential(
-        self,
-        time: Float,
-        sample1: Float,
-        sample2: mi.Point2f,
-        sample3: mi.Point2f,
+        self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
         active: Bool | bool = True,
-    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:  # fmt: skip
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()
         beside = []

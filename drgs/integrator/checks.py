@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_large_reason
 from drgs.gaussians.parameters import Gaussians
@@ -116,16 +115,6 @@ def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: 
             f"splats: on a film of {width} x {height} px, nested_spp (or spp) must be at most "
             f"{most // (width * height):,}, got {nested_spp:,}; take the mean of images "
             "with other seeds"
-        )
-
-
-def check_columns(columns: dict[str, int]) -> None:
-    """Raise PluginError for AOVs with too many channels; columns: by name."""
-    if sum(columns.values()) > MAX_FEATURES:
-        counts = ", ".join(f"{name} {count:,}" for name, count in columns.items())
-        raise PluginError(
-            f"splats: aovs can have at most {MAX_FEATURES} channels together, got "
-            f"{sum(columns.values()):,} ({counts}); render them in parts, which share a kernel"
         )
 
 

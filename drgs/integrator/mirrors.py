@@ -96,15 +96,11 @@ class FlatMirror:
         bsdf = shape.bsdf()
         if bsdf is None or shape.is_emitter():
             return None
-        delta, glossy, diffuse, through = (
-            mi.has_flag(bsdf.flags(), flag)
-            for flag in (
-                mi.BSDFFlags.DeltaReflection,
-                mi.BSDFFlags.GlossyReflection,
-                mi.BSDFFlags.DiffuseReflection,
-                mi.BSDFFlags.Transmission,
-            )
-        )
+        flags, kinds = bsdf.flags(), mi.BSDFFlags
+        delta = mi.has_flag(flags, kinds.DeltaReflection)
+        glossy = mi.has_flag(flags, kinds.GlossyReflection)
+        diffuse = mi.has_flag(flags, kinds.DiffuseReflection)
+        through = mi.has_flag(flags, kinds.Transmission)
         plane = _plane_through(_points(shape)) if delta or glossy else None
         return plane and FlatMirror(*plane, delta, not (diffuse or through))
 

@@ -69,7 +69,7 @@ class SensorRender:
         planes, constant = self.planes(), constant_background(self.splats)
         with dr.resume_grad():
             of_background = constant is not None and dr.grad_enabled(self.splats.background)
-        with dr.resume_grad():  # colours are converted again, and differentiated by Dr.Jit
+            # Colours are converted again, and differentiated by Dr.Jit.
             dr.enable_grad(planes)
             if of_background:
                 dr.enable_grad(constant)

@@ -58,11 +58,9 @@ class CameraSensor(Protocol):
     def num_poses(self) -> int:
         """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
 
-    def near_clip(self) -> float:
-        """Return the depth of the near plane, scene units."""
+    def near_clip(self) -> float: ...
 
-    def far_clip(self) -> float:
-        """Return the depth of the far plane, scene units."""
+    def far_clip(self) -> float: ...
 
 
 def num_poses(sensor: mi.Sensor) -> int:

@@ -17,17 +17,12 @@ import numpy as np
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations, Value
 from drgs.core.arrays import tangent_of
+from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.core.types import Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.checks import (
-    check_columns,
-    check_degree,
-    check_instances,
-    check_shapes,
-    ellipsoids_in,
-)
+from drgs.integrator.checks import check_degree, check_instances, check_shapes, ellipsoids_in
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
@@ -212,8 +207,14 @@ class SplatsState:
         return AOVS[kind] if kind in AOVS else range(feature_widths(self.objects)[kind])
 
     def check_columns(self) -> None:
-        """Raise PluginError for AOVs of too many channels."""
-        check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
+        """Raise PluginError for AOVs with more channels than a kernel can have."""
+        columns = {n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"}
+        if sum(columns.values()) > MAX_FEATURES:
+            counts = ", ".join(f"{name} {count:,}" for name, count in columns.items())
+            raise PluginError(
+                f"splats: aovs can have at most {MAX_FEATURES} channels together, got "
+                f"{sum(columns.values()):,} ({counts}); render them in parts, which share a kernel"
+            )
 
     def parameters_changed(self, keys: Sequence[str], is_object: bool) -> None:
         """Check that own parameters fit together; keys: none for all."""

@@ -281,24 +281,16 @@ class Hybrid:
     def backward(self, params: object, d_images: list[mi.TensorXf]) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
         gradients = iter(d_images)
-
-        def add(sensor: mi.Sensor) -> None:
-            self.adjoint_integrator.render_backward(
-                self.rays.scene, params, next(gradients), sensor, self.seed, self.spp
-            )
-
         with self._differentiating() as parameters:
             if parameters:
-                self._needed_surfaces(add)
+                self._needed_surfaces(
+                    lambda sensor: self.adjoint_integrator.render_backward(
+                        self.rays.scene, params, next(gradients), sensor, self.seed, self.spp
+                    )
+                )
 
     def tangents(self, params: object, images: list[mi.TensorXf]) -> list[mi.TensorXf]:
         """Return derivatives of the nested images along those set on the parameters."""
-
-        def render_nested(sensor: mi.Sensor) -> mi.TensorXf:
-            return self.adjoint_integrator.render_forward(
-                self.rays.scene, params, sensor, self.seed, self.spp
-            )
-
         found: list[mi.TensorXf | None] = [None] * len(images)
         with self._differentiating() as parameters:
             if parameters:
@@ -306,7 +298,11 @@ class Hybrid:
                 # objects have derived from their parameters.
                 dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
                 dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-                found = self._needed_surfaces(render_nested)
+                found = self._needed_surfaces(
+                    lambda sensor: self.adjoint_integrator.render_forward(
+                        self.rays.scene, params, sensor, self.seed, self.spp
+                    )
+                )
         pairs = zip(found, images, strict=True)
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 

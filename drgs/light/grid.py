@@ -54,19 +54,14 @@ class SplatGrid:
     cells: UInt32  # (2 cells,): number of entries, the first one; if empty, 0, cells to skip
     rows: UInt32  # (entries,): Gaussians
 
-    @property
-    def reach(self) -> Float:
-        """Half the outermost cube's edge, world units: (1,)."""
-        Float = type(self.size)
-        return self.size * dr.exp2(Float(self.num_levels) - 1)
-
     def span(self, origin: Array3f, direction: Array3f) -> tuple[Float, Float]:
         """Return where rays enter and leave the outermost cube; for misses, enter > leave."""
         Float = type(self.size)
+        reach = self.size * dr.exp2(Float(self.num_levels) - 1)  # half the outermost cube's edge
         first, last = Float(-dr.inf), Float(dr.inf)
         for o, d, c in zip(origin, direction, self.center, strict=True):
             inverse = 1 / d
-            a, b = (c - self.reach - o) * inverse, (c + self.reach - o) * inverse
+            a, b = (c - reach - o) * inverse, (c + reach - o) * inverse
             # Parallel to a side and on it: 0 / 0 is NaN, and no bound.
             low, high = dr.select(a < b, a, b), dr.select(a < b, b, a)
             first = dr.select(low > first, low, first)
