@@ -44,17 +44,17 @@ PROPERTIES = {
     "shutter": one_of("global", "rolling"),
     "shutter_samples": integer(SHUTTER_SAMPLES, 1, MAX_SHUTTER_SAMPLES),
 }
-"""Single values, but for coefficients; the film decides what those in pixels are by default."""
+"""Single values besides coefficients; defaults in pixels depend on the film."""
 
 KNOWN = (
     *("to_world", "to_world_close", "fy", "lens", *COEFFICIENTS, *PROPERTIES),
     *("shutter_open", "shutter_close"),
 )
-"""Names of the properties, but for the film, the sampler and what else Mitsuba's sensors have."""
+"""Names of the properties, besides those of all Mitsuba sensors."""
 
 
 class CalibratedSensor(mi.Sensor):
-    """Camera as calibration tools describe it; ``docs/mitsuba.md`` has the details.
+    """Camera with the parameters of calibration tools; details are in ``docs/mitsuba.md``.
 
     - ``to_world``: pose, in the axes of Mitsuba's ``perspective``. (Default: the identity)
     - ``fx``, ``fy``: focal lengths, px of the whole film. (Default: the film's width; ``fx``)
@@ -62,7 +62,7 @@ class CalibratedSensor(mi.Sensor):
     - ``lens``: ``pinhole``, ``opencv``, ``fisheye``, ``thin_prism_fisheye``. (Default: ``pinhole``)
     - ``k1``, ``k2``, ``k3``, ``k4``, ``k5``, ``k6``, ``p1``, ``p2``, ``sx1``, ``sy1``: coefficients
       of the lens, exposed if they are given. (Default: 0)
-    - ``near_clip``, ``far_clip``: depths between which something is seen. (Default: 0.01, 10000)
+    - ``near_clip``, ``far_clip``: depths of the near and far plane. (Default: 0.01, 10000)
     - ``to_world_close``: pose when the shutter closes. (Default: none)
     - ``shutter_open``, ``shutter_close``: times of the two poses. (Default: 0, and 1 if it moves)
     - ``shutter``: ``global``, which blurs, or ``rolling``, row by row. (Default: ``global``)
@@ -74,9 +74,8 @@ class CalibratedSensor(mi.Sensor):
     def __init__(self, props: mi.Properties) -> None:
         check_variant("calibrated", mi.variant())
         if "to_world_close" in props and "shutter_close" not in props:
-            # Integrators that trace rays choose their times within these two.
             opens = read(props, {"shutter_open": number(0.0)})["shutter_open"]
-            props["shutter_close"] = opens + 1.0
+            props["shutter_close"] = opens + 1.0  # times of rays are within the two
         super().__init__(props)
         self.m_needs_sample_3 = False  # no aperture
         width, height = self.film().size()
@@ -101,9 +100,8 @@ class CalibratedSensor(mi.Sensor):
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
         cb.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
-        for name in ("fx", "fy", "cx", "cy"):
-            cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
-        for name, value in self.coefficients.items():
+        intrinsics = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
+        for name, value in (intrinsics | self.coefficients).items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
         if self.to_world_close is not None:
             cb.put("to_world_close", self.to_world_close, mi.ParamFlags.NonDifferentiable)
@@ -153,13 +151,9 @@ class CalibratedSensor(mi.Sensor):
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
 
     def sample_ray(
-        self,
-        time: Float,
-        sample1: Float,
-        sample2: mi.Point2f,
-        sample3: mi.Point2f,
+        self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
         active: Bool | bool = True,
-    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
         del sample3
         place = sample2 * mi.Vector2f(self.film().crop_size())
         state = read_sensor(self, 0.0)
@@ -186,7 +180,7 @@ class CalibratedSensor(mi.Sensor):
         return ray, weight & seen
 
     def _time_of(self, camera: Camera, time: Float, y: Float) -> Float:
-        """Return when a ray starts in the row ``y`` (px), from 0, the first pose, to 1."""
+        """Return the time of a ray in the row ``y`` (px), from 0, the first pose, to 1."""
         if self.shutter == "rolling":
             return (y - camera.film_start.y) / (camera.film_end.y - camera.film_start.y)
         if self.shutter_open_time() == 0:
@@ -194,13 +188,9 @@ class CalibratedSensor(mi.Sensor):
         return (mi.Float(time) - self.shutter_open()) / self.shutter_open_time()
 
     def sample_ray_differential(
-        self,
-        time: Float,
-        sample1: Float,
-        sample2: mi.Point2f,
-        sample3: mi.Point2f,
+        self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
         active: Bool | bool = True,
-    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:  # fmt: skip
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()
         beside = []

@@ -1,9 +1,9 @@
-"""The ``splatpath`` integrator: a path tracer whose rays pass splats (``drgs.light``)."""
+"""The ``splatpath`` integrator: a path tracer whose paths pass splats (``drgs.light``)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -16,10 +16,13 @@ from mitsuba.ad.integrators.common import (  # pyright: ignore[reportMissingImpo
 from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.properties import flag, integer, read, refuse_unknown
-from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
-
-if TYPE_CHECKING:
-    from drgs.integrator.rays import SplatTransport
+from drgs.integrator.rays import (
+    UNBOUNDED_DEPTH,
+    PathSegment,
+    SplatTransport,
+    StraightRays,
+    has_transparent_parts,
+)
 
 T = TypeVar("T")
 
@@ -29,11 +32,7 @@ PROPERTIES = {
     "hide_emitters": flag(False),
 }
 
-UNBOUNDED = 0xFFFFFFFF
-"""Limit that Mitsuba's integrators use for a ``max_depth`` of -1."""
-
-MOST_LIKELY = 0.95
-"""Largest probability with which a path goes on, as in Mitsuba's ``path``."""
+MAX_SURVIVAL_PROBABILITY = 0.95  # largest probability of Russian roulette, as in Mitsuba's ``path``
 
 
 class SplatPathIntegrator(RBIntegrator):
@@ -43,12 +42,12 @@ class SplatPathIntegrator(RBIntegrator):
     - ``rr_depth``: depth from which on Russian roulette ends paths. (Default: 5)
     - ``hide_emitters``: hide directly visible emitters. (Default: false)
 
-    The first segment of a path passes no splats: ``splats`` renders those. What lets light pass
-    straight on (``null``, ``mask``, ``thindielectric``) is no vertex. Derivatives by path replay
-    with detached sampling, with respect to materials, emitters and poses of objects.
+    The first segment of a path passes no splats: ``splats`` renders those. Surfaces that light
+    passes straight on (``null``, ``mask``, ``thindielectric``) are no vertices. Derivatives by path
+    replay with detached sampling, with respect to materials, emitters and poses of objects.
 
-    Not differentiated: the splats and what a path meets of them, where perfect mirrors and glass
-    send light, silhouettes.
+    Not differentiated: the splats and their light on a path, the directions of perfect mirrors and
+    glass, silhouettes.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -57,12 +56,11 @@ class SplatPathIntegrator(RBIntegrator):
         super().__init__(props)
         refuse_unknown(props, list(PROPERTIES))
         if "max_depth" not in props:
-            self.max_depth = UNBOUNDED
+            self.max_depth = UNBOUNDED_DEPTH
         self.sees_through = False  # whether anything in the scene lets light pass straight on
         self._transport: SplatTransport | None = None
 
     def use_transport(self, transport: SplatTransport | None) -> None:
-        """Let paths pass the splats of the integrator that this one is nested in; None: of none."""
         self._transport = transport
 
     @dr.syntax
@@ -77,8 +75,8 @@ class SplatPathIntegrator(RBIntegrator):
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], mi.Spectrum]:
         """Estimate radiance along rays, or its derivatives; others: see ``RBIntegrator.sample``.
 
-        Path replay (Vicini et al. 2021): the second walk takes the same path, and knows of each
-        vertex what radiance is still to come, as the first one has left the sum.
+        Path replay (Vicini et al. 2021): the second walk takes the same path, and subtracts each
+        vertex from the first one's sum to have the radiance still to come.
         """
         primal = mode == dr.ADMode.Primal
         self.sees_through = has_transparent_parts(scene)
@@ -104,8 +102,8 @@ class SplatPathIntegrator(RBIntegrator):
                     total = emitted + direct + L * step.relative_change(si, path.ray)
                     if not dr.grad_enabled(total):
                         raise UnsupportedError(
-                            "splatpath: nothing that a path meets changes with the parameters that "
-                            "derivatives are asked for"
+                            "splatpath: nothing that a path meets changes with the parameters "
+                            "that are differentiated"
                         )
                     if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                         dr.backward_from(δL * total)
@@ -204,7 +202,7 @@ class SplatPathIntegrator(RBIntegrator):
         throughput = dr.select(is_null, path.throughput, arrives) * weight
         most = dr.max(throughput)
         active = active & (most != 0) & (has_bounces | is_null)
-        probability = dr.minimum(most * dr.square(eta), MOST_LIKELY)
+        probability = dr.minimum(most * dr.square(eta), MAX_SURVIVAL_PROBABILITY)
         is_played = path.depth >= self.rr_depth
         throughput[is_played] *= dr.rcp(probability)
         active &= ~is_played | (sampler.next_1d() < probability)
@@ -223,44 +221,43 @@ class SplatPathIntegrator(RBIntegrator):
     def _pass_splats(
         self, scene: mi.Scene, path: _Path, sampler: mi.Sampler
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """Return the radiance of splats up to the vertex, and the path's throughput past them."""
+        """Return the radiance of splats before the vertex, and the throughput past them."""
         if self._transport is None:
             return mi.Spectrum(0), mi.Spectrum(path.throughput)
         radiance, let_through = self._transport.composite_segment(
             path.segment(scene), sampler.next_1d(), path.active & ~path.straight
         )
-        # Within glass of index n, radiance is n^2 times what arrives outside: so is that of splats,
-        # or they would be darker there.
+        # Radiance within glass of index n is n^2 times that outside, for splats as well.
         radiance *= dr.square(path.eta)
         return path.throughput * radiance, path.throughput * let_through
 
 
 def _replace_grad(values: T, gradient: T) -> T:
     """Return ``values`` with the derivatives of ``gradient``."""
-    return cast(T, dr.replace_grad(values, gradient))  # which the stub says to return nothing
+    return cast(T, dr.replace_grad(values, gradient))  # the stub has no return type
 
 
 @dataclass  # not frozen: ``dr.syntax`` carries it through a loop
 class _Path:
     """A path at a vertex."""
 
-    ray: mi.Ray3f  # that has led here
+    ray: mi.Ray3f  # that leads here
     hit: mi.PreliminaryIntersection3f
     active: mi.Bool
     depth: mi.UInt32  # vertices before
     throughput: mi.Spectrum
     eta: mi.Float  # product of relative indices of refraction
-    straight: mi.Bool  # from the camera on
+    straight: mi.Bool  # whether it is straight from the camera on
     origin: mi.Point3f  # of the ray before it went straight on
     length: mi.Float  # from there to where the ray starts
-    last_ray: mi.Ray3f  # the same of the vertex before, which is not straight on
+    last_ray: mi.Ray3f  # of the last vertex that was not passed straight on; so are the following
     last_hit: mi.PreliminaryIntersection3f
     last_si: mi.SurfaceInteraction3f
     last_pdf: mi.Float  # of the direction
     last_is_delta: mi.Bool
 
     def segment(self, scene: mi.Scene) -> PathSegment:
-        """Return the segment that has led here."""
+        """Return the segment that leads here."""
         ray, hits = mi.Ray3f(self.ray), self.hit.is_valid()
         ray.o = self.origin
         ray.maxt = dr.select(hits, self.length + self.hit.t, dr.inf)
@@ -271,7 +268,7 @@ class _Path:
         return PathSegment(ray, self.last_hit.shape, emitter, pdf, is_open)
 
     def vertex(self, attached: bool) -> mi.SurfaceInteraction3f:
-        """Return the vertex; attached: to the surfaces of this vertex and the one before."""
+        """Return the vertex; attached: to the surfaces of this vertex and the last."""
         si = self.hit.compute_surface_interaction(self.ray, ray_flags=mi.RayFlags.All)
         if attached:
             last = self.last_hit.compute_surface_interaction(
@@ -316,27 +313,27 @@ class _Step:
     eta: mi.Float
     pdf: mi.Float
     type: mi.UInt32  # flags of the BSDF's part that was sampled
-    numbers: tuple[mi.Float, mi.Point2f]  # in 0..1, that it was sampled with
+    numbers: tuple[mi.Float, mi.Point2f]  # random, in 0..1
 
     @property
     def is_delta(self) -> mi.Bool:
-        """True where the BSDF had no other direction to choose from."""
+        """True where the sampled part of the BSDF is a delta function."""
         return mi.has_flag(self.type, mi.BSDFFlags.Delta)
 
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
-        """Return 1, attached to the relative change of what the vertex reflects of the segment."""
+        """Return 1, attached to the relative change of the light that the vertex reflects."""
         bsdf, is_delta = si.bsdf(ray), self.is_delta
         next_si = self.hit.compute_surface_interaction(
             self.ray, ray_flags=mi.RayFlags.Minimal, active=self.active
         )
-        # A vertex that moves sees the next one in another solid angle. That moves along the ray.
+        # A moving vertex sees the next one in another solid angle.
         next_si = dr.detach(next_si)
         hits = self.active & next_si.is_valid() & ~is_delta
         jacobian = solid_angle_to_area_jacobian(si.p, next_si.p, next_si.n, hits)
         moved = dr.select(next_si.is_valid(), dr.normalize(next_si.p - si.p), self.ray.d)
         wo = si.to_local(_replace_grad(self.ray.d, moved))
         value = bsdf.eval(mi.BSDFContext(), si, wo, self.active & ~is_delta)
-        # A perfect reflection evaluates to 0; the same numbers sample it again.
+        # A delta function evaluates to 0; the same numbers sample it again.
         again, weight = bsdf.sample(mi.BSDFContext(), si, *self.numbers, self.active & is_delta)
         value = dr.select(is_delta, weight * again.pdf, value)
         return dr.relative_grad(value) * dr.relative_grad(jacobian)
@@ -350,12 +347,12 @@ def _attach_sample(
     numbers: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Attach an emitter's sample, drawn with ``numbers``, and its weight to emitter and vertex."""
+    """Attach an emitter sample, drawn with ``numbers``, and its weight to emitter and vertex."""
     flags = ds.emitter.flags()
     is_surface = mi.has_flag(flags, mi.EmitterFlags.Surface)
     is_infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
     is_textured = active & is_surface & mi.has_flag(flags, mi.EmitterFlags.SpatiallyVarying)
-    # The point of a textured emitter that moves has another radiance.
+    # A point on a moving textured emitter changes its radiance.
     towards = si.spawn_ray_to(ds.p)
     towards.o = dr.fma(towards.d, towards.maxt, towards.o)
     towards.maxt = dr.largest(towards.maxt)
@@ -363,11 +360,11 @@ def _attach_sample(
     moved = dr.select(is_textured, moved, dr.zeros(mi.DirectionSample3f))
     moved.d = dr.select(is_textured, moved.d, dr.normalize(ds.p - si.p))
     moved.d = dr.select(is_infinite, ds.d, moved.d)
-    # A lamp without a surface is sampled where it is: the same numbers find it again.
+    # An emitter without a surface: the same numbers sample it again.
     again, of_lamp = scene.sample_emitter_direction(si, numbers, False, active & ds.delta)
     moved.d = dr.select(ds.delta, again.d, moved.d)
     ds = _replace_grad(ds, moved)
-    # Samples are points of the emitter: a vertex that moves sees them in another solid angle.
+    # Samples are points of the emitter: a moving vertex sees them in another solid angle.
     jacobian = solid_angle_to_area_jacobian(
         si.p, dr.detach(ds.p), dr.detach(ds.n), active & is_surface
     )

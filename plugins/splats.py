@@ -29,7 +29,7 @@ from drgs.splatting.rendering import ProjectionStage
 class SplatsIntegrator(mi.CppADIntegrator):
     """3D Gaussian splatting, composited front to back over each pixel (Kerbl et al. 2023).
 
-    Types and details of these parameters are in ``docs/mitsuba.md``; "Default: none" is off.
+    Types and details are in ``docs/mitsuba.md``; "Default: none" is off.
 
     - ``filename``: PLY file of the 3DGS layout, compressed PLY, SPZ, ``.glb`` or ``.splat``.
     - ``means``, ``quats``, ``log_scales``, ``logit_opacities``, ``sh0``, ``shN``: tensors instead.
@@ -44,7 +44,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     - ``nested_spp``: samples of the nested integrator. (Default: as many as of the splats)
     - ``light``: ``none``, ``probe``, ``rays``: how splats light surfaces. (Default: ``none``)
     - ``probes``: ids of shapes and emitters that have one. (Default: none)
-    - ``unseen``: ``none``, ``rays``: what probes cannot see. (Default: ``none``)
+    - ``unseen``: ``none``, ``rays``: for rays that probes have no answer for. (Default: ``none``)
     - ``light_samples``: splats that a ray draws; 0: it composites all. (Default: 4)
     - ``exposure``: radiance of white splats where surfaces see them. (Default: 1)
     - ``shadows``: ids of shapes that shade splats. (Default: none)
@@ -63,8 +63,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        # Before the base class, which has a warning of its own about scalar variants.
-        check_variant("splats", mi.variant())
+        check_variant("splats", mi.variant())  # before the base class warns of scalar variants
         super().__init__(props)
         self._given = tuple(props.keys())
         nested = nested_integrators(props)
@@ -79,11 +78,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             [v for k, v in nested.items() if k not in self.objects],
         )
         self.last: BackwardResult | None = None
-        self._lock = threading.RLock()  # of the cache, and of what a rendering leaves in the film
-
-    # ------------------------------------------------------------------------------------------
-    # Parameters
-    # ------------------------------------------------------------------------------------------
+        self._lock = threading.RLock()  # of the cache and the film
 
     def traverse(self, cb: mi.TraversalCallback) -> None:
         state, own = self.state, self.state.own
@@ -101,13 +96,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
             cb.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check that parameters fit together; forget frames, also if written in place."""
+        """Check that parameters fit together; forget frames, also after writes in place."""
         if list(keys) != ["background"]:
             self.forget_frames()
         self.state.parameters_changed(keys, self._is_object)
 
     def forget_frames(self) -> None:
-        """Render the next image anew, also if no parameter has changed."""
+        """Drop cached frames, as if a parameter had changed."""
         self.state.cache.forget("frames")
         if self.last is not None:
             self.last = replace(self.last, frames=[])
@@ -149,7 +144,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     ignore = property(attrgetter("state.ignore"), doc="Effects that are not simulated.")
 
     def use_projection(self, stage: ProjectionStage) -> None:
-        """Project the Gaussians by another stage, such as one that several processes share."""
+        """Project the Gaussians by another stage, such as one across several processes."""
         self.state.projection = stage
 
     def aov_names(self) -> list[str]:
@@ -157,13 +152,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return self.state.aov_names()
 
     def to_string(self) -> str:
-        """Return one line a setting, without those that are off or at their default."""
+        """Return one line a setting that is on and not at its default."""
         lines = ",\n".join(f"  {name} = {value}" for name, value in self.state.settings().items())
         return f"SplatsIntegrator[\n{lines}\n]"
-
-    # ------------------------------------------------------------------------------------------
-    # Rendering
-    # ------------------------------------------------------------------------------------------
 
     def render(
         self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
@@ -202,13 +193,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it may hold an attached block
 
     def render_forward(
-        self,
-        scene: mi.Scene,
-        params: object,
-        sensor: int | mi.Sensor = 0,
-        seed: int | mi.UInt32 = 0,
-        spp: int = 0,
-    ) -> mi.TensorXf:
+        self, scene: mi.Scene, params: object,
+        sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
+    ) -> mi.TensorXf:  # fmt: skip
         """Return the directional derivative of the image along gradients set on parameters."""
         sensor = _resolve_sensor(scene, sensor)
         self._check_derivatives(scene, sensor, dr.ADMode.Forward)
@@ -223,14 +210,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
         return d_image
 
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]  called by keyword
-        self,
-        *,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.RayDifferential3f,
-        active: Bool,
+        self, *, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, active: Bool,
         **others: object,
-    ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
+    ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:  # fmt: skip
         """Render along the rays of a whole image, for ``aov``: see ``drgs.integrator.aov_rays``."""
         from drgs.integrator.aov_rays import ImageRays
 
@@ -240,7 +222,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         attached = any(dr.grad_enabled(value) for one in nodes for _, value in mi.traverse(one))
         with dr.suspend_grad():
             rays = ImageRays.from_rays(sensor, self.state.near, dr.detach(ray))
-            assert sensor is not None, "refused by ImageRays.of"
+            assert sensor is not None, "refused by ImageRays.from_rays"
             if self.state.aovs and attached:
                 raise UnsupportedError(
                     "splats: inside 'aov', derivatives with 'aovs' of this integrator are not "
@@ -252,7 +234,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             return mi.Color3f(red, green, blue), active & (alpha > 0), aovs, None
 
     def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
-        """Return one line an effect: what is simulated, what asked for it, and what is not."""
+        """Return one line per simulated effect with its reason, and the effects that are not."""
         from drgs.integrator.summary import summary_of_scene
 
         self._gather(scene)

@@ -1,13 +1,12 @@
-"""Inside Mitsuba's ``aov``: splats along the single rays of a whole image.
+"""Splats along the single rays of a whole image, inside Mitsuba's ``aov``.
 
-Imported when ``aov`` calls ``sample``, with the rays of all pixels at once. Splats are composited
-over whole images, so that ray k must start in pixel k // n of the sensor that was rendered last, n
-rays a pixel. Each is found by looking at it through the camera, and the splats are evaluated there.
+Imported when ``aov`` calls ``sample`` with the rays of all pixels at once. With n rays per pixel,
+ray k must start in pixel k // n of the sensor that was rendered last. The camera projects each to
+its place on the film, where the splats are evaluated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -26,34 +25,27 @@ from drgs.integrator.state import SplatsState
 if TYPE_CHECKING:  # imported where a scene has surfaces
     from drgs.integrator.surfaces import Hybrid
 
-REFUSAL = (
-    "splats: this integrator renders whole images: of those that sample the rays of another one, "
-    "such as 'moment', it can only be nested in 'aov'"
-)
-
-NESTED = -1
-"""Number of the view."""
-
-PIXEL_MARGIN_PX = 1 / 16
-"""px: how far outside of its pixel a ray may be found. Single precision finds it to 1e-3."""
-
-MAX_CENTER_ERROR = 1e-5
-"""Largest distance of a ray from the camera's centre, relative to their coordinates."""
+NESTED_VIEW = -1  # index of the view in the cache
+PIXEL_MARGIN_PX = 1 / 16  # largest distance of a ray from its pixel; float32 finds it to 1e-3 px
+MAX_CENTER_ERROR = 1e-5  # distance of a ray from the camera's centre, relative to coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class ImageRays:
-    """Rays of a whole image, and where they start. Equality is identity."""
+    """Rays of a whole image and their sample positions. Equality is identity."""
 
-    ray: mi.RayDifferential3f  # (H * W * count,): those of a pixel are neighbours
+    ray: mi.RayDifferential3f  # (H * W * count,): the rays of a pixel are neighbours
     count: int  # rays per pixel
     positions: tuple[SamplePoints, ...]  # by pass
 
     @staticmethod
     def from_rays(sensor: mi.Sensor | None, near: float, ray: mi.RayDifferential3f) -> ImageRays:
-        """Find where in pixels the rays start; UnsupportedError unless they are of an image."""
+        """Find the rays' sample positions; UnsupportedError unless they are of an image."""
         if sensor is None:
-            raise UnsupportedError(REFUSAL)
+            raise UnsupportedError(
+                "splats: this integrator renders whole images: of those that sample the rays of "
+                "another one, such as 'moment', it can only be nested in 'aov'"
+            )
         film = sensor.film()
         width, height = film.crop_size()
         count, rest = divmod(dr.width(ray), width * height)
@@ -83,12 +75,12 @@ class ImageRays:
     ) -> Channels:
         """Return colour, alpha and AOVs of the rays, each Float (H * W * count,)."""
         hybrid = hybrid_of(splats, scene, sensor, 0, 1)
-        # With a single sample, what is seen of edges would be the mean over their pixels.
+        # A single sample would average the coverage of edges over their pixels.
         times = 2 if self.count == 1 and hybrid is not None else 1
         view = SensorRender(
             splats=splats,
             scene=scene,
-            index=NESTED,
+            index=NESTED_VIEW,
             sensor=sensor,
             positions=times * self.positions,
             key=self,
@@ -98,22 +90,19 @@ class ImageRays:
         if hybrid is not None:
             hybrid = hybrid.with_surfaces(view.num_surfaces(hybrid))
             view = replace(view, hybrid=hybrid)
-        channels = self._collect_channels(view.channels(view.planes(), constant_background(splats)))
+        passes = view.channels(view.planes(), constant_background(splats))
+        samples = split_samples(self.positions, passes[: len(self.positions)])
+        channels = [mi.Float(interleave(list(planes))) for planes in zip(*samples, strict=True)]
         for kind in ("frames", "surfaces"):
-            splats.cache.forget(f"{kind} {NESTED}")
+            splats.cache.forget(f"{kind} {NESTED_VIEW}")
         if hybrid is not None:
             channels = self._with_surfaces(channels, hybrid, sampler, active)
         return channels
 
-    def _collect_channels(self, passes: Sequence[Channels]) -> Channels:
-        samples = split_samples(self.positions, passes[: len(self.positions)])
-        planes = zip(*samples, strict=True)
-        return [mi.Float(interleave(list(of_samples))) for of_samples in planes]
-
     def _with_surfaces(
         self, channels: Channels, hybrid: Hybrid, sampler: mi.Sampler, active: mi.Bool
     ) -> Channels:
-        """Add what the nested integrator sees along the rays."""
+        """Add the nested integrator's radiance along the rays."""
         insertion = hybrid.insertion
         aovs, own = channels[3 : -len(insertion.channels)], channels[-len(insertion.channels) :]
         behind = own[2 * insertion.num_surfaces :] or [mi.Float(0)] * 3

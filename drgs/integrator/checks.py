@@ -7,17 +7,12 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_large_reason
 from drgs.gaussians.parameters import Gaussians
 
-MAX_SAMPLES = 4096
-"""Most samples of a pixel, times the poses that motion blurs, whose frames take 0.15 MB each even
-of the smallest film."""
-
-NESTED_SAMPLE_BYTES = 64
-"""About what Mitsuba's path tracers take at least for a sample: its ray, sampler and radiance."""
+MAX_SAMPLES = 4096  # samples of a pixel times poses of motion blur; a frame takes 0.15 MB at least
+NESTED_SAMPLE_BYTES = 64  # at least, for a path tracer's sample: its ray, sampler and radiance
 
 
 def check_shapes(gaussians: Gaussians) -> None:
@@ -55,7 +50,7 @@ def check_shapes(gaussians: Gaussians) -> None:
 
 
 def check_degree(degree: int, gaussians: Gaussians) -> None:
-    """Raise PluginError for a degree of spherical harmonics that the Gaussians do not have."""
+    """Raise PluginError for a spherical harmonics degree that the Gaussians do not have."""
     if degree > gaussians.sh_degree:
         raise PluginError(
             f"splats: sh_degree must be an integer from 0 to {gaussians.sh_degree}, the degree of "
@@ -64,12 +59,12 @@ def check_degree(degree: int, gaussians: Gaussians) -> None:
 
 
 def ellipsoids_in(scene: mi.Scene) -> list[mi.Shape]:
-    """Return the shapes whose Gaussians are rendered as splats."""
+    """Return the shapes of Gaussians, which are rendered as splats."""
     return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
 
 
 def surfaces_in(scene: mi.Scene) -> list[mi.Shape]:
-    """Return all other shapes."""
+    """Return the shapes that are no Gaussians."""
     return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
 
 
@@ -90,10 +85,10 @@ def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]
 
 
 def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: int) -> None:
-    """Raise PluginError for a image that would take more than there is.
+    """Raise PluginError for an image that does not fit into memory.
 
-    spp: of the splats; poses: of the sensor, whose images are averaged; num_aovs: channels
-    besides colour and alpha; nested_spp: of the nested integrator, 0 where there is none.
+    spp: of the splats; poses: of the sensor; num_aovs: channels besides colour and alpha;
+    nested_spp: of the nested integrator, 0 for none.
     """
     width, height = film.crop_size()
     if min(width, height) < 1:
@@ -123,18 +118,8 @@ def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: 
         )
 
 
-def check_columns(columns: dict[str, int]) -> None:
-    """Raise PluginError where AOVs have more channels (by name) than a kernel can have."""
-    if sum(columns.values()) > MAX_FEATURES:
-        counts = ", ".join(f"{name} {count:,}" for name, count in columns.items())
-        raise PluginError(
-            f"splats: aovs can have at most {MAX_FEATURES} channels together, got "
-            f"{sum(columns.values()):,} ({counts}); render them in parts, which share a kernel"
-        )
-
-
 def check_ids(parameter: str, names: Sequence[str], nodes: Sequence[mi.Object]) -> None:
-    """Raise PluginError for names that are no node's id; parameter: what has the names."""
+    """Raise PluginError for names that are no node's id; parameter: the property, in words."""
     known = [node.id() for node in nodes]
     for name in names:
         if name not in known:

@@ -13,27 +13,24 @@ from drgs.integrator.checks import ellipsoids_in
 from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.state import SplatsState
 
-ATTACHED = ("PathIntegrator", "DirectIntegrator")
-"""Classes of Mitsuba's integrators whose samples move with parameters."""
-
-REPLAYED = ("PRBIntegrator", "BasicPRBIntegrator")
-"""Classes of Mitsuba's integrators whose samples stay where they are."""
+ATTACHED_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")  # samples move with parameters
+REPLAYED_INTEGRATORS = ("PRBIntegrator", "BasicPRBIntegrator")  # samples stay in place
 
 DIFFERENTIATED_BY_PATH = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor"),
     *("SmoothDielectric", "RoughDielectric", "ThinDielectric", "TwoSidedBRDF"),
 )
-"""Classes of BSDFs that do not choose between parts with a probability that parameters change."""
+"""Classes of BSDFs that sample no parts with probabilities that depend on parameters."""
 
 COVERAGE = {"MaskBSDF": ("opacity",), "ThinDielectric": ("eta", "specular_transmittance")}
-"""Parameters that change how much of a pixel a surface covers, by the class of the BSDF."""
+"""Parameters that change a surface's coverage of pixels, by the class of the BSDF."""
 
 WRONG_IN_MITSUBA = {
     "RoughPlastic": ("alpha", "eta"),  # tables of its transmittance are not differentiated
     "RoughDielectric": ("eta",),
     "NormalMap": ("normalmap",),
 }
-"""Parameters of which the derivative of Mitsuba's own ``eval`` is not that of its values."""
+"""Parameters by which Mitsuba's own derivative of ``eval`` is wrong."""
 
 SPLATPATH = "splatpath"
 
@@ -42,13 +39,13 @@ TO_SPLATPATH = f"nest {SPLATPATH}, which does"
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a scene or sensor, derivatives with respect to which are asked for."""
+    """An attached parameter of a scene or sensor."""
 
-    name: str  # as mi.traverse has it
-    key: str  # the same within its object
-    owners: list[mi.Object]  # its object, the one that this belongs to, and so on
+    name: str  # in mi.traverse
+    key: str  # its name within its object
+    owners: list[mi.Object]  # its object, the parent of that, and so on
     value: object  # attached
-    has_nested: bool  # whether the material that it belongs to has others in it
+    has_nested: bool  # whether its material contains other materials
 
     @property
     def is_geometry(self) -> bool:
@@ -59,20 +56,20 @@ class Parameter:
 
     @property
     def bsdfs(self) -> list[mi.BSDF]:
-        """The material that it belongs to, and those around that."""
+        """Its material and those around it, from the inside out."""
         return [owner for owner in self.owners if isinstance(owner, mi.BSDF)]
 
     def name_in(self, bsdf: mi.BSDF) -> str:
-        """Return the material's name of the parameter, or of the texture that it belongs to."""
-        depth = self.owners.index(bsdf)
-        return self.name.split(".")[-1 - depth]
+        """Return the material's name of the parameter or of its texture."""
+        return self.name.split(".")[-1 - self.owners.index(bsdf)]
 
 
 def check_derivatives(
     splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong."""
-    if (splats.light != "none" or splats.shadows) and _has_attached_gaussians(splats, scene):
+    parts = splats.parts(ellipsoids_in(scene)) if splats.light != "none" or splats.shadows else []
+    if any(dr.grad_enabled(value) for part in parts for value in part.values.values()):
         raise UnsupportedError(
             f"splats: with light '{splats.light}' and shadows "
             f"'{', '.join(splats.shadows)}', the Gaussians are not differentiated, as surfaces "
@@ -88,7 +85,10 @@ def check_derivatives(
     parameters, reasons = list(attached_parameters(scene)), {}
     for parameter in parameters:
         reason = _refusal(parameter, splats)
-        if reason is None and mode == dr.ADMode.Forward and _is_padded(parameter):
+        # Mitsuba renders a padded copy of an environment map's texels.
+        node = parameter.owners[0].class_name(), parameter.key
+        is_padded = node == ("EnvironmentMapEmitter", "data")
+        if reason is None and mode == dr.ADMode.Forward and is_padded:
             reason = "forward mode does not reach its texels; use dr.backward"
         if reason is not None:
             reasons.setdefault(reason, []).append(parameter.name)
@@ -98,12 +98,6 @@ def check_derivatives(
             f"splats: {format_names(names)} {are} not differentiated, as {reason}; or detach "
             f"{'it' if are == 'is' else 'them'}"
         )
-
-
-def _has_attached_gaussians(splats: SplatsState, scene: mi.Scene) -> bool:
-    parts = splats.parts(ellipsoids_in(scene))
-    values = [value for part in parts for value in part.values.values()]
-    return any(dr.grad_enabled(value) for value in values)
 
 
 def attached_parameters(scene: mi.Scene) -> Iterator[Parameter]:
@@ -133,16 +127,11 @@ def parameter_value(params: mi.SceneParameters, name: str) -> object:
 
 
 def type_of(integrator: mi.Integrator) -> str:
-    """Return the name of its class; those that are written in Python have one name for Mitsuba."""
+    """Return the name of its class; Mitsuba has one name for all that are written in Python."""
     if isinstance(integrator, TransportIntegrator):
         return SPLATPATH
     name = integrator.class_name()
     return type(integrator).__name__ if name == "SamplingIntegrator" else name
-
-
-def _is_padded(parameter: Parameter) -> bool:
-    """True where Mitsuba renders another array than the parameter, made from the same values."""
-    return parameter.owners[0].class_name() == "EnvironmentMapEmitter" and parameter.key == "data"
 
 
 def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
@@ -156,11 +145,11 @@ def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
     if (
         isinstance(owner, mi.Shape)
         and parameter.is_geometry
-        and kind in (SPLATPATH, *ATTACHED, *REPLAYED)
+        and kind in (SPLATPATH, *ATTACHED_INTEGRATORS, *REPLAYED_INTEGRATORS)
     ):
         return _geometry_refusal(owner, kind)
     if isinstance(owner, mi.Emitter) and parameter.key in ("position", "to_world"):
-        if kind in (ATTACHED if owner.is_environment() else REPLAYED):
+        if kind in (ATTACHED_INTEGRATORS if owner.is_environment() else REPLAYED_INTEGRATORS):
             return f"{kind} does not follow a lamp that moves; {TO_SPLATPATH}"
         if splats.light != "none" and not owner.is_environment():
             return "the shadows that splats throw move with it; set light to 'none'"
@@ -168,7 +157,7 @@ def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
 
 
 def _geometry_refusal(shape: mi.Shape, kind: str) -> str | None:
-    if kind in ATTACHED:
+    if kind in ATTACHED_INTEGRATORS:
         return f"{kind} does not differentiate where paths hit surfaces; {TO_SPLATPATH}"
     if shape.is_emitter():
         return "the edge of a lamp that moves is not; optimise the lamp's radiance"
@@ -191,9 +180,9 @@ def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
         is_mixed = _has_flag(bsdf, mi.BSDFFlags.Smooth, mi.BSDFFlags.Null)
         if name != "BlendBSDF" or is_mixed:
             return f"{name} is around a perfect mirror or glass; use a rough one"
-    if kind in REPLAYED and _is_mirror(outer):
+    if kind in REPLAYED_INTEGRATORS and _is_mirror(outer):
         return f"{kind} leaves out what perfect mirrors and glass reflect; {TO_SPLATPATH}"
-    if kind in ATTACHED and any(
+    if kind in ATTACHED_INTEGRATORS and any(
         b.class_name() not in DIFFERENTIATED_BY_PATH for b in parameter.bsdfs
     ):
         return f"{kind} does not differentiate which part of a {name} it samples; {TO_SPLATPATH}"
@@ -201,7 +190,7 @@ def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
 
 
 def _is_mirror(bsdf: mi.BSDF) -> bool:
-    """True where a part of it has one direction, and not straight on."""
+    """Return whether a part of it is a delta function, other than straight on."""
     return _has_flag(bsdf, mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
 
 

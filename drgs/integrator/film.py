@@ -1,11 +1,10 @@
-"""Samples of a film: where pixels are evaluated, and how an image comes of the values.
+"""Samples of a film: sample positions, and the image from the values there.
 
-:class:`CenterSamples` evaluates each pixel once, at its centre. :class:`DrawnSamples` evaluates it
-at several points that Mitsuba's samplers choose: each pass evaluates every pixel at one point or,
-of a small film, at several (:class:`SamplePoints`). With a box filter the samples are averaged, in
-their order: the same bytes in every run. Any other filter spreads a sample over its neighbours,
-which Mitsuba does by atomic additions: such an image is the same up to rounding. No samples are
-taken beyond the film, also where it has ``sample_border``.
+:class:`CenterSamples` evaluates each pixel once, at its centre; :class:`DrawnSamples` at several
+points of Mitsuba's samplers, in passes of one point per pixel or, on a small film, of several
+(:class:`SamplePoints`). A box filter averages the samples in their order: the same bytes in every
+run. Any other filter adds a sample to neighbours atomically: runs agree only up to rounding. No
+samples are taken beyond the film, also where it has ``sample_border``.
 """
 
 from __future__ import annotations
@@ -25,18 +24,16 @@ from drgs.splatting.footprint import PixelCenters, SamplePositions, flat_columns
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.lanes import load_pixels
 
-Channels = list[Float]
-"""Channels of one pass for a film, each (samples * H * W,): red, green, blue, perhaps alpha,
-then what the integrator puts out besides (AOVs)."""
+Channels = list[Float]  # by pass, each (samples * H * W,): red, green, blue, perhaps alpha, AOVs
 
 
 def num_colors(film: mi.Film) -> int:
-    """Return the number of colour channels that a film gets: with or without alpha."""
+    """Return the number of a film's colour channels, alpha included."""
     return 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
 
 
 def with_weight(film: mi.Film, channels: Channels, weight: Float) -> Channels:
-    """Return the channels of a block of this film: the weight is behind the colours."""
+    """Return the channels of a block of this film: the weight follows the colours."""
     count = num_colors(film)
     return [*channels[:count], weight, *channels[count:]]
 
@@ -50,7 +47,7 @@ def pixel_corners(film: mi.Film, samples: int = 1) -> mi.Point2f:
 
 
 def num_samples(film: mi.Film, x: Float | float) -> int:
-    """Return the number of samples of a pixel in a plane; x may be a number for all pixels."""
+    """Return the samples per pixel of a plane; x may be one number for all pixels."""
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
 
@@ -60,7 +57,7 @@ def sample_offsets(positions: SamplePositions) -> tuple[Float | float, Float | f
 
 
 class CenterSamples:
-    """A single sample per pixel, at its centre. Exact for films whose filter is a box."""
+    """A single sample per pixel, at its centre. Exact for a box filter."""
 
     positions: Sequence[SamplePositions] = (PixelCenters(),)  # by pass
     key: object = None  # equal for equal positions
@@ -68,7 +65,7 @@ class CenterSamples:
     def __init__(
         self, film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str] = ()
     ) -> None:
-        """Sample a film; maps: linear maps of films by description; aovs: channels' names."""
+        """Sample a film; maps: linear maps of films by description; aovs: names of channels."""
         self.film, self.maps, self.aovs = film, maps, list(aovs)
 
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
@@ -82,10 +79,9 @@ class CenterSamples:
 
 
 def develop_pixels(film: mi.Film, channels: Channels, aovs: Sequence[str]) -> mi.TensorXf:
-    """Put the channels into ``film`` as one block, which is not filtered again, and develop it."""
-    weight = dr.ones(mi.Float, dr.width(channels[0]))
+    """Put the channels into ``film`` as one block, without filtering, and develop it."""
     size = film.crop_size()
-    columns = with_weight(film, channels, weight)
+    columns = with_weight(film, channels, dr.ones(mi.Float, dr.width(channels[0])))
     raw = mi.TensorXf(interleave(columns), (size[1], size[0], len(columns)))
     film.prepare(list(aovs))
     film.put_block(mi.ImageBlock(raw, mi.ScalarPoint2i(film.crop_offset())))
@@ -97,8 +93,8 @@ def pixels_adjoint(
 ) -> Channels:
     """Compute the adjoint of :func:`develop_pixels`.
 
-    A film develops each pixel by the same linear map, found once by developing unit images.
-    (The derivative of ``develop`` itself would be scattered by atomic additions.)
+    A film develops each pixel by the same linear map, found once by developing unit images: the
+    derivative of ``develop`` itself would be scattered atomically.
     """
     matrix = film_map(film, maps, aovs)
     pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
@@ -117,12 +113,8 @@ def pixels_adjoint(
 def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) -> np.ndarray:
     """Return the linear map that a film applies to each pixel: (developed channels, channels)."""
     key = f"{film} {', '.join(aovs)}"
-    if key not in maps:
-        maps[key] = _measure_map(film, aovs)
-    return maps[key]
-
-
-def _measure_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
+    if key in maps:
+        return maps[key]
     count = num_colors(film) + len(aovs)
     num_pixels = film.crop_size()[0] * film.crop_size()[1]
 
@@ -134,26 +126,24 @@ def _measure_map(film: mi.Film, aovs: Sequence[str]) -> np.ndarray:
     units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]
     matrix = np.stack(units, axis=1)
     mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
-    linear = np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4)
-    if not linear:
+    if not np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4):
         raise UnsupportedError(
             f"splats: gradients through this film are not supported: {film} does not map each "
             "pixel's channels linearly"
         )
+    maps[key] = matrix
     return matrix
 
 
-PIXELS_PER_PASS = 1 << 17
-"""Most pixels of a pass of several samples: a launch of fewer costs more than what it computes."""
+PIXELS_PER_PASS = 1 << 17  # most pixels in a pass of several samples: larger launches gain nothing
 
 SAMPLES_PER_KERNEL = 16
-"""Samples per pixel after which the sums of a box filter are evaluated: compilers take longer than
-proportionally to a kernel's length. With other filters, which reach over many pixels, each pass is
-evaluated by itself."""
+"""Samples per pixel after which a box filter's sums are evaluated: compile time is superlinear.
+Other filters evaluate each pass by itself."""
 
 
 def split_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePoints, ...]:
-    """Divide samples into passes; points: of all, those of a pixel are neighbours."""
+    """Divide samples into passes; points: the samples of a pixel are neighbours."""
     at_once = min(max(PIXELS_PER_PASS // num_pixels, 1), count)
     passes = []
     for first in range(0, count, at_once):
@@ -192,17 +182,15 @@ class DrawnSamples(CenterSamples):
         aovs: Sequence[str] = (),
     ) -> None:
         super().__init__(sensor.film(), maps, aovs)
-        # The owner of an array may change it in place.
+        # A copy: the owner of an array may change it in place.
         seed = seed if isinstance(seed, (int, np.integer)) else int(seed[0])
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # some round it up
-        size = self.film.crop_size()
-        num_pixels = size[0] * size[1]
+        num_pixels = int(dr.prod(self.film.crop_size()))
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, num_pixels * spp)
-        self.points = split_passes(sampler.next_2d(), spp, num_pixels)
-        self.positions = self.points
+        self.positions = self.points = split_passes(sampler.next_2d(), spp, num_pixels)
         dr.eval([(p.x, p.y) for p in self.points])
         self.key = (seed, spp, str(sensor.sampler()))
 
@@ -253,7 +241,7 @@ class DrawnSamples(CenterSamples):
 
 @dataclass(frozen=True)
 class SamplePoints(SamplePositions):
-    """Points in each pixel, one for each of some samples; equal if the arrays are the same."""
+    """Points in each pixel, one per sample; equal if the arrays are the same."""
 
     margin: ClassVar[float] = 0.5
 

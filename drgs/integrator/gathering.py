@@ -1,9 +1,9 @@
-"""Gaussians of an image, put together of those of splat objects and of shapes.
+"""Gaussians of an image, gathered from splat objects and shapes.
 
-Imported when a scene has more than the Gaussians of one integrator where they are. Each
-:class:`Part` converts what is stored of some Gaussians to raw parameters in world space; Dr.Jit
-differentiates the conversions. Columns are gathered and interleaved as permutations: nothing is
-added atomically, and derivatives are the same to the last bit in every run.
+Imported when a scene has more than the unmoved Gaussians of one integrator. Each :class:`Part`
+converts stored Gaussians to raw parameters in world space; Dr.Jit differentiates the conversions.
+Columns are gathered and interleaved as permutations, without atomic additions: derivatives are the
+same bytes in every run.
 
 A :class:`Placement` moves the Gaussians of an object by a ``to_world`` x' = k R x + t:
 
@@ -27,10 +27,10 @@ in 0..1 and ``sh_coeffs`` (3 K N: per row K coefficients of red, green, blue)::
     log_scales = ln |scales|    logit_opacities = ln(o / (1 - o))    shN = D sh_coeffs
 
 with D the rotation by which a shape was turned, as Mitsuba turns centres and quaternions but no
-coefficients. o is clamped to :data:`OPACITIES`: the derivative at o = 1 is that of the inside;
-outside of 0..1 it is zero. What has no positive opacity, or a standard deviation of zero, is not
-visible, and its derivatives are zero. The sign of a standard deviation means nothing, as for
-``volprim_rf_basic``. Numbers written in place through a view of a shape's memory are not noticed.
+coefficients. o is clamped to :data:`OPACITY_RANGE`: the derivative at o = 1 is that of the inside;
+outside of 0..1 it is zero. Gaussians without a positive opacity, or with a standard deviation of
+zero, are not visible, and their derivatives are zero. Signs of standard deviations are ignored, as
+by ``volprim_rf_basic``. Changes in place through a view of a shape's memory are not noticed.
 """
 
 from __future__ import annotations
@@ -59,11 +59,8 @@ from drgs.gaussians.rotation import (
 from drgs.gaussians.sh import num_coefficients
 from drgs.gaussians.similarity import Similarity
 
-ParameterArrays = dict[str, Any]
-"""Arrays by name: a TensorXf or Float for each parameter, a Matrix4f for ``to_world``."""
-
-ParameterColumns = dict[str, list[Float]]
-"""Columns of parameters by name."""
+ParameterArrays = dict[str, Any]  # TensorXf or Float by name; a Matrix4f for ``to_world``
+ParameterColumns = dict[str, list[Float]]  # columns of parameters by name
 
 TO_WORLD = "to_world"
 
@@ -71,37 +68,33 @@ PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
 
 
 class Part(Protocol):
-    """Conversion of stored Gaussians to raw parameters in world space."""
+    """Stored Gaussians and their conversion to raw parameters in world space."""
 
     @property
     def values(self) -> ParameterArrays:
-        """Arrays by name; a gathered part holds them, so that their indices are not reused."""
-        ...
+        """Stored arrays by name, held so that their indices are not reused."""
 
     @property
     def fixed_inputs(self) -> object:
-        """Anything else that the conversion depends on; equal if the same."""
-        ...
+        """Other dependencies of the conversion, compared by ==."""
 
     def gaussians(self) -> Gaussians:
-        """Return all parameters, differentiable with respect to ``values``."""
-        ...
+        """Return the raw parameters, differentiable with respect to ``values``."""
 
     def detach(self) -> Part:
         """Return the same conversion of detached values."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Gaussians of a rendering, by part."""
+    """Gathered Gaussians and their parts."""
 
     parts: list[Part]  # detached
     sizes: list[tuple[int, int]]  # by part: number of Gaussians, degree
     gaussians: Gaussians  # detached and evaluated
 
     def matches(self, parts: Sequence[Part]) -> bool:
-        """Return whether gathering these would give the same Gaussians."""
+        """Return whether gathering ``parts`` would give the same Gaussians."""
         return same_variables(
             [part.values for part in self.parts], [part.values for part in parts]
         ) and [part.fixed_inputs for part in self.parts] == [part.fixed_inputs for part in parts]
@@ -140,10 +133,10 @@ class Gathered:
 
 
 def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
-    """Return the Gaussians of all parts in their order, of the highest degree that any has.
+    """Return the Gaussians of all parts, in order and of the highest degree.
 
-    last: the result of the last call, which is returned again while nothing has changed. Features
-    and coefficients that a part lacks are zeros, and so is a smoothing filter.
+    last: the last result, returned again while nothing has changed. Features, coefficients and
+    smoothing filters that a part lacks are zeros.
     """
     parts = [part.detach() for part in parts]
     if last is not None and last.matches(parts):
@@ -169,7 +162,7 @@ def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
 
 
 def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
-    """Return ``num`` rows from row ``start`` on, with the coefficients that ``degree`` has."""
+    """Return ``num`` rows from row ``start`` on, with the coefficients of ``degree``."""
     arrays = _arrays(gaussians)
     shapes = {k: v.shape[1:] for k, v in arrays.items()} | {"shN": _sh_shape(degree)}
     total = gaussians.num_gaussians
@@ -199,7 +192,7 @@ def _gaussians(arrays: ParameterArrays) -> Gaussians:
 def _block(
     values: mi.TensorXf | Float | None, start: int, num: int, total: int, row: tuple[int, ...]
 ) -> Float:
-    """Return ``num`` rows of ``total``, flat: cut to ``row``, or filled with zeros."""
+    """Return ``num`` of ``total`` rows, flat: cut to the shape ``row``, or filled with zeros."""
     flat = mi.Float() if values is None else values.array  # an array is its own
     kept, width = math.prod(row), dr.width(flat) // total
     if width == kept and num == total:
@@ -223,12 +216,12 @@ def columns(flat: Float, width: int) -> list[Float]:
 
 
 def interleave_columns(values: list[Float]) -> Float:
-    """Return columns as rows again, flat; of no columns, an empty array."""
+    """Interleave columns to flat rows; without columns, return an empty array."""
     return interleave(values) if values else mi.Float()
 
 
 def entry(flat: Float, index: int) -> Float:
-    """Return one entry of an array, in no kernel: other numbers need no other one."""
+    """Return one entry of an array, which is no literal of kernels."""
     return dr.gather(type(flat), flat, types_of(type(flat)).UInt32(index))
 
 
@@ -274,16 +267,11 @@ class Turn:
         return turned
 
 
-# ----------------------------------------------------------------------------------------------
-# Objects
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The move of an object into the scene: see :class:`Part`."""
+    """Gaussians of an object and its ``to_world``; see :class:`Part`."""
 
-    values: ParameterArrays  # of the object's Gaussians, and its to_world
+    values: ParameterArrays  # of the Gaussians, and to_world
     fixed_inputs: str  # name of the parameter to_world, in messages
 
     def detach(self) -> Placement:
@@ -291,7 +279,7 @@ class Placement:
 
     @staticmethod
     def from_matrix(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
-        """Place Gaussians by a matrix of one lane."""
+        """Place Gaussians by one matrix; name: of the parameter."""
         return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
 
     def gaussians(self) -> Gaussians:
@@ -340,8 +328,7 @@ class Placement:
     def _with_motion(self, moved: ParameterColumns) -> ParameterColumns:
         """Attach Gaussians, turned about the object's origin, to a change of the matrix.
 
-        Numbers that are not finite, of Gaussians that are not visible, do not move: they would make
-        all of a sum NaN.
+        Numbers that are not finite do not move: they would make the matrix's derivative NaN.
         """
         scale, w, shift = self._motion(dr.width(moved["means"]))
         arms = {
@@ -381,7 +368,7 @@ class Placement:
 
 
 def similarity_of(to_world: Matrix4f, name: str) -> Similarity:
-    """Return the similarity nearest to a Matrix4f; PluginError unless it is close to one."""
+    """Return the similarity nearest to a matrix; PluginError if it is too far from one."""
     matrix = np.array(dr.detach(to_world), np.float64)
     if matrix.size != 16:
         raise PluginError(f"{name} must be one transform, got {matrix.shape[2]}")
@@ -396,24 +383,16 @@ def _columns_of(tensor: mi.TensorXf) -> list[Float]:
     return columns(tensor.array, math.prod(tensor.shape[1:]))
 
 
-ELLIPSOID_DATA_WIDTH = 10
-"""Numbers of a row of ``data``: centre, standard deviations, quaternion xyzw."""
+ELLIPSOID_DATA_WIDTH = 10  # numbers per row: centre, standard deviations, quaternion xyzw
 
-OPACITIES = (2.0**-64, 1 - 2.0**-24)
-"""The largest float32 below 1, whose logit is 16.6; and an opacity that no image shows, so far
-from zero that neither it nor its reciprocal leaves float32."""
+OPACITY_RANGE = (2.0**-64, 1 - 2.0**-24)
+"""An invisible opacity, which has a reciprocal in float32; the largest float32 below 1."""
 
-TRANSPARENT_LOGIT = -1e4
-"""A logit whose sigmoid is exactly zero."""
-
-
-# ----------------------------------------------------------------------------------------------
-# Reading
-# ----------------------------------------------------------------------------------------------
+TRANSPARENT_LOGIT = -1e4  # logit with a sigmoid of exactly zero
 
 
 def read(shape: mi.Shape) -> ParameterArrays:
-    """Read the shape's arrays, attached. Raises PluginError that names what does not fit."""
+    """Return a shape's arrays, attached; PluginError for missing ones and wrong sizes."""
     values = mi.traverse(shape)
     where = f"splats: the {_name(shape)}"
     missing = [name for name in ("opacities", "sh_coeffs") if name not in values]
@@ -438,17 +417,12 @@ def _name(shape: mi.Shape) -> str:
     return f"shape '{shape.id()}' ({kind})" if shape.id() else f"shape without an id ({kind})"
 
 
-# ----------------------------------------------------------------------------------------------
-# Converting
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """The conversion of a shape's arrays to raw parameters; see ``gathering.Part``."""
+    """The arrays of a shape; see :class:`Part`."""
 
     values: ParameterArrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
-    fixed_inputs: Turn | None  # of the harmonics, which is not differentiated
+    fixed_inputs: Turn | None  # of the harmonics, not differentiated
 
     def detach(self) -> Conversion:
         return replace(self, values=dr.detach(self.values))
@@ -474,8 +448,8 @@ class Conversion:
         )
 
     def _opacity(self, is_visible: mi.Bool) -> mi.Float:
-        """Return opacities between bounds, attached where they were within 0..1; a NaN stays."""
-        (lowest, highest), value = OPACITIES, self.values["opacities"]
+        """Return clamped opacities, attached within 0..1; NaN stays NaN."""
+        (lowest, highest), value = OPACITY_RANGE, self.values["opacities"]
         clamped = dr.detach(dr.select(value < lowest, lowest, value))
         clamped = dr.select(clamped > highest, highest, clamped)
         inside = (value >= 0) & (value <= 1) & is_visible
@@ -483,7 +457,7 @@ class Conversion:
 
 
 def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, Turn]) -> list[Conversion]:
-    """Read the values of shapes, attached; turns: by their ids, "": of all others."""
+    """Read shapes, attached; turns: by their ids, "": of all other shapes."""
     unknown = set(turns) - {shape.id() for shape in shapes} - {""}
     if unknown:
         found = ", ".join(f"'{shape.id()}'" for shape in shapes if shape.id()) or "none"

@@ -2,8 +2,7 @@
 
 An :class:`ImageRender` has a :class:`SensorRender` for each sensor of a ``batch``, or one. The film
 develops their channels (``drgs.integrator.film``), and a nested integrator's image of surfaces is
-inserted (``drgs.integrator.surfaces``). :meth:`ImageRender.backward` and
-:meth:`ImageRender.tangent` run the same way back and along.
+inserted (``drgs.integrator.surfaces``).
 """
 
 from __future__ import annotations
@@ -24,25 +23,25 @@ from drgs.integrator.sensors import is_batch, num_poses, sensors_of
 from drgs.integrator.state import SplatsState
 from drgs.splatting import rendering
 
-if TYPE_CHECKING:  # imported where a scene calls for them
+if TYPE_CHECKING:  # imported where a scene requires them
     from drgs.integrator.sensors import SideBySide
     from drgs.integrator.surfaces import Hybrid
 
 
 @dataclass(frozen=True, eq=False)
 class ImageRender:
-    """An image of a sensor: of one, or of several side by side."""
+    """An image of one sensor, or of several side by side."""
 
     views: list[SensorRender]
     samples: CenterSamples
-    hybrid: Hybrid | None  # None: there are splats alone
+    hybrid: Hybrid | None  # the surfaces; None: the scene has none
     batch: SideBySide | None = None  # for several views
 
     @staticmethod
     def prepare(
         splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
     ) -> ImageRender:
-        """Choose where pixels are evaluated; spp: 0 for that of the sensor's sampler."""
+        """Choose sample positions; spp: 0 for that of the sensor's sampler."""
         hybrid = hybrid_of(splats, scene, sensor, seed, spp)
         names = splats.aov_names()
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
@@ -122,8 +121,7 @@ class ImageRender:
             if constant is not None:
                 dr.set_grad(constant, dr.grad(splats.background))
             image = self._develop(planes, constant)
-            # The nested integrator, and other images of the same pass, read the gradients of
-            # parameters again, also of those that are computed from others.
+            # Keep vertices: the nested integrator and other images read the gradients again.
             dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
             d_image = dr.grad(image)
         if self.hybrid is None:
@@ -145,7 +143,7 @@ class ImageRender:
 def hybrid_of(
     splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
 ) -> Hybrid | None:
-    """Return the surfaces' part of an image; None where there are none."""
+    """Return the surfaces in an image; None where the scene has none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
     from drgs.integrator.rays import StraightRays
@@ -159,8 +157,8 @@ def hybrid_of(
         if splats.nested is not None:
             nested = adjoint = splats.nested
         else:
-            # The same paths, whose derivatives are right for more of their parameters, and which
-            # see lamps through what lets light pass straight on.
+            # The same paths as ``path``, with correct derivatives for more parameters, and lamps
+            # seen through transparent surfaces.
             adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
             nested = adjoint
             if not surfaces.is_transparent:

@@ -1,10 +1,10 @@
-"""Flat mirrors among probes: the splats as cameras see them that are mirrored in their planes.
+"""Flat mirrors: the splats as seen by cameras that are mirrored in their planes.
 
-A ray of a camera that a plane mirrors goes on along a ray of the mirrored camera: what it meets of
-splats is a pixel of that one's image, which has a few texels for each pixel. Splats on the other
-side of the plane are left out, and so are those behind the surface that the mirrored ray meets: a
-ray looks at those of the texels around it that end where it does. A ray that leaves the plane on
-none of the mirrored camera's rays, after other bounces or scattered, is not known.
+A camera ray continues behind a flat mirror along a ray of the mirrored camera, and meets the splats
+of that one's image, which has a few texels for each pixel. Splats on the other side of the plane
+are left out, and so are those behind the surface that the mirrored ray meets: a ray reads only the
+texels around it whose rays end where it does. Rays that leave the plane along none of the mirrored
+camera's rays, after other bounces or scattered, have no answer.
 
 Nothing here is differentiated.
 """
@@ -28,42 +28,32 @@ from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
-from drgs.light.probe import LOW_PASS, ProbeHit
+from drgs.light.probe import LOW_PASS, ProbeHit, bilinear_texels
 from drgs.splatting import rendering
 
-TEXELS_PER_PIXEL = 2
-"""Texels of a small film's pixel, along either axis."""
+TEXELS_PER_PIXEL = 2  # texels per pixel of a small film, along either axis
 
 FINE_TEXELS, MAX_TEXELS = 2**21, 2**26
-"""Texels of all images together, 20 bytes each, from which on there are fewer of a pixel; and
-from which on there are fewer than one."""
+"""Texels of all images, 20 bytes each, from which on a pixel has fewer; and fewer than one."""
 
-BORDER_TEXELS = 8
-"""Texels around a image: filters of the film reach beyond its edge."""
+BORDER_TEXELS = 8  # texels around an image: filters of the film reach beyond its edge
+MAX_RELATIVE_DEPARTURE = 1e-5  # of vertices from the plane of a flat shape, relative to its size
+MAX_ROUNDING_DEPARTURE = 1e-6  # the same, relative to the coordinates: both are allowed
+MAX_RAY_OFFSET = 1e-3  # distance between a ray and the camera's, relative to that from the camera
 
-MAX_RELATIVE_DEPARTURE = 1e-5
-"""Largest distance of a vertex from the plane of a flat shape, relative to the shape's size."""
-
-MAX_ROUNDING_DEPARTURE = 1e-6
-"""The same, relative to the coordinates: both are allowed."""
-
-OFF_RAY = 1e-3
-"""Largest distance between a ray and the camera's, relative to the distance from the camera."""
-
-OFF_SURFACE = 2e-4
+MAX_ROUNDING_OFFSET = 2e-4
 """The same, relative to the coordinates: twice as far as Mitsuba starts rays off a surface."""
 
-LEAST_WEIGHT = 1e-3
-"""Smallest weight, of 1, of the texels around a ray that end where it does."""
+MIN_TEXEL_WEIGHT = 1e-3  # smallest weight, of 1, of the texels around a ray that end where it does
 
-SAME_END = (0.1, 0.01)
-"""Largest distance between the ends of rays that are taken for the same, relative to their length
-from the mirror on, and to that from the camera to the mirror: both are allowed."""
+MAX_END_DISTANCES = (0.1, 0.01)
+"""Largest distance between equal ends of rays, relative to their length from the mirror on, and
+from the camera to the mirror: the sum is allowed."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Points x with normal . x = offset, world; arrays of them, by mirror, in :class:`Mirrors`."""
+    """Points x with normal . x = offset, world."""
 
     normal: mi.Vector3f  # unit
     offset: mi.Float
@@ -93,33 +83,29 @@ class Plane:
 
 @dataclass(frozen=True)
 class FlatMirror:
-    """A flat shape that reflects light about where a mirror would."""
+    """A flat shape that reflects light about in a mirror's direction."""
 
     normal: list[float]  # world, unit
     offset: float  # of the plane along it
     has_delta: bool  # whether a part of the light goes exactly there
-    is_specular: bool  # whether all that goes on does so about there
+    is_specular: bool  # whether all reflected light goes about there
 
     @staticmethod
     def from_shape(shape: mi.Shape) -> FlatMirror | None:
-        """Recognise one; None for all other shapes, and for emitters."""
+        """Recognise a mirror; None for all other shapes, and for emitters."""
         bsdf = shape.bsdf()
         if bsdf is None or shape.is_emitter():
             return None
-        delta, glossy, diffuse, through = (
-            mi.has_flag(bsdf.flags(), flag)
-            for flag in (
-                mi.BSDFFlags.DeltaReflection,
-                mi.BSDFFlags.GlossyReflection,
-                mi.BSDFFlags.DiffuseReflection,
-                mi.BSDFFlags.Transmission,
-            )
-        )
+        flags, kinds = bsdf.flags(), mi.BSDFFlags
+        delta = mi.has_flag(flags, kinds.DeltaReflection)
+        glossy = mi.has_flag(flags, kinds.GlossyReflection)
+        diffuse = mi.has_flag(flags, kinds.DiffuseReflection)
+        through = mi.has_flag(flags, kinds.Transmission)
         plane = _plane_through(_points(shape)) if delta or glossy else None
         return plane and FlatMirror(*plane, delta, not (diffuse or through))
 
     def mirror_camera(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mirror a camera's centre, (3,); give the plane, (4,), with its normal to the camera."""
+        """Return the mirrored centre (3,), and the plane (4,) with its normal to the camera."""
         normal = np.array(self.normal)
         height = normal @ center - self.offset
         plane = np.sign(height) * np.array([*normal, self.offset])
@@ -127,7 +113,7 @@ class FlatMirror:
 
 
 def _points(shape: mi.Shape) -> np.ndarray:
-    """Return points (N, 3) of a shape, world, on one plane if it is flat; none if it cannot be."""
+    """Return points (N, 3) of a shape, world, on its plane if it is flat; none if it cannot be."""
     if isinstance(shape, mi.Mesh):
         return np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     if shape.class_name() != "Disk":
@@ -139,7 +125,7 @@ def _points(shape: mi.Shape) -> np.ndarray:
 
 
 def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
-    """Find normal and offset of the one plane of points (N, 3); None where there is not one."""
+    """Fit normal and offset of the plane of points (N, 3); None where there is not just one."""
     if len(points) < 3 or not np.isfinite(points).all():
         return None
     middle = points.mean(0)
@@ -156,7 +142,7 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
 
 @dataclass(frozen=True, eq=False)
 class Mirrors:
-    """Images of the splats that cameras see in mirrors."""
+    """Images of the splats in mirrors, for each camera."""
 
     planes: Plane  # by mirror
     views: list[_View]  # by camera
@@ -192,7 +178,7 @@ class Mirrors:
         return Mirrors(every, views)
 
     def look(self, mirror: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:
-        """Look up the splats along segments that leave a mirror; mirror: its number, of each."""
+        """Look up the splats along segments that leave a mirror; mirror: its number."""
         plane, ray = self.planes.gather(mirror, active), segment.ray
         origin = ray.o - 2 * plane.height(ray.o) * plane.normal
         direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
@@ -207,12 +193,12 @@ class Mirrors:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Images of what one camera sees in each mirror."""
+    """Images of the splats that one camera sees in each mirror."""
 
-    camera: Camera  # of a film that has a pixel for each texel
-    size: mi.Vector2u  # width and height, not to be compiled into kernels
+    camera: Camera  # with a pixel for each texel
+    size: mi.Vector2u  # width and height, opaque
     colors: mi.Float  # 4 a texel: linear red, green, blue, times the coverage; coverage
-    ends: mi.Float  # of each texel: how far from the camera its ray ends
+    ends: mi.Float  # by texel: distance from the camera to the ray's end
 
     def look(
         self,
@@ -222,15 +208,15 @@ class _View:
         far: mi.Float,
         active: mi.Bool,
     ) -> ProbeHit:
-        """Look up what mirrored rays meet, as far as they go on along those of the camera."""
-        camera, rounding = self.camera, OFF_SURFACE * (1 + dr.max(dr.abs(origin)))
+        """Look up mirrored rays that continue along those of the camera."""
+        camera, rounding = self.camera, MAX_ROUNDING_OFFSET * (1 + dr.max(dr.abs(origin)))
         origin = camera.rotation @ (mi.Vector3f(origin) - camera.center)
         direction = camera.rotation @ mi.Vector3f(direction)
         place, off = camera.place_of_ray(origin, direction)
         start, towards, is_seen = camera.look_through(place.x, place.y)
         way = origin - start
         distance = dr.norm(way)
-        off += OFF_RAY * distance + rounding
+        off += MAX_RAY_OFFSET * distance + rounding
         active = active & is_seen & (dr.dot(towards, direction) > 0) & (dr.dot(way, direction) > 0)
         active &= dr.norm(dr.cross(way, direction)) <= off
         x, y = place - 0.5
@@ -240,30 +226,25 @@ class _View:
         right, down = x - mi.Float(column), y - mi.Float(row)
         first = mirror * (width * height) + row * width + column
         total, weights = mi.Vector4f(0), mi.Float(0)
-        for texel, weight in (
-            (first, (1 - right) * (1 - down)),
-            (first + 1, right * (1 - down)),
-            (first + width, (1 - right) * down),
-            (first + width + 1, right * down),
-        ):
+        for texel, weight in bilinear_texels(first, width, right, down):
             end = dr.gather(mi.Float, self.ends, texel, active)
             weight = dr.select(_is_same(distance, far, end), weight, 0)
             total += weight * dr.gather(mi.Vector4f, self.colors, texel, active)
             weights += weight
-        is_known = active & (weights > LEAST_WEIGHT)
+        is_known = active & (weights > MIN_TEXEL_WEIGHT)
         *color, coverage = dr.select(is_known, total / weights, 0)
         return ProbeHit(mi.Color3f(color), coverage, is_known)
 
 
 def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
-    """Return whether a ray, as long to the mirror and as far from there, ends at ``end``."""
-    of_far, of_distance = SAME_END
+    """Return whether a ray ends at ``end``; distance, far: its lengths to and from the mirror."""
+    of_far, of_distance = MAX_END_DISTANCES
     is_near = dr.abs(distance + far - end) <= of_far * far + of_distance * distance
     return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
 
 
 def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> rendering.Pipeline:
-    """Build the pipeline that shows Gaussians as rays meet them, as far as a lens allows it."""
+    """Build the pipeline that renders Gaussians as rays meet them, as far as a lens allows."""
     projection = "exact"
     if not isinstance(lens, Pinhole):
         projection = "ewa" if lens.parallel else "unscented"  # the former is exact then
@@ -295,7 +276,7 @@ def _render_mirror(
     gaussians: Gaussians,
     pipeline: rendering.Pipeline,
 ) -> tuple[mi.Float, mi.Float]:
-    """Render what the camera sees in a mirror: see :class:`_View`."""
+    """Render the splats that the camera sees in a mirror: see :class:`_View`."""
     side = dr.sign(plane.height(mi.Vector3f(camera.center)))
     plane = Plane(side * plane.normal, side * plane.offset)
     camera = plane.mirror(camera)
@@ -316,7 +297,7 @@ def _render_mirror(
 
 
 def _trace(camera: Camera, plane: Plane, scene: mi.Scene) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Find the depths where a mirrored camera's rays pass the mirror and end, and their lengths."""
+    """Return the depths where mirrored camera rays pass the mirror and end, and their lengths."""
     texel = dr.arange(mi.UInt32, camera.width * camera.height)
     width = dr.opaque(mi.UInt32, camera.width)
     row = texel // width

@@ -1,8 +1,7 @@
 """Properties of scene descriptions, read and checked for the plugins.
 
-:data:`SETTINGS` declares the settings of ``splats``; :func:`read` reads such a table. Errors are
-:class:`drgs.core.errors.PluginError` with the plugin's name, that of the property, what was
-expected and what was given; where the type is wrong, ``PluginTypeError``.
+Errors are :class:`drgs.core.errors.PluginError` with the names of plugin and property, the expected
+and the given value; for a wrong type, ``PluginTypeError``.
 """
 
 from __future__ import annotations
@@ -31,17 +30,12 @@ if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
     from drgs.integrator.gathering import Turn
 
 
-# ----------------------------------------------------------------------------------------------
-# Tables of properties
-# ----------------------------------------------------------------------------------------------
-
-
 class Property(NamedTuple):
-    """A value of one type that a plugin can be given."""
+    """A property of a plugin, with values of one type."""
 
     kind: type  # bool, int, float or str
     default: Value | None
-    expected: str  # what messages ask for
+    expected: str  # in messages
     allows: Callable[[Any], bool] = lambda value: True
     words: Sequence[str] = ()
 
@@ -52,12 +46,12 @@ def flag(default: bool) -> Property:
 
 
 def number(default: float) -> Property:
-    """Declare a number that is finite in single precision, in which it is kept."""
+    """Declare a number that is finite in single precision."""
     return Property(float, default, "a finite number", lambda v: math.isfinite(_single(v)))
 
 
 def positive(default: float) -> Property:
-    """Declare a number above 0 and finite, in single precision as well."""
+    """Declare a number that is positive and finite in single precision."""
     return Property(float, default, "a positive number", lambda v: 0 < _single(v) < math.inf)
 
 
@@ -78,7 +72,7 @@ def _single(value: float) -> float:
 
 
 def read(props: mi.Properties, declared: Mapping[str, Property]) -> dict[str, Any]:
-    """Return the values of declared properties that are given, and defaults for the others."""
+    """Return the values of declared properties, or their defaults."""
     return {
         name: _check_property(props, name, one) if name in props else one.default
         for name, one in declared.items()
@@ -98,7 +92,7 @@ def _check_property(props: mi.Properties, name: str, declared: Property) -> Any:
 
 
 def matrix(props: mi.Properties, name: str) -> np.ndarray:
-    """Return a transform that is given: (4, 4) float64."""
+    """Return the matrix of a transform, (4, 4) float64."""
     value: Any = props[name]
     if props.type(name) != mi.Properties.Type.Transform:
         raise PluginTypeError(
@@ -108,15 +102,11 @@ def matrix(props: mi.Properties, name: str) -> np.ndarray:
 
 
 def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:
-    """Raise PluginError for a property that nobody has read: a mistyped name."""
+    """Raise PluginError for a property that was not read: a mistyped name."""
     for name in props.unqueried():
         hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
         raise PluginError(f"{props.plugin_name()}: there is no parameter {name}{hint}")
 
-
-# ----------------------------------------------------------------------------------------------
-# The integrator's
-# ----------------------------------------------------------------------------------------------
 
 SETTINGS = {
     "near": positive(NEAR),
@@ -129,30 +119,26 @@ SETTINGS = {
     "unseen": one_of("none", "rays"),
     "exposure": positive(1.0),
 }
-"""Settings of ``splats`` that are single values, besides the approximations."""
+"""Settings of ``splats`` with single values, besides the approximations."""
 
 APPROXIMATIONS = {
     name: Property(one.kind, one.default, one.expected_values, one.allows, one.words)
     for name, one in DECLARED.items()
 }
 
-FEATURE = "feature_"
-"""Prefix of the names of parameters that hold numbers of the user's own."""
+FEATURE = "feature_"  # prefix of the names of the user's own features
+SHAPES_TO_WORLD = "shapes_to_world"  # prefix of properties with the ``to_world`` of shapes
 
-SHAPES_TO_WORLD = "shapes_to_world"
-"""Prefix of the names of parameters that hold the ``to_world`` of shapes."""
-
-OF_OBJECTS = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
-"""Names of the properties of a ``splats`` that is nested in another, but for :data:`FEATURE`."""
+OBJECT_PROPERTIES = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
+"""Properties of a ``splats`` that is nested in another, besides :data:`FEATURE`."""
 
 KNOWN = (
     *("filename", "to_world", SHAPES_TO_WORLD, "background", "probes", "shadows", "aovs", "ignore"),
     *("smoothing", *SETTINGS, *APPROXIMATIONS, *PARAMETER_NAMES),
 )
-"""Names of the properties of ``splats``, but for nested objects and names with a prefix."""
+"""Properties of ``splats``, besides nested objects and names with a prefix."""
 
-UNNAMED = "_arg_"
-"""Prefix of the names that Mitsuba gives to nested objects without one."""
+UNNAMED = "_arg_"  # prefix of Mitsuba's names for nested objects without one
 
 
 def read_state(
@@ -160,16 +146,17 @@ def read_state(
     objects: Mapping[str, SplatObject],
     nested: Sequence[mi.SamplingIntegrator],
 ) -> SplatsState:
-    """Return the state of ``splats``; objects: nested ones, nested: the other integrators."""
+    """Return the state of ``splats``; objects: nested ``splats``; nested: other integrators."""
     if len(nested) > 1:
         raise PluginError(
             f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
         )
     gaussians, file = load_gaussians(props), str(props.get("filename", ""))
-    said = {n: v for n, v in (gaussians.rendered_with or {}).items() if n not in props}
-    own = SplatObject(
-        gaussians, _to_world(props), "to_world" in props, file, from_ply_header(file, said)
-    )
+    values = {n: v for n, v in (gaussians.rendered_with or {}).items() if n not in props}
+    own_header, to_world = from_ply_header(file, values), mi.AffineTransform4f()
+    if "to_world" in props:
+        to_world = mi.AffineTransform4f(matrix(props, "to_world").astype(np.float32))
+    own = SplatObject(gaussians, to_world, "to_world" in props, file, own_header)
     if own.is_moved:
         own.check_to_world()
     every = {"": own} | {f"{name}.": one for name, one in objects.items()}
@@ -221,7 +208,7 @@ def _words(props: mi.Properties, name: str) -> tuple[str, ...]:
 
 
 def load_gaussians(props: mi.Properties) -> Gaussians:
-    """Return the Gaussians of a scene description: of a file, or six tensors; or none."""
+    """Return the Gaussians of a file or of tensors, or none."""
     given = [name for name in (*PARAMETER_NAMES, "smoothing") if name in props]
     features = {n: _tensor(props, n) for n in props.keys() if n.startswith(FEATURE)}  # noqa: SIM118
     if "filename" in props:
@@ -236,8 +223,7 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
         gaussians = replace(_gaussians_of_tensors(props, given), features=features)
     else:
         shapes = [(0, 3), (0, 4), (0, 3), (0,), (0, 1, 3), (0, 0, 3)]
-        means, quats, log_scales, logits, sh0, shN = (np.zeros(s, np.float32) for s in shapes)
-        return Gaussians(means, quats, log_scales, logits, sh0, shN).to(mi.TensorXf)
+        return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes)).to(mi.TensorXf)
     check_shapes(gaussians)
     return gaussians
 
@@ -261,7 +247,7 @@ def _gaussians_of_tensors(props: mi.Properties, given: Sequence[str]) -> Gaussia
 
 
 def _load_gaussians(path: str) -> Gaussians:
-    """Return the Gaussians of a file, in coordinates that Mitsuba's float32 can tell apart."""
+    """Return the Gaussians of a file, relative to its origin, which float32 requires."""
     gaussians = Gaussians.load(path)
     if gaussians.origin != WORLD:
         note = (
@@ -273,23 +259,17 @@ def _load_gaussians(path: str) -> Gaussians:
 
 
 def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
-    """Copy a tensor: parameters are assigned in place, the caller's are not."""
+    """Return a copy of a tensor: parameters are assigned in place."""
     value: Any = props[name]
     if not dr.is_array_v(value):
         raise PluginTypeError(f"splats: {name} must be a tensor, got {type(value).__name__}")
-    if not dr.is_jit_v(value):  # of the host, as is what a property set makes of three numbers
+    if not dr.is_jit_v(value):  # on the host, as three numbers are
         value = np.array(value, np.float32)
     return mi.TensorXf(value)
 
 
-def _to_world(props: mi.Properties) -> mi.AffineTransform4f:
-    if "to_world" not in props:
-        return mi.AffineTransform4f()
-    return mi.AffineTransform4f(matrix(props, "to_world").astype(np.float32))
-
-
 def _turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
-    """Return rotations of spherical harmonics by ids of shapes, and under "" for all others."""
+    """Return rotations of spherical harmonics by ids of shapes; "": all other shapes."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
         return {}
@@ -311,7 +291,7 @@ def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:
     if isinstance(value, mi.Texture):
         return value
     try:
-        if isinstance(value, str):  # of which nanobind complains itself, beside its error
+        if isinstance(value, str):  # nanobind would print a warning besides its error
             raise TypeError
         color = mi.Color3f(value)
     except TypeError:
@@ -340,8 +320,8 @@ def _aovs(props: mi.Properties, kinds: Sequence[str]) -> dict[str, str]:
 def _merge_headers(
     props: mi.Properties, files: Mapping[str, Mapping[str, Value]]
 ) -> dict[str, Value]:
-    """Return what headers set and no property gives; PluginError where files differ."""
-    made_with = {file: Approximations.from_values(said) for file, said in files.items()}
+    """Return approximations that headers set, not properties; PluginError where files differ."""
+    made_with = {file: Approximations.from_values(header) for file, header in files.items()}
     names = [name for name in DECLARED if name not in props]
     for name in names:
         values = {file: getattr(made, name) for file, made in made_with.items()}
@@ -351,17 +331,12 @@ def _merge_headers(
                 f"splats: files that are rendered together must be made for the same {name}, got "
                 f"{words}; give the integrator {name}, which then holds for all"
             )
-    return {name: said[name] for said in files.values() for name in names if name in said}
-
-
-# ----------------------------------------------------------------------------------------------
-# Nested integrators
-# ----------------------------------------------------------------------------------------------
+    return {name: one[name] for one in files.values() for name in names if name in one}
 
 
 def nested_integrators(props: mi.Properties) -> dict[str, mi.SamplingIntegrator]:
     """Return nested integrators by name: their key, or in XML the id where no name is given."""
-    # Objects alone: whatever is read counts as known, and a mistyped name would not be refused.
+    # Read objects alone: a mistyped name that was read would not be refused.
     is_object = mi.Properties.Type.Object
     names = [name for name in props.keys() if props.type(name) == is_object]  # noqa: SIM118
     nested = {}
@@ -380,11 +355,11 @@ def nested_integrators(props: mi.Properties) -> dict[str, mi.SamplingIntegrator]
 
 
 def check_object(name: str, given: Sequence[str]) -> None:
-    """Raise PluginError for properties of a nested ``splats`` that are not those of an object."""
-    others = [n for n in given if n not in OF_OBJECTS and not n.startswith(FEATURE)]
+    """Raise PluginError for properties that a nested ``splats`` must not have."""
+    others = [n for n in given if n not in OBJECT_PROPERTIES and not n.startswith(FEATURE)]
     if others or not given:
         got = f"{others[0]}, which holds for all: give it to the outer one" if others else "nothing"
         raise PluginError(
             f"splats: {name} is nested in another splats integrator, and must be given Gaussians "
-            f"by {', '.join(OF_OBJECTS)} and {FEATURE}... alone, got {got}"
+            f"by {', '.join(OBJECT_PROPERTIES)} and {FEATURE}... alone, got {got}"
         )

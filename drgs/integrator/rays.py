@@ -1,9 +1,9 @@
-"""Rays between surfaces: segments of paths, and rays that pass straight on.
+"""Rays that pass straight through surfaces, and segments of paths between them.
 
-The opacity of a surface at a point is what it does not let pass straight on (``null``, ``mask``,
-``thindielectric``), averaged over red, green and blue. What is less opaque than :data:`INVISIBLE`
-is not there: rays go on as if it were not. A sensor whose rays start behind the first k visible
-surfaces has any nested integrator render what these let through.
+The opacity of a surface at a point is the part of light that it does not let pass straight on
+(``null``, ``mask``, ``thindielectric``), averaged over red, green and blue. Rays ignore surfaces of
+at most :data:`MAX_INVISIBLE_OPACITY`. A sensor whose rays start behind the first k visible surfaces
+makes any nested integrator render the light that these let through.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ from drgs.core.types import Bool, Float
 Ray = TypeVar("Ray", bound="mi.Ray3f")
 
 MAX_INVISIBLE_OPACITY = 1e-6
-"""Opacity, of which rounding leaves up to 2e-7 where there is none."""
+"""Largest opacity of an invisible surface; rounding leaves up to 2e-7 where there is none."""
+
+UNBOUNDED_DEPTH = 0xFFFFFFFF  # ``max_depth`` of Mitsuba's integrators where paths have no limit
 
 
 def has_transparent_parts(scene: mi.Scene) -> bool:
     """Return whether any BSDF of a scene lets light pass straight on."""
-    with dr.suspend_grad():  # or values that are read would be new nodes of a graph in use
+    with dr.suspend_grad():  # values that are read would be new nodes of a graph in use
         nodes = mi.traverse(scene).hierarchy
     bsdfs = (node for node in nodes if isinstance(node, mi.BSDF))
     return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
@@ -34,7 +36,7 @@ def has_transparent_parts(scene: mi.Scene) -> bool:
 
 @dataclass(frozen=True)
 class StraightRays:
-    """Rays that go straight on until something is visible. In no loop's state: it would attach."""
+    """Tracing of rays up to visible surfaces. Keep it out of loop states, which would attach it."""
 
     scene: mi.Scene
     hide_emitters: bool  # whether surfaces that are emitters are invisible
@@ -43,13 +45,10 @@ class StraightRays:
     def next_visible(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
-        """Return a ray behind all that is invisible, its hit, and the hit's opacity, 0 for none."""
+        """Return the ray past invisible surfaces, its hit, and the hit's opacity (0 for no hit)."""
         hit, opacity = self._meet(ray, active)
         if not self.sees_through:
             return ray, hit, opacity
-
-        def is_invisible(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float):
-            return hit.is_valid() & (opacity <= MAX_INVISIBLE_OPACITY)
 
         def pass_surface(
             ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float
@@ -58,13 +57,15 @@ class StraightRays:
             return ray, *self._meet(ray, mi.Bool(True))
 
         return dr.while_loop(
-            state=(mi.Ray3f(ray), hit, opacity), cond=is_invisible, body=pass_surface
+            state=(mi.Ray3f(ray), hit, opacity),
+            cond=lambda ray, hit, opacity: hit.is_valid() & (opacity <= MAX_INVISIBLE_OPACITY),
+            body=pass_surface,
         )
 
     def continue_rays(
         self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
     ) -> mi.Ray3f:
-        """Return the rest of rays behind what they hit; ``ray`` where not active."""
+        """Return the rest of rays behind their hits; ``ray`` where not active."""
         si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         rest = mi.Ray3f(ray)
         rest.o = dr.select(active, si.spawn_ray(ray.d).o, ray.o)
@@ -72,50 +73,46 @@ class StraightRays:
         return rest
 
     def transmittance(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """Return what all surfaces up to the ray's end let pass straight on, 0..1."""
+        """Return the transmittance, 0..1, of all surfaces up to the rays' ends."""
         if not self.sees_through:
             return dr.select(active & self.scene.ray_test(ray, active), 0, mi.Float(1))
 
-        def go_on(ray: mi.Ray3f, passes: mi.Float, goes_on: mi.Bool) -> tuple:
-            hit, opacity = self._meet(ray, goes_on)
-            passes = passes * (1 - opacity)
-            goes_on = goes_on & hit.is_valid() & (passes > MAX_INVISIBLE_OPACITY)
-            return self.continue_rays(ray, hit, goes_on), passes, goes_on
+        def pass_surface(ray: mi.Ray3f, T: mi.Float, active: mi.Bool) -> tuple:
+            hit, opacity = self._meet(ray, active)
+            T = T * (1 - opacity)
+            active = active & hit.is_valid() & (T > MAX_INVISIBLE_OPACITY)
+            return self.continue_rays(ray, hit, active), T, active
 
-        ones = dr.full(mi.Float, 1, dr.width(ray))
-        _, passes, _ = dr.while_loop(
-            state=(mi.Ray3f(ray), ones, mi.Bool(active)),
-            cond=lambda ray, passes, goes_on: goes_on,
-            body=go_on,
+        _, T, _ = dr.while_loop(
+            state=(mi.Ray3f(ray), dr.full(mi.Float, 1, dr.width(ray)), mi.Bool(active)),
+            cond=lambda ray, T, active: active,
+            body=pass_surface,
         )
-        return dr.select(passes > MAX_INVISIBLE_OPACITY, passes, 0)
+        return dr.select(T > MAX_INVISIBLE_OPACITY, T, 0)
 
     def _meet(
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.PreliminaryIntersection3f, mi.Float]:
+        """Return the first hit and its opacity, 0 where nothing is hit."""
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        return hit, self._opacity(ray, hit)
-
-    def _opacity(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> mi.Float:
-        """Return the opacity of what is hit; 0 where nothing is."""
         if not self.sees_through:
-            return dr.select(hit.is_valid(), mi.Float(1), 0)
+            return hit, dr.select(hit.is_valid(), mi.Float(1), 0)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
         opacity = dr.mean(1 - si.bsdf().eval_null_transmission(si, hit.is_valid()))
         if self.hide_emitters:
             opacity = dr.select(si.shape.is_emitter(), 0, opacity)
-        return dr.select(hit.is_valid(), opacity, 0)
+        return hit, dr.select(hit.is_valid(), opacity, 0)
 
 
 @dataclass(frozen=True)
 class RaysBehind:
-    """Rays behind the first ``count`` visible surfaces; the weight is what these let through."""
+    """Rays behind the first ``count`` visible surfaces, weighted by their transmittance."""
 
     rays: StraightRays
     count: int
 
     def advance(self, ray: Ray, active: mi.Bool) -> tuple[Ray, mi.Float]:
-        """Return the rays, which may have differentials, and their weights. Not differentiated."""
+        """Return rays, also with differentials, and their weights. Not differentiated."""
         with dr.suspend_grad():
             rest, active = mi.Ray3f(ray), dr.full(mi.Bool, True, dr.width(ray)) & active
             weight = dr.full(mi.Float, 1, dr.width(ray))
@@ -132,7 +129,7 @@ class RaysBehind:
 
 
 def sensor_behind(sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind) -> mi.Sensor:
-    """Return a sensor whose rays start behind surfaces; sensors: those of a ``batch``."""
+    """Return a sensor whose rays start behind surfaces; sensors: the children of a ``batch``."""
     return _sensor_type(mi.variant())(sensor, sensors, behind)
 
 
@@ -141,7 +138,7 @@ def _sensor_type(variant: str) -> type:
     del variant
 
     class SensorBehind(mi.Sensor):
-        """Rays of another sensor, without their beginning."""
+        """Rays of another sensor, from behind the first surfaces on."""
 
         def __init__(
             self, sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind
@@ -156,25 +153,17 @@ def _sensor_type(variant: str) -> type:
             self.m_needs_sample_3 = sensor.needs_sample_3()
 
         def sample_ray(
-            self,
-            time: Float,
-            sample1: Float,
-            sample2: mi.Point2f,
-            sample3: mi.Point2f,
+            self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
             active: Bool | bool = True,
-        ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
             ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
             return mi.Ray3f(ray), weight
 
         def sample_ray_differential(
-            self,
-            time: Float,
-            sample1: Float,
-            sample2: mi.Point2f,
-            sample3: mi.Point2f,
+            self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
             active: Bool | bool = True,
-        ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-            # Not by the batch, whose calls reach all sensors that there are, this one included.
+        ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:  # fmt: skip
+            # Not through the batch, whose virtual calls reach all sensors, this one included.
             place, found = sample2.x * len(self.sensors), None
             for k, sensor in enumerate(self.sensors):
                 point = mi.Point2f(place - k, sample2.y)
@@ -192,12 +181,12 @@ def _sensor_type(variant: str) -> type:
 
 @dataclass(frozen=True)
 class PathSegment:
-    """A part of a path: from one vertex to the next, or to an emitter."""
+    """A segment of a path: from one vertex to the next, or to an emitter."""
 
-    ray: mi.Ray3f  # maxt: where it ends
-    start: mi.ShapePtr  # that it leaves
-    end: mi.EmitterPtr  # that it reaches, if it is one
-    pdf: mi.Float  # of the direction, by solid angle; inf: there was no other
+    ray: mi.Ray3f  # maxt: the segment's end
+    start: mi.ShapePtr  # the shape that it leaves
+    end: mi.EmitterPtr  # the emitter that it reaches, or null
+    pdf: mi.Float  # of the direction, by solid angle; inf: delta
     is_open: mi.Bool  # whether it leaves a scene without an environment: black is the last splat
 
 
@@ -208,16 +197,14 @@ class SplatTransport(Protocol):
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
         """Return linear radiance and transmittance of segments; sample: in 0..1."""
-        ...
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """Return the transmittance of the splats along segments, or an estimate of it."""
-        ...
 
 
 @runtime_checkable
 class TransportIntegrator(Protocol):
-    """An integrator whose paths can pass splats, as those of ``splatpath`` do."""
+    """An integrator whose paths can pass splats: ``splatpath``, a class of each variant."""
 
     def use_transport(self, transport: SplatTransport | None) -> None:
-        """Pass splats by this transport from now on."""
+        """Set the splats that paths pass from now on; None: paths pass none."""

@@ -1,4 +1,4 @@
-"""Mitsuba objects from a dataset: sensors for the views, a scene with the integrator."""
+"""Mitsuba objects from a dataset: sensors of views, a scene with the integrator."""
 
 from __future__ import annotations
 
@@ -17,11 +17,8 @@ from drgs.core.memory import too_large_reason
 from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
-NEAR_CLIP = 1e-9
-"""Scene units: the smallest near plane of a configuration, so that the integrator's own decides."""
-
-SQUARE_PIXEL_TOLERANCE = 0.01
-"""px: largest shift at the image's border that may come from treating pixels as square."""
+NEAR_CLIP = 1e-9  # scene units: the smallest near plane, so that the integrator's applies
+SQUARE_PIXEL_TOLERANCE = 0.01  # px: largest shift at the border from treating pixels as square
 
 
 def make_scene(
@@ -30,14 +27,15 @@ def make_scene(
     background: tuple[float, float, float] | Path,
     **settings: object,
 ) -> mi.Scene:
-    """Return a scene of the integrator ``splats`` alone, with ``settings``, in display space."""
+    """Return a scene of the integrator ``splats`` with ``settings``, in display space."""
     uploaded = gaussians.to(mi.TensorXf)
     tensors = {name: getattr(uploaded, name) for name in PARAMETER_NAMES}
     if uploaded.smoothing is not None:
         tensors["smoothing"] = uploaded.smoothing
+    bitmap = {"type": "bitmap", "filename": str(background), "wrap_mode": "clamp"}
     integrator = {
         "type": "splats",
-        "background": _bitmap(background) if isinstance(background, Path) else list(background),
+        "background": list(background) if isinstance(background, tuple) else bitmap,
         "near": model.near_plane,
         **model.approximations.non_default,
         "srgb_primitives": False,
@@ -47,12 +45,8 @@ def make_scene(
     return mi.load_dict({"type": "scene", "integrator": integrator})
 
 
-def _bitmap(path: Path) -> dict[str, object]:
-    return {"type": "bitmap", "filename": str(path), "wrap_mode": "clamp"}
-
-
 def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, remedy: str) -> None:
-    """Raise UserError for a lens that the projection cannot render; where, remedy: words."""
+    """Raise UserError for lenses that ``exact`` cannot render; where, remedy: of the message."""
     bent = next(((view.name, view.lens) for view in views if view.lens is not None), None)
     if model.projection == "exact" and bent is not None:
         name, lens = bent
@@ -64,7 +58,7 @@ def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, rem
 
 
 def check_sizes(views: Iterable[Viewpoint], remedy: str) -> None:
-    """Raise :class:`UserError` for an image that cannot be held; remedy: end of the message."""
+    """Raise :class:`UserError` for images too large for memory; remedy: end of the message."""
     for view in views:
         motion = view.motion
         samples = 1 if motion is None or motion.shutter != "global" else motion.samples
@@ -75,7 +69,7 @@ def check_sizes(views: Iterable[Viewpoint], remedy: str) -> None:
 def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[mi.Sensor]:
     """Return one sensor per view: box filter, one sample, RGB.
 
-    ``perspective`` where Mitsuba's own sensor can be the view's camera, else (or if all are to be)
+    ``perspective`` where that can represent the camera, else (or with ``calibrated``)
     ``calibrated``. Views of one size share a film.
     """
     films: dict[tuple[int, int], mi.Film] = {}
@@ -147,6 +141,6 @@ def _has_square_pixels(view: Viewpoint) -> bool:
 def render_views(scene: mi.Scene, views: Iterable[Viewpoint]) -> Iterator[np.ndarray]:
     """Yield images (H, W, 3) of ``views``, display space, clamped to [0, 1]."""
     for sensor in make_sensors(views):
-        with dr.suspend_grad():  # ends before the image is out: nobody may ask for the next one
+        with dr.suspend_grad():  # not around the yield: the caller may not resume
             image = np.array(mi.render(scene, sensor=sensor, spp=1))
-        yield np.clip(image[:, :, :3], 0, 1)  # what else is put out comes behind the colours
+        yield np.clip(image[:, :, :3], 0, 1)  # without AOVs

@@ -1,9 +1,9 @@
 """An image of one sensor: frames, their planes, and the channels of its film.
 
-A :class:`SensorRender` renders frames (``drgs.splatting.rendering``), one for each time at which
-the shutter is open and each pass of samples, or reuses those of the last image where nothing has
-changed. It composites them over the background, and adds the surfaces. Derivatives of a
-background's texels are added atomically: they are the same in every run only up to rounding.
+A :class:`SensorRender` renders a frame (``drgs.splatting.rendering``) for each time of the shutter
+and each pass of samples, or reuses those of the last image. It composites them over the background
+and adds the surfaces. Derivatives of a background's texels are added atomically: runs agree only up
+to rounding.
 """
 
 from __future__ import annotations
@@ -27,33 +27,26 @@ from drgs.integrator.state import Cached, SplatsState
 from drgs.splatting import rendering
 from drgs.splatting.footprint import SamplePositions
 
-if TYPE_CHECKING:  # imported where a scene calls for them
+if TYPE_CHECKING:  # imported where a scene has surfaces
     from drgs.integrator.surfaces import Hybrid
     from drgs.integrator.visible_surfaces import SurfaceLayers
 
 
-Passes = list[Channels]
-"""Channels by pass: of one sample per pixel or, on a small film, of several."""
-
-Planes = list[list[list[Float]]]
-"""Planes of frames, each (samples * H * W,), by time and by pass."""
-
-
-PASSES_PER_KERNEL = 16
-"""Passes, or times at which the shutter is open, after which planes and sums are evaluated:
-compilers take longer than proportionally to a kernel's length."""
+Passes = list[Channels]  # channels by pass: one sample per pixel or, on a small film, several
+Planes = list[list[list[Float]]]  # planes of frames, each (samples * H * W,), by time and by pass
+PASSES_PER_KERNEL = 16  # passes or times between evaluations: compile time is superlinear
 
 
 @dataclass(frozen=True, eq=False)
 class SensorRender:
-    """The image of one sensor: all of it, unless it is one of a batch."""
+    """The image of one sensor, alone or in a batch."""
 
     splats: SplatsState
     scene: mi.Scene
     index: int  # of the view, in the cache
     sensor: mi.Sensor
     positions: Sequence[SamplePositions]  # by pass
-    key: object  # of these: see drgs.integrator.film.CenterSamples
+    key: object  # of the positions: see drgs.integrator.film.CenterSamples
     has_alpha: bool
     hybrid: Hybrid | None  # the part of surfaces, if there are any
 
@@ -76,17 +69,14 @@ class SensorRender:
         planes, constant = self.planes(), constant_background(self.splats)
         with dr.resume_grad():
             of_background = constant is not None and dr.grad_enabled(self.splats.background)
-        # Colour conversion and background are a few operations per pixel, traced again and
-        # differentiated by Dr.Jit.
-        with dr.resume_grad():
+            # Colours are converted again, and differentiated by Dr.Jit.
             dr.enable_grad(planes)
             if of_background:
                 dr.enable_grad(constant)
             channels = self.channels(planes, constant)
             dr.accum_grad(channels, d_channels)
             dr.enqueue(dr.ADMode.Backward, channels)
-            # Other views, the nested integrator, and other images of the same pass go back along
-            # what textures were computed from again.
+            # Keep edges: other images of the same pass differentiate computed textures again.
             dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
             d_planes = dr.grad(planes)
             d_constant = dr.grad(constant) if of_background else None
@@ -129,7 +119,7 @@ class SensorRender:
         color: mi.Color3f,
         radiance: mi.Color3f | None,
     ) -> Channels:
-        """Return channels of a sample; layers: surfaces that it sees, None if there are none."""
+        """Return a sample's channels; layers: visible surfaces, None in a scene without any."""
         if layers is None:
             return self._to_channels(planes, mi.Float(1), behind, color)
         from drgs.integrator.visible_surfaces import transmittance_behind
@@ -161,7 +151,7 @@ class SensorRender:
         """Turn planes of pixels into channels: red, green, blue, perhaps alpha, AOVs.
 
         whole: sum of the weights of splats and background, 1 less the shares of surfaces;
-        of_surfaces: what surfaces contribute to the channels of an AOV of this kind.
+        of_surfaces: the surfaces' contribution to an AOV of a kind.
         """
         transmittance, red, green, blue, *others = planes
         color, alpha = mi.Color3f(red, green, blue), 1 - transmittance
@@ -204,7 +194,7 @@ class SensorRender:
         return _Behind(colors, environment is not None, radiance)
 
     def _frames(self) -> list[list[rendering.Frame]]:
-        """Return frames by time and by pass, those of the last image where nothing has changed."""
+        """Return frames by time and by pass, from the cache where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
         state = self._state().detach()
         traced = None if self.hybrid is None else self._traced_surfaces(self.hybrid, state)
@@ -255,7 +245,7 @@ class SensorRender:
         return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
 
     def _camera_tangents(self, count: int) -> Sequence[list[mi.Float] | None]:
-        """Return the derivatives of each time's camera numbers along those set on the sensor."""
+        """Return the tangents of each time's ``Camera.numbers()`` along those of the sensor."""
         state = self._state()
         if not state.is_attached:
             return [None] * count
@@ -287,18 +277,13 @@ class _Behind:
     """The background of an image, at each sample."""
 
     colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below
-    is_radiance: bool  # of an environment: it covers the film, and its colours are linear where
-    # the channels are
+    is_radiance: bool  # an environment: covers the film; its colours are linear where channels are
     radiance: Iterable[Iterable[mi.Color3f | None]]  # linear, of an environment or a texture
 
 
 def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
-    """Return the linear radiance of splats, A D(C / A), where something else may be behind them.
-
-    color: C, display space, premultiplied; coverage: A, the sum of the weights.
-    """
-    covered = coverage > 0
-    return coverage * mi.math.srgb_to_linear(color / dr.select(covered, coverage, 1))
+    """Return linear radiance A D(C / A); color: C, display space; coverage: A, sum of weights."""
+    return coverage * mi.math.srgb_to_linear(color / dr.select(coverage > 0, coverage, 1))
 
 
 def _render(
@@ -308,7 +293,7 @@ def _render(
     positions: Sequence[SamplePositions],
     surfaces: Sequence[SurfaceLayers] | None,
 ) -> list[rendering.Frame]:
-    """Render a frame for each pass; surfaces: the visible ones of each."""
+    """Render a frame for each pass; surfaces: the visible ones, by pass."""
     pipeline = with_effects(pipeline, gaussians, camera)
     models = [replace(pipeline.model, positions=points) for points in positions]
     if surfaces is not None:
@@ -325,7 +310,7 @@ def _render(
 
 
 def constant_background(splats: SplatsState) -> mi.Color3f | None:
-    """Return the background, detached and in no kernel, if it is a colour."""
+    """Return a background colour, detached and opaque; None for a texture."""
     if isinstance(splats.background, mi.Texture):
         return None
     constant = mi.Color3f(dr.detach(splats.background))
@@ -337,17 +322,8 @@ def accumulate_in_sensor(
     ignored: Collection[str], state: SensorState, gradients: list[list[Float]]
 ) -> None:
     """Accumulate derivatives by ``Camera.numbers()``, by time, into a sensor."""
-    numbers = [camera.numbers() for camera in _attached_cameras(ignored, state)]
-    _accumulate_through(numbers, gradients)
-
-
-def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
-    dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
-    return cameras_in_time(without_effects(state.make(state), ignored))
-
-
-def _accumulate_through(values: list[list[Float]], gradients: list[list[mi.Float]]) -> None:
-    pairs = zip(chain(*values), chain(*gradients), strict=True)
+    numbers = chain(*(camera.numbers() for camera in _attached_cameras(ignored, state)))
+    pairs = zip(numbers, chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
     for value, gradient in attached:
         dr.accum_grad(value, gradient)
@@ -355,28 +331,31 @@ def _accumulate_through(values: list[list[Float]], gradients: list[list[mi.Float
     dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
 
 
+def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
+    dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+    return cameras_in_time(without_effects(state.make(state), ignored))
+
+
 LENS_POINTS = 16
-"""Points at which an aperture is sampled, for each place on the film: always the same, so that
-nothing is random. What is much brighter than its surroundings and smaller than the gaps between
-the points is seen as so many images of itself."""
+"""Fixed sample points of an aperture. A small light that is much brighter than its surroundings
+is seen as this many images of itself."""
 
 
 def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f) -> mi.Color3f:
-    """Return an emitter's radiance at a place of the crop window, px; black where the lens ends."""
+    """Return an environment at places of the crop window, px; black where the lens ends."""
     ray, seen, count = camera.view_directions(place.x, place.y, LENS_POINTS)
     interaction = dr.zeros(mi.SurfaceInteraction3f, count * dr.width(place))
-    # As the environment is infinitely far, only directions count.
-    interaction.wi = -mi.Vector3f(dr.normalize(ray))
+    interaction.wi = -mi.Vector3f(dr.normalize(ray))  # the environment is infinitely far
     radiance = mi.Color3f(emitter.eval(interaction))
     if seen is not True:
         radiance = dr.select(seen, radiance, 0)
-    if count == 1 or dr.width(radiance) == 1:  # the latter: the same from everywhere
+    if count == 1 or dr.width(radiance) == 1:  # the latter: a constant environment
         return radiance
     return mi.Color3f([dr.block_sum(color, count) for color in radiance]) / count
 
 
 def stretched_radiance(texture: mi.Texture, film: mi.Film, place: mi.Point2f) -> mi.Color3f:
-    """Return a texture that is stretched over the whole film; place: on the crop window, px."""
+    """Return a texture that is stretched over the film; place: on the crop window, px."""
     interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
     interaction.uv = (place + mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.size())
     return mi.Color3f(texture.eval(interaction))
@@ -390,7 +369,7 @@ def background_radiance(
 ) -> list[list[mi.Color3f]]:
     """Return the background at all pixels, by time and by pass.
 
-    cameras: of each time; offsets: of each pass, x and y from the pixel's upper left corner, px.
+    cameras: by time; offsets: by pass, x and y from the pixel's upper left corner, px.
     """
     places = [pixel_corners(film, num_samples(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
     if isinstance(background, mi.Texture):

@@ -16,8 +16,7 @@ from drgs.core.types import Array3f, Float, Matrix3f, Matrix4f
 from drgs.integrator.film import Channels, SamplePoints
 from drgs.splatting.footprint import SamplePositions
 
-Pair = tuple[Float, Float]
-"""Numbers along the two sides of the film."""
+Pair = tuple[Float, Float]  # numbers along the two sides of the film
 
 
 @dataclass(frozen=True)
@@ -48,27 +47,20 @@ class SensorState:
 
 @runtime_checkable
 class CameraSensor(Protocol):
-    """A sensor that makes its camera itself, as ``calibrated`` does."""
+    """A sensor that makes its camera itself: ``calibrated``, a class of each variant."""
 
     def camera_parameters(self) -> list[str]:
         """Return the parameters that the camera depends on, named as by ``mi.traverse``."""
-        ...
 
     def camera_from_state(self, state: SensorState) -> Camera:
         """Return the camera with these values of its parameters; OpenCV axes, px."""
-        ...
 
     def num_poses(self) -> int:
         """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
-        ...
 
-    def near_clip(self) -> float:
-        """Return the depth of the near plane, scene units."""
-        ...
+    def near_clip(self) -> float: ...
 
-    def far_clip(self) -> float:
-        """Return the depth of the far plane, scene units."""
-        ...
+    def far_clip(self) -> float: ...
 
 
 def num_poses(sensor: mi.Sensor) -> int:
@@ -105,9 +97,8 @@ def depth_range(sensor: mi.Sensor) -> tuple[float, float]:
 def read_sensor(sensor: mi.Sensor, near: float) -> SensorState:
     """Collect a sensor's state without reading anything back from the device.
 
-    near: near plane, scene units; the sensor's ``near_clip`` applies as well, the larger wins.
-
-    Raises PluginTypeError as :func:`depth_range` does.
+    near: near plane, scene units; the larger of it and the sensor's ``near_clip`` applies. Raises
+    PluginTypeError as :func:`depth_range` does.
     """
     near_clip, _ = depth_range(sensor)
     if isinstance(sensor, CameraSensor):
@@ -123,10 +114,7 @@ def read_sensor(sensor: mi.Sensor, near: float) -> SensorState:
 
 
 def camera_from_sensor(state: SensorState) -> Camera:
-    """Create the camera of a Mitsuba sensor's crop window, detached.
-
-    ``state.make(state)`` is the one that Dr.Jit differentiates in the sensor's parameters.
-    """
+    """Create the camera of a crop window, detached; ``state.make(state)`` is differentiable."""
     state = state.detach()
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
     camera = state.make(state)
@@ -174,15 +162,11 @@ _PROJECTIVE = {
     "ThinLensCamera": (("to_world", "x_fov", "aperture_radius", "focus_distance"), _thin_lens),
     "OrthographicCamera": (("to_world",), _orthographic),
 }
-"""Parameters that a camera depends on, and the function that makes it, by the name of Mitsuba's
-class, which has no type in Python."""
+"""Parameters of a camera and the function that makes it, by the class name: it has no type."""
 
 
 def opaque_host(state: SensorState) -> list[Float]:
-    """Move the numbers of the host to the device.
-
-    None may be compiled into a kernel: each film, crop or view would compile its own.
-    """
+    """Move the host's numbers to the device: as literals, each film would compile its kernels."""
     Float = type(state.device["to_world"][0, 0])
     return [dr.opaque(Float, value) for value in state.host]
 
@@ -190,9 +174,9 @@ def opaque_host(state: SensorState) -> list[Float]:
 def on_crop_window(
     state: SensorState, host: list[Float], to_world: Matrix4f, focal: Pair, principal: Pair
 ) -> Camera:
-    """Create the camera of the crop window of a film.
+    """Create the camera of a film's crop window.
 
-    to_world: 4 x 4, from Mitsuba's camera axes; focal and principal: pairs, px, of the whole film.
+    to_world: 4 x 4, from Mitsuba's camera axes; focal, principal: px of the whole film.
     """
     width, height, crop_x, crop_y, *_, near = host
     *_, crop_width, crop_height, _ = state.host
@@ -235,9 +219,9 @@ def _columns(matrix: Matrix4f) -> list[Array3f]:
 
 @dataclass(frozen=True)
 class SideBySide:
-    """The sensors of a batch, whose images of one size (px) stand side by side."""
+    """The sensors of a batch, with images of one size (px) side by side."""
 
-    sensors: list[mi.Sensor]  # the same one, perhaps, at several places
+    sensors: list[mi.Sensor]  # may contain one several times
     width: int
     height: int
 
@@ -252,7 +236,7 @@ class SideBySide:
     def positions(
         self, positions: Sequence[SamplePositions], index: int
     ) -> tuple[SamplePositions, ...]:
-        """Return the points at which the pixels of one image are evaluated, by pass."""
+        """Return the sample positions of one image, by pass."""
         return tuple(
             replace(p, x=self._cut(p.x, index), y=self._cut(p.y, index))
             if isinstance(p, SamplePoints)
@@ -261,11 +245,11 @@ class SideBySide:
         )
 
     def cut(self, passes: Sequence[Channels], index: int) -> list[Channels]:
-        """Cut the part of one image out of the channels for the film, by pass."""
+        """Return one image's part of the film's channels, by pass."""
         return [[self._cut(plane, index) for plane in channels] for channels in passes]
 
     def concatenate(self, images: Sequence[Sequence[Channels]]) -> list[Channels]:
-        """Return the channels for the film, by pass; images: by sensor, each by pass."""
+        """Return the film's channels, by pass; images: by sensor, each by pass."""
         return [
             [self._concatenate(planes) for planes in zip(*of_pass, strict=True)]
             for of_pass in zip(*images, strict=True)
@@ -284,7 +268,7 @@ class SideBySide:
         column = pixel - row * whole
         sensor = column // dr.opaque(mi.UInt32, self.width)
         place = row * self.width + column - sensor * self.width
-        # Each pixel is taken once, so that derivatives are written, not added.
+        # Each pixel is read once, so that derivatives are written, not added.
         parts = [
             dr.gather(mi.Float, plane, place, sensor == k, mode=dr.ReduceMode.Permute)
             for k, plane in enumerate(planes)

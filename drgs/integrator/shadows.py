@@ -1,20 +1,20 @@
 """Shadows of surfaces on splats.
 
-A splat's colour is that of photographs, in which an object that was put among the splats is not.
-The shadow of such objects is estimated once for each splat, and not for each view: with E the
-irradiance at its mean from the scene's lamps and environment, which stand for those of the
-photographs, and E' that without the objects, its colour is multiplied by
+Splats have the colours of photographs, without the objects that were put among them. The shadow of
+such objects is estimated once for each splat, not for each view: with E the irradiance at its mean
+from the scene's emitters, which stand for those of the photographs, and E' that without the
+objects, its colour is multiplied by
 
     f = (E / E')^(1 / 2.2),
 
 in each channel: display-encoded colours are about the 2.2nd root of radiance, and f multiplies the
-harmonics. A splat faces along its shortest axis, to both sides. Light that splats weaken counts as
-little as they let through, and at least :data:`HIDDEN`. Light that objects reflect is left out.
+harmonics. A splat faces along its shortest axis, to both sides. Light is weakened by other splats,
+to :data:`MIN_SHADOW_TRANSMITTANCE` at least. Light that objects reflect is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -31,33 +31,26 @@ from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
-GAMMA = 2.2
-
-MIN_SHADOW_TRANSMITTANCE = 1 / 64
-"""Least part of the light that splats let through."""
-
-EMITTER_SAMPLES = 64
-"""Samples of the scene's emitters for each splat; a pixel shows the mean of many."""
-
-MIN_SHADED_SHARE = 1 / 64
-"""Least part of the light without other splats that objects hold off a splat to be shaded."""
+GAMMA = 2.2  # exponent of radiance as a function of display values
+MIN_SHADOW_TRANSMITTANCE = 1 / 64  # smallest transmittance of splats
+EMITTER_SAMPLES = 64  # samples of the scene's emitters for each splat; a pixel averages many splats
+MIN_SHADED_SHARE = 1 / 64  # least share of a splat's unoccluded light that objects block
 
 SHADOW_OFFSET_STDS = 3.0
-"""Standard deviations of a splat, along its shortest axis, from its mean to where light is asked
-for: its own alpha does not count."""
+"""Standard deviations along a splat's shortest axis from its mean to the shadow ray's start, so
+that its own alpha does not count."""
 
 
 def shade(splats: SplatsState, scene: mi.Scene) -> None:
-    """Shade the Gaussians by the objects that cast shadows, unless all is as it was.
-
-    Raises PluginError for the name of an object that the scene does not have.
-    """
+    """Shade the Gaussians by the objects that cast shadows; PluginError for unknown names."""
     gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
     surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
 
     def estimate() -> Gaussians:
+        shapes = [node for node in surfaces.objects if isinstance(node, mi.Shape)]
+        check_ids("shadows must be ids of the scene's shapes", splats.shadows, shapes)
         rays = _rays_through(surfaces.objects)
-        without = _rays_through(_exclude(surfaces.objects, splats.shadows))
+        without = _rays_through([o for o in surfaces.objects if o.id() not in splats.shadows])
         blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
         return _darken(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
 
@@ -65,14 +58,8 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
     cache.shaded = cache.find("shaded", (surfaces,), gaussians, estimate).value
 
 
-def _exclude(objects: Sequence[mi.Object], names: Sequence[str]) -> list[mi.Object]:
-    shapes = [node for node in objects if isinstance(node, mi.Shape)]
-    check_ids("shadows must be ids of the scene's shapes", names, shapes)
-    return [node for node in objects if node.id() not in names]
-
-
-def _rays_through(objects: Sequence[mi.Object]) -> StraightRays:
-    scene = scene_of(list(objects))
+def _rays_through(objects: list[mi.Object]) -> StraightRays:
+    scene = scene_of(objects)
     return StraightRays(scene, False, has_transparent_parts(scene))
 
 
@@ -139,14 +126,14 @@ class _Estimate:
         return lit, dark
 
     def _transmittance(self, ray: mi.Ray3f, sample: mi.Float) -> mi.Float:
-        """Return HIDDEN or 1, so that the mean is about the transmittance."""
+        """Return MIN_SHADOW_TRANSMITTANCE or 1, with about the transmittance as their mean."""
         segment = Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.maxt, dr.full(mi.Bool, True))
         T = self.splats.transmittance(segment, sample)
         return dr.select(sample > T, MIN_SHADOW_TRANSMITTANCE, mi.Float(1))
 
 
 def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:
-    """Return the directions in which splats are thinnest, as long as they are thick."""
+    """Return the shortest axes of splats, as long as their standard deviations."""
     rotation = quat_to_rotation(quats)
     axes = [mi.Vector3f([rotation[row, k] for row in range(3)]) for k in range(3)]
     shortest, thickness = axes[0], log_scales[0]
@@ -158,7 +145,7 @@ def _shortest_axes(quats: mi.Vector4f, log_scales: mi.Vector3f) -> mi.Vector3f:
 
 
 def _darken(gaussians: Gaussians, ratio: mi.Color3f) -> Gaussians:
-    """Multiply colours by ratio^(1 / GAMMA): of 0.5 + basis x coefficients."""
+    """Multiply colours, 0.5 + basis x coefficients, by ratio^(1 / GAMMA)."""
     factor = [dr.power(channel, 1 / GAMMA) for channel in ratio]
 
     def scale(tensor: mi.TensorXf, of_half: float) -> mi.TensorXf:

@@ -1,30 +1,27 @@
-"""Light between splats and surfaces, for the integrator ``splatpath``.
+"""Light between splats and surfaces, for the integrator ``splatpath``; imported on demand.
 
-Imported where a scene asks for it. Splats have display-encoded colours: what a ray has composited
-of them, C with transmittance T, is the colour C / (1 - T) with the coverage 1 - T. Its radiance is
+Splats have display-encoded colours: a ray's composited colour C with transmittance T is the colour
+C / (1 - T) with the coverage 1 - T. Its radiance is
 
     exposure (1 - T) lin(C / (1 - T)),
 
-so that what is opaque looks the same in a mirror, and a white fog before a white wall stays white.
+so that opaque splats look the same in a mirror, and a white fog before a white wall stays white.
 Where a ray leaves a scene that has no environment, black is the last splat: exposure lin(C).
 
-To composite all that a ray passes takes long. By default, a few splats are drawn with their weights
-instead, n of them. Their colours c estimate the powers of C / (1 - T), without bias: from the sums
-s_k of c^k,
+By default, n splats are drawn with their weights instead of compositing all. Their colours c
+estimate the powers of C / (1 - T), without bias: from the sums s_k of c^k,
 
     m: s_1 / n,   m^2: (s_1^2 - s_2) / (n (n - 1)),
     m^3: (s_1^3 - 3 s_1 s_2 + 2 s_3) / (n (n - 1) (n - 2))
 
-(Hoeffding 1948), of which lin is a sum to within :data:`DECODED_WITHIN`. How far the draws had to
-look for splats estimates T, and does not depend on which splats they have: the product of both is
-without bias as well. For rays that meet black at last, a draw is black with the probability T.
+(Hoeffding 1948), of which lin is a sum to within 2e-3 (:data:`DECODING`). The distance that draws
+search estimates T independently of the splats drawn: the product of both is without bias as well.
+For rays that meet black at last, a draw is black with the probability T.
 
-:class:`ProbeTransport` looks segments up in probes (:mod:`drgs.light.probe`), which stand in the
-middle of objects of the scene, shapes or emitters. Rays that start at the object look there; so do
-rays to an emitter that has one, from shapes that have none, as far as their transmittance goes. All
-others pass no splats. Where a probe does not know what a ray meets, it is nothing or, where an
-object is so close to splats that its middle sees others than its surface does, what
-:class:`RayTransport` finds.
+:class:`ProbeTransport` looks segments up in probes (:mod:`drgs.light.probe`) in the middle of
+shapes and emitters: rays that start at the object, and for their transmittance, rays from shapes
+without a probe to an emitter with one. All other rays pass no splats. A ray that a probe has no
+answer for meets nothing or, with ``unseen``, is traced by :class:`RayTransport`.
 """
 
 from __future__ import annotations
@@ -60,18 +57,11 @@ else:  # Dr.Jit evaluates annotations
 
 
 DECODING = (0.012522878, 0.682171111, 0.305306011)
-"""Factors of the first three powers of an encoded colour, whose sum is nearly linear radiance
-(Chapman, "sRGB approximations for HLSL", 2012)."""
+"""Factors of the first three powers of an encoded colour, whose sum is its linear radiance to
+within 2e-3 (Chapman, "sRGB approximations for HLSL", 2012)."""
 
-DECODED_WITHIN = 2e-3
-"""Largest error of a colour in 0..1, decoded by :data:`DECODING`."""
-
-LEAST_SAMPLES = 3
-"""Splats that a ray draws, at least: for the third power."""
-
-ROULETTE_TRANSMITTANCE = 0.25
-"""Transmittance to an emitter, below which the rest of the splats is asked for with a probability:
-few splats make a ray dark, and many more are behind them."""
+MIN_DRAWN_SPLATS = 3  # least splats that a ray draws: the third power needs three
+ROULETTE_TRANSMITTANCE = 0.25  # to an emitter: below it, Russian roulette ends the search
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +70,7 @@ class RayTransport:
 
     splats: RaySplats
     exposure: mi.Float  # (1,): factor of the splats' radiance
-    num_samples: int  # splats that are drawn; 0: all are composited
+    num_samples: int  # drawn splats; 0: all are composited
 
     @staticmethod
     def from_splats(splats: SplatsState) -> RayTransport:
@@ -96,21 +86,21 @@ class RayTransport:
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
-        look = self._composite_sampled if self.num_samples else self._composite_all
-        color, coverage = look(_segment(segment.ray, active), segment.is_open, sample)
+        ray = _segment(segment.ray, active)
+        if self.num_samples:
+            color, coverage = self._composite_sampled(ray, segment.is_open, sample)
+        else:
+            color, coverage = self._composite_all(ray, segment.is_open)
         return dr.select(active, self.exposure * color, 0), dr.select(active, 1 - coverage, 1)
 
-    def _composite_all(
-        self, segment: Segment, is_open: mi.Bool, sample: mi.Float
-    ) -> tuple[mi.Color3f, mi.Float]:
-        del sample
+    def _composite_all(self, segment: Segment, is_open: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         color, T = self.splats.composite_segment(segment)
         return decode(mi.Color3f(color), dr.select(is_open, 1, 1 - T)), 1 - T
 
     def _composite_sampled(
         self, segment: Segment, is_open: mi.Bool, sample: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
-        seed, n = reinterpret(mi.UInt32, sample), max(self.num_samples, LEAST_SAMPLES)
+        seed, n = reinterpret(mi.UInt32, sample), max(self.num_samples, MIN_DRAWN_SPLATS)
         drawn, exist, T = self.splats.sample_splats(segment, seed, n)
         colors = [
             dr.select(is_open & ~exists, 0, mi.Color3f(color))
@@ -128,8 +118,8 @@ class RayTransport:
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """Estimate the transmittance of the splats along segments.
 
-        Below :data:`ROULETTE_TRANSMITTANCE`, Russian roulette: a ray that lets through less than
-        ``sample`` (in 0..1) times that is dark, and all others let through as much as that.
+        Russian roulette below :data:`ROULETTE_TRANSMITTANCE`: a ray of less than ``sample`` (in
+        0..1) times that is dark, all others have that transmittance.
         """
         least = sample * ROULETTE_TRANSMITTANCE
         T = self.splats.transmittance(_segment(segment.ray, active), least)
@@ -150,7 +140,7 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
 def nested_with_transport(
     splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
 ) -> mi.SamplingIntegrator:
-    """Return the nested integrator, given the splats; num_paths: of a pixel; sensors: rendered."""
+    """Return the nested integrator with its splats; num_paths: per pixel; sensors: rendered."""
     nested: mi.SamplingIntegrator | None = splats.nested
     if nested is None:
         settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
@@ -169,17 +159,8 @@ def _segment(ray: mi.Ray3f, active: mi.Bool) -> Segment:
     return Segment(mi.Vector3f(ray.o), mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Bool(active))
 
 
-MIN_PROBE_DISTANCE = 1.25
-"""Distance of splats from an object's middle, in halves of its size, below which its surface sees
-others."""
-
-TOO_CLOSE = (
-    "splats: splats are so close to '{}' for its size that its surface sees others than its middle "
-    "does, where its probe is: its image may be far from that of light 'rays'"
-)
-
-NO_PROBE = 0xFFFFFFFF
-"""Number in place of a probe's, where there is none."""
+MIN_PROBE_DISTANCE = 1.25  # of splats without a warning, in halves of the object's size
+NO_PROBE = 0xFFFFFFFF  # number of a missing probe
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,13 +168,13 @@ class ProbeTransport:
     """Transport along rays that are looked up in probes."""
 
     probes: Probes
-    mirrors: Mirrors | None  # the shapes that are some; None: none is
+    mirrors: Mirrors | None  # images of flat mirrors; None: there are none
     exposure: mi.Float  # (1,): factor of the splats' radiance
-    shapes: dict[int, mi.ShapePtr]  # that have a probe, by its number
-    emitters: dict[int, mi.EmitterPtr]  # likewise
-    flat: dict[int, int]  # numbers of the mirrors, by that of the probe
-    num_paths: mi.Float  # (1,): of a pixel
-    unseen: SplatTransport | None  # for rays of which probes do not know what they meet
+    shapes: dict[int, mi.ShapePtr]  # by number of their probe
+    emitters: dict[int, mi.EmitterPtr]  # by number of their probe
+    flat: dict[int, int]  # numbers of mirrors, by number of their probe
+    num_paths: mi.Float  # (1,): per pixel
+    unseen: SplatTransport | None  # for rays that probes have no answer for
 
     @staticmethod
     def from_splats(
@@ -203,7 +184,7 @@ class ProbeTransport:
         sensors: Sequence[mi.Sensor],
         unseen: SplatTransport | None,
     ) -> ProbeTransport:
-        """Return the transport by probes; sensors: of flat mirrors. PluginError for ids."""
+        """Return the transport by probes; sensors: of flat mirrors. PluginError for unknown ids."""
         objects = _objects(scene, splats.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
@@ -232,7 +213,7 @@ class ProbeTransport:
         color = mi.Color3f(seen.color)
         color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
         radiance = dr.select(is_known, self.exposure * color, radiance)
-        # An emitter knows how much of its light arrives, but not how splats look from elsewhere.
+        # An emitter's probe has transmittances of its light, but no view of splats from elsewhere.
         radiance = dr.select(is_reversed, 0, radiance)
         return radiance, dr.select(is_known, 1 - seen.coverage, T)
 
@@ -241,7 +222,7 @@ class ProbeTransport:
         return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)
 
     def _look(self, segment: PathSegment, active: mi.Bool) -> tuple[ProbeHit, mi.Bool, mi.Bool]:
-        """Look up segments: result, whether they have a probe, whether it is that of their end."""
+        """Look up segments: result, whether they have a probe, whether it is their end's."""
         probe, other = mi.UInt32(NO_PROBE), mi.UInt32(NO_PROBE)
         for k, shape in self.shapes.items():
             probe = dr.select(segment.start == shape, mi.UInt32(k), probe)
@@ -268,7 +249,7 @@ class ProbeTransport:
         return seen, is_asked, is_reversed
 
     def _look_in_mirrors(self, probe: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:
-        """Look up segments that leave flat mirrors; probe: that of the shape they leave."""
+        """Look up segments that leave flat mirrors; probe: of the shape that they leave."""
         if self.mirrors is None:
             return ProbeHit(mi.Color3f(0), mi.Float(0), mi.Bool(False))
         mirror = mi.UInt32(NO_PROBE)
@@ -277,7 +258,7 @@ class ProbeTransport:
         return self.mirrors.look(mirror, segment, active & (mirror != NO_PROBE))
 
     def _level(self, pdf: mi.Float) -> mi.UInt32:
-        """Return the level whose texels are as large as the solid angle of one path."""
+        """Return the level with texels of the solid angle of one path."""
         texel = 4 * math.pi / (6 * CUBE_SIZE_TEXELS**2)
         level = 0.5 * dr.log2(dr.rcp(dr.maximum(pdf * self.num_paths * texel, 1e-20)))
         return mi.UInt32(dr.clip(level + 0.5, 0, NUM_LEVELS - 1))
@@ -289,7 +270,7 @@ def _probes(
     flat: dict[int, FlatMirror],
     sensor: SensorState,
 ) -> Probes:
-    """Render the probes of objects; flat: mirrors by the probe's number; sensor: that sees them."""
+    """Render the probes of objects; flat: mirrors by the probe's number; sensor: the first one."""
     gaussians, (centers, planes) = dr.detach(splats.gaussians), _places(objects, flat, sensor)
 
     def render() -> Probes:
@@ -314,7 +295,7 @@ def _warn_of_close(
     flat: dict[int, FlatMirror],
     probes: Probes,
 ) -> None:
-    """Log a warning for each shape that is too close to splats, the first time that it is."""
+    """Log a warning for each shape that is too close to splats, once."""
     close = {
         node.id()
         for k, node in enumerate(objects)
@@ -323,13 +304,17 @@ def _warn_of_close(
         and probes.nearest[k] < MIN_PROBE_DISTANCE * float(dr.max(node.bbox().extents())) / 2
     }
     for name in sorted(close - splats.cache.too_close):
-        message = TOO_CLOSE.format(name)
+        message = (
+            f"splats: splats are so close to '{name}' for its size that its surface sees others "
+            "than its middle does, where its probe is: its image may be far from that of light "
+            "'rays'"
+        )
         mi.Log(mi.LogLevel.Warn, message)  # pyright: ignore[reportCallIssue]  no type in the stub
     splats.cache.too_close |= close
 
 
 def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, FlatMirror]:
-    """Return the shapes that are flat mirrors; shapes, mirrors: by the probe's number."""
+    """Return flat mirrors among the shapes, by the probe's number."""
     from drgs.integrator.mirrors import FlatMirror
 
     def recognise() -> dict[int, FlatMirror]:
@@ -361,10 +346,10 @@ def _mirror_images(
 def _places(
     objects: Sequence[mi.Emitter | mi.Shape], flat: dict[int, FlatMirror], sensor: SensorState
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find where the probes of objects are, (P, 3), and planes beyond which they see, (P, 4).
+    """Return centres (P, 3) of the objects' probes, and planes (P, 4) beyond which they see.
 
-    That of a specular flat mirror is where the first camera is in it: rays of the camera that it
-    reflects pass close by.
+    The probe of a specular flat mirror is at the first camera's mirror image, close to which its
+    reflected rays pass.
     """
     centers, planes = np.array(list(map(_center, objects))), np.zeros((len(objects), 4))
     specular = {k: mirror for k, mirror in flat.items() if mirror.is_specular}

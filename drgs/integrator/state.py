@@ -1,7 +1,7 @@
-"""The state of the integrator ``splats``: what it was given, and what it keeps between renderings.
+"""The state of the integrator ``splats``: its parameters, and a cache between renderings.
 
-``mi.render`` has Dr.Jit traverse it, which evaluates the annotations of fields in whatever variant
-is active: types that are imported on demand are ``Any`` then.
+Dr.Jit traverses it in ``mi.render``, and evaluates the annotations of fields in the active variant:
+types that are imported on demand are ``Any`` then.
 """
 
 from __future__ import annotations
@@ -17,17 +17,12 @@ import numpy as np
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations, Value
 from drgs.core.arrays import tangent_of
+from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.core.types import Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.checks import (
-    check_columns,
-    check_degree,
-    check_instances,
-    check_shapes,
-    ellipsoids_in,
-)
+from drgs.integrator.checks import check_degree, check_instances, check_shapes, ellipsoids_in
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
@@ -38,12 +33,12 @@ else:
 T = TypeVar("T")
 
 AOVS = {"depth": ("T",), "alpha": ("I",), "normal": ("X", "Y", "Z")}
-"""Outputs besides colour, and the names of their channels as in Mitsuba's ``aov``."""
+"""AOVs and the suffixes of their channels, as in Mitsuba's ``aov``."""
 
 
 @dataclass(frozen=True)
 class BackwardResult:
-    """Results of a backward pass that ``mi.render`` cannot return; N Gaussians."""
+    """Results of a backward pass besides the derivatives of parameters; N Gaussians."""
 
     means2d_grad: TensorXf  # (N, 2): derivative of the loss, per px on the film
     visible: Bool  # (N,): the Gaussian's extent touches the film
@@ -53,8 +48,8 @@ class BackwardResult:
     def weighted_sums(self, plane: Float) -> Float:
         """Return the sum over pixels of each Gaussian's weight times ``plane``: Float (N,).
 
-        plane: Float (H * W,). The weight is alpha times transmittance, as composited; its mean over
-        samples and times. To be called before a parameter changes.
+        plane: Float (H * W,). The weight is alpha times transmittance, averaged over samples and
+        times. Call it before a parameter changes.
         """
         sums = [rendering.weighted_sums(frame, plane) for frame in self.frames]
         return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
@@ -62,7 +57,7 @@ class BackwardResult:
 
 @dataclass(frozen=True, eq=False)
 class Cached(Generic[T]):
-    """A value with all that it depends on, held so that indices of variables are not reused."""
+    """A value and its dependencies, held so that indices of variables are not reused."""
 
     value: T
     settings: tuple[object, ...]  # compared by ==
@@ -73,47 +68,47 @@ class Cached(Generic[T]):
 class RenderCache:
     """Intermediate results of the last renderings."""
 
-    kept: dict[str, Cached[Any]] = field(default_factory=dict)  # by what they are
+    kept: dict[str, Cached[Any]] = field(default_factory=dict)  # by name
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
-    gathered: Gathered | None = None  # None: the own Gaussians, unmoved
+    gathered: Gathered | None = None  # None: the own Gaussians alone, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
-    sensor: mi.Sensor | None = None  # the last that was rendered
-    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that had some
-    too_close: frozenset[str] = frozenset()  # ids of objects that a warning was logged for
-    shaded: Gaussians | None = None  # in the shadow of surfaces; None: there are no such shadows
+    sensor: mi.Sensor | None = None  # rendered last
+    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that has some
+    too_close: frozenset[str] = frozenset()  # ids of objects with a logged warning
+    shaded: Gaussians | None = None  # in the shadow of surfaces; None: no shadows
 
     def find(
         self, name: str, settings: tuple[object, ...], arrays: object, make: Callable[[], T]
     ) -> Cached[T]:
-        """Return what was kept under a name, made anew unless settings and arrays are the same."""
+        """Return the entry of this name, made anew unless settings and arrays are the same."""
         last = self.kept.get(name)
         if last is None or last.settings != settings or not same_variables(last.arrays, arrays):
             last = self.kept[name] = Cached(make(), settings, arrays)
         return last
 
     def forget(self, prefix: str) -> None:
-        """Drop what was kept under names that begin with ``prefix``."""
+        """Drop the entries whose names begin with ``prefix``."""
         self.kept = {k: v for k, v in self.kept.items() if not k.startswith(prefix)}
 
 
 @dataclass
 class SplatObject:
-    """Gaussians that one ``to_world`` places: the integrator's own, or those of a nested one."""
+    """Gaussians with one ``to_world``: the integrator's own, or a nested one's."""
 
     gaussians: Gaussians  # in the space of the object; Mitsuba assigns to its arrays in place
     to_world: mi.AffineTransform4f
-    is_moved: bool  # whether it moves them
+    is_moved: bool  # whether to_world is not the identity
     file: str = ""
     header: dict[str, Value] = field(default_factory=dict)  # approximations of the file's header
 
     @property
     def has_gaussians(self) -> bool:
-        """False for an integrator that renders those of objects and shapes alone."""
+        """False for an integrator that renders only objects and shapes."""
         return self.gaussians.num_gaussians > 0
 
     def check_to_world(self) -> None:
-        """Raise PluginError for a ``to_world`` that is no similarity; find whether it moves."""
+        """Update ``is_moved``; PluginError for a ``to_world`` that is no similarity."""
         from drgs.integrator.gathering import similarity_of
 
         self.is_moved = not similarity_of(self.to_world.matrix, "splats: to_world").is_identity
@@ -121,17 +116,17 @@ class SplatObject:
 
 @dataclass
 class SplatsState:
-    """Gaussians, settings as the plugin documents them, and a cache."""
+    """Gaussians, settings as ``docs/mitsuba.md`` describes them, and a cache."""
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
-    turns: dict[str, Turn]  # of harmonics, by shapes' ids; "": of all others
+    turns: dict[str, Turn]  # of harmonics, by shapes' ids; "": of all other shapes
     background: mi.Color3f | mi.Texture  # in display space; or linear
     nested: mi.SamplingIntegrator | None  # of surfaces
     default_degree: int  # of spherical harmonics, where the scene has no other Gaussians
     given_degree: int | None  # None: the highest that the Gaussians have
     approximations: Approximations
-    header: dict[str, Value]  # those of them that files' headers have set
+    header: dict[str, Value]  # the approximations that files' headers set
     near: float  # scene units
     aovs: dict[str, str]  # types by name
     ignore: Sequence[str]
@@ -155,7 +150,7 @@ class SplatsState:
 
     @property
     def has_smoothing(self) -> bool:
-        """True if Gaussians have a smoothing filter, be it ignored."""
+        """True if Gaussians have a smoothing filter, ignored or not."""
         return any(one.gaussians.smoothing is not None for one in self.objects.values())
 
     @property
@@ -175,7 +170,7 @@ class SplatsState:
         pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
         gathered = self.cache.gathered
         if gathered is not None and gathered.gaussians.smoothing is not None:
-            pipeline = replace(pipeline, of_smoothing=True)  # which grows with an object
+            pipeline = replace(pipeline, of_smoothing=True)  # it scales with an object
         return replace(pipeline, source=self.projection)
 
     def aov_names(self) -> list[str]:
@@ -212,8 +207,14 @@ class SplatsState:
         return AOVS[kind] if kind in AOVS else range(feature_widths(self.objects)[kind])
 
     def check_columns(self) -> None:
-        """Raise PluginError for AOVs of too many channels."""
-        check_columns({n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"})
+        """Raise PluginError for AOVs with more channels than a kernel can have."""
+        columns = {n: len(self.channels_of(k)) for n, k in self.aovs.items() if k != "alpha"}
+        if sum(columns.values()) > MAX_FEATURES:
+            counts = ", ".join(f"{name} {count:,}" for name, count in columns.items())
+            raise PluginError(
+                f"splats: aovs can have at most {MAX_FEATURES} channels together, got "
+                f"{sum(columns.values()):,} ({counts}); render them in parts, which share a kernel"
+            )
 
     def parameters_changed(self, keys: Sequence[str], is_object: bool) -> None:
         """Check that own parameters fit together; keys: none for all."""
@@ -235,7 +236,7 @@ class SplatsState:
             check_degree(self.sh_degree, own.gaussians)
 
     def rendered_part_of(self, one: SplatObject, with_all_features: bool = False) -> Gaussians:
-        """Return an object's Gaussians, in its own space, without what is not rendered."""
+        """Return an object's Gaussians in its space, without unrendered filter and features."""
         found, features = one.gaussians, one.gaussians.features or {}
         if "smoothing" in self.ignore:
             found = replace(found, smoothing=None)
@@ -253,14 +254,16 @@ class SplatsState:
     def unshaded_gaussians(self) -> Gaussians:
         """Rendered Gaussians, without the shadows of surfaces."""
         if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
-            self.cache.gathered = _gather_parts(self._placements(), None)
+            from drgs.integrator.gathering import gather
+
+            self.cache.gathered = gather(self._placements(), None)
         gathered = self.cache.gathered
         return self.rendered_part_of(self.own) if gathered is None else gathered.gaussians
 
     def gather(self, scene: mi.Scene) -> None:
         """Find the scene's Gaussians, and convert them if they have changed."""
         cache = self.cache
-        for one in self.objects.values():  # rows that an update was refused for are not read
+        for one in self.objects.values():  # an update that was refused may have left rows
             check_shapes(self.rendered_part_of(one))
         cache.instances = check_instances(scene, cache.instances)
         shapes = ellipsoids_in(scene)
@@ -269,7 +272,12 @@ class SplatsState:
             is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
             is_alone = not (shapes or set(self.turns) - {""} or self.nested_objects or is_moved)
             parts = [] if is_alone else self.parts(shapes)
-        cache.gathered = None if is_alone else _gather_parts(parts, cache.gathered)
+        if is_alone:
+            cache.gathered = None
+        else:
+            from drgs.integrator.gathering import gather
+
+            cache.gathered = gather(parts, cache.gathered)
         gaussians = self.unshaded_gaussians
         if gaussians.num_gaussians == 0:
             raise PluginError(
@@ -280,7 +288,7 @@ class SplatsState:
         check_degree(self.sh_degree, gaussians)
 
     def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
-        """Return Gaussians of objects and shapes, attached, in the order of rendering."""
+        """Return the Gaussians of objects and shapes, attached, in the order of rendering."""
         parts: list[Part] = [*self._placements()]
         if shapes or self.turns:
             from drgs.integrator.gathering import conversions_of
@@ -342,9 +350,3 @@ def feature_of(kind: str) -> rendering.Feature:
     from drgs.effects.compose import NamedFeature, normal_features
 
     return normal_features if kind == "normal" else NamedFeature(kind)
-
-
-def _gather_parts(parts: Sequence[Part], last: Gathered | None) -> Gathered:
-    from drgs.integrator.gathering import gather
-
-    return gather(parts, last)

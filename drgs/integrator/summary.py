@@ -1,7 +1,7 @@
-"""Summary of the simulated effects of a scene, of what asked for each, and of the others.
+"""Summary of simulated effects, the reason for each, and of effects that are not simulated.
 
-Commands print one at their start, a line an effect: :func:`summary_of_sensors` of a Mitsuba scene,
-:func:`summary_of_views` of images of Gaussians. That of a fit is in ``drgs.training.summary``.
+Commands print one at their start, a line an effect: :func:`summary_of_sensors` for a Mitsuba scene,
+:func:`summary_of_views` for images of Gaussians, ``drgs.training.summary`` for a fit.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ from drgs.integrator.checks import surfaces_in
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState
 
-AS_THE_FILE_SAYS = "as the file says"
-"""Why something is simulated that the header of the Gaussians' file asks for."""
+FILE_HEADER_REASON = "as the file says"  # for effects that the header of the Gaussians' file sets
 
 
 @dataclass(frozen=True)
 class SimulatedEffect:
-    """An effect of a summary: simulated, or not."""
+    """An effect in a summary, simulated or not."""
 
     name: str
-    what: str | None  # that is simulated; None: nothing is
-    why: str = ""  # what asked for it
-    ignored: bool = False  # whether it is asked for where it is not to be simulated
+    what: str | None  # description; None: not simulated
+    why: str = ""  # the setting or data that it comes from
+    ignored: bool = False  # whether a setting switches it off
 
     def unless_ignored(self, is_ignored: bool) -> SimulatedEffect:
         """Return the effect, not simulated if it ``is_ignored``."""
@@ -40,7 +39,7 @@ class SimulatedEffect:
 
 
 def format_effects(effects: Sequence[SimulatedEffect]) -> str:
-    """Format the summary: a line for each effect that is simulated, one for all the others."""
+    """Format the summary: a line for each simulated effect, one for all the others."""
     lines = [f"  {e.name}: {e.what} ({e.why})" for e in effects if e.what is not None]
     absent = [
         f"{e.name} (ignored)" if e.ignored else e.name
@@ -66,15 +65,14 @@ def summary_of_sensors(
     environment: mi.Emitter | None,
     num_surfaces: int = 0,
 ) -> list[SimulatedEffect]:
-    """Return the effects that ``splats`` simulates for sensors in front of an environment.
+    """Return the effects that ``splats`` simulates.
 
-    cameras: as the sensors have them, so that what the integrator ignores of them can be named;
-    num_surfaces: shapes of the scene that are no Gaussians.
+    cameras: of the sensors, with ignored effects; num_surfaces: shapes that are no Gaussians.
     """
     left = [without_effects(camera, splats.ignore) for camera in cameras]
 
     def effect(name: str, words: Callable[[Camera], str | None]) -> SimulatedEffect:
-        """Summarise one effect; words: describes what a camera has of it, or None."""
+        """Summarise one effect; words: describes a camera's effect, or returns None."""
         shown = [what for what in map(words, left) if what is not None]
         why = "the sensor" if len(left) == 1 else f"{len(shown)} of {len(left)} sensors"
         ignored = sum(words(camera) is not None for camera in cameras) > len(shown)
@@ -95,36 +93,35 @@ def summary_of_sensors(
         None if splats.light == "none" else "along rays of surfaces",
         "the integrator's light",
     )
-    of_surfaces = [surfaces, light] if num_surfaces else [surfaces]
-    said = splats.header
-    return [*_summary_of_integrator(splats, environment, of_cameras, said), *of_surfaces]
+    of_integrator = _summary_of_integrator(splats, environment, of_cameras, splats.header)
+    return [*of_integrator, surfaces, *([light] if num_surfaces else [])]
 
 
 def summary_of_views(
-    splats: SplatsState, views: Sequence[Viewpoint], said: Collection[str] = ()
+    splats: SplatsState, views: Sequence[Viewpoint], from_header: Collection[str] = ()
 ) -> list[SimulatedEffect]:
-    """Return the effects for views; said: approximations that the Gaussians' file decided."""
+    """Return the effects for views; from_header: approximations that the file's header sets."""
     count = f"{len(views)} cameras"
     of_cameras = [
         effect_of(views, count).unless_ignored(word in splats.ignore)
         for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
     ]
-    return _summary_of_integrator(splats, None, of_cameras, said)
+    return _summary_of_integrator(splats, None, of_cameras, from_header)
 
 
 def _summary_of_integrator(
     splats: SplatsState,
     environment: mi.Emitter | None,
     of_cameras: Sequence[SimulatedEffect],
-    said: Collection[str],
+    from_header: Collection[str],
 ) -> list[SimulatedEffect]:
     background = SimulatedEffect("background", "a constant colour", "the integrator's background")
     if environment is not None and not splats.hide_emitters:
         background = SimulatedEffect("background", "an environment", "the scene's emitter")
     elif isinstance(splats.background, mi.Texture):
-        background = SimulatedEffect("background", "a image", "the integrator's background")
+        background = SimulatedEffect("background", "an image", "the integrator's background")
     smooth = splats.gaussians.smoothing is not None
-    antialiased = AS_THE_FILE_SAYS if "antialiased" in said else "antialiased"
+    antialiased = FILE_HEADER_REASON if "antialiased" in from_header else "antialiased"
     effects = [
         view_dependence_effect(splats.sh_degree, "the Gaussians' coefficients"),
         background,
@@ -137,9 +134,9 @@ def _summary_of_integrator(
     if splats.has_smoothing and not smooth:
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
     others = splats.approximations.non_default
-    values = [f"{k} = {v}" for k, v in others.items() if k in said and k != "antialiased"]
+    values = [f"{k} = {v}" for k, v in others.items() if k in from_header and k != "antialiased"]
     if values:
-        effects.append(SimulatedEffect("approximations", ", ".join(values), AS_THE_FILE_SAYS))
+        effects.append(SimulatedEffect("approximations", ", ".join(values), FILE_HEADER_REASON))
     return effects
 
 
@@ -151,7 +148,7 @@ def _lens_words(lens: Lens) -> str | None:
 
 
 def antialiasing_effect(opacities: str | None, smoothing: str | None) -> SimulatedEffect:
-    """Return the effect, from what asked for compensated opacities and the smoothing filter."""
+    """Summarise it from the reasons for compensated opacities and for the smoothing filter."""
     what = join_parts(
         "opacities compensated for the low-pass filter" if opacities else None,
         "3D smoothing filter" if smoothing else None,
@@ -160,20 +157,20 @@ def antialiasing_effect(opacities: str | None, smoothing: str | None) -> Simulat
 
 
 def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
-    """Summarise colours that depend on the direction, up to a degree of the spherical harmonics."""
+    """Summarise view-dependent colours; degree: of the spherical harmonics."""
     what = None if degree == 0 else f"spherical harmonics up to degree {degree}"
     return SimulatedEffect("view dependence", what, why)
 
 
 def lens_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
-    """Summarise lenses that are no pinholes; of: whose."""
+    """Summarise lenses that are no pinholes; of: all cameras, in words."""
     bent = [view.lens for view in views if view.lens is not None]
     kinds = sorted({f"{lens.kind} ({', '.join(lens.coefficients())})" for lens in bent})
     return SimulatedEffect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
 
 
 def motion_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
-    """Summarise cameras that move while a photograph is taken; of: whose."""
+    """Summarise cameras that move during an exposure; of: all cameras, in words."""
     moving = [view.motion.shutter for view in views if view.motion is not None]
     shutters = " and ".join(f"{kind} shutter" for kind in sorted(set(moving)))
     return SimulatedEffect("motion", shutters or None, f"{len(moving)} of {of}")

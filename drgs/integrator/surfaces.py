@@ -1,15 +1,15 @@
-"""Meshes and other surfaces that a scene holds besides its splats.
+"""Meshes and other surfaces among splats; imported when a scene has surfaces.
 
-Imported when a scene has surfaces. A nested integrator, such as Mitsuba's ``path``, renders them at
+A nested integrator, such as Mitsuba's ``path``, renders them at
 the depths of the surfaces in each pixel, between the splats (``drgs.integrator.visible_surfaces``).
 With p_k the part of the light that the k-th surface stops, T_k the transmittance of the splats in
-front of it, T that of all splats, L_k what the surface sends to the camera, B the background, and C
-and A the sums of the colours and weights of the splats as far as surfaces let them through
+front of it, T that of all splats, L_k the surface's radiance, B the background, and C and A the
+sums of the colours and weights of the splats as far as surfaces let them through
 (``drgs.effects.occlusion``), a pixel is
 
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
-With N_k the nested image of what is behind the first k surfaces, times what these let through
+With N_k the nested image from behind the first k surfaces, times their transmittance
 (``drgs.integrator.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is (1 - sum_k p_k) B
 where the nested integrator shows the background, and else 0.
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -31,9 +31,9 @@ from drgs.core.arrays import image_of, planes_of
 from drgs.core.errors import PluginError, UnsupportedError, format_names, one_line, root_cause
 from drgs.core.private import same_variables
 from drgs.integrator.derivatives import Parameter, attached_parameters, parameter_value, type_of
-from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors
-from drgs.integrator.film import pixels_adjoint as film_adjoint
+from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixels_adjoint
 from drgs.integrator.rays import (
+    UNBOUNDED_DEPTH,
     RaysBehind,
     StraightRays,
     TransportIntegrator,
@@ -46,27 +46,20 @@ from drgs.integrator.visible_surfaces import SurfaceLayers, transmittance_behind
 T = TypeVar("T")
 
 INDEPENDENT = ("does not depend", "nothing that a path meets changes")
-"""Words of errors of Dr.Jit and ``splatpath`` about a image that no parameter changes."""
-
-UNBOUNDED_DEPTH = 0xFFFFFFFF
-"""``max_depth`` of Mitsuba's integrators where there is no limit."""
-
-# ----------------------------------------------------------------------------------------------
-# What a scene holds
-# ----------------------------------------------------------------------------------------------
+"""Words of Dr.Jit's and ``splatpath``'s errors for an image that no parameter changes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The surfaces of a scene, and all that they depend on.
+    """The surfaces of a scene, and everything that they depend on.
 
-    It holds no scene that has the integrator, which keeps it: neither would ever be freed.
+    It holds no scene with the integrator that keeps it: neither would ever be freed.
     """
 
     objects: list[mi.Object]  # of the scene, without its Gaussians and integrator
     parameters: list[object]  # of these, detached: held, so that equal indices mean equal values
-    apart: mi.Scene | None  # made of the objects, where the scene has Gaussians besides
-    is_transparent: bool  # in parts: whether anything lets light pass straight on
+    apart: mi.Scene | None  # a scene of the objects, where the original one has Gaussians
+    is_transparent: bool  # whether anything lets light pass straight on
 
     @staticmethod
     def find(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
@@ -84,17 +77,14 @@ class Surfaces:
         return Surfaces(objects, dr.detach(parameters), apart, has_transparent_parts(scene))
 
     def scene_to_trace(self, scene: mi.Scene) -> mi.Scene:
-        """Return the scene that the nested integrator renders; scene: the one that these are of."""
+        """Return the scene that the nested integrator renders; scene: the original one."""
         return scene if self.apart is None else self.apart
 
 
 def _surroundings(scene: mi.Scene) -> tuple[list[mi.Object], list[object]]:
-    """Return a scene's objects but Gaussians and integrators, and parameters of all but sensors.
-
-    Shape groups are found among them alone: instances do not show what they repeat.
-    """
+    """Return a scene's objects but Gaussians and integrators, and parameters of all but sensors."""
     params = mi.traverse(scene)
-    objects, left_out = [], set()
+    objects, left_out = [], set()  # shape groups included: instances do not list what they repeat
     for node, (parent, depth) in params.hierarchy.items():
         is_gaussians = isinstance(node, mi.Shape) and node.is_ellipsoids()
         if parent in left_out or isinstance(node, mi.Integrator) or is_gaussians:
@@ -122,37 +112,31 @@ def scene_of(objects: list[mi.Object]) -> mi.Scene:
     return scene
 
 
-# ----------------------------------------------------------------------------------------------
-# The nested image between the splats
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Insertion:
-    """Puts nested images into that of the splats; all are developed already.
+    """Insertion of nested images into the image of the splats; all are developed already.
 
-    That of the splats has channels of its own at its end: for each surface its share p_k T_k and
-    its coverage p_k, and where the nested image shows a background, (1 - sum p_k) B in linear
-    RGB.
+    The last channels of the splats' image are, for each surface, its share p_k T_k and coverage
+    p_k, and where the nested image shows a background, (1 - sum p_k) B in linear RGB.
     """
 
     film: mi.Film
     maps: dict[str, np.ndarray]  # see drgs.integrator.film
-    aovs: Sequence[str]  # that the user asked for
+    aovs: Sequence[str]  # of the user
     shows_background: bool
     display_space: bool  # of the splats' image; the nested one is linear
-    num_surfaces: int = 1  # that are seen one through the other
+    num_surfaces: int = 1  # seen one through the other
 
     @property
     def channels(self) -> list[str]:
-        """Names of the channels that the image of the splats must have at its end."""
+        """Names of the last channels of the splats' image."""
         names = ["share", "coverage"] * self.num_surfaces + ["R", "G", "B"] * self.shows_background
         return [f"surface.{k}.{name}" for k, name in enumerate(names)]
 
     def values(
         self, layers: SurfaceLayers, fronts: Sequence[mi.Float], radiance: mi.Color3f | None
     ) -> Channels:
-        """Return those channels of a pass; fronts: sums of weights; radiance: B, linear."""
+        """Return a pass's last channels; fronts: sums of weights before surfaces; radiance: B."""
         values = []
         for surface, front in zip(layers, fronts, strict=True):
             values += [surface.share(front), surface.coverage]
@@ -164,19 +148,19 @@ class Insertion:
         return values
 
     def develop(self, image: mi.TensorXf, nested: list[mi.TensorXf]) -> mi.TensorXf:
-        """Develop the image of all, which the film then holds."""
+        """Develop the complete image, which the film then holds."""
         channels = self._insert(planes_of(image), [planes_of(each) for each in nested])
         return develop_pixels(self.film, channels, self.aovs)
 
     def adjoint(
         self, image: mi.TensorXf, nested: list[mi.TensorXf], grad_in: mi.TensorXf
     ) -> tuple[mi.TensorXf, list[mi.TensorXf]]:
-        """Return derivatives of the loss with respect to all, given those of :meth:`develop`."""
+        """Return the loss's derivatives by image and nested images, given those by the result."""
         planes = planes_of(image), [planes_of(each) for each in nested]
         with dr.resume_grad():
             dr.enable_grad(planes)
             channels = self._insert(*planes)
-            dr.accum_grad(channels, film_adjoint(self.film, self.maps, grad_in, self.aovs))
+            dr.accum_grad(channels, pixels_adjoint(self.film, self.maps, grad_in, self.aovs))
             dr.enqueue(dr.ADMode.Backward, channels)
             dr.traverse(dr.ADMode.Backward)
             d_image, d_nested = dr.grad(planes)
@@ -192,7 +176,7 @@ class Insertion:
         d_image: mi.TensorXf,
         d_nested: list[mi.TensorXf],
     ) -> mi.TensorXf:
-        """Return the directional derivative of :meth:`develop` along those of all."""
+        """Return the directional derivative of :meth:`develop`."""
         planes = planes_of(image), [planes_of(each) for each in nested]
         d_planes = planes_of(d_image), [planes_of(each) for each in d_nested]
         with dr.resume_grad():
@@ -214,11 +198,7 @@ class Insertion:
         return [*_apply_map(to_rgb, colors), *rest]
 
     def visible_radiance(self, own: list[mi.Float], images: list[list[mi.Float]]) -> list[mi.Float]:
-        """Return the sum of what surfaces show past the splats.
-
-        own: channels of :meth:`values`; images: colours of N_0, N_1, ..., the last of which is
-        the background alone.
-        """
+        """Return sum_k T_k L_k; own: see :meth:`values`; images: colours of N_0, N_1, ..."""
         total, weight = [mi.Float(0)] * len(images[0]), mi.Float(0)
         for k in range(self.num_surfaces):
             share, coverage = own[2 * k : 2 * k + 2]
@@ -228,17 +208,14 @@ class Insertion:
             weight = weight + share
         if self.num_surfaces > 1:  # differences of noisy images may be negative
             total = [dr.maximum(t, 0) for t in total]
-        return self._encode(total, weight) if self.display_space else total
-
-    @staticmethod
-    def _encode(total: list[mi.Float], weight: mi.Float) -> list[mi.Float]:
-        """Return the sum of weighted colours in display space: that of their mean."""
+        if not self.display_space:
+            return total
         part = dr.select(weight > 0, weight, 1)
         mean = mi.Color3f([dr.maximum(t / part, 0) for t in total])
         return list(weight * mi.math.linear_to_srgb(mean))
 
     def _color_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the maps from linear RGB to the film's colours (RGB, XYZ, luminance), and back."""
+        """Return the maps between linear RGB and the film's colours (RGB, XYZ, luminance)."""
         matrix = film_map(self.film, self.maps, ())
         has_alpha = num_colors(self.film) == 4
         to_developed = matrix[: len(matrix) - has_alpha, :3]
@@ -262,7 +239,7 @@ def _apply_map(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
 
 @dataclass(frozen=True)
 class Hybrid:
-    """The part of the surfaces in a rendering of splats and surfaces."""
+    """The surfaces in an image of splats and surfaces."""
 
     surfaces: Surfaces
     integrator: mi.SamplingIntegrator  # of the image
@@ -274,7 +251,7 @@ class Hybrid:
     rays: StraightRays  # through the scene that the nested integrator renders
 
     def with_surfaces(self, count: int) -> Hybrid:
-        """Return the same for so many surfaces that are seen one through the other."""
+        """Return a copy for ``count`` surfaces that are seen one through the other."""
         return replace(self, insertion=replace(self.insertion, num_surfaces=count))
 
     def images(self) -> list[mi.TensorXf]:
@@ -294,7 +271,7 @@ class Hybrid:
             if self.surfaces.is_transparent:
                 behind, weight = RaysBehind(self.rays, count).advance(behind, active)
             with _reduce_depth(self.integrator, count):
-                # The base class's, as integrators written in Python have another signature.
+                # The base class's: integrators written in Python have another signature.
                 radiance, *_ = mi.SamplingIntegrator.sample(
                     self.integrator, self.rays.scene, sampler, behind, None, active
                 )
@@ -304,32 +281,28 @@ class Hybrid:
     def backward(self, params: object, d_images: list[mi.TensorXf]) -> None:
         """Accumulate derivatives into the parameters of surfaces and emitters."""
         gradients = iter(d_images)
-
-        def add(sensor: mi.Sensor) -> None:
-            self.adjoint_integrator.render_backward(
-                self.rays.scene, params, next(gradients), sensor, self.seed, self.spp
-            )
-
         with self._differentiating() as parameters:
             if parameters:
-                self._needed_surfaces(add)
+                self._needed_surfaces(
+                    lambda sensor: self.adjoint_integrator.render_backward(
+                        self.rays.scene, params, next(gradients), sensor, self.seed, self.spp
+                    )
+                )
 
     def tangents(self, params: object, images: list[mi.TensorXf]) -> list[mi.TensorXf]:
         """Return derivatives of the nested images along those set on the parameters."""
-
-        def render_nested(sensor: mi.Sensor) -> mi.TensorXf:
-            return self.adjoint_integrator.render_forward(
-                self.rays.scene, params, sensor, self.seed, self.spp
-            )
-
         found: list[mi.TensorXf | None] = [None] * len(images)
         with self._differentiating() as parameters:
             if parameters:
-                # A loop sees tangents of what is inside of it alone, so that those of all that
-                # objects have computed from their parameters must be known before.
+                # A loop sees only tangents inside of it: compute before those of everything that
+                # objects have derived from their parameters.
                 dr.enqueue(dr.ADMode.Forward, [parameter.value for parameter in parameters])
                 dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-                found = self._needed_surfaces(render_nested)
+                found = self._needed_surfaces(
+                    lambda sensor: self.adjoint_integrator.render_forward(
+                        self.rays.scene, params, sensor, self.seed, self.spp
+                    )
+                )
         pairs = zip(found, images, strict=True)
         return [dr.zeros(mi.TensorXf, p.shape) if d is None else d for d, p in pairs]
 
@@ -350,10 +323,9 @@ class Hybrid:
         return found
 
     def _sensors(self) -> Iterator[mi.Sensor]:
-        """Yield sensors that see what is behind 0, 1, ... surfaces, while nested images are made.
+        """Yield sensors whose rays start behind 0, 1, ... surfaces, for the nested images.
 
-        A path that starts behind windows has fewer bounces left than one from the camera, where
-        the nested integrator says so in Python.
+        Paths from behind windows have fewer bounces where ``max_depth`` can be set in Python.
         """
         if not self.surfaces.is_transparent:
             with _keep_sample_count(self.sensor):
@@ -371,7 +343,7 @@ class Hybrid:
 
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
-        """Yield the nested integrator's parameters, with whose names its errors are raised."""
+        """Yield the attached parameters of the surfaces; errors are raised with their names."""
         with dr.resume_grad(), _keep_sample_count(self.sensor):
             parameters = list(attached_parameters(self.rays.scene))
             try:
@@ -384,23 +356,18 @@ class Hybrid:
                 ) from None
 
 
-@runtime_checkable
-class _HasMaxDepth(Protocol):
-    """An integrator with a limit of its paths that Python can set."""
-
-    max_depth: object
-
-
 @contextmanager
-def _reduce_depth(integrator: mi.Integrator, count: int) -> Iterator[None]:
-    """Shorten paths by ``count`` bounces, where they are bounded by an attribute of Python."""
-    counts_windows = not isinstance(integrator, TransportIntegrator)
-    if not counts_windows or not isinstance(integrator, _HasMaxDepth):
+def _reduce_depth(integrator: Any, count: int) -> Iterator[None]:
+    """Shorten paths by ``count`` bounces where integrators limit them by ``max_depth`` in Python.
+
+    Windows are no bounces for a :class:`TransportIntegrator`.
+    """
+    depth = getattr(integrator, "max_depth", None)
+    is_bounded = isinstance(depth, int) and depth < UNBOUNDED_DEPTH
+    if isinstance(integrator, TransportIntegrator) or not is_bounded:
         yield
         return
-    depth = integrator.max_depth
-    if isinstance(depth, int) and depth < UNBOUNDED_DEPTH:
-        integrator.max_depth = max(depth - count, 0)
+    integrator.max_depth = max(depth - count, 0)
     try:
         yield
     finally:
@@ -409,10 +376,7 @@ def _reduce_depth(integrator: mi.Integrator, count: int) -> Iterator[None]:
 
 @contextmanager
 def _keep_sample_count(sensor: mi.Sensor) -> Iterator[None]:
-    """Restore the sampler's sample count, which Mitsuba's integrators set to their own.
-
-    With ``nested_spp``, the splats' next image would have other samples than the one before.
-    """
+    """Restore the sampler's sample count, which the nested integrator sets to its own."""
     sampler = sensor.sampler()
     count = sampler.sample_count()
     try:

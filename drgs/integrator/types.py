@@ -1,4 +1,4 @@
-"""The plugin ``splats`` in annotations: Mitsuba's classes exist once a variant is set."""
+"""The plugin ``splats`` in annotations: its class exists once for each variant that is set."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from drgs.splatting.rendering import Pipeline, ProjectionStage
 
 if TYPE_CHECKING:
 
-    class SplatsIntegrator(mi.Integrator):
-        """The part of ``plugins/splats.py`` that other modules use."""
+    class SplatsPlugin(mi.Integrator):
+        """Members of the integrator ``splats`` that other modules use."""
 
         state: SplatsState
         gaussians: Gaussians
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
         def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str: ...
 
 else:
-    SplatsIntegrator = Any
+    SplatsPlugin = Any
 
 
-def is_splats(node: object) -> TypeGuard[SplatsIntegrator]:
-    """Return whether an object of Mitsuba is the integrator ``splats``."""
+def is_splats(node: object) -> TypeGuard[SplatsPlugin]:
+    """Return whether a Mitsuba object is the integrator ``splats``."""
     return isinstance(getattr(node, "state", None), SplatsState)

@@ -1,9 +1,9 @@
-"""The surfaces that a camera sees at each pixel: depths, and what they stop of the light behind.
+"""The surfaces that a camera sees at each pixel: depths and coverage.
 
-Rays go from the camera to the first visible surface, and past what lets light pass straight on to
-the next one. Where a surface ends within a pixel, it covers a part of it: with one sample per
-pixel, rays are traced through :data:`EDGE_SAMPLES` places of such pixels; with several samples,
-each has its own depth. A ``thinlens`` sees depths and coverage from the middle of its aperture.
+Rays go from the camera to the first visible surface, and through transparent ones to the next. A
+surface that ends within a pixel covers a part of it: with one sample per pixel, 16 rays are traced
+through such pixels; with several samples, each has its own depth. A ``thinlens`` sees depths and
+coverage from the middle of its aperture.
 """
 
 from __future__ import annotations
@@ -20,16 +20,9 @@ from drgs.effects.occlusion import Surface
 from drgs.integrator.film import num_samples, pixel_corners
 from drgs.integrator.rays import MAX_INVISIBLE_OPACITY, StraightRays
 
-EDGE_GRID = 4
-
-EDGE_SAMPLES = EDGE_GRID**2
-"""Rays through a pixel in which a surface ends."""
-
-MAX_SURFACES = 4
-"""Surfaces that are seen one through the other; the last of them stands for all that follow."""
-
-FAR_AWAY = 1e30
-"""Depth of a surface that is not there: behind all splats, and 0 times it is 0."""
+EDGE_GRID = 4  # rays along each axis of a pixel in which a surface ends
+MAX_SURFACES = 4  # seen one through the other; the last one stands for all that follow
+MISSING_SURFACE_DEPTH = 1e30  # depth of a missing surface: behind all splats, and 0 times it is 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +39,7 @@ class VisibleSurface(Surface):
         )
 
     def share(self, front: mi.Float) -> mi.Float:
-        """Return the weight of the surface; front: sum of the weights of splats in front of it."""
+        """Return the surface's weight; front: sum of the weights of splats in front of it."""
         return self.coverage * (1 - front)
 
     def aov_values(self, kind: str, front: mi.Float) -> list[mi.Float] | None:
@@ -58,12 +51,11 @@ class VisibleSurface(Surface):
         return None
 
 
-SurfaceLayers = list[VisibleSurface]
-"""The surfaces of each pixel, nearest first."""
+SurfaceLayers = list[VisibleSurface]  # the surfaces of each pixel, nearest first
 
 
 def transmittance_behind(surfaces: Sequence[Surface]) -> mi.Float:
-    """Return the part of each pixel's light that all surfaces let through."""
+    """Return the transmittance of all surfaces at each pixel."""
     rest = mi.Float(1)
     for surface in surfaces:
         rest = rest - surface.coverage
@@ -78,11 +70,10 @@ def trace_surfaces(
     within: Sequence[tuple[Float | float, Float | float]],
     with_normals: bool,
 ) -> list[list[SurfaceLayers]]:
-    """Return what is seen of the surfaces, by time and by pass, evaluated.
+    """Return the visible surfaces by time and by pass, evaluated, all with the same number.
 
-    far: depth of the farthest surfaces; cameras: of each time; within: of each pass, x and y from
-    the pixel's upper left corner, px.
-    All have the same number of surfaces. The host reads whether more are seen through others.
+    far: largest depth of surfaces; cameras: by time; within: by pass, x and y from the pixel's
+    upper left corner, px. The host reads whether more surfaces are seen through others.
     """
     tracer = _Tracer(rays, dr.opaque(mi.Float, far), with_normals)
     if len(within) == 1 and dr.width(within[0]) == 1:  # the same place in all pixels
@@ -99,14 +90,14 @@ def trace_surfaces(
 def _pad(layers: SurfaceLayers, count: int) -> SurfaceLayers:
     first = layers[0]
     zero = dr.zeros(mi.Float, dr.width(first.coverage))
-    far = zero + FAR_AWAY
+    far = zero + MISSING_SURFACE_DEPTH
     normal = None if first.normal is None else dr.zeros(mi.Normal3f, dr.width(zero))
     return layers + [VisibleSurface(far, zero, normal)] * (count - len(layers))
 
 
 @dataclass(frozen=True)
 class _Tracer:
-    """Traces rays of a camera to the surfaces of a scene."""
+    """Tracer of camera rays to the surfaces of a scene."""
 
     rays: StraightRays
     far: mi.Float  # depth, scene units: farther surfaces are not seen
@@ -115,7 +106,7 @@ class _Tracer:
     def trace(
         self, camera: Camera, corner: mi.Point2f, x: Float | float, y: Float | float
     ) -> SurfaceLayers:
-        """Return what rays meet at x, y from the corners of pixels, px."""
+        """Return the surfaces at x, y from the corners of pixels, px."""
         place = corner + mi.Point2f(x, y)
         camera = camera.at_row(place.y)
         ray, active = self._camera_rays(camera, place)
@@ -137,7 +128,7 @@ class _Tracer:
             dr.eval(ray, rest, active)
 
     def _camera_rays(self, camera: Camera, place: mi.Point2f) -> tuple[mi.Ray3f, mi.Bool]:
-        """Return rays through places of the film (px), and whether the lens sees anything there."""
+        """Return rays through places of the film (px), and whether the lens has one there."""
         origin, direction, seen = camera.look_through(place.x, place.y)
         direction = dr.normalize(direction)
         start, end = camera.lens.ray_range(direction, camera.near, self.far)
@@ -159,15 +150,15 @@ class _Tracer:
         if self.with_normals:
             frame = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame, valid).sh_frame
             normal = dr.select(valid, coverage * mi.Normal3f(frame.n), 0)
-        return VisibleSurface(dr.select(valid, depth, FAR_AWAY), coverage, normal)
+        return VisibleSurface(dr.select(valid, depth, MISSING_SURFACE_DEPTH), coverage, normal)
 
     def trace_with_edges(
         self, camera: Camera, film: mi.Film, x: Float | float, y: Float | float
     ) -> SurfaceLayers:
-        """Trace at one place of each pixel, or at several where coverage changes next to it.
+        """Trace at one place of each pixel, or at several where coverage differs in its neighbours.
 
-        Around the crop window is a row of pixels more, so that its edges are those of the film.
-        The host reads how many of the latter there are.
+        One more row of pixels surrounds the crop window, which has the film's edges then. The host
+        reads the number of edge pixels.
         """
         count = dr.prod(film.crop_size() + 2)
         width = dr.opaque(mi.UInt32, film.crop_size()[0] + 2)
@@ -204,7 +195,8 @@ def _with_means(
     """Return ``surface`` with means over several rays in the pixels ``edge``."""
     covered = sum((h.coverage for h in hits), mi.Float(0))
     depth = sum((h.coverage * h.depth for h in hits), mi.Float(0))
-    depth = dr.select(covered > 0, depth / dr.select(covered > 0, covered, 1), FAR_AWAY)
+    mean = depth / dr.select(covered > 0, covered, 1)
+    depth = dr.select(covered > 0, mean, MISSING_SURFACE_DEPTH)
     means, planes = [depth, covered / len(hits)], [surface.depth, surface.coverage]
     if surface.normal is not None:
         normals = (h.normal for h in hits if h.normal is not None)

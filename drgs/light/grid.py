@@ -1,10 +1,9 @@
-"""Nested grids of cells, in which a ray finds the Gaussians whose peaks lie on it.
+"""Nested grids of cells with lists of Gaussians, for the peaks along a ray.
 
-A cube around most of the Gaussians is cut into R^3 cells, and so is one twice as wide around it,
-and another one, until all are inside: far away, where there is little, cells are large. A point
-belongs to the cell of the smallest cube that it is in. Each cell has a list of the Gaussians that
-reach into it. As a ray meets a Gaussian at one point, the peak, it finds it in the list of the cell
-that this point is in, once, and those in cells that come later are behind it.
+A cube around most of the Gaussians is cut into R^3 cells, as are cubes of twice the width around
+it, until all Gaussians are inside. A point belongs to the cell of the smallest cube that it is in.
+Each cell has a list of the Gaussians that reach into it. A ray meets a Gaussian at one point, the
+peak, and finds it once, in the list of that point's cell; Gaussians of later cells are behind it.
 """
 
 from __future__ import annotations
@@ -19,37 +18,24 @@ from drgs.core.arrays import from_host, reinterpret, types_of
 from drgs.core.types import Array3f, Array3u, Bool, Float, UInt32
 from drgs.splatting.tiles import lower_bounds
 
-CELLS_PER_GAUSSIAN = 2.0
-"""Cells of the innermost cube for each Gaussian. More shorten the lists and lengthen the walk."""
-
-RESOLUTIONS = (8, 128)
-"""Least and most cells along an edge. All are multiples of 4: the middle half is a finer cube."""
-
-INNER_CUBE_SHARE = 0.9
-"""Part of the means that is in the innermost cube."""
-
-MOST_LEVELS = 24
-"""Cubes; what is farther out than 2^23 times the innermost one's size is in no list."""
-
-MOST_ENTRIES = 32
-"""Entries for each Gaussian, besides :data:`FREE_ENTRIES`: cells grow until there are no more."""
+CELLS_PER_GAUSSIAN = 2.0  # of the innermost cube; more shorten lists and lengthen the walk
+RESOLUTION_RANGE = (8, 128)  # cells along an edge, multiples of 4: the middle half is finer
+INNER_CUBE_SHARE = 0.9  # share of the means in the innermost cube
+MAX_LEVELS = 24  # most cubes; Gaussians beyond 2^23 times the innermost one's size are in no list
+MAX_ENTRIES_PER_GAUSSIAN = 32  # besides FREE_ENTRIES; cells grow until there are no more
 
 FREE_ENTRIES = 1 << 20
 
-CELL_MARGIN = 1 / 64
-"""Parts of a cell by which Gaussians reach into it from outside: far more than rounding moves a
-ray, and than :data:`STEP`."""
-
-CELL_STEP = 1 / 1024
-"""Parts of a cell by which a ray looks ahead for the cell that it is in."""
+CELL_MARGIN = 1 / 64  # cells by which Gaussians are extended: far more than rounding and CELL_STEP
+CELL_STEP = 1 / 1024  # step in cells after which a ray looks up its cell
 
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """The ellipsoids in which N Gaussians show."""
+    """The ellipsoids at which N Gaussians end."""
 
     centers: Array3f  # world
-    axes: list[Array3f]  # three, world: principal half axes, as far as the Gaussian shows
+    axes: list[Array3f]  # three, world: principal half axes
     exist: Bool
 
     def half_sizes(self) -> Array3f:
@@ -65,23 +51,18 @@ class SplatGrid:
     size: Float  # (1,): half the innermost cube's edge, world units
     num_levels: UInt32  # (1,)
     resolution: UInt32  # (1,): R
-    cells: UInt32  # (2 cells,): number of entries, the first of them; or 0, cells to pass over
+    cells: UInt32  # (2 cells,): number of entries, the first one; if empty, 0, cells to skip
     rows: UInt32  # (entries,): Gaussians
 
-    @property
-    def reach(self) -> Float:
-        """Half the outermost cube's edge, world units: (1,)."""
-        Float = type(self.size)
-        return self.size * dr.exp2(Float(self.num_levels) - 1)
-
     def span(self, origin: Array3f, direction: Array3f) -> tuple[Float, Float]:
-        """Return where rays enter and leave the outermost cube; the first is larger for misses."""
+        """Return where rays enter and leave the outermost cube; for misses, enter > leave."""
         Float = type(self.size)
+        reach = self.size * dr.exp2(Float(self.num_levels) - 1)  # half the outermost cube's edge
         first, last = Float(-dr.inf), Float(dr.inf)
         for o, d, c in zip(origin, direction, self.center, strict=True):
             inverse = 1 / d
-            a, b = (c - self.reach - o) * inverse, (c + self.reach - o) * inverse
-            # Parallel to a side: 0 / 0 on it, which is not a number, and no bound.
+            a, b = (c - reach - o) * inverse, (c + reach - o) * inverse
+            # Parallel to a side and on it: 0 / 0 is NaN, and no bound.
             low, high = dr.select(a < b, a, b), dr.select(a < b, b, a)
             first = dr.select(low > first, low, first)
             last = dr.select(high < last, high, last)
@@ -90,13 +71,13 @@ class SplatGrid:
     def cell(self, origin: Array3f, direction: Array3f, t: Float) -> tuple[UInt32, UInt32, Float]:
         """Return the first entry and the end of the list of the cell that rays enter at t.
 
-        Then where they leave it, or empty ones around it; at least a step ahead.
+        Also return where they leave it, and empty cells around it; at least a step ahead.
         """
         t_ = types_of(type(self.size))
         count = t_.Float(self.resolution)
         distance = self._distance(origin + direction * t)
         step = CELL_STEP * (self.size * dr.select(distance > 1, distance, 1) * 2 / count)
-        rounding = 4 * dr.epsilon(t) * t  # a ray from far away goes on where cells are smaller
+        rounding = 4 * dr.epsilon(t) * t  # for rays from far away
         ahead = t + dr.select(step > rounding, step, rounding)
         point = origin + direction * ahead
         level, edges = self._cube(self._distance(point))
@@ -109,7 +90,7 @@ class SplatGrid:
             index = index * self.resolution + t_.UInt32(place)
             places.insert(0, place)
         number, first = dr.gather(t_.Array2u, self.cells, index)
-        # Of an empty cell: how many cells there are to the next list, in any direction.
+        # An empty cell: the number of cells to the next list, in any direction.
         free = t_.Float(dr.select(number == 0, first, 1))
         leaves = t_.Float(dr.inf)
         for k, place in enumerate(places):
@@ -120,7 +101,7 @@ class SplatGrid:
         return first, first + number, dr.select(leaves > ahead, leaves, ahead)
 
     def _cube(self, distance: Float) -> tuple[UInt32, Float]:
-        """Find the smallest cube that a point is in: its number, and its size in innermost ones."""
+        """Return the number of the smallest cube around a point, and its size in innermost ones."""
         Single = cast(type[Float], dr.float32_array_t(type(distance)))
         UInt32 = types_of(Single).UInt32
         # A number from 2^k to 2^(k + 1) has k + 127 above its 23 bits of mantissa.
@@ -130,7 +111,7 @@ class SplatGrid:
         return level, type(distance)(reinterpret(Single, (level + 127) << 23))
 
     def _distance(self, point: Array3f) -> Float:
-        """Return the distance from the centre, as cubes go, in half edges of the innermost one."""
+        """Return the maximum-norm distance from the centre, in half edges of the innermost cube."""
         return dr.max(dr.abs(point - self.center)) / self.size
 
 
@@ -141,17 +122,17 @@ def build_grid(ellipsoids: Ellipsoids) -> SplatGrid:
     sizes = np.array(ellipsoids.half_sizes(), np.float64)[:, shown]
     center = np.median(centers, axis=1) if shown.any() else np.zeros(3)
     distances = np.abs(centers - center[:, None]).max(axis=0)
-    # Equal or few centres: no cell is much smaller than what it holds.
+    # Equal or few centres: no cell is much smaller than its Gaussians.
     spreads = np.stack([distances, sizes.max(axis=0)])
     size = np.quantile(spreads, INNER_CUBE_SHARE, axis=1).max() if shown.any() else 1.0
     farthest = (np.abs(centers - center[:, None]) + sizes).max(initial=0.0)
-    size = max(size, farthest / 2 ** (MOST_LEVELS - 1), np.finfo(np.float32).tiny)
-    # Two cells of a cube with all Gaussians are empty on either side: nothing is at the border.
+    size = max(size, farthest / 2 ** (MAX_LEVELS - 1), np.finfo(np.float32).tiny)
+    # Two cells on either side of a cube with all Gaussians are empty.
     levels = max(1, 1 + int(np.ceil(np.log2(max(1.05 * farthest / size, 1)))))
-    least, most = RESOLUTIONS
+    least, most = RESOLUTION_RANGE
     wanted = (CELLS_PER_GAUSSIAN * max(1, shown.sum())) ** (1 / 3)
     resolution = 4 * int(np.clip(round(wanted / 4), least // 4, most // 4))
-    affordable = MOST_ENTRIES * len(shown) + FREE_ENTRIES
+    affordable = MAX_ENTRIES_PER_GAUSSIAN * len(shown) + FREE_ENTRIES
     boxes = _Boxes(ellipsoids, center, size)
     while (
         resolution > least
@@ -163,20 +144,20 @@ def build_grid(ellipsoids: Ellipsoids) -> SplatGrid:
 
 @dataclass(frozen=True)
 class _Boxes:
-    """Makes entries of ellipsoids in cells."""
+    """Boxes around ellipsoids, and their entries in cells."""
 
     ellipsoids: Ellipsoids
     center: np.ndarray
     size: float
 
     def count(self, level: int, resolution: int) -> int:
-        """Count the cells of a level that are in boxes around the ellipsoids."""
+        """Count the cells of a level in boxes around the ellipsoids."""
         return int(np.array(dr.prod(self._ranges(level, resolution)[1])).sum(dtype=np.int64))
 
     def grid(self, levels: int, resolution: int) -> SplatGrid:
-        """Sort the entries by cell, and in a cell by Gaussian."""
-        Float = type(self.ellipsoids.centers.x)
-        t = types_of(Float)
+        """Sort the entries by cell, and within a cell by Gaussian."""
+        t = types_of(type(self.ellipsoids.centers.x))
+        Float = t.Float
         # Dr.Jit does not compute with empty arrays, and a level may have no entries.
         made = [self._entries(level, resolution) for level in range(levels)]
         made = [each for each in made if dr.width(each[0]) > 0]
@@ -224,9 +205,8 @@ class _Boxes:
         return triple(first), triple(number)
 
     def _entries(self, level: int, resolution: int) -> tuple[UInt32, UInt32]:
-        """Make rows and cells of a level, in the order of the rows, of what is in both."""
-        Float = type(self.ellipsoids.centers.x)
-        t = types_of(Float)
+        """Return rows and cells of a level's entries, in the order of the rows."""
+        t = types_of(type(self.ellipsoids.centers.x))
         first, number = self._ranges(level, resolution)
         counts = dr.prod(number)
         row, local = _expand(counts)
@@ -250,7 +230,7 @@ class _Boxes:
         return dr.gather(t.UInt32, row, kept), dr.gather(t.UInt32, cell, kept)
 
     def _touches(self, place: list[UInt32], row: UInt32, level: int, resolution: int) -> Bool:
-        """Return whether no principal axis of an ellipsoid tells it from a cell."""
+        """Return whether no principal axis of an ellipsoid separates it from a cell."""
         Float = type(self.ellipsoids.centers.x)
         t = types_of(Float)
         cell = dr.opaque(Float, float(self.size * 2.0 ** (level + 1) / resolution))
@@ -260,7 +240,7 @@ class _Boxes:
         touches = t.Bool(True)
         for axis in self.ellipsoids.axes:
             direction = dr.gather(t.Array3f, axis, row)
-            # Along the axis, times its length: how far the cell reaches, and the ellipsoid.
+            # Extents of the cell and the ellipsoid along the axis, times its length.
             of_cell = dr.sum(dr.abs(direction)) * cell * (0.5 + CELL_MARGIN)
             distance = dr.abs(dr.dot(direction, offset))
             touches &= distance <= of_cell + dr.squared_norm(direction)
@@ -268,7 +248,7 @@ class _Boxes:
 
 
 def _expand(counts: UInt32) -> tuple[UInt32, UInt32]:
-    """List for each of ``counts[row]`` items of each row: the row, and the item's number in it."""
+    """Return the row of each of ``counts[row]`` items, and the item's number in it."""
     UInt32 = type(counts)
     size = dr.width(counts)
     row = dr.arange(UInt32, size)
@@ -284,7 +264,7 @@ def _expand(counts: UInt32) -> tuple[UInt32, UInt32]:
 
 
 def _cells(starts: np.ndarray, levels: int, resolution: int) -> np.ndarray:
-    """Make :attr:`SplatGrid.cells`; starts: (cells + 1,) first entry of each."""
+    """Return :attr:`SplatGrid.cells`; starts: (cells + 1,) first entries."""
     from scipy.ndimage import distance_transform_cdt
 
     shape = (levels, *(resolution,) * 3)

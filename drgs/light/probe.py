@@ -1,14 +1,13 @@
-"""Probes: the splats as they look from one place, in all directions.
+"""Probes: the splats as seen from one place, in all directions.
 
 A probe is a cube of six images around a centre: colour, coverage, and distance of the splats in
-each direction. A ray that starts near the centre sees about the same points, but not in its own
-direction: where it meets the splats is searched on it, in steps that look the same size from the
-centre, until it is behind what the probe sees in the direction of where it is. Where it gets behind
-something that it has not met, as what is seen there was nearer all the time, it is in the shadow of
-the centre, and what it meets is not known.
+each direction. A ray that starts near the centre sees about the same points, in other directions:
+the search for the first one goes along the ray in steps of about equal angle from the centre, until
+the probe's distance in the direction of the current point is smaller. If it was smaller all the
+time, the ray is occluded from the centre, and the probe has no answer.
 
-Rays that stand for others around them look at smaller images, of which each texel is the mean over
-a larger angle (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance Sampling").
+Rays of rough surfaces read smaller images, of which each texel is the mean over a larger angle
+(Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance Sampling").
 
 Nothing here is differentiated.
 """
@@ -28,52 +27,33 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.splatting import rendering
 from drgs.splatting.projection import GaussianRows
 
-CUBE_SIZE_TEXELS = 256
-"""Texels of an edge of the largest cube."""
-
-NUM_LEVELS = 7
-"""Cubes of a probe; each has half the edges of the one before."""
-
-LOW_PASS = 0.03
-"""px^2 of the images: rays have none at all."""
-
-LAST_DISTANCE_LEVEL = 2
-"""The last level in which distances are searched: those of smaller images are no surface."""
-
-MAX_RAY_STEPS = 8
-"""Places of a ray that are looked at, at most."""
-
-STEP_HALVINGS = 4
-"""Halvings of the step that meets something."""
-
-MIN_SOLID_COVERAGE = 0.5
-"""Coverage of what ends a ray."""
-
-BORDER_TEXELS = 1
-"""Texels around each image that show what the neighbours do, for interpolation."""
-
-LEAST_REACH = 0.1
-"""Part of the distance to the nearest splats: the first steps of a ray from the centre."""
-
-HIT_DISTANCE_SHARE = 0.98
-"""Part of the distance before a step, from which on what is seen behind it is met."""
+CUBE_SIZE_TEXELS = 256  # texels of an edge of the largest cube
+NUM_LEVELS = 7  # cubes of a probe, each with half the edge of the one before
+LOW_PASS = 0.03  # low-pass filter of the images, px^2: rays have none
+LAST_DISTANCE_LEVEL = 2  # whose distances are searched: means over larger angles are no surface
+MAX_RAY_STEPS = 8  # most steps of a search along a ray
+STEP_HALVINGS = 4  # halvings of the step in which a ray meets splats
+MIN_SOLID_COVERAGE = 0.5  # smallest coverage that ends a ray
+BORDER_TEXELS = 1  # texels around each image that repeat the neighbours', for interpolation
+MIN_FIRST_STEP = 0.1  # of a ray from the centre, relative to the distance of the nearest splats
+HIT_DISTANCE_SHARE = 0.98  # least distance of splats that a step meets, relative to that before it
 
 
 @dataclass(frozen=True)
 class ProbeHit:
-    """Results of looking along rays."""
+    """Results of looking rays up in a probe."""
 
     color: Array3f  # times the coverage
     coverage: Float
-    is_known: Bool  # whether the probe can tell
+    is_known: Bool  # whether the probe has an answer
 
 
 @dataclass(frozen=True)
 class Probes:
-    """Probes, whose texels follow each other: by probe, level, face, row and column."""
+    """Probes; texels are ordered by probe, level, face, row and column."""
 
     centers: Array3f  # world, by probe
-    normals: Array3f  # of the planes beyond which they see, by probe; 0: there is none
+    normals: Array3f  # of the planes beyond which they see, by probe; 0: no plane
     nearest: Float  # world units, by probe: to the nearest splats
     colors: Float  # 4 a texel: colour times coverage; the last one is 0
     places: Float  # 2 a texel: coverage, and coverage by distance
@@ -87,11 +67,11 @@ class Probes:
         decode: Callable[[list[Float]], list[Float]],
         planes: np.ndarray | None = None,
     ) -> Probes:
-        """Render them.
+        """Render probes.
 
-        pipeline: its features are colour and depth; centers: (P, 3) world; near: near plane, world
-        units; decode: makes the colour that is kept from that which splats composite; planes:
-        (P, 4), a normal n and an offset h of each, which sees the splats at n . x >= h alone.
+        pipeline: with the features colour and depth; centers: (P, 3) world; near: near plane, world
+        units; decode: of composited colours; planes: (P, 4), normal n and offset h of each probe,
+        which only sees splats at n . x >= h.
         """
         t = types_of(type(gaussians.means.array))
         planes = np.zeros((len(centers), 4)) if planes is None else planes
@@ -128,10 +108,10 @@ class Probes:
         level: UInt32,
         active: Bool,
     ) -> ProbeHit:
-        """Look along unit directions up to ``far``; probe, level: of each ray."""
+        """Look up rays along unit directions up to ``far``; probe, level: of each ray."""
         t = types_of(type(far))
         start = origin - dr.gather(t.Array3f, self.centers, probe, active)
-        reach = LEAST_REACH * dr.gather(t.Float, self.nearest, probe, active)
+        reach = MIN_FIRST_STEP * dr.gather(t.Float, self.nearest, probe, active)
         reach = dr.maximum(reach, dr.norm(start))
         end = dr.select(far < dr.inf, far / (far + reach), 1)
         towards = direction * reach
@@ -150,7 +130,7 @@ class Probes:
         places = [w * dr.gather(t.Array2f, self.places, texel, is_known) for texel, w in texels]
         red, green, blue, _ = sum(colors[1:], colors[0])
         coverage, nearness = sum(places[1:], places[0])
-        # What is too thin to be met counts if it is before the ray's end.
+        # Splats too thin to be met count if they are before the ray's end.
         shows = is_known & (meets | (coverage * (1 - u) < nearness * dr.norm(v)))
         color = dr.select(shows, t.Array3f(red, green, blue), 0)
         return ProbeHit(color, dr.select(shows, coverage, 0), is_known)
@@ -158,11 +138,11 @@ class Probes:
     def _search(
         self, place: Callable[[Float], Array3f], end: Float, cube: _Cube, active: Bool
     ) -> tuple[Float, Bool, Bool]:
-        """Find where lines meet the splats, or end; whether they meet any; is that known."""
+        """Find where rays meet the splats, or end; whether they meet any; whether that is known."""
         t = types_of(type(end))
 
         def look(u: Float, active: Bool) -> tuple[Float, Float, Bool]:
-            """Return the distances of a place and of splats there, and which is nearer."""
+            """Return the distances of a place and of splats there, and whether these are nearer."""
             v = place(u)
             coverage, nearness = dr.gather(t.Array2f, self.places, cube.nearest(v), active)
             is_solid, r = coverage > MIN_SOLID_COVERAGE, dr.norm(v)
@@ -195,7 +175,7 @@ class Probes:
 def _clip_to_plane(
     t: ArrayTypes, plane: np.ndarray, pipeline: rendering.Pipeline
 ) -> rendering.Pipeline:
-    """Return a pipeline that leaves out Gaussians whose means are on the other side of a plane."""
+    """Return a pipeline without the Gaussians whose means are on the other side of a plane."""
     *normal, offset = (dr.opaque(t.Float, float(value)) for value in plane)
 
     def rows(rows: GaussianRows) -> GaussianRows:
@@ -243,25 +223,31 @@ class _Cube:
         UInt32, Float = type(self.size), type(x)
         x, y = (place * Float(self.size) + (BORDER_TEXELS - 0.5) for place in (x, y))
         column, row = UInt32(x), UInt32(y)
-        right, down = x - Float(column), y - Float(row)
         texel, edge = self._texel(face, column, row), self.size + 2 * BORDER_TEXELS
-        return [
-            (texel, (1 - right) * (1 - down)),
-            (texel + 1, right * (1 - down)),
-            (texel + edge, (1 - right) * down),
-            (texel + edge + 1, right * down),
-        ]
+        return bilinear_texels(texel, edge, x - Float(column), y - Float(row))
 
     def _texel(self, face: UInt32, column: UInt32, row: UInt32) -> UInt32:
         edge = self.size + 2 * BORDER_TEXELS
         return self.first + (face * edge + row) * edge + column
 
 
-def _place_on_cube(v: Array3f) -> tuple[UInt32, Float, Float]:
-    """Find the face that a vector points to (+x, -x, +y, ...), and where, 0..1 from its corner.
+def bilinear_texels(
+    texel: UInt32, width: UInt32, right: Float, down: Float
+) -> list[tuple[UInt32, Float]]:
+    """Return four texels and weights; texel: the upper left one; right, down: from it, 0..1."""
+    return [
+        (texel, (1 - right) * (1 - down)),
+        (texel + 1, right * (1 - down)),
+        (texel + width, (1 - right) * down),
+        (texel + width + 1, right * down),
+    ]
 
-    On the face of an axis, the next axis points to the right and the one after it down; on that of
-    the opposite direction, the other way around, so that neither is mirrored.
+
+def _place_on_cube(v: Array3f) -> tuple[UInt32, Float, Float]:
+    """Return the face that a vector points to (+x, -x, ...), and the place, 0..1 from its corner.
+
+    On the face of an axis, the next axis points right and the one after it down; on the opposite
+    face the other way around, so that neither is mirrored.
     """
     x, y, z = (dr.abs(c) for c in v)
     is_x = (x >= y) & (x >= z)
@@ -286,10 +272,7 @@ def _face(
     near: float,
     decode: Callable[[list[Float]], list[Float]],
 ) -> list[Float]:
-    """Render a side of a cube (+x, -x, +y, ...), borders included.
-
-    Red, green, blue, coverage, nearness of its texels.
-    """
+    """Render red, green, blue, coverage, nearness of a cube's side (+x, -x, ...) with borders."""
     Float = type(gaussians.means.array)
     UInt32, edge = types_of(Float).UInt32, CUBE_SIZE_TEXELS + 2 * BORDER_TEXELS
     axis, is_negative = divmod(number, 2)
@@ -324,7 +307,7 @@ def _concatenate(parts: list[list[Float]]) -> list[Float]:
 
 
 def _halve(columns: list[Float], size: int) -> list[Float]:
-    """Make a cube of ``size`` texels an edge from twice as many: means of four places each."""
+    """Downsample a cube to ``size`` texels an edge, from twice as many: means of four places."""
     t = types_of(type(columns[0]))
     edge, larger = size + 2 * BORDER_TEXELS, _Cube(t.UInt32(0), t.UInt32(2 * size))
     index = dr.arange(t.UInt32, 6 * edge * edge)

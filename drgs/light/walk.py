@@ -8,9 +8,9 @@ is the unit Gaussian,
 
 A segment 0 < t < far composites the Gaussians whose peaks lie on it, in the order of their peaks,
 with the cut-offs of the pipeline and colours seen along the ray. Rays find them in a grid
-(:mod:`drgs.light.grid`). In a cell, a ray reads the list and keeps the :data:`WINDOW` nearest peaks
-that it has not composited yet, composites them, and, if there were more, reads the list again: the
-order is exact however many there are.
+(:mod:`drgs.light.grid`). In a cell, a ray reads the list, keeps the :data:`WINDOW_PEAKS` nearest
+peaks that it has not composited yet, composites them, and reads the list again if there were more:
+the order is exact.
 
 Nothing here is differentiated.
 """
@@ -33,25 +33,16 @@ from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import GaussianRows
 from drgs.splatting.rasterize import composite_step
 
-WINDOW_PEAKS = 8
-"""Peaks that a ray keeps before it composites them."""
-
-ENTRIES_PER_TURN = 16
-"""Entries of a list, after which a ray lets others of its vector find their next cell."""
-
-MOST_RANDOM = 2.0**32 - 2**8
-"""Bound of random numbers for a certainty: the largest number of 32 bits in float32."""
-
-MAX_DISTANCE = 1e18
-"""World units from the origin, beyond which Gaussians do not exist: their squares overflow."""
-
-_SHAPE = 13
-"""Numbers of a record: mean, rows of W, base-2 logarithm of the opacity."""
+WINDOW_PEAKS = 8  # peaks that a ray sorts before it composites them
+ENTRIES_PER_TURN = 16  # after which a ray waits for others of its vector to find their next cell
+MAX_RANDOM_WORD = 2.0**32 - 2**8  # bound for the probability 1: the largest float32 of 32 bits
+MAX_DISTANCE = 1e18  # of Gaussians from the origin, world units: larger squares overflow
+SHAPE_WIDTH = 13  # numbers of a record: mean, rows of W, base-2 logarithm of the opacity
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Rays from where they start to where they end."""
+    """Segments of rays."""
 
     origin: Array3f  # world
     direction: Array3f  # unit
@@ -61,9 +52,9 @@ class Segment:
 
 @dataclass(frozen=True)
 class RaySplats:
-    """Gaussians as rays meet them."""
+    """Gaussians prepared for rays."""
 
-    shapes: Rows  # by Gaussian: see _SHAPE
+    shapes: Rows  # by Gaussian: see SHAPE_WIDTH
     colors: Rows  # by Gaussian: coefficients of the harmonics, three colours each
     grid: SplatGrid
     sh_degree: int
@@ -71,10 +62,10 @@ class RaySplats:
 
     @staticmethod
     def from_gaussians(rows: GaussianRows, sh_degree: int, cutoffs: Cutoffs) -> RaySplats:
-        """Copy the Gaussians, and sort them into a grid. Waits for the device.
+        """Copy the Gaussians and sort them into a grid. The host waits for the device.
 
-        rows: detached, as a pipeline has them. Those that are not finite, or reach beyond
-        :data:`MAX_DISTANCE`, do not exist.
+        rows: detached. Rows that are not finite, or reach beyond :data:`MAX_DISTANCE`, are left
+        out.
         """
         t = types_of(type(rows.logit_opacities))
         rotation, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
@@ -93,17 +84,14 @@ class RaySplats:
         exists = (exponent > 0) & dr.isfinite(total)
         ellipsoids = Ellipsoids(t.Array3f(rows.means), half_axes, exists)
         exists &= dr.max(dr.abs(ellipsoids.centers) + ellipsoids.half_sizes()) < MAX_DISTANCE
-        shapes = Rows.from_columns([*numbers, *[t.Float(0)] * (16 - _SHAPE)])
+        shapes = Rows.from_columns([*numbers, *[t.Float(0)] * (16 - SHAPE_WIDTH)])
         colors = Rows.from_columns(sh)
         ellipsoids = replace(ellipsoids, exist=exists)
         dr.eval(shapes, colors, ellipsoids)
         return RaySplats(shapes, colors, build_grid(ellipsoids), sh_degree, cutoffs)
 
     def composite_segment(self, segment: Segment) -> tuple[Array3f, Float]:
-        """Composite the splats along segments, in the order of their peaks.
-
-        Return the sum of w_i c_i, display space, and the transmittance.
-        """
+        """Return the sum of w_i c_i, display space, in order of the peaks, and transmittance."""
         walk = _Walk.from_segment(self, segment)
         t = types_of(self.shapes.Float)
         basis = sh_basis(walk.direction, self.sh_degree)
@@ -111,9 +99,10 @@ class RaySplats:
         def body(at: _Place, last: list, T: Float, color: list) -> tuple:
             at, window, overflows = walk.nearest(at, last, T)
             T, color, last = walk.composite(window, basis, T, color)
-            # What did not fit comes behind what was composited, and is in the same list.
+            # Peaks that did not fit are behind the composited ones, in the same list.
             last = [dr.select(overflows, last[0], -dr.inf), last[1]]
-            return at.rewind(overflows), last, T, color
+            at = replace(at, entry=dr.select(overflows, at.first, at.entry))
+            return at, last, T, color
 
         size = dr.width(walk.origin)
         _, _, T, color = dr.while_loop(
@@ -133,15 +122,15 @@ class RaySplats:
     ) -> tuple[list[Array3f], list[Bool], Float]:
         """Draw ``count`` splats that segments show, with their weights.
 
-        A splat lets light pass with the probability 1 - alpha; the first that does not is drawn
-        (Enderton et al. 2010, "Stochastic Transparency"; Sun et al. 2025, "Stochastic Ray Tracing
-        of Transparent 3D Gaussians"): with the probability w_i, and none with T. That needs no
-        order: a later splat of the list that does not, either, replaces the last one if it is
-        nearer. See :class:`_Draw` for when none does.
+        A splat stops light with the probability alpha; the first that does is drawn (Enderton et
+        al. 2010, "Stochastic Transparency"; Sun et al. 2025, "Stochastic Ray Tracing of Transparent
+        3D Gaussians"): with the probability w_i, and none with T. That needs no order: a later
+        splat of the list that also stops light replaces the last one if it is nearer. See
+        :class:`_Draw` for rays that no splat stops.
 
-        seed: of each ray; count: at least 1. Return colours of independent draws, display space; of
-        each whether it exists, independent of them, with the probability 1 - T; and an estimate of
-        T, which is independent of the colours.
+        seed: of each ray; count: at least 1. Return colours of independent draws, display space;
+        whether each exists, independent of them, with the probability 1 - T; and an estimate of T,
+        independent of the colours.
         """
         walk = _Walk.from_segment(self, segment)
         t = types_of(self.shapes.Float)
@@ -171,7 +160,7 @@ class RaySplats:
             )
 
         def should_continue(at: _Place, coverage: Float, draws: list) -> Bool:
-            # Cells that come later are behind what was drawn in this one.
+            # Later cells are behind the splats drawn in this one.
             more = (at.entry < at.last) | ((_farthest(draws) == dr.inf) & (at.end < walk.stop))
             return segment.active & more
 
@@ -187,7 +176,7 @@ class RaySplats:
         )
         basis = sh_basis(walk.direction, self.sh_degree)
         found = [self._color(one.row, basis, one.peak < dr.inf) for one in draws]
-        # Russian roulette: with the probability A^n, all are stopped, and the walk has ended early.
+        # Russian roulette: with the probability A^n, all draws are stopped, and the walk has ended.
         # Else T is (1 - A) / (1 - A^n), the inverse of a sum of powers.
         powers = t.Float(1)
         for _ in range(count - 1):
@@ -208,7 +197,7 @@ class RaySplats:
         return color
 
     def transmittance(self, segment: Segment, least: Float) -> Float:
-        """Return what segments let through; where that is less than ``least``, anything less."""
+        """Return the transmittance; where it is below ``least``, any value below ``least``."""
         walk = _Walk.from_segment(self, segment)
         t = types_of(self.shapes.Float)
 
@@ -237,13 +226,13 @@ class RaySplats:
 
 @dataclass
 class _Place:
-    """The place of rays: a cell, and an entry of its list. Not frozen: Dr.Jit assigns to it."""
+    """The place of rays: a cell and an entry of its list. Not frozen: Dr.Jit assigns to it."""
 
     start: Float  # where the ray enters the cell
     end: Float  # where it leaves it
-    entry: UInt32  # the next one of the list
-    first: UInt32  # of the list
-    last: UInt32  # one behind the list; where that is the next entry, there is another cell
+    entry: UInt32  # next entry of the list
+    first: UInt32  # first entry of the list
+    last: UInt32  # one past the list's end
     turn: UInt32  # entries since rays of a vector waited for each other
 
     @staticmethod
@@ -253,17 +242,13 @@ class _Place:
         return _Place(start, type(start)(start), *(dr.zeros(UInt32, size) for _ in range(4)))
 
     def has_entry(self) -> Bool:
-        """Return whether the list goes on, and other rays need not find another cell first."""
+        """Return whether the list has entries, and other rays need not find another cell first."""
         return (self.entry < self.last) & (self.turn < ENTRIES_PER_TURN)
-
-    def rewind(self, goes_back: Bool) -> _Place:
-        """Return to the beginning of the list that was read last, on some rays."""
-        return replace(self, entry=dr.select(goes_back, self.first, self.entry))
 
 
 @dataclass(frozen=True)
 class _Walk:
-    """Rays on their way through the grid, from where they enter it."""
+    """Rays through the grid, from where they enter it."""
 
     splats: RaySplats
     origin: Array3f  # where a ray enters, or starts
@@ -279,11 +264,11 @@ class _Walk:
         return _Walk(splats, origin, segment.direction, end - start)
 
     def should_continue(self, at: _Place) -> Bool:
-        """Return whether there is another entry, or another cell."""
+        """Return whether there is another entry or cell."""
         return (at.entry < at.last) | (at.end < self.stop)
 
     def find(self, at: _Place) -> _Place:
-        """Return the place, moved to the next cell with a list where this one is at its end."""
+        """Return the place, moved to the next cell with a list where this list is at its end."""
         grid = self.splats.grid
 
         def body(at: _Place) -> tuple[_Place]:
@@ -296,7 +281,7 @@ class _Walk:
         return replace(at, turn=type(at.turn)(0))
 
     def read_entry(self, at: _Place) -> tuple[_Place, UInt32, Float, Float]:
-        """Read the next entry: place behind it, Gaussian, where it is met, log2 of its alpha."""
+        """Return the place after the next entry, its Gaussian, the peak and log2 of its alpha."""
         UInt32 = type(at.entry)
         row = dr.gather(UInt32, self.splats.grid.rows, at.entry)
         peak, log2_alpha = self.meet(row, True)
@@ -306,14 +291,13 @@ class _Walk:
         return behind, row, peak, log2_alpha
 
     def meet(self, row: UInt32, active: Bool | bool) -> tuple[Float, Float]:
-        """Return where a ray meets a Gaussian, and the base-2 logarithm of alpha, -inf outside."""
+        """Return the peak of a Gaussian on a ray, and log2 of its alpha, -inf outside."""
         Array3f = types_of(self.splats.shapes.Float).Array3f
         numbers = self.splats.shapes.load(row, active)
-        mean, log2_opacity = Array3f(numbers[:3]), numbers[_SHAPE - 1]
-        whitening = [Array3f(numbers[k : k + 3]) for k in (3, 6, 9)]
-        offset = self.origin - mean
-        o = Array3f([dr.dot(row, offset) for row in whitening])
-        d = Array3f([dr.dot(row, self.direction) for row in whitening])
+        mean, log2_opacity = Array3f(numbers[:3]), numbers[SHAPE_WIDTH - 1]
+        W, offset = [Array3f(numbers[k : k + 3]) for k in (3, 6, 9)], self.origin - mean
+        o = Array3f([dr.dot(row, offset) for row in W])
+        d = Array3f([dr.dot(row, self.direction) for row in W])
         peak = -dr.dot(o, d) / dr.squared_norm(d)
         log2_alpha = dr.fma(
             dr.squared_norm(dr.fma(d, peak, o)), -0.5 * math.log2(math.e), log2_opacity
@@ -328,10 +312,9 @@ class _Walk:
     def nearest(self, at: _Place, last: list, T: Float) -> tuple[_Place, list[list], Bool]:
         """Find the next peaks, and whether the list that was read last has more.
 
-        Rays read one list after the other while half of the window is free, at least, and what
-        they have read lets something through. Of each peak: where it is, the Gaussian, the base-2
-        logarithm of alpha; where there is none, inf. last: of the peaks that were composited, where
-        it is and the Gaussian; T: transmittance before the window.
+        Rays read lists while at least half of the window is free and its peaks let light through. A
+        peak has its distance (inf: none), Gaussian and log2 of alpha. last: distance and Gaussian
+        of the last composited peak; T: transmittance before the window.
         """
         t = types_of(self.splats.shapes.Float)
 
@@ -340,7 +323,7 @@ class _Walk:
             behind = (peak > last[0]) | ((peak == last[0]) & (row > last[1]))
             peak = dr.select(behind & (log2_alpha > -dr.inf), peak, dr.inf)
             item, kept = [peak, row, log2_alpha], []
-            # Of equals, that of the smaller row, which the list has first, stays before.
+            # Equal peaks stay in the order of the list, by Gaussian.
             for place in window:
                 before = item[0] < place[0]
                 pairs = list(zip(place, item, strict=True))
@@ -378,7 +361,7 @@ class _Walk:
     def composite(
         self, window: list[list], basis: list[Scalar], T: Float, color: list[Float]
     ) -> tuple[Float, list[Float], list]:
-        """Composite what was kept; returns T, negative where the ray is finished, colour, last."""
+        """Composite the window; return T, negative for finished rays, colour, last peak."""
         t = types_of(self.splats.shapes.Float)
 
         def body(window: list, T: Float, color: list, last: list) -> tuple:
@@ -406,13 +389,13 @@ class _Walk:
 class _Draw:
     """A splat that rays draw. Not frozen: Dr.Jit assigns a loop's state.
 
-    A splat of the list stops it with the probability alpha. If none does, it still has one, drawn
-    as if any had: so all draws have splats as soon as there are any, with weights by their sum,
-    and whether they are stopped does not depend on which splats these are.
+    A splat of the list stops a draw with the probability alpha. A draw that is not stopped still
+    has a splat, drawn as if one had stopped it: all draws have splats as soon as there are any,
+    and whether they are stopped is independent of the splats drawn.
     """
 
     row: UInt32
-    peak: Float  # inf: it has none
+    peak: Float  # inf: no splat
     is_stopped: Bool
 
     @staticmethod
@@ -437,9 +420,9 @@ class _Draw:
 class _Chances:
     """Probabilities of a splat in draws, as bounds of random numbers of 2^32.
 
-    With A the coverage by the splats before it in the list and A' that after it, it is the first
-    to stop light with the probability v = (1 - A) alpha; given that any does, with v / A'. A draw
-    that is not stopped is decided anew by that, as in reservoir sampling.
+    With A and A' the coverage by the list before and after the splat, it is the first to stop light
+    with the probability v = (1 - A) alpha; given that any does, with v / A'. A draw that is not
+    stopped is decided anew by that, as in reservoir sampling.
     """
 
     stops: UInt32  # alpha
@@ -449,11 +432,11 @@ class _Chances:
 
     @staticmethod
     def from_alpha(alpha: Float, coverage: Float) -> _Chances:
-        """Compute them for a splat; coverage: before it."""
+        """Compute the probabilities of a splat; coverage: before it."""
         t = types_of(type(alpha))
 
         def bound(probability: Float) -> UInt32:
-            return t.UInt32(t.Float(probability) * MOST_RANDOM)
+            return t.UInt32(t.Float(probability) * MAX_RANDOM_WORD)
 
         stopped = (1 - coverage) * alpha
         after = coverage + stopped
@@ -464,16 +447,15 @@ class _Chances:
 
 
 def _farthest(draws: list[_Draw]) -> Float:
-    """Return the peak of the farthest splat; inf while not all draws are stopped."""
+    """Return the farthest peak; inf while not all draws are stopped."""
     peaks = [dr.select(one.is_stopped, one.peak, dr.inf) for one in draws]
     return reduce(lambda a, b: dr.select(a > b, a, b), peaks)
 
 
 def _hashes(row: UInt32, seed: UInt32, count: int) -> list[UInt32]:
-    """Return random numbers of a Gaussian and a ray.
+    """Return random numbers of a Gaussian and a ray, by PCG's output function (O'Neill 2014).
 
-    By PCG's output function (O'Neill 2014). Two numbers a hash: its first 16 bits are those of the
-    one, its last 16 bits of the other; what follows in one are the first bits of the other.
+    Each hash gives two numbers: itself, and itself with its halves exchanged.
     """
     UInt32 = type(row)
     numbers, state = [], row ^ seed

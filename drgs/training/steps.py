@@ -20,7 +20,7 @@ from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.datasets.images import smaller_view
 from drgs.datasets.types import View
 from drgs.integrator.scene import make_sensors
-from drgs.integrator.types import SplatsIntegrator
+from drgs.integrator.types import SplatsPlugin
 from drgs.training.effects.base import TrainingEffect, as_tensor
 from drgs.training.losses import TARGET_BYTES, Target, prepare_target
 from drgs.training.rates import LearningRates
@@ -207,7 +207,7 @@ class ViewLoss:
 class WholeGradients:
     """Steps of one view: see :class:`drgs.training.parallel.exchange.ViewExchange`."""
 
-    def __init__(self, integrator: SplatsIntegrator) -> None:
+    def __init__(self, integrator: SplatsPlugin) -> None:
         self.integrator = integrator
         self._views: Sequence[StepView] = ()
         self._sums: Mapping[str, Float] = {}

@@ -24,7 +24,7 @@ from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
-from drgs.integrator.types import SplatsIntegrator
+from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.registry import density_strategy
 from drgs.training.density.strategy import (
@@ -133,7 +133,7 @@ class Trainer:
             dataset.background,
             **integrator_settings(self.effects),
         )
-        self.integrator = cast(SplatsIntegrator, self.scene.integrator())
+        self.integrator = cast(SplatsPlugin, self.scene.integrator())
         self.params = mi.traverse(self.scene)
         self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
         self.optimizer = make_optimizer(
@@ -394,7 +394,7 @@ class Trainer:
             gaussians, scene = self.gaussians(), None
             if self.comm.is_root:
                 scene = make_scene(gaussians, self.config.model, self.dataset.background)
-                cast(SplatsIntegrator, scene.integrator()).sh_degree = self.integrator.sh_degree
+                cast(SplatsPlugin, scene.integrator()).sh_degree = self.integrator.sh_degree
             self._full_scene = self.iteration, scene
         return self._full_scene[1]
 

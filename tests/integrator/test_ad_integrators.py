@@ -77,7 +77,7 @@ def renders(kind: type[Config], thetas: Sequence[float]) -> list[np.ndarray]:
 
 @contextmanager
 def attached(kind: type[Config]) -> Iterator[tuple[mi.Float, mi.TensorXf]]:
-    """Theta, and a image that depends on it, whose derivative is that of :func:`images`."""
+    """Theta, and an image that depends on it, whose derivative is that of :func:`images`."""
     theta = mi.Float(0)
     dr.enable_grad(theta)
     with initialized(kind) as config:
@@ -152,7 +152,7 @@ def error_of_backward(kind, actual) -> float:
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_images_are_those_that_are_stored(name):
+def test_images_equal_the_stored_ones(name):
     """The second, which is as the first: nothing is left behind by one that it could show.
 
     Machines round differently, so that a light path or a splat's end may fall otherwise.
@@ -169,7 +169,7 @@ def test_images_are_those_that_are_stored(name):
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_images_that_are_a_percent_brighter_are_others(name):
+def test_images_one_percent_brighter_differ(name):
     expected = read_reference(name)
     _, differing = errors_of_image(1.01 * expected, expected)
     assert differing > 0.01

@@ -108,7 +108,7 @@ def test_any_filter_and_sampler_may_be_used(srgb_primitives, rfilter, samples, s
     np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=SAME)
 
 
-def test_one_sample_is_the_pixels_centre_in_the_image_and_the_rays_place_in_the_rest():
+def test_one_sample_is_at_the_pixel_centre_in_the_image_and_on_the_ray_in_aovs():
     scene = Scene()
     image = image_of(load(scene, AOV))
     assert np.array_equal(image[..., :6], image_of(load(scene)))
@@ -150,7 +150,7 @@ def refusal(loaded, **arguments) -> str:
     return last_line(caught.value)
 
 
-def test_derivatives_with_aovs_of_its_own_are_refused():
+def test_derivatives_with_own_aovs_are_refused():
     loaded = load(Scene(), AOV)
     params = mi.traverse(loaded)
     dr.enable_grad(params["integrator.integrator_0.means"])
@@ -174,7 +174,7 @@ MOVING = (*LENS, ("shutter_close", 1.0))
 
 
 @pytest.mark.parametrize("case", ["border", "moving", "batch"])
-def test_rays_that_are_not_those_of_a_film_are_refused(case):
+def test_rays_that_do_not_cover_a_film_are_refused(case):
     view, film = VIEWS[1], {}
     if case == "border":
         film = {"sample_border": True, "rfilter": "gaussian"}

@@ -96,7 +96,7 @@ def test_normals_and_features_are_composited_as_numbers(view, srgb_primitives):
     assert [c.name for c in film.bitmap().struct_()] == [*"RGBA", *names]
 
 
-def test_colors_are_as_without_them():
+def test_aovs_leave_colors_unchanged():
     scene = Scene()
     np.testing.assert_array_equal(
         image_of(with_features(scene))[..., :4], image_of(load(scene, ""))
@@ -134,7 +134,7 @@ def test_a_feature_of_ones_is_alpha():
     np.testing.assert_allclose(image[..., 4], image[..., 5], atol=2e-6)
 
 
-def test_a_feature_that_is_not_put_out_costs_nothing():
+def test_an_unused_feature_costs_nothing():
     scene = Scene()
     loaded = load(scene, "", feature_mine=mi.TensorXf(features_of(scene)))
     mi.render(loaded)

@@ -62,7 +62,7 @@ def test_a_default_that_is_not_rounded_is_the_default():
     assert chosen.non_default == {"alpha_max": 0.98, "extent": 3.0}
 
 
-def test_a_configuration_is_refused_that_single_precision_rounds_onto_a_limit(tmp_path):
+def test_a_value_that_float32_rounds_to_a_limit_is_refused(tmp_path):
     path = tmp_path / "x.yml"
     path.write_text("data: {path: lego}\nmodel: {alpha_max: 0.999999999}\n")
     with pytest.raises(UserError, match=r"model.alpha_max must be above 0 and below 1 in float32"):

@@ -132,7 +132,7 @@ def test_what_is_seen_past_the_splats_is_what_path_renders(emitter):
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_several_samples_are_each_before_their_own_part_of_the_environment(seed):
+def test_each_sample_has_its_own_background_radiance(seed):
     """Opaque splats hide it; elsewhere it is the environment that ``path`` sees at the same
     points."""
     sensor, gaussians = Camera().dictionary(), Scene(count=8, seed=1).gaussians
@@ -148,7 +148,7 @@ def test_several_samples_are_each_before_their_own_part_of_the_environment(seed)
 
 
 @pytest.mark.parametrize("camera", ["barrel"])
-def test_where_the_lens_model_ends_it_is_black(camera):
+def test_the_background_is_black_beyond_the_lens_model(camera):
     camera = CAMERAS[camera]
     sensor = camera.dictionary()
     loaded = load(sensor, integrator_of(gaussians_before(camera)), sky=EMITTERS["constant"]())
@@ -173,7 +173,7 @@ def test_hidden_emitters_leave_the_background():
             assert image[..., 3].min() < 0.1
 
 
-def test_emitters_that_surround_nothing_are_not_seen():
+def test_only_environment_emitters_are_seen():
     """A point light is no environment."""
     scene, sensor = Scene(), Camera().dictionary()
     light = {"type": "point", "intensity": 10.0}
@@ -200,7 +200,7 @@ def image_of_film(width, height) -> np.ndarray:
 
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
 @pytest.mark.parametrize("view", [VIEW, VIEWS[6], VIEWS[12], VIEWS[13]], ids=lambda v: v.name)
-def test_a_image_is_stretched_over_the_film_upright(view, srgb_primitives):
+def test_a_background_texture_is_stretched_over_the_film_upright(view, srgb_primitives):
     """A texel for each pixel of the whole film, of which a crop window shows a part."""
     camera = Camera(view)
     values = image_of_film(view.width, view.height)
@@ -214,7 +214,7 @@ def test_a_image_is_stretched_over_the_film_upright(view, srgb_primitives):
     np.testing.assert_allclose(image[..., :3], expected[..., :3], atol=2 * IMAGE)
 
 
-def test_a_image_of_another_size_is_interpolated():
+def test_a_background_texture_of_another_size_is_interpolated():
     """Bilinearly, between the middles of texels, as numpy does it."""
     values = texels(4, 5, seed=6)
     sensor = Camera().dictionary()
@@ -232,7 +232,7 @@ def test_a_image_of_another_size_is_interpolated():
     np.testing.assert_allclose(image[..., :3], expected, atol=IMAGE)
 
 
-def test_an_environment_is_before_a_image():
+def test_an_environment_replaces_a_background_texture():
     """Both are given: the environment is seen, unless it is hidden."""
     sensor, gaussians = Camera().dictionary(), Scene().gaussians
     settings = {"background": rendered(texels())}

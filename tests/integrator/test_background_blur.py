@@ -160,7 +160,7 @@ def test_motion_blurs_the_environment_as_it_does_the_splats(times):
     ],
     ids=["distortion", "blur", "rolling shutter"],
 )
-def test_what_is_ignored_is_ignored_behind_the_splats_as_well(camera, ignored):
+def test_ignored_effects_are_ignored_in_the_background(camera, ignored):
     gaussians = Scene().gaussians
     image, expected = (
         image_of(

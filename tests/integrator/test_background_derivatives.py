@@ -154,7 +154,7 @@ BACKGROUND = "integrator.background.data"
 @pytest.mark.parametrize(
     "way", [*TWICE, "batch", "surface", "surface of the same", "splats of the same"]
 )
-def test_gradients_reach_what_the_radiance_was_computed_from(way, kind):
+def test_gradients_reach_the_inputs_of_the_radiance(way, kind):
     """A factor of all of it, by central differences, from the same points of the emitters."""
     loaded, keys = factored(way, kind)
     start = {key: np.array(mi.traverse(loaded)[key]) for key in keys}
@@ -185,7 +185,7 @@ def test_gradients_reach_what_the_radiance_was_computed_from(way, kind):
     assert dr.grad(factor)[0] == pytest.approx((both[0] - both[1]) / (2 * step), rel=3e-3)
 
 
-def test_the_derivative_of_a_constant_radiance_is_what_passes_the_splats():
+def test_the_derivative_of_a_constant_radiance_is_the_transmittance():
     """Computed from the transmittance."""
     loaded, key = scene_with("constant")
     weights = weights_of(loaded)
@@ -199,7 +199,7 @@ def test_the_derivative_of_a_constant_radiance_is_what_passes_the_splats():
 
 
 @all_kinds
-def test_derivatives_of_the_gaussians_know_what_is_behind_them(kind):
+def test_derivatives_of_gaussians_include_the_background(kind):
     """The reference's gradients with respect to colour and transmittance are chained by hand."""
     scene = Scene()
     loaded, _ = scene_with(kind)

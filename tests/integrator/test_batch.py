@@ -77,7 +77,7 @@ def test_several_samples_are_those_of_the_whole_film():
     assert np.abs(sampled - center).mean() > difference.mean()
 
 
-def test_gradients_are_the_sums_of_those_of_each_alone():
+def test_gradients_of_a_batch_are_sums_over_its_sensors():
     weights = weights_of()
 
     def gradients(sensor, weights):
@@ -100,7 +100,7 @@ def test_gradients_are_the_sums_of_those_of_each_alone():
     assert bitwise(actual) == bitwise(gradients(batch(), weights))
 
 
-def test_the_gradient_of_a_sensor_is_that_of_its_own_part():
+def test_the_gradient_of_a_sensor_is_that_of_its_part_of_the_film():
     weights = weights_of()
     loaded = load(batch())
     params = mi.traverse(loaded)
@@ -119,7 +119,7 @@ def test_the_gradient_of_a_sensor_is_that_of_its_own_part():
         assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
 
 
-def test_a_sensor_may_stand_in_it_twice():
+def test_a_batch_may_contain_a_sensor_twice():
     """Its gradient is the sum of those of both parts."""
     weights, view = weights_of(), SENSORS[0]
     twice = mi.load_dict(view.sensor())

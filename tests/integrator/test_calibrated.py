@@ -172,7 +172,7 @@ def test_differentials_are_the_rays_of_the_neighbouring_pixels(sensor):
 
 
 @pytest.mark.parametrize("sensor", [*STILL, MOVING[3]], **by_name)
-def test_rays_are_as_long_as_what_is_seen(sensor):
+def test_rays_end_at_the_far_plane(sensor):
     """From depth ``near_clip`` to ``far_clip``: z, with a fisheye the distance."""
     near_view = replace(sensor.view, near_clip=0.5)
     loaded = replace(sensor, view=near_view).load(far_clip=8.0)
@@ -226,9 +226,7 @@ def test_rays_are_differentiable_in_the_calibration(sensor, name):
 
 @pytest.mark.parametrize("integrator", ["path", "prb"])
 @pytest.mark.parametrize("view", [VIEWS[1], VIEWS[12]], ids=lambda view: view.name)
-def test_integrators_that_trace_rays_see_through_it_what_they_see_through_perspective(
-    integrator, view
-):
+def test_path_traced_images_equal_those_of_perspective(integrator, view):
     """With the same samples: to rounding, and to pixels whose ray just misses or hits."""
     camera = view.camera
     focal, principal = (float(camera.fx),) * 2, (float(camera.cx), float(camera.cy))

@@ -146,7 +146,7 @@ def test_an_opencv_lens_without_coefficients_is_a_pinhole():
 
 
 @pytest.mark.parametrize("sensor", STILL, **by_name)
-def test_gradients_of_a_image_reach_the_calibration(sensor):
+def test_gradients_of_an_image_reach_the_calibration(sensor):
     """Against central differences in single precision; some slopes are clamped."""
     gaussians = splats_before(FILM, 1, 40, 0)
     # Nothing is cut: nothing jumps.
@@ -262,7 +262,7 @@ def test_wrong_values_are_refused(values, message):
     assert str(caught.value).strip().splitlines()[-1].removeprefix("drgs.core.errors.") == message
 
 
-def test_a_property_that_there_is_not_is_refused():
+def test_an_unknown_property_is_refused():
     message = (
         r"PluginError: calibrated: there is no parameter shutter_sample; did you mean shutter_s"
     )

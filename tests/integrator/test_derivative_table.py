@@ -62,13 +62,13 @@ def check(row, route):
 
 
 @pytest.mark.parametrize("row, route", CORE)
-def test_cells_are_what_is_found(row, route):
+def test_cells_equal_the_measured_errors(row, route):
     check(row, route)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row, route", [cell for cell in CELLS if cell not in CORE])
-def test_all_other_cells_are_what_is_found(row, route):
+def test_all_other_cells_equal_the_measured_errors(row, route):
     check(row, route)
 
 
@@ -81,12 +81,12 @@ def test_the_table_has_all_parameters_and_routes():
         assert empty == ([] if case.is_seen_alone else [ALONE])
 
 
-def test_only_poses_among_splats_that_surfaces_show_are_differentiated_in_part():
+def test_only_poses_with_light_of_splats_are_partly_differentiated():
     rows = {row for row, route in CELLS if TABLE[row][route] == IN_PART}
     assert rows == {"`to_world`, diffuse", "`to_world`, rough"}
 
 
-def test_an_object_that_others_see_moves():
+def test_poses_seen_by_other_surfaces_are_differentiated():
     """Along the rays that find it, which see it in the same solid angle."""
     to_world = identity().translate([0, 3, -3]).rotate([1, 0, 0], 45).scale(30)
     bsdf = {"type": "diffuse", "reflectance": rgb(0.7)}  # or Mitsuba would merge it with the panel

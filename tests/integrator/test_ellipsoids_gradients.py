@@ -296,7 +296,7 @@ MODULES = (
 )
 
 
-def test_without_such_shapes_or_a_place_nothing_of_this_is_imported_and_kernels_are_the_same(
+def test_scenes_without_shapes_or_to_world_import_no_gathering_and_keep_their_kernels(
     run_python,
 ):
     results = [

@@ -68,7 +68,7 @@ def test_an_opacity_of_one_is_the_largest_below_one():
     ],
     ids=str,
 )
-def test_what_cannot_be_seen_leaves_the_image_of_the_others(changes):
+def test_invisible_gaussians_leave_the_image_unchanged(changes):
     """With any least alpha."""
     scene = Held()
     others = {name: np.delete(values, SEEN, axis=0) for name, values in scene.held.items()}
@@ -82,7 +82,7 @@ def test_what_cannot_be_seen_leaves_the_image_of_the_others(changes):
             assert np.isfinite(rows).all() and (rows[SEEN] == 0).all() and rows.any()
 
 
-def test_the_sign_of_a_standard_deviation_means_nothing():
+def test_the_sign_of_a_standard_deviation_is_ignored():
     """Derivatives change theirs."""
     scene = Held()
     loaded = scene.load()
@@ -172,7 +172,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_shapes_without_what_is_needed_are_refused(case):
+def test_shapes_with_missing_attributes_are_refused(case):
     make, expected = REFUSED[case]
     scene = Held()
     assert expected in refusal(scene.load(shape=shape_of(make(scene.held))))
@@ -220,7 +220,7 @@ def test_own_coefficients_may_be_fewer_than_those_of_shapes_were():
     assert loaded.integrator().sh_degree == 2 and np.abs(after - before).max() > 1e-3
 
 
-def test_a_to_world_for_a_shape_that_is_not_there_is_refused():
+def test_a_to_world_for_an_unknown_shape_is_refused():
     settings = {"shapes_to_world_chair": transform()}
     assert refusal(Held().load(settings)) == (
         "splats: shapes_to_world_chair must end with the id of a shape of type ellipsoids or "

@@ -85,7 +85,7 @@ def without_panes(name) -> np.ndarray:
 @pytest.mark.parametrize("z", [2.0, 0.05, -1.5], ids=["before", "amid", "behind"])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("pane", PANES)
-def test_what_is_invisible_changes_no_image(pane, name, z):
+def test_invisible_surfaces_change_no_image(pane, name, z):
     objects, settings = SCENES[name]
     found = rendered(objects | {"pane": plane(z, PANES[pane])}, settings)
     expected = without_panes(name)

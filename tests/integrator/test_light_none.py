@@ -84,7 +84,7 @@ def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
 
 
 @pytest.mark.parametrize("objects", [dict, surfaces], ids=["splats alone", "splats and surfaces"])
-def test_none_is_what_is_not_said(objects):
+def test_light_is_none_by_default(objects):
     """The same kernels and bytes, also after another scene had light."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, objects())
@@ -97,7 +97,7 @@ def test_none_is_what_is_not_said(objects):
     assert kernels_and_bytes(tensors, objects(), light="none") == plain
 
 
-def test_without_surfaces_there_is_no_light_to_pass():
+def test_light_changes_nothing_without_surfaces():
     """The property makes no kernel of its own, and no difference."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, {})
@@ -108,7 +108,7 @@ def test_without_surfaces_there_is_no_light_to_pass():
     assert kernels_and_bytes(tensors, sky, light="rays") == kernels_and_bytes(tensors, sky)
 
 
-def test_a_nested_integrator_forgets_the_light_of_the_one_it_was_nested_in_before():
+def test_a_nested_integrator_drops_the_transport_of_its_last_outer_integrator():
     tensors, shared = gaussians(), mi.load_dict({"type": "splatpath"})
 
     def rendered(nested, **settings):

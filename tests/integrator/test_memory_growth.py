@@ -13,7 +13,7 @@ import drgs  # noqa: F401  (registers the plugin)
 pytestmark = pytest.mark.slow
 
 WIDTH, HEIGHT = 200, 150
-"""px: a image that is kept would take 0.5 MB, its frame 3 MB."""
+"""px: an image that is kept would take 0.5 MB, its frame 3 MB."""
 
 MEGABYTE = 1 << 20
 SCENE = Scene(count=2000)

@@ -42,5 +42,5 @@ def test_images_and_gradients_are_those_of_splats_at_its_defaults(ply, pixel_for
     assert results[0] == results[1]
 
 
-def test_it_is_one_page():
+def test_the_minimal_integrator_fits_one_page():
     assert len((REPOSITORY / "plugins" / "minimal.py").read_text().splitlines()) <= 120

@@ -190,7 +190,7 @@ def test_a_camera_that_goes_on_needs_no_new_kernels():
     assert kernels[2] == kernels[1]
 
 
-def test_flat_shapes_are_known_by_their_vertices():
+def test_flat_shapes_are_recognised_by_their_vertices():
     def plane(shape):
         return FlatMirror.from_shape(mi.load_dict(shape | {"bsdf": CONDUCTOR}))
 
@@ -212,9 +212,7 @@ def test_flat_shapes_are_known_by_their_vertices():
     ("bsdf", "has_delta", "is_specular"),
     [("plastic", True, False), ("dielectric", True, False), ("roughconductor", False, True)],
 )
-def test_what_is_reflected_elsewhere_is_no_business_of_the_mirrored_camera(
-    bsdf, has_delta, is_specular
-):
+def test_scattered_reflections_do_not_read_the_mirrored_image(bsdf, has_delta, is_specular):
     found = FlatMirror.from_shape(mi.load_dict(floor(bsdf={"type": bsdf})))
     assert (found.has_delta, found.is_specular) == (has_delta, is_specular)
     assert FlatMirror.from_shape(mi.load_dict(floor(bsdf={"type": "diffuse"}))) is None

@@ -186,7 +186,7 @@ CALLED_FOR = {
 
 
 @pytest.mark.parametrize(("sensor", "module"), CALLED_FOR.values(), ids=CALLED_FOR)
-def test_modules_are_missed_when_a_sensor_calls_for_them(run_python, sensor, module):
+def test_a_sensor_requires_its_module(run_python, sensor, module):
     """test_summary covers other sensors, and kernels without these modules."""
     result = run_python(RENDERING.format(blocked=module, sensor=sensor))
     assert result.returncode != 0 and f"drgs.{module}" in result.stderr, result.stderr

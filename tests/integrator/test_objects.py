@@ -146,7 +146,7 @@ def test_settings_of_rendering_are_refused_of_an_object(name):
         load(nested(lego={name: value}))
 
 
-def test_what_holds_no_gaussians_or_objects_of_its_own_is_refused():
+def test_an_object_without_gaussians_or_with_objects_is_refused():
     with pytest.raises(
         Exception,
         match=r"splats: lego is nested .* must be given Gaussians by filename, .* nothing",
@@ -168,7 +168,7 @@ def test_what_holds_no_gaussians_or_objects_of_its_own_is_refused():
         scene.integrator().render(scene)
 
 
-def test_files_that_say_different_things_are_refused_unless_the_integrator_decides(tmp_path):
+def test_files_with_different_headers_require_a_property(tmp_path):
     paths = {}
     for name, said in (("lego", {"low_pass": 0.1}), ("fox", None)):
         arrays = {n: getattr(MODELS[name], n).astype(np.float32) for n in PARAMETER_NAMES}

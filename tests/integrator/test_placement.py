@@ -303,7 +303,7 @@ def test_forward_and_backward_mode_are_transposed():
     assert np.sum(d_image * weights) == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
 
 
-def test_derivatives_reach_what_a_transform_was_computed_from():
+def test_derivatives_reach_the_inputs_of_a_transform():
     scene, model = scene_and_object()
     loaded = load(scene, model)
     params = mi.traverse(loaded)
@@ -342,7 +342,7 @@ def test_gaussians_that_leave_float32_are_refused():
         loaded.integrator().render(loaded)
 
 
-def test_gaussians_that_are_no_numbers_add_nothing_to_derivatives():
+def test_nan_gaussians_add_nothing_to_derivatives():
     scene, model = scene_and_object()
     means, shN = model.means.copy(), model.shN.copy()
     means[5], shN[6] = np.nan, np.inf

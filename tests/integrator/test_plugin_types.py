@@ -22,7 +22,7 @@ def splats():
     return mi.load_dict({"type": "splats", **{k: mi.TensorXf(v) for k, v in tensors.items()}})
 
 
-def test_errors_of_plugins_can_be_caught_by_what_they_are():
+def test_plugin_errors_have_their_types():
     """They are user errors, and Python's ValueError or TypeError."""
     assert issubclass(PluginError, UserError) and issubclass(UserError, ValueError)
     assert issubclass(PluginTypeError, PluginError) and issubclass(PluginTypeError, TypeError)
@@ -44,14 +44,14 @@ def test_a_degree_that_the_gaussians_lack_is_an_error_of_the_plugin():
         integrator.render(scene)
 
 
-def test_sensors_are_told_apart_by_what_they_can():
+def test_sensors_are_recognised_by_their_protocol():
     calibrated, perspective = (mi.load_dict({"type": t}) for t in ("calibrated", "perspective"))
     assert isinstance(calibrated, CameraSensor) and not isinstance(perspective, CameraSensor)
     batch = mi.load_dict({"type": "batch", "one": {"type": "perspective"}})
     assert is_batch(batch) and not is_batch(perspective) and not is_batch(calibrated)
 
 
-def test_the_integrator_splats_is_known_by_its_state():
+def test_the_integrator_splats_is_recognised_by_its_state():
     assert is_splats(splats()) and not is_splats(mi.load_dict({"type": "path"}))
 
 

@@ -78,7 +78,7 @@ def test_objects_without_a_probe_pass_no_splats():
     np.testing.assert_array_equal(probe, none)
 
 
-def test_what_a_probe_does_not_see_is_nothing_or_traced():
+def test_rays_without_a_probe_answer_meet_nothing_or_are_traced():
     """Splats in the ball hide all others from the probe, and none from its rays."""
     parts = [vars(around()), vars(around(count=400, distance=0.3, size=0.08))]
     splats = splatting.Gaussians(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
@@ -122,7 +122,7 @@ def test_probes_see_smoothed_gaussians():
     np.testing.assert_allclose(smoothed, render(wide, **settings), atol=1e-3)
 
 
-def test_objects_that_splats_are_close_to_are_named_once():
+def test_objects_too_close_to_splats_are_warned_of_once():
     """A splat is nearer to the middle than 1.25 radii; changes repeat no warning."""
     lines = []
 
@@ -150,7 +150,7 @@ def test_objects_that_splats_are_close_to_are_named_once():
         logger.remove_appender(appender)
 
 
-def test_what_cannot_have_a_probe_is_refused():
+def test_objects_that_cannot_have_a_probe_are_refused():
     def scene(**settings):
         return scene_of(around(4), light="probe", **settings, **mirror_ball(sky=SKY))
 

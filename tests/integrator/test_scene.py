@@ -122,7 +122,7 @@ def test_views_of_one_size_share_a_film():
         ThinPrismFisheye.from_coefficients(k1=0.1, sx1=0.01),
     ],
 )
-def test_what_mitsubas_sensors_cannot_express_is_a_calibrated_camera(lens):
+def test_cameras_beyond_mitsubas_sensors_are_calibrated(lens):
     view = replace(make_view(fx=30.0, fy=33.0), lens=lens)
     (sensor,) = make_sensors([view])
     camera = camera_of(sensor)
@@ -138,7 +138,7 @@ def test_what_mitsubas_sensors_cannot_express_is_a_calibrated_camera(lens):
     assert type(camera.lens) is (Pinhole if lens is None else type(lens))
 
 
-def test_pixels_that_are_nearly_square_move_by_less_than_said():
+def test_nearly_square_pixels_move_by_less_than_the_tolerance():
     view = make_view(fx=30.0, fy=30.01)
     (sensor,) = make_sensors([view])
     assert sensor.class_name() == "PerspectiveCamera"

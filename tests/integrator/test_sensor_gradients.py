@@ -459,7 +459,7 @@ def kernels_of(action) -> list:
 
 
 @pytest.mark.parametrize("name", ["perspective", "opencv", "rolling shutter"])
-def test_what_nobody_asks_for_is_not_computed(name, monkeypatch):
+def test_derivatives_of_detached_parameters_are_not_computed(name, monkeypatch):
     """Kernels of the Gaussians' derivatives are the same before and after a camera's were wanted;
     nothing is stored for each lane."""
     case, scene = CASES[name], clear_scene(name)

@@ -68,7 +68,7 @@ SKY = {"type": "constant"}
 
 
 @pytest.mark.parametrize(("height", "radius"), [(1.0, 1.0), (0.5, 0.2), (2.0, 6.0)])
-def test_a_disc_holds_off_its_part_of_the_sky(height, radius, monkeypatch):
+def test_a_disc_blocks_its_part_of_the_sky(height, radius, monkeypatch):
     """1 - sin^2 of half the angle under which it is seen (Lambert)."""
     monkeypatch.setattr(
         shadows, "EMITTER_SAMPLES", 512

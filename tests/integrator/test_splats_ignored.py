@@ -125,5 +125,5 @@ def test_a_plan_names_what_asked_for_each_effect():
     assert "  background: a constant colour (the integrator's background)\n" in defocused
     rendered = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))}
     blurred = plan_of(sensor_like(VIEWS[1], **moving()), background=rendered)
-    assert "  background: a image (the integrator's background)\n" in blurred
+    assert "  background: an image (the integrator's background)\n" in blurred
     assert "  motion: blurred (the sensor)\n" in blurred

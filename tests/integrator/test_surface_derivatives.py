@@ -210,13 +210,13 @@ def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
     assert nested.count == 1
 
 
-@pytest.mark.parametrize("use", ["a image", "a gradient", "a image with gradients"])
+@pytest.mark.parametrize("use", ["an image", "a gradient", "an image with gradients"])
 @pytest.mark.parametrize("with_shapes", [False, True])
 def test_a_scene_is_freed_when_nobody_holds_it(use, with_shapes):
     """Though its integrator keeps what it saw of it."""
     loaded = load(SCENE, sky=True, shapes={"blob": blob([0, 0, 0])} if with_shapes else {})
     params = mi.traverse(loaded)
-    if use != "a image":
+    if use != "an image":
         dr.enable_grad(params["integrator.means"], params[RADIANCE_KEY])
     image = mi.render(loaded, params)
     if use == "a gradient":

@@ -51,7 +51,7 @@ from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import load_rows
 
 AS_RAYS = {"projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0}
-"""The approximations of a image that shows what rays pass."""
+"""The approximations of an image that shows what rays pass."""
 
 MOST_ON_A_RAY = 64
 """Splats that a pixel may put in order, at most; fewer are on any ray of these scenes."""

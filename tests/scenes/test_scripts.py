@@ -27,7 +27,7 @@ def files_of_the_checkout():
 def photographs_in(folder):
     """In the place of what a script computes."""
     folder.mkdir(parents=True)
-    (folder / "target.png").write_text("a image")
+    (folder / "target.png").write_text("an image")
 
 
 @pytest.fixture

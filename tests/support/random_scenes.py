@@ -126,7 +126,7 @@ def point_at(camera, film, z) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Result:
-    """A image on black, and the gradients of sum(weights * planes)."""
+    """An image on black, and the gradients of sum(weights * planes)."""
 
     rendered: dict  # what reference.Image holds
     gradients: dict  # of the six parameters and means2d; visible

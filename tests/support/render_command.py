@@ -26,7 +26,7 @@ def run(*arguments):
     render.main([str(argument) for argument in arguments])
 
 
-# A image of 8 bits is within half a level of what was rendered; the renderer is within 1e-4.
+# An image of 8 bits is within half a level of what was rendered; the renderer is within 1e-4.
 EIGHT_BITS = 0.5 / 255 + 1e-4
 
 

@@ -50,7 +50,7 @@ def poses(count):
 
 
 def write_photographs(folder, names, **options):
-    """A image of each name; their poses."""
+    """An image of each name; their poses."""
     folder.mkdir(parents=True, exist_ok=True)
     textures = walls()
     found = poses(len(names))

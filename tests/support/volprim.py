@@ -335,9 +335,9 @@ def bound(gaussians, camera, covariance, excess=0.0) -> np.ndarray:
 
 
 def propagated(on_film, d_alpha, d_colors) -> np.ndarray:
-    """(H, W, 3): what errors of alphas (N, H, W) and colours (N, H, W, 3) make of a image.
+    """(H, W, 3): what errors of alphas (N, H, W) and colours (N, H, W, 3) make of an image.
 
-    A image is linear in each alpha, with the slope T (color - the image behind), which is at
+    An image is linear in each alpha, with the slope T (color - the image behind), which is at
     most the largest color; and the weight of a color is at most its alpha.
     """
     colors = np.maximum(on_film.color_by_mean, on_film.color_by_ray) + d_colors

@@ -20,7 +20,7 @@ from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
-from drgs.integrator.types import SplatsIntegrator
+from drgs.integrator.types import SplatsPlugin
 from drgs.training.views import TrainingView
 
 
@@ -32,7 +32,7 @@ class FitState:
     iterations_of_step: range
     begins_stage: bool  # whether the images have other sizes than in the step before
     rate_decay: float  # the means' learning rate, relative to the initial one
-    integrator: SplatsIntegrator  # renders the fit
+    integrator: SplatsPlugin  # renders the fit
     means: TensorXf  # (N, 3), world
     views: list[TrainingView]  # the training views, at the image size that is in use
     effects: Sequence[TrainingEffect]

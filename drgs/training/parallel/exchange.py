@@ -36,7 +36,7 @@ from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.sensor_render import accumulate_in_sensor
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.integrator.types import SplatsIntegrator
+from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
@@ -236,7 +236,7 @@ class ViewExchange:
     def __init__(
         self,
         comm: Communicator,
-        integrator: SplatsIntegrator,
+        integrator: SplatsPlugin,
         params: mi.SceneParameters,
         prefix: str,
         views_per_step: int,

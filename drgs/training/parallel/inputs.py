@@ -30,7 +30,7 @@ from drgs.datasets.fingerprint import Fingerprint, fingerprint_of
 from drgs.datasets.images import without_images
 from drgs.datasets.types import Dataset, Viewpoint
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.types import SplatsIntegrator
+from drgs.integrator.types import SplatsPlugin
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import own_views
 
@@ -126,7 +126,7 @@ def check_scene(
     files: for the message, the origin of ``cameras`` and ``background``, and of the ``model``.
     Called by all processes; returns when all have agreed.
     """
-    integrator = cast(SplatsIntegrator, scene.integrator())
+    integrator = cast(SplatsPlugin, scene.integrator())
     own = versions()
     parameters = {**mi.traverse(integrator), "smoothing": integrator.smoothing}
     for name, value in parameters.items():

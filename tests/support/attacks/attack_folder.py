@@ -83,7 +83,7 @@ def pose(angle: float) -> list[list[float]]:
 
 
 def noise(seed: int, channels: int) -> np.ndarray:
-    """A image of random bytes."""
+    """An image of random bytes."""
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, channels), np.uint8)
 
 

@@ -35,7 +35,7 @@ def refusal(scene, **arguments) -> str:
 
 @pytest.mark.parametrize("sampler", ["independent", "stratified", "orthogonal", "ldsampler"])
 @pytest.mark.parametrize("count", [0, 10**9])
-def test_counts_of_samples_that_cannot_be_taken_are_refused(sampler, count):
+def test_invalid_sample_counts_are_refused(sampler, count):
     """Mitsuba makes some samplers' 0 a number of their own; ``independent`` ended the process."""
     scene = load(SCENE.view.sensor(sampler=sampler, samples=count))
     taken = scene.sensors()[0].sampler().sample_count()
@@ -61,7 +61,7 @@ def test_counts_of_samples_that_cannot_be_taken_are_refused(sampler, count):
         (2**40, "at most 4,096 samples, got 1,099,511,627,776;"),
     ],
 )
-def test_samples_that_a_rendering_asks_for_are_refused_as_well(spp, message):
+def test_invalid_spp_of_a_rendering_is_refused(spp, message):
     assert message in refusal(load(), spp=spp)
 
 
@@ -78,7 +78,7 @@ def test_poses_of_a_shutter_count_as_samples():
 
 
 @pytest.mark.parametrize("surfaces", [False, True])
-def test_films_that_cannot_be_held_are_refused(surfaces):
+def test_films_too_large_for_memory_are_refused(surfaces):
     sensor = SCENE.view.sensor(width=1_000_000, height=1_000_000)
     objects = {"wall": WALL.shape(SCENE.view.camera)} if surfaces else {}
     integrator = SCENE.settings | tensors(SCENE.gaussians)
@@ -92,7 +92,7 @@ def test_films_that_cannot_be_held_are_refused(surfaces):
     )
 
 
-def test_memory_is_compared_with_what_there_is(monkeypatch):
+def test_available_memory_limits_images(monkeypatch):
     monkeypatch.setattr("drgs.core.memory.available_memory", lambda: 10**9)
     scene = load(SCENE.view.sensor(width=4000, height=4000))
     assert refusal(scene, spp=1) == (
@@ -104,9 +104,7 @@ def test_memory_is_compared_with_what_there_is(monkeypatch):
 
 
 @pytest.mark.parametrize(("available", "most"), [(2**50, 2**32 - 1), (2**33, 2**27)])
-def test_samples_of_surfaces_that_cannot_be_held_or_counted_are_refused(
-    monkeypatch, available, most
-):
+def test_nested_samples_too_many_for_memory_are_refused(monkeypatch, available, most):
     monkeypatch.setattr(checks, "available_memory", lambda: available)
     integrator = SCENE.settings | tensors(SCENE.gaussians) | {"nested_spp": 10**9}
     wall = WALL.shape(SCENE.view.camera)
@@ -132,7 +130,7 @@ def features(count):
     return mi.TensorXf(np.zeros((8, count), np.float32))
 
 
-def test_features_have_as_many_columns_as_can_be_compiled():
+def test_features_have_at_most_the_columns_of_a_kernel():
     """Only features that an AOV uses are compiled."""
     message = (
         r"splats: aovs can have at most 64 channels together, got 2,003 \(n 3, f 2,000\); render "
@@ -144,7 +142,7 @@ def test_features_have_as_many_columns_as_can_be_compiled():
     load(aovs="f:feature_x, a:alpha", feature_x=features(MAX_FEATURES))
 
 
-def test_features_do_not_grow_beyond_that_later():
+def test_updated_features_have_at_most_the_columns_of_a_kernel():
     params = mi.traverse(load(aovs="f:feature_x", feature_x=features(2)))
     params["integrator.feature_x"] = features(2000)
     with pytest.raises(ValueError, match="at most 64 channels together, got 2,000"):

@@ -10,7 +10,7 @@ from support.views import VIEWS, Scene, image_of, tensors
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
 
-SAID = {"antialiased": True, "low_pass": 0.1}
+HEADER = {"antialiased": True, "low_pass": 0.1}
 SCENE = Scene()
 
 
@@ -22,7 +22,7 @@ def variant():
 @pytest.fixture
 def file(tmp_path):
     """A file of Gaussians with these settings in its header."""
-    return saved(tmp_path / "model.ply", SAID)
+    return saved(tmp_path / "model.ply", HEADER)
 
 
 def saved(path, said):
@@ -37,14 +37,14 @@ def scene_of(gaussians, **settings):
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor()})
 
 
-def test_a_file_is_rendered_as_its_header_says(file):
+def test_a_file_is_rendered_with_the_approximations_of_its_header(file):
     by_file = image_of(scene_of({"filename": str(file)}))
-    given = image_of(scene_of(tensors(SCENE.gaussians), **SAID))
+    given = image_of(scene_of(tensors(SCENE.gaussians), **HEADER))
     plain = image_of(scene_of(tensors(SCENE.gaussians)))
     assert np.array_equal(by_file, given) and not np.array_equal(by_file, plain)
 
 
-def test_a_property_wins_and_leaves_the_others_as_the_file_says(file):
+def test_a_property_overrides_only_its_header_entry(file):
     by_file = image_of(scene_of({"filename": str(file)}, low_pass=0.3))
     given = image_of(scene_of(tensors(SCENE.gaussians), antialiased=True, low_pass=0.3))
     assert np.array_equal(by_file, given)
@@ -52,25 +52,25 @@ def test_a_property_wins_and_leaves_the_others_as_the_file_says(file):
     assert tuple(integrator.state.header) == ("antialiased",)
 
 
-def test_the_default_can_be_asked_for(file):
+def test_a_property_with_the_default_overrides_the_header(file):
     by_file = image_of(scene_of({"filename": str(file)}, low_pass=0.3, antialiased=False))
     assert np.array_equal(by_file, image_of(scene_of(tensors(SCENE.gaussians))))
 
 
-def test_gaussians_that_are_moved_are_rendered_as_the_file_says(file):
+def test_moved_gaussians_are_rendered_with_the_header(file):
     still = mi.ScalarTransform4f().translate([0, 0, 0])
     integrator = scene_of({"filename": str(file)}, to_world=still).integrator()
-    assert integrator.state.approximations.non_default == SAID
+    assert integrator.state.approximations.non_default == HEADER
 
 
-def test_the_summary_says_what_the_file_has_decided(file):
+def test_the_summary_lists_approximations_of_the_header(file):
     scene = scene_of({"filename": str(file)})
     lines = scene.integrator().summary(scene, *scene.sensors()).splitlines()
     assert (
         "  antialiasing: opacities compensated for the low-pass filter (as the file says)" in lines
     )
     assert "  approximations: low_pass = 0.1 (as the file says)" in lines
-    scene = scene_of({"filename": str(file)}, **SAID)
+    scene = scene_of({"filename": str(file)}, **HEADER)
     lines = scene.integrator().summary(scene, *scene.sensors()).splitlines()
     assert "  antialiasing: opacities compensated for the low-pass filter (antialiased)" in lines
     assert not any("file" in line for line in lines)
