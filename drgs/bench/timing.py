@@ -82,7 +82,10 @@ class StageClock:
 
 @contextmanager
 def stage_clock() -> Iterator[StageClock]:
-    """Run a clock that ends the renderer's stages; the caller ends the last one."""
+    """Run a clock that ends the renderer's stages.
+
+    The caller ends what precedes the first stage, and what follows the last.
+    """
     clock = StageClock()
 
     def wrap(function: Callable, before: str | None, after: str | None) -> Callable:

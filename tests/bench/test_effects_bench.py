@@ -78,7 +78,7 @@ def test_every_case_is_another_image(small):
         assert (np.abs(image - plain).max() < 1e-4) == same, key
 
 
-def test_a_image_is_never_reused(small):
+def test_an_image_is_never_reused(small):
     """Each is rendered: the second launches what the first did."""
     renderer = effects.CaseRenderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
     counts = [effects.operations(renderer) for _ in range(2)]

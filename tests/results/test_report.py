@@ -425,7 +425,7 @@ def test_text_from_outside_is_escaped(tmp_path, dataset, images, out):
     assert "<b>r_0" in "".join(page.text)
 
 
-def test_a_image_that_equals_its_photograph_is_infinitely_good(tmp_path, dataset, out):
+def test_an_image_that_equals_its_photograph_is_infinitely_good(tmp_path, dataset, out):
     equal = replace(dataset, test=dataset.test[:1])
     report.write_report(
         tmp_path / "report.html",

@@ -44,7 +44,7 @@ SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-
 NO_WEBGL = ("--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis")
 
 PATIENCE = 120.0
-"""Seconds until a browser that says nothing is given up: one of two busy cores."""
+"""Timeout of an unresponsive browser, seconds, on one of two busy cores."""
 
 SECOND_TO_END = 5.0
 

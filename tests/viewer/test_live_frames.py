@@ -1,4 +1,4 @@
-"""Images that somebody asks for: what they show, and with which approximations."""
+"""Frames for viewer clients: contents and approximations."""
 
 from dataclasses import replace
 

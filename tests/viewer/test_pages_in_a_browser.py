@@ -84,7 +84,7 @@ def wait_for_a_image(page) -> np.ndarray:
         rendered = 255 * page.rendered()
         return rendered[-20:, :20].min() > 250 and np.ptp(shown(rendered)) > 100
 
-    browsers.wait_until(is_there, "a image")
+    browsers.wait_until(is_there, "an image")
     return seen(page)
 
 
@@ -143,7 +143,7 @@ def test_a_fit_is_seen_paused_and_ended(tmp_path):
 
         page.open(address)
         page.wait_for(f"document.body.innerText.includes(' of {ENDLESS:,} iterations')")
-        browsers.wait_until(lambda: np.ptp(seen(page)) > 40, "a image")
+        browsers.wait_until(lambda: np.ptp(seen(page)) > 40, "an image")
         time.sleep(FADE_SECONDS)
         before = seen(page)
         page.drag((400, 500), (460, 470))
@@ -156,7 +156,7 @@ def test_a_fit_is_seen_paused_and_ended(tmp_path):
         held, still = iteration(), seen(page)
         page.drag((400, 500), (340, 530))
         browsers.wait_until(
-            lambda: np.abs(seen(page) - still).mean() > 3, lambda: "a image in the pause"
+            lambda: np.abs(seen(page) - still).mean() > 3, lambda: "an image in the pause"
         )
         assert iteration() == held
         page.click("Go on")

@@ -20,7 +20,7 @@ REQUEST = FrameRequest(ViewerCamera(np.eye(4), 40.0, 1.0), 800, 600)
 
 
 class Clock(SimpleNamespace):
-    """Seconds that pass when somebody says so."""
+    """A clock that the test advances, seconds."""
 
     now = 100.0
 
@@ -125,7 +125,7 @@ def test_what_changes_by_itself_is_rendered_again_after_a_while(clock):
     served(them, stage)
     clock.now += STILL_SECONDS
     served(them, stage)
-    clock.now += 4.7  # of a image that took 0.48 s
+    clock.now += 4.7  # of an image that took 0.48 s
     assert not served(them, stage)
     clock.now += 0.2
     assert served(them, stage)

@@ -1,4 +1,4 @@
-"""A fit that somebody watches: the same bytes, a pause, an early end; no browser is needed."""
+"""A fit with a viewer: the same bytes, a pause, an early end; no browser is needed."""
 
 import time
 
