@@ -190,7 +190,7 @@ def add_background(parser: argparse._ActionsContainer) -> None:
         "--background",
         nargs="+",
         metavar="COLOR",
-        help="white, black, R G B in 0..1, or a image's file (default: the configuration's; "
+        help="white, black, R G B in 0..1, or an image's file (default: the configuration's; "
         "without one, black)",
     )
 
@@ -429,7 +429,7 @@ def _check_cameras(args: argparse.Namespace) -> None:
     _check_options(args, used, place)
     if way == "split" and isinstance(parse_background(args.background), Path):
         raise UserError(
-            "--background: a image is not what the photographs were composited over; use it with "
+            "--background: an image is not what the photographs were composited over; use it with "
             "--orbit, --camera or --origin"
         )
 
@@ -473,7 +473,7 @@ def parse_background(words: Sequence[str] | None) -> Background | None:
         color = ()
     if len(color) != 3 or not all(0 <= value <= 1 for value in color):
         raise UserError(
-            "--background: must be white, black, three numbers in 0..1 or a image's file, got "
+            "--background: must be white, black, three numbers in 0..1 or an image's file, got "
             + one_line(" ".join(words), 60)
         )
     return color

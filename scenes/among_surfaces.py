@@ -86,7 +86,7 @@ def balls(means: np.ndarray, scale: float, opacities: np.ndarray, color: float) 
 
 
 def furnace(size: int, settings: dict, objects: dict, rounds: int = ROUNDS) -> tuple[float, float]:
-    """Mean over a image of the furnace, and its standard error by images of several seeds."""
+    """Mean over an image of the furnace, and its standard error by images of several seeds."""
     sky = {"sky": {"type": "constant", "radiance": WHITE}} if "background" not in settings else {}
     scene = load(white_cloud(), [0, 0, 4], size, settings, objects | sky)
     means = [np.mean(mi.render(scene, seed=seed)) for seed in range(rounds)]

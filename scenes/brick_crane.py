@@ -3,7 +3,7 @@
 Our own design, under the licence of this repository; no commercial set or data set was copied.
 
 Lengths are in studs, with x to the truck's front, y to its left and z up from the base plate's
-top. The numbers are where a part sits: read them beside a image.
+top. The numbers are where a part sits: read them beside an image.
 """
 
 from __future__ import annotations

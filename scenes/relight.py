@@ -1,10 +1,10 @@
-"""Find what a image of a fitted model in a path-traced scene was made of.
+"""Find what an image of a fitted model in a path-traced scene was made of.
 
     python scenes/relight.py out/lego --out out/relight
     python scenes/relight.py out/lego --case mirror --out out/mirror
 
 A model that was fitted to photographs (``python -m drgs.fit``) stands among path-traced surfaces:
-what a splat trainer cannot render, and Mitsuba alone cannot either. A image of this is taken, and
+what a splat trainer cannot render, and Mitsuba alone cannot either. An image of this is taken, and
 what it was made of is forgotten. From wrong values, gradient descent through the composited image
 finds the true ones. The unit of length is the model's radius.
 
@@ -178,7 +178,7 @@ def main() -> None:
 
 
 def relight(case: Case, model: Gaussians, size: int, iterations: int, out: Path) -> None:
-    """Forget what a image was made of, find it again, and write what happened."""
+    """Forget what an image was made of, find it again, and write what happened."""
     stage = case.stage.of(model, size)
     stage.show(case.true.variables())
     target = stage.rendered(seed=0, spp=TARGET_SPP)

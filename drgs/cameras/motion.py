@@ -70,7 +70,7 @@ class MotionBlur(Motion):
         return [self.pose(camera, (k + 0.5) / self.samples) for k in range(self.samples)]
 
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
-        raise ValueError("a camera that motion blurs has a image for each of its cameras_in_time")
+        raise ValueError("a camera that motion blurs has an image for each of its cameras_in_time")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The approximations that a image is made with, declared once.
+"""The approximations that an image is made with, declared once.
 
 :data:`DECLARED` lists them for the section ``model`` of a configuration (``drgs.config.schema``),
 the properties of the plugin ``splats`` (``drgs.integrator.properties``) and the test of that
@@ -129,7 +129,7 @@ def _declare(
 
 @dataclass(frozen=True)
 class Approximations:
-    """The approximations that a image is made with; the defaults are those of 3DGS.
+    """The approximations that an image is made with; the defaults are those of 3DGS.
 
     :data:`DECLARED` describes each, as does the section ``model`` of a configuration.
 

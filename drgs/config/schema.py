@@ -74,7 +74,7 @@ ColorField = Annotated[Color | None, PlainValidator(_color), PlainSerializer(_co
 PathField = Annotated[Path, Field(strict=False)]
 
 CameraRate = Annotated[float, Field(le=1)]
-"""The same: a radian, a scene's extent, a factor e of focal lengths, a image's size."""
+"""The same: a radian, a scene's extent, a factor e of focal lengths, an image's size."""
 
 Decay = Annotated[float, Field(ge=0, le=0.999999)]
 """A mean over a million steps; float32 knows few numbers between this and 1."""
@@ -136,8 +136,8 @@ class DataConfig(Section):
         SHUTTER_SAMPLES,
         ge=1,
         le=MAX_SHUTTER_SAMPLES,
-        description="Times at which a image is rendered that a moving camera with a global "
-        "shutter blurs; each takes as much memory and time as a image.",
+        description="Times at which an image is rendered that a moving camera with a global "
+        "shutter blurs; each takes as much memory and time as an image.",
     )
     ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
     ignore_depth: bool = Field(

@@ -50,8 +50,8 @@ COLOR_MIN = 0.0
 is clamped; at exactly this value it passes, so that black splats can learn."""
 
 SHUTTER_SAMPLES = 8
-"""Times at which a image is rendered that a moving camera blurs, the default of the sensor
-``calibrated``: each covers an eighth of the motion, and costs a image."""
+"""Times at which an image is rendered that a moving camera blurs, the default of the sensor
+``calibrated``: each covers an eighth of the motion, and costs an image."""
 
 MAX_SHUTTER_SAMPLES = 1000
 """Each time's image is kept for the derivatives: a thousand of the smallest film take 90 MB, a
@@ -82,7 +82,7 @@ MAX_COEFFICIENT = 1e6
 """A coefficient of distortion, in size: calibrations give less than 1e3."""
 
 MAX_FEATURES = 64
-"""Numbers that a image composites besides RGB, or instead of it: see
+"""Numbers that an image composites besides RGB, or instead of it: see
 :mod:`drgs.splatting.feature_groups`. The kernels of 64 and their derivatives compile in 8 s with
 AVX2, in either precision, once: Dr.Jit keeps them."""
 

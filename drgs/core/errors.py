@@ -95,7 +95,7 @@ def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> s
 def show_causes_last() -> None:
     """Print a user's error once more after the traceback of what was raised because of it.
 
-    Dr.Jit raises errors of a image, a loop or a frozen function again, as a RuntimeError whose
+    Dr.Jit raises errors of an image, a loop or a frozen function again, as a RuntimeError whose
     text is "see above", which may be pages away. In scripts and, where this is called from one, in
     notebooks.
     """

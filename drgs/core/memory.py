@@ -43,7 +43,7 @@ UNASKED_FILE_BYTES = 1 << 24
 """A file that takes less is read without asking: a fit reads hundreds of photographs."""
 
 UNASKED_BYTES = 1 << 28
-"""A image that needs less is rendered without asking what there is, which may take a millisecond:
+"""An image that needs less is rendered without asking what there is, which may take a millisecond:
 fits render hundreds in a second."""
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
@@ -124,7 +124,7 @@ def out_of_memory_reason(error: BaseException) -> str | None:
 
 
 def too_large_reason(width: int, height: int, channels: int = 3, samples: int = 1) -> str | None:
-    """Return why a image of ``width`` x ``height`` px cannot be rendered here; None: it can.
+    """Return why an image of ``width`` x ``height`` px cannot be rendered here; None: it can.
 
     channels: of the film, without alpha; samples: per pixel, times those of an open shutter.
     """

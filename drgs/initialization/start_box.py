@@ -182,7 +182,7 @@ def check_box(box: Box, dataset: Dataset) -> None:
     if looking < LEAST_LOOKING * len(views):
         reason = f"only {looking} of {len(views)} have it in the middle of their images"
     elif covered < LEAST_COVERED:
-        reason = f"it covers only {100 * covered:.2g} % of a image (the median)"
+        reason = f"it covers only {100 * covered:.2g} % of an image (the median)"
     else:
         return
     in_world = Box(box.center + dataset.origin, box.half_extent)

@@ -209,7 +209,7 @@ def read_pixels(path: Path) -> np.ndarray:
     with _open_image(path) as image:
         _check(path, image)  # before memory is allocated for it
         needed = image.width * image.height * PIXEL_BYTES
-        require_memory(path, needed, f"a image of {image.width} x {image.height} px")
+        require_memory(path, needed, f"an image of {image.width} x {image.height} px")
         # Pillow turns TIFFs, and no others.
         turn, decoded = _orientation(image) if image.format == "TIFF" else 1, image
         if image.mode not in ("RGBA", "LA") and _has_alpha(image):

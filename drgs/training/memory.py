@@ -215,7 +215,7 @@ def _refusal(
         f"memory: {who} needs about {readable(memory.required_bytes)} "
         f"({readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
         f"{readable(memory.gaussians)} for {part}{count:,} Gaussians, "
-        f"{readable(memory.splats + memory.pixels)} for a image of them), and may take "
+        f"{readable(memory.splats + memory.pixels)} for an image of them), and may take "
         f"{readable(usable)}, nine tenths of what is available; {advice}"
     )
 

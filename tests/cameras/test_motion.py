@@ -192,7 +192,7 @@ def small_scene(case, rng):
     )
 
 
-def test_small_splats_look_as_if_each_row_had_a_image_of_its_own():
+def test_small_splats_look_as_if_each_row_had_an_image_of_its_own():
     """While a row is read, splats move by up to V / H = 4.9 px / 40 = 0.12 px; d rows from its mean
     a splat is off by so much d. With a standard deviation of sigma = 0.74 px and more, low-pass
     included, and an opacity of 0.82, alpha is off by 0.12 d 0.82 exp(-1/2) / sigma exp(-d^2 / 2

@@ -63,7 +63,7 @@ def test_cornells_box_is_photographed_from_inside():
     for view in camera_placement.views_of(scene, settings):
         rendered = camera.image(view)
         assert lit_part(rendered) > 0.8
-        # Its front is open, and a image may look through it.
+        # Its front is open, and an image may look through it.
         assert (rendered[:, :, 3] > 0).mean() > 0.15
 
 

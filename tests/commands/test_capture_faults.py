@@ -64,7 +64,7 @@ def refused(outcome):
 
 
 def test_files_that_were_edited_since_are_kept(ball, captured, tmp_path):
-    """A mask in a frame, a image that was touched up; what is missing is made again."""
+    """A mask in a frame, an image that was touched up; what is missing is made again."""
     run(ball, tmp_path / "out")
     edited = ("transforms_train.json", "points3d.ply", "train/r_0.png")
     for name in edited:
@@ -180,7 +180,7 @@ def test_strange_notes_of_a_capture_are_refused_and_kept(ball, tmp_path, content
     assert contents(tmp_path) == {"capture.json": content.encode()}
 
 
-def test_a_image_of_another_size_among_the_captures_is_refused(ball, captured, tmp_path):
+def test_an_image_of_another_size_among_the_captures_is_refused(ball, captured, tmp_path):
     assert run(ball, tmp_path / "out").returncode == 0
     assert run(ball, tmp_path / "other", "--size", 5, 4).returncode == 0
     path = tmp_path / "out" / "train" / "r_1.png"

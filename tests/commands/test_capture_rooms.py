@@ -86,7 +86,7 @@ def test_it_ends_with_the_command_that_fits_its_result(inside):
 
 @pytest.mark.slow
 def test_a_fit_of_a_room_shows_the_room(cornell, tmp_path):
-    """On views that it has not seen; a image's mean colour alone is at 12 dB."""
+    """On views that it has not seen; an image's mean colour alone is at 12 dB."""
     larger = ["--views", 40, "--test-views", 8, "--size", 32, 32, "--spp", 64, "--points", 4000]
     outcome = run(cornell, tmp_path / "room", *larger)
     path, words = fitting_command(outcome)

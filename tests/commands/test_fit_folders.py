@@ -147,7 +147,7 @@ def test_results_that_were_changed_are_not_removed(ended):
     assert_fit_refused(*arguments, folder=ended, message="got history.csv; move")
 
 
-def test_a_image_of_the_users_in_the_way_of_a_fit_is_kept(stopped):
+def test_an_image_of_the_users_in_the_way_of_a_fit_is_kept(stopped):
     (stopped / "out" / "renders" / "test").mkdir(parents=True)
     (stopped / "out" / "renders" / "test" / "r_1.png").symlink_to(
         stopped / "data" / "test" / "r_1.png"

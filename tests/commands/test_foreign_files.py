@@ -47,7 +47,7 @@ def test_images_are_not_rendered_among_photographs(fitted, way):
         ("origin", "camera.png"),
     ],
 )
-def test_a_file_of_the_users_is_not_replaced_by_a_image(fitted, tmp_path, way, name):
+def test_a_file_of_the_users_is_not_replaced_by_an_image(fitted, tmp_path, way, name):
     out = tmp_path / "out"
     out.mkdir()
     (out / name).write_text("[]")

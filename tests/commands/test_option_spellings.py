@@ -57,7 +57,7 @@ def ball(tmp_path):
     return path
 
 
-def test_a_image_is_as_wide_and_high_and_sees_as_many_degrees_as_was_asked(ball, tmp_path):
+def test_an_image_is_as_wide_and_high_and_sees_as_many_degrees_as_was_asked(ball, tmp_path):
     out = tmp_path / "out"
     options = ["--views", 1, "--test-views", 0, "--spp", 1, "--points", 20]
     options += ["--size", 24, 12, "--fov", 60]

@@ -138,7 +138,7 @@ def test_values_of_the_configuration_can_be_set(fit, tmp_path):
     assert rendered(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)
 
 
-def test_a_image_equal_to_its_photograph_has_no_number_in_json():
+def test_an_image_equal_to_its_photograph_has_no_number_in_json():
     quality = {"psnr": float("inf"), "views": {"a": {"psnr": 3.5}}}
     assert render._replace_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
 

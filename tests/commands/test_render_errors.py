@@ -62,7 +62,7 @@ def fails(capsys, *arguments):
             ["--origin", "3", "0", "0", "--size", "0", "9"],
             "--size: must be a whole",
         ),
-        ("", ["--background", "pink"], "or a image's file, got pink"),
+        ("", ["--background", "pink"], "or an image's file, got pink"),
         ("", ["--background", "0", "0", "1.5"], "got 0 0 1.5"),
         ("", ["--camera", "nowhere.json", "--size", "8", "8"], "nowhere.json: cannot read"),
         ("", ["--data", "nowhere"], "data.path: there is no folder"),

@@ -67,7 +67,7 @@ def test_so_is_a_camera_of_a_file(model, tmp_path, width):
 
 
 def test_each_time_of_an_open_shutter_counts(photographs, model, tmp_path):
-    """A image that would fit once does not a thousand times; more times are refused."""
+    """An image that would fit once does not a thousand times; more times are refused."""
     path = cameras(tmp_path, camera_angle_x=0.7, w=800, h=800)
     values = json.loads(path.read_text())
     values["frames"][0]["transform_matrix_close"] = look_at((4, 0.1, 1), (0, 0, 0)).tolist()

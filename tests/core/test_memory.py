@@ -118,12 +118,12 @@ def eight_gigabytes(monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 8 * GB)
 
 
-def test_a_image_that_fits_is_not_refused(eight_gigabytes):
+def test_an_image_that_fits_is_not_refused(eight_gigabytes):
     assert memory.too_large_reason(400, 400) is None
     assert memory.too_large_reason(4000, 5000) is None
 
 
-def test_a_image_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
+def test_an_image_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
     needed = 20_000**2 * memory.IMAGE_BYTES / GB
     assert memory.too_large_reason(20_000, 20_000) == (
         f"20000 x 20000 px need about {needed:g} GB of memory, of which 8 GB are available; at "

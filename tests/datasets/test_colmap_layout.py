@@ -397,7 +397,7 @@ def test_folders_may_be_the_splits(tmp_path):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_image_that_is_not_there_is_left_out_unless_most_are(tmp_path):
+def test_an_image_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images" / "b.jpg").unlink()
     dataset, notes = load_noting(tmp_path)
@@ -410,7 +410,7 @@ def test_a_image_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     assert message.endswith("; not there: 3 of 4 photographs")
 
 
-def test_a_image_of_another_shape_is_refused(tmp_path):
+def test_an_image_of_another_shape_is_refused(tmp_path):
     write_dataset(tmp_path)
     write_images(tmp_path / "images", ["b.jpg"], (480, 640))
     assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
@@ -429,7 +429,7 @@ def test_scaled_images_are_told_from_cropped_ones(original):
     assert is_scaled(original, original) and not is_scaled((width, height - 1), original)
 
 
-def test_a_image_that_was_turned_since_is_turned_as_exif_says(tmp_path):
+def test_an_image_that_was_turned_since_is_turned_as_exif_says(tmp_path):
     """COLMAP reads images as they are stored: where the stored size is the camera's, it is right.
 
     Where another program has turned what COLMAP saw, EXIF says how it is turned back.
@@ -445,7 +445,7 @@ def test_a_image_that_was_turned_since_is_turned_as_exif_says(tmp_path):
     assert np.asarray(view.image).shape == (480, 640, 3)
 
 
-def test_a_image_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
+def test_an_image_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
     """Its size does not tell, but COLMAP turns nothing."""
     pycolmap = pytest.importorskip("pycolmap")
     write_dataset(tmp_path)

@@ -177,7 +177,7 @@ def test_a_matrix_is_rigid_to_1e_4(blender, shear, is_accepted):
         assert "must be rigid (rotation, translation, row 0 0 0 1) to 0.0001" in refusal(blender[0])
 
 
-def test_a_image_without_alpha_is_refused(blender):
+def test_an_image_without_alpha_is_refused(blender):
     path = blender[0] / "val" / "r_2.png"
     iio.imwrite(path, np.zeros((4, 6, 3), np.uint8))
     assert refusal(blender[0]) == (
@@ -186,7 +186,7 @@ def test_a_image_without_alpha_is_refused(blender):
     )
 
 
-def test_a_image_of_another_size_is_refused(blender):
+def test_an_image_of_another_size_is_refused(blender):
     path = blender[0] / "train" / "r_2.png"
     iio.imwrite(path, np.zeros((6, 4, 4), np.uint8))
     assert refusal(blender[0]) == (
@@ -212,7 +212,7 @@ def test_a_missing_image_is_left_out_and_named(blender):
 
 def test_a_broken_image_is_named(blender):
     broken = blender[0] / "train" / "r_1.png"
-    broken.write_bytes(b"not a image")
+    broken.write_bytes(b"not an image")
     assert refusal(blender[0]).startswith(f"{broken}: cannot read the image: ")
 
 

@@ -88,7 +88,7 @@ def test_a_smaller_mask_counts_pixels_all_of_which_count(photographs):
 
 
 @pytest.mark.parametrize("kind", ["mask", "depth"])
-def test_a_image_of_another_size_than_the_photograph_is_refused(photographs, kind):
+def test_an_image_of_another_size_than_the_photograph_is_refused(photographs, kind):
     key = {"mask": "mask_path", "depth": "depth_file_path"}[kind]
     iio.imwrite(photographs / "other.png", np.ones((4, 8), np.uint16))
     give(photographs, **{key: "other.png"})
@@ -208,7 +208,7 @@ STEPS = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
     ],
     ids=["default", "top", "frame"],
 )
-def test_depths_of_a_image_are_in_steps_of_a_unit(photographs, place, values, unit):
+def test_depths_of_an_image_are_in_steps_of_a_unit(photographs, place, values, unit):
     iio.imwrite(photographs / "depth.png", STEPS)
     give(photographs, depth_file_path="depth.png")
     if place == "top":
@@ -294,7 +294,7 @@ def test_an_array_that_holds_no_depths_is_refused(photographs, write, message):
     [(np.full((6, 8), 9, np.uint8), "L"), (np.full((6, 8, 3), 9, np.uint8), "RGB")],
     ids=["8 bits", "colours"],
 )
-def test_a_image_of_depths_has_16_bits(photographs, pixels, mode):
+def test_an_image_of_depths_has_16_bits(photographs, pixels, mode):
     """Numbers of an image of 8 bits would be read as other depths."""
     iio.imwrite(photographs / "depth.png", pixels)
     give(photographs, depth_file_path="depth.png")

@@ -69,7 +69,7 @@ def test_a_point_does_not_get_the_colour_of_what_hides_it():
     assert (colors[COUNT:, 0] > colors[COUNT:, 1]).mean() > 0.99
 
 
-def test_a_image_that_shows_something_else_does_not_matter(ball):
+def test_an_image_that_shows_something_else_does_not_matter(ball):
     points, spacing = on_the_ball()
     wrong = replace(ball[0], image=np.zeros_like(ball[0].image), alpha=np.ones_like(ball[0].alpha))
     colors = colors_from_images(points, spacing, [wrong, *ball[1:], *ball[1:]], WHITE)

@@ -68,7 +68,7 @@ def test_a_box_at_the_edge_of_the_images_is_refused():
 
 def test_a_box_that_hardly_shows_in_the_images_is_refused():
     views = views_from(AROUND, scale=100)
-    assert "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of a image (the " in (
+    assert "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of an image (the " in (
         refusal(views, half_extent=1.3)
     )
 

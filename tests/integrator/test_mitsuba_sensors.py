@@ -98,7 +98,7 @@ def test_an_orthographic_image_is_that_of_the_reference(factors):
     assert image[..., 3].max() > 0.8
 
 
-def test_a_image_through_a_thin_lens_is_that_of_the_reference():
+def test_an_image_through_a_thin_lens_is_that_of_the_reference():
     view = View("", 53, 41, crop=WINDOW)
     sensor = Calibrated("thin lens", view=view)
     camera, defocus = replace(view.camera, near=0.01), ThinLens(0.125, 3.0)

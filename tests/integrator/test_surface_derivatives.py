@@ -288,7 +288,7 @@ def test_a_wall_that_has_moved_is_seen_where_it_is():
     np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, wall=Wall(z=2.9))))
 
 
-def test_a_image_in_between_does_not_change_the_gradients():
+def test_an_image_in_between_does_not_change_the_gradients():
     scene, weights = apart(SCENE), weights_of(SCENE)
     loaded = load(scene)
     expected = gradients_of(loaded, weights, ["means"])["means"]

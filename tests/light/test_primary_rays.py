@@ -161,7 +161,7 @@ def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
 
 
 @some_views
-def test_a_image_of_the_plugin_shows_what_the_sensors_rays_pass(view):
+def test_an_image_of_the_plugin_shows_what_the_sensors_rays_pass(view):
     """Both against the reference."""
     problem = Problem.of(view)
     expected, kept = problem.planes_of_reference(MARKED[FLOAT32])

@@ -346,7 +346,7 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
         Image.new("RGB", (8, 8)).save(tmp_path / "images" / name, format="PNG")
     images, names = photographs_in(tmp_path)
     assert images == tmp_path / "images" and names == ["1.JPG", "2.png", "10.png", "b/3.png"]
-    (tmp_path / "images" / "10.png").write_bytes(b"not a image")
+    (tmp_path / "images" / "10.png").write_bytes(b"not an image")
     with pytest.raises(UserError, match=r"10\.png: cannot read the image"):
         photographs_in(tmp_path)
 

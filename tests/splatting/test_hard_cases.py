@@ -1,4 +1,4 @@
-"""Hard inputs stay finite and as accurate as float32 can be: a image and gradients for each.
+"""Hard inputs stay finite and as accurate as float32 can be: an image and gradients for each.
 
 Every family is rendered and differentiated in float64 and in float32 and compared with the
 float64 reference (whose analytic gradients are compared with central differences in

@@ -77,7 +77,7 @@ def seen(page) -> np.ndarray:
     return shown(255 * page.rendered())
 
 
-def wait_for_a_image(page) -> np.ndarray:
+def wait_for_an_image(page) -> np.ndarray:
     """Splats on white, once the page has ceased to fade in."""
 
     def is_there() -> bool:
@@ -116,7 +116,7 @@ def test_gaussians_are_seen_as_they_are_and_turn_under_the_mouse(fit, size, tmp_
         browsers.a_page(width, height) as page,
     ):
         page.open(address)
-        wait_for_a_image(page)
+        wait_for_an_image(page)
         page.wait_for("/\\d+ ms for \\d+×\\d+/.test(document.body.innerText)")
         expected = shown(expected_view(fit, width, height))
         # JPEG at a quality of 92 is within one or two of 255, half a pixel more at edges.
