@@ -73,16 +73,20 @@ class Part(Protocol):
     @property
     def values(self) -> ParameterArrays:
         """Stored arrays by name, held so that their indices are not reused."""
+        ...
 
     @property
     def fixed_inputs(self) -> object:
         """Other dependencies of the conversion, compared by ==."""
+        ...
 
     def gaussians(self) -> Gaussians:
         """Return the raw parameters, differentiable with respect to ``values``."""
+        ...
 
     def detach(self) -> Part:
         """Return the same conversion of detached values."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
