@@ -20,9 +20,7 @@ from drgs.core.types import Bool, Float
 
 Ray = TypeVar("Ray", bound="mi.Ray3f")
 
-MAX_INVISIBLE_OPACITY = 1e-6
-"""Largest opacity of an invisible surface; rounding leaves up to 2e-7 where there is none."""
-
+MAX_INVISIBLE_OPACITY = 1e-6  # rounding leaves up to 2e-7 where surfaces are invisible
 UNBOUNDED_DEPTH = 0xFFFFFFFF  # ``max_depth`` of Mitsuba's integrators where paths have no limit
 
 
