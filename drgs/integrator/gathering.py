@@ -388,10 +388,7 @@ def _columns_of(tensor: mi.TensorXf) -> list[Float]:
 
 
 ELLIPSOID_DATA_WIDTH = 10  # numbers per row: centre, standard deviations, quaternion xyzw
-OPACITY_RANGE = (
-    2.0**-64,
-    1 - 2.0**-24,
-)  # invisible, with a float32 reciprocal; the float32 below 1
+OPACITY_RANGE = (2.0**-64, 1 - 2.0**-24)  # invisible, its reciprocal fits float32; below 1
 TRANSPARENT_LOGIT = -1e4  # logit with a sigmoid of exactly zero
 
 
