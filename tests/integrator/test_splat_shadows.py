@@ -70,7 +70,9 @@ SKY = {"type": "constant"}
 @pytest.mark.parametrize(("height", "radius"), [(1.0, 1.0), (0.5, 0.2), (2.0, 6.0)])
 def test_a_disc_blocks_its_part_of_the_sky(height, radius, monkeypatch):
     """1 - sin^2 of half the angle under which it is seen (Lambert)."""
-    monkeypatch.setattr(shadows, "SAMPLES", 512)  # the quotient of few is biased by a hundredth
+    monkeypatch.setattr(
+        shadows, "EMITTER_SAMPLES", 512
+    )  # the quotient of few is biased by a hundredth
     means = np.random.default_rng(1).normal(0, 0.01, (150, 3)) * [1, 1, 0.01]
     factor, higher = factors(
         scene_of(discs(means), "lid", lid=disc(height, radius), sky=SKY, floor=disc(-0.05, 50.0))
