@@ -362,10 +362,9 @@ def _reduce_depth(integrator: Any, count: int) -> Iterator[None]:
 
     Windows are no bounces for a :class:`TransportIntegrator`.
     """
-    depth = UNBOUNDED_DEPTH
-    if not isinstance(integrator, TransportIntegrator):
-        depth = getattr(integrator, "max_depth", None)
-    if not isinstance(depth, int) or depth >= UNBOUNDED_DEPTH:
+    depth = getattr(integrator, "max_depth", UNBOUNDED_DEPTH)
+    is_bounded = isinstance(depth, int) and depth < UNBOUNDED_DEPTH
+    if isinstance(integrator, TransportIntegrator) or not is_bounded:
         yield
         return
     integrator.max_depth = max(depth - count, 0)
