@@ -136,10 +136,7 @@ def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) ->
 
 
 PIXELS_PER_PASS = 1 << 17  # most pixels in a pass of several samples: larger launches gain nothing
-
-SAMPLES_PER_KERNEL = 16
-"""Samples per pixel after which a box filter's sums are evaluated: compile time is superlinear.
-Other filters evaluate each pass by itself."""
+SAMPLES_PER_KERNEL = 16  # of a box filter, between evaluations: compile time is superlinear
 
 
 def split_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[SamplePoints, ...]:

@@ -73,16 +73,20 @@ class Part(Protocol):
     @property
     def values(self) -> ParameterArrays:
         """Stored arrays by name, held so that their indices are not reused."""
+        ...
 
     @property
     def fixed_inputs(self) -> object:
         """Other dependencies of the conversion, compared by ==."""
+        ...
 
     def gaussians(self) -> Gaussians:
         """Return the raw parameters, differentiable with respect to ``values``."""
+        ...
 
     def detach(self) -> Part:
         """Return the same conversion of detached values."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,10 +388,7 @@ def _columns_of(tensor: mi.TensorXf) -> list[Float]:
 
 
 ELLIPSOID_DATA_WIDTH = 10  # numbers per row: centre, standard deviations, quaternion xyzw
-
-OPACITY_RANGE = (2.0**-64, 1 - 2.0**-24)
-"""An invisible opacity, which has a reciprocal in float32; the largest float32 below 1."""
-
+OPACITY_RANGE = (2.0**-64, 1 - 2.0**-24)  # invisible, its reciprocal fits float32; below 1
 TRANSPARENT_LOGIT = -1e4  # logit with a sigmoid of exactly zero
 
 

@@ -40,15 +40,9 @@ BORDER_TEXELS = 8  # texels around an image: filters of the film reach beyond it
 MAX_RELATIVE_DEPARTURE = 1e-5  # of vertices from the plane of a flat shape, relative to its size
 MAX_ROUNDING_DEPARTURE = 1e-6  # the same, relative to the coordinates: both are allowed
 MAX_RAY_OFFSET = 1e-3  # distance between a ray and the camera's, relative to that from the camera
-
-MAX_ROUNDING_OFFSET = 2e-4
-"""The same, relative to the coordinates: twice as far as Mitsuba starts rays off a surface."""
-
+MAX_ROUNDING_OFFSET = 2e-4  # the same, relative to coordinates: twice the offset of Mitsuba's rays
 MIN_TEXEL_WEIGHT = 1e-3  # smallest weight, of 1, of the texels around a ray that end where it does
-
-MAX_END_DISTANCES = (0.1, 0.01)
-"""Largest distance between equal ends of rays, relative to their length from the mirror on, and
-from the camera to the mirror: the sum is allowed."""
+MAX_END_DISTANCES = (0.1, 0.01)  # of equal ends, relative to the lengths from and to the mirror
 
 
 @dataclass(frozen=True)

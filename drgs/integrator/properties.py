@@ -223,7 +223,8 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
         gaussians = replace(_gaussians_of_tensors(props, given), features=features)
     else:
         shapes = [(0, 3), (0, 4), (0, 3), (0,), (0, 1, 3), (0, 0, 3)]
-        return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes)).to(mi.TensorXf)
+        means, quats, log_scales, logits, sh0, shN = (np.zeros(s, np.float32) for s in shapes)
+        return Gaussians(means, quats, log_scales, logits, sh0, shN).to(mi.TensorXf)
     check_shapes(gaussians)
     return gaussians
 

@@ -20,9 +20,7 @@ from drgs.core.types import Bool, Float
 
 Ray = TypeVar("Ray", bound="mi.Ray3f")
 
-MAX_INVISIBLE_OPACITY = 1e-6
-"""Largest opacity of an invisible surface; rounding leaves up to 2e-7 where there is none."""
-
+MAX_INVISIBLE_OPACITY = 1e-6  # rounding leaves up to 2e-7 where surfaces are invisible
 UNBOUNDED_DEPTH = 0xFFFFFFFF  # ``max_depth`` of Mitsuba's integrators where paths have no limit
 
 
@@ -197,9 +195,11 @@ class SplatTransport(Protocol):
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
         """Return linear radiance and transmittance of segments; sample: in 0..1."""
+        ...
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """Return the transmittance of the splats along segments, or an estimate of it."""
+        ...
 
 
 @runtime_checkable

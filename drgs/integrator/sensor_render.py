@@ -336,9 +336,7 @@ def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Came
     return cameras_in_time(without_effects(state.make(state), ignored))
 
 
-LENS_POINTS = 16
-"""Fixed sample points of an aperture. A small light that is much brighter than its surroundings
-is seen as this many images of itself."""
+LENS_POINTS = 16  # fixed points of an aperture; a small, bright light is seen as this many
 
 
 def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f) -> mi.Color3f:

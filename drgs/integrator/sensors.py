@@ -51,12 +51,15 @@ class CameraSensor(Protocol):
 
     def camera_parameters(self) -> list[str]:
         """Return the parameters that the camera depends on, named as by ``mi.traverse``."""
+        ...
 
     def camera_from_state(self, state: SensorState) -> Camera:
         """Return the camera with these values of its parameters; OpenCV axes, px."""
+        ...
 
     def num_poses(self) -> int:
         """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
+        ...
 
     def near_clip(self) -> float: ...
 

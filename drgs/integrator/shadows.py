@@ -35,10 +35,7 @@ GAMMA = 2.2  # exponent of radiance as a function of display values
 MIN_SHADOW_TRANSMITTANCE = 1 / 64  # smallest transmittance of splats
 EMITTER_SAMPLES = 64  # samples of the scene's emitters for each splat; a pixel averages many splats
 MIN_SHADED_SHARE = 1 / 64  # least share of a splat's unoccluded light that objects block
-
-SHADOW_OFFSET_STDS = 3.0
-"""Standard deviations along a splat's shortest axis from its mean to the shadow ray's start, so
-that its own alpha does not count."""
+SHADOW_OFFSET_STDS = 3.0  # along the shortest axis: a splat's own alpha does not count
 
 
 def shade(splats: SplatsState, scene: mi.Scene) -> None:

@@ -362,7 +362,7 @@ def _reduce_depth(integrator: Any, count: int) -> Iterator[None]:
 
     Windows are no bounces for a :class:`TransportIntegrator`.
     """
-    depth = getattr(integrator, "max_depth", None)
+    depth = getattr(integrator, "max_depth", UNBOUNDED_DEPTH)
     is_bounded = isinstance(depth, int) and depth < UNBOUNDED_DEPTH
     if isinstance(integrator, TransportIntegrator) or not is_bounded:
         yield
