@@ -35,23 +35,19 @@ from drgs.splatting.rendering import (
     render,
 )
 
-Array = np.ndarray | TensorXf
-"""Arrays of the caller: numpy arrays, or tensors of Dr.Jit."""
+Array = np.ndarray | TensorXf  # arrays of the caller: numpy arrays, or tensors of Dr.Jit
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 
-LEAST_ALPHA = 1e-10
-"""Smallest divisor of expected depths, as in gsplat."""
+LEAST_ALPHA = 1e-10  # smallest divisor of expected depths, as in gsplat
 
-MAX_SKEW = 1e-6
-"""Rounding, relative to the largest number in K, where a pinhole without skew has 0."""
+MAX_SKEW = 1e-6  # rounding, relative to the largest number in K, where a pinhole without skew has 0
 
 LEAST_SCALE = 1e-18
 """World units: a smaller standard deviation is taken as this one, whose square float32 holds."""
 
-OPAQUE_LOGIT = 100.0
-"""Its sigmoid is 1 in float64: the opacity is then what it is multiplied by."""
+OPAQUE_LOGIT = 100.0  # its sigmoid is 1 in float64: the opacity is then what it is multiplied by
 
 MITSUBA_CAMERAS = (
     "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render takes "
@@ -347,20 +343,17 @@ class _Planes(dr.CustomOp):
     def eval(
         self, views: list[_View], inputs: dict[str, TensorXf]
     ) -> tuple[list[list[Float]], list[Float]]:
-        """Return what the views have rendered from ``inputs``, detached."""
         self.views, self.inputs = views, inputs
         planes = [view.frame.planes() for view in views]
         dr.eval(planes)  # or storing them would run the kernels once for each
         return planes, self._entries(inputs)
 
     def forward(self) -> None:
-        """Propagate tangents of the inputs."""
         directions = cast(dict[str, TensorXf], self.grad_in("inputs"))
         tangents = [view.tangents(directions) for view in self.views]
         self.set_grad_out((tangents, self._entries(directions)))
 
     def backward(self) -> None:
-        """Propagate derivatives to the inputs."""
         grad_out: Any = self.grad_out()  # as of :meth:`eval`
         all_d_planes, d_backgrounds = grad_out
         found: dict[str, list] = {name: [] for name in self.inputs}
@@ -388,7 +381,6 @@ class _Planes(dr.CustomOp):
         return [dr.gather(type(flat), flat, place) for place in places]
 
     def name(self) -> str:
-        """Return the name for Dr.Jit."""
         return "rasterization"
 
 

@@ -148,7 +148,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.state.projection = stage
 
     def aov_names(self) -> list[str]:
-        """Return the names of the channels besides colour and alpha."""
         return self.state.aov_names()
 
     def to_string(self) -> str:

@@ -79,11 +79,9 @@ MOST_ECCENTRIC = 0.99
 long as wide, whose size is known to 1e-5 in single precision. The same for t h, the share of the
 way to the camera."""
 
-_UNBOUNDED_OUTLINE = 1e-12
-"""1 / px: U of an outline that holds every film."""
+_UNBOUNDED_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
 
-LARGEST_EXPONENT = 1e4
-"""2^-1e4 is 0 in either precision."""
+LARGEST_EXPONENT = 1e4  # 2^-1e4 is 0 in either precision
 
 
 def exact_shape(

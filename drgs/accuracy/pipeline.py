@@ -15,8 +15,7 @@ from drgs.splatting.projection import (
 )
 from drgs.splatting.rendering import Feature, Pipeline, color_features
 
-LEAST_STOP = 1e-30
-"""Stop where none is set: past it float32 has no transmittance to go back from."""
+LEAST_STOP = 1e-30  # stop where none is set: past it float32 has no transmittance to go back from
 
 
 def pipeline_of(

@@ -37,8 +37,7 @@ CENTER_WEIGHT = 2.0
 """Weight of the mean in the covariance, lambda / (n + lambda) + 1 - alpha^2 + beta; its weight in
 the mean of the points is 0."""
 
-SIGMA_POINT_WEIGHT = 1 / 6
-"""Weight of each other point, in both."""
+SIGMA_POINT_WEIGHT = 1 / 6  # weight of each other point, in both
 
 MIN_RELATIVE_DEPTH = 1 / 3
 """Part of the mean's depth: where a point would be nearer, a Gaussian has no mean or covariance on

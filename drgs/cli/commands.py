@@ -25,11 +25,9 @@ from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.processes import end_job_on_error, process_count, root_output_only
 from drgs.core.registry import reporting_extensions
 
-MAX_ERROR = 500
-"""Characters of what is wrong with a command line, which may quote all of it."""
+MAX_ERROR = 500  # characters of what is wrong with a command line, which may quote all of it
 
-MAX_PORT = 65535
-"""Largest port of TCP."""
+MAX_PORT = 65535  # largest port of TCP
 
 
 class Subcommand(NamedTuple):

@@ -25,11 +25,9 @@ USER_ERROR_STATUS = 2
 INTERRUPTED_STATUS = 130
 """Exit status of a command that was stopped by Ctrl-C: 128 + SIGINT, as shells report it."""
 
-BROKEN_PIPE_STATUS = 141
-"""The same for SIGPIPE."""
+BROKEN_PIPE_STATUS = 141  # the same for SIGPIPE
 
-TERMINATED_STATUS = 143
-"""The same for SIGTERM, as ``kill``, ``timeout`` and batch systems send it."""
+TERMINATED_STATUS = 143  # the same for SIGTERM, as ``kill``, ``timeout`` and batch systems send it
 
 MAX_ERROR_CHARACTERS = 800
 """Names of files may have thousands; where and what to do are at an error's ends."""

@@ -21,8 +21,7 @@ from drgs.core.environment import VARIANTS, denormals_flushed
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import out_of_memory_reason
 
-MAX_THREADS = 4096
-"""Dr.Jit starts a thread for each, whatever there is to do."""
+MAX_THREADS = 4096  # dr.Jit starts a thread for each, whatever there is to do
 
 
 def add_execution_arguments(

@@ -10,8 +10,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-LOG_SECONDS = 10.0
-"""Seconds between two lines where no bar can be drawn."""
+LOG_SECONDS = 10.0  # seconds between two lines where no bar can be drawn
 
 
 def draws_bars(stream: TextIO) -> bool:

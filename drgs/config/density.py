@@ -12,8 +12,7 @@ from pydantic import Field, field_validator
 from drgs.config.extensions import STRATEGIES, StrategyName
 from drgs.config.section import UNRESOLVED, Count, Resolved, Section, subsection
 
-REFERENCE_START, REFERENCE_STOP = 500, 15_000
-"""Iterations: the reference's schedule, for 30,000."""
+REFERENCE_START, REFERENCE_STOP = 500, 15_000  # iterations: the reference's schedule, for 30,000
 
 
 class Schedule(NamedTuple):

@@ -23,8 +23,7 @@ PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")
 MAX_BYTES = 1 << 20
 """Largest configuration file: a thousand times what every value with a comment takes."""
 
-MAX_EXPLAINED = 3
-"""Wrong values that an error names; the rest are counted."""
+MAX_EXPLAINED = 3  # wrong values that an error names; the rest are counted
 
 
 def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:

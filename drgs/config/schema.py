@@ -40,20 +40,15 @@ Color = str | tuple[float, float, float]
 
 NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
-DEFAULT_BACKGROUND = "white"
-"""Background where there are no photographs to ask."""
+DEFAULT_BACKGROUND = "white"  # background where there are no photographs to ask
 
-NEAR_LIMITS = (1e-9, 1e9)
-"""Scene units, of near planes."""
+NEAR_LIMITS = (1e-9, 1e9)  # scene units, of near planes
 
-REFERENCE_NEAR = 0.2
-"""Scene units: the reference's near plane, of scenes that are about 4 wide."""
+REFERENCE_NEAR = 0.2  # scene units: the reference's near plane, of scenes that are about 4 wide
 
-LATEST_DEGREE = 1000
-"""Iterations: the reference's schedule, for 30,000."""
+LATEST_DEGREE = 1000  # iterations: the reference's schedule, for 30,000
 
-DEGREE_SHARE = 1 / 40
-"""Iterations between rises of the harmonics' degree, in parts of all."""
+DEGREE_SHARE = 1 / 40  # iterations between rises of the harmonics' degree, in parts of all
 
 
 def _color(value: object) -> Color | None:

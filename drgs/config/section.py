@@ -23,8 +23,7 @@ else:
 """A value that may be null in a file. Once the configuration is resolved, which it is wherever it
 is used, it has the type in brackets."""
 
-UNRESOLVED: Any = None
-"""Default of a value that follows from others, or from the dataset."""
+UNRESOLVED: Any = None  # default of a value that follows from others, or from the dataset
 
 Rate = Annotated[float, Field(le=10)]
 """A step of Adam is about as long as its rate: ten units of a logarithm or a logit go from next to

@@ -104,8 +104,7 @@ def wrap_numpy(flat_type: type[Array], values: np.ndarray) -> Array:
     return flat_type(values.reshape(-1))
 
 
-_ALIGNMENT = 64
-"""Bytes: what the widest vectors ask for."""
+_ALIGNMENT = 64  # bytes: what the widest vectors ask for
 
 _NUMPY_TYPES = {
     dr.VarType.Float32: np.float32,
@@ -231,8 +230,7 @@ def block_widths(width: int) -> tuple[int, ...]:
     return tuple(each for each in widths if each)
 
 
-PACKET = 4
-"""Numbers in a packet of rows that are back to back."""
+PACKET = 4  # numbers in a packet of rows that are back to back
 
 
 def load_columns(

@@ -75,11 +75,9 @@ WHITENING_SCALE = math.sqrt(0.5 * math.log2(math.e))
 squares, so never positive whatever the rounding, and where it is so small that exp2 underflows,
 alpha is below the cut and discarded."""
 
-MAX_INT = 2**31 - 1
-"""The counters of Mitsuba and Dr.Jit are of 32 bits."""
+MAX_INT = 2**31 - 1  # the counters of Mitsuba and Dr.Jit are of 32 bits
 
-MAX_COEFFICIENT = 1e6
-"""A coefficient of distortion, in size: calibrations give less than 1e3."""
+MAX_COEFFICIENT = 1e6  # A coefficient of distortion, in size: calibrations give less than 1e3
 
 MAX_FEATURES = 64
 """Numbers that an image composites besides RGB, or instead of it: see

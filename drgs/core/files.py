@@ -37,8 +37,7 @@ _REMEDIES = {
 }
 
 
-STEM_BYTES = 200
-"""Bytes of a file's name that is made of another: numbers and suffixes follow."""
+STEM_BYTES = 200  # bytes of a file's name that is made of another: numbers and suffixes follow
 
 
 def shorten_stem(stem: str) -> str:

@@ -21,8 +21,7 @@ import warnings
 from glob import glob
 from pathlib import Path
 
-MINIMUM_VERSION = 17
-"""First major version that compiles every kernel."""
+MINIMUM_VERSION = 17  # first major version that compiles every kernel
 
 TESTED_VERSION = 19
 """First major version that drgs is tested with (19 and 22 are); earlier ones give a warning."""

@@ -25,15 +25,13 @@ _EXHAUSTED = re.compile(
     "out of memory|std::bad_alloc|cannot allocate memory|failed to map segment", re.IGNORECASE
 )
 
-MAX_LANES = 2**32 - 1
-"""Entries of an array of Dr.Jit, which counts them in 32 bits."""
+MAX_LANES = 2**32 - 1  # entries of an array of Dr.Jit, which counts them in 32 bits
 
 IMAGE_BYTES = 250
 """Bytes for a pixel, about: splats in its tile, planes, the film's block, the image, its copy on
 the host."""
 
-SAMPLE_BYTES = 80
-"""Bytes for each further sample of a pixel, whose planes are kept as well."""
+SAMPLE_BYTES = 80  # bytes for each further sample of a pixel, whose planes are kept as well
 
 CHANNEL_BYTES = 24
 """Bytes for each channel of the film besides colour: its plane, and its part of the block, of

@@ -12,11 +12,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-Origin = tuple[float, float, float]
-"""World position of zero, exact in float64."""
+Origin = tuple[float, float, float]  # world position of zero, exact in float64
 
-WORLD: Origin = (0.0, 0.0, 0.0)
-"""The world's own origin."""
+WORLD: Origin = (0.0, 0.0, 0.0)  # the world's own origin
 
 MAX_SCENE_SIZES = 1000
 """Sizes of a scene: farther away, its positions are kept relative to another origin. At that

@@ -25,15 +25,14 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from traceback import walk_tb
-from typing import TYPE_CHECKING, ClassVar, Generic, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-ENTRY_POINT_GROUP = "drgs"
-"""Group of the entry points whose modules register extensions."""
+ENTRY_POINT_GROUP = "drgs"  # group of the entry points whose modules register extensions
 
 HOW_TO_INSTALL = 'others come with installed packages that have an entry point of the group "drgs"'
 """Completes messages that list the extensions that exist."""
@@ -159,10 +158,6 @@ class Registry(Generic[T]):
         return self._extensions[name]
 
 
-class _HasKind(Protocol):
-    kind: ClassVar[str]
-
-
 Base = TypeVar("Base")
 
 
@@ -176,14 +171,13 @@ class ClassRegistry(Registry[type[Base]]):
         decorate = super().register(name, section)
 
         def register_class(cls: Registered) -> Registered:
-            cast(type[_HasKind], cls).kind = name
+            cls.kind = name  # pyright: ignore[reportAttributeAccessIssue]
             return decorate(cls)
 
         return register_class
 
 
-_registries: list[Registry] = []
-"""All registries: what is registered is global by its nature."""
+_registries: list[Registry] = []  # all registries: what is registered is global by its nature
 
 
 def all_extensions() -> list[Extension]:

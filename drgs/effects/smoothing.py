@@ -103,8 +103,7 @@ KEPT_VARIANCE = 0.04
 """Parts of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
 derivatives by their scales."""
 
-VIEWER_APPROXIMATIONS = Approximations()
-"""Approximations of viewers."""
+VIEWER_APPROXIMATIONS = Approximations()  # approximations of viewers
 
 
 def bake_for_viewers(

@@ -24,8 +24,7 @@ from drgs.core.origin import WORLD, Origin, shown_origin
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.core.types import TensorXf
 
-Tensor = TypeVar("Tensor", bound=np.ndarray | dr.ArrayBase)
-"""``np.ndarray`` or ``TensorXf``."""
+Tensor = TypeVar("Tensor", bound=np.ndarray | dr.ArrayBase)  # ``np.ndarray`` or ``TensorXf``
 
 PARAMETER_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 

@@ -18,8 +18,7 @@ from drgs.core.errors import UserError
 from drgs.core.types import Array3f
 from drgs.gaussians.sh import num_coefficients, sh_basis
 
-MAX_QUATERNION = 1e30
-"""Components of larger ones might leave float32 when they are turned."""
+MAX_QUATERNION = 1e30  # components of larger ones might leave float32 when they are turned
 
 
 def to_float32(name: str, values: np.ndarray) -> np.ndarray:

@@ -55,7 +55,6 @@ class Box:
         return self.center + rng.uniform(-self.half_extent, self.half_extent, (count, 3))
 
     def __str__(self) -> str:
-        """Return the box as messages name it."""
         if not self.center.any():
             return f"[-{self.half_extent:g}, {self.half_extent:g}]^3"
         center = format_point(self.center, self.half_extent)

@@ -121,7 +121,6 @@ class Pinhole(Lens):
     """film = (fx x/z + cx, fy y/z + cy)."""
 
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return (M, 2), px, film."""
         return _focal(camera) * points[:, :2] / points[:, 2:] + _principal(camera)
 
     def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -155,7 +154,6 @@ class OpenCV(Lens):
     p2: float = 0.0
 
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return (M, 2), px, film."""
         slopes = points[:, :2] / points[:, 2:]
         return _focal(camera) * self.distort(slopes) + _principal(camera)
 
@@ -246,7 +244,6 @@ class Fisheye(Lens):
     k4: float = 0.0
 
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return (M, 2), px, film."""
         rho = np.linalg.norm(points[:, :2], axis=1)
         theta = np.arctan2(rho, points[:, 2])
         # On the axis (x, y) = 0, whatever it is multiplied by.
@@ -294,7 +291,6 @@ class ThinPrismFisheye(Fisheye):
     sy1: float = 0.0
 
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return (M, 2), px, film."""
         rho = np.linalg.norm(points[:, :2], axis=1)
         theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
         distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
@@ -352,7 +348,6 @@ class Orthographic(Lens):
     """film = (fx x + cx, fy y + cy), with fx and fy in px per world unit."""
 
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return (M, 2), px, film."""
         return _focal(camera) * points[:, :2] + _principal(camera)
 
     def view_directions(self, camera: Camera, means: np.ndarray) -> np.ndarray:

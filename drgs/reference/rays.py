@@ -188,14 +188,13 @@ def render(
     """Return the image of Gaussians under a model; with a region, that part of it.
 
     background: (3,) display space; region: rows and columns of the film, None for all; positions:
-    (camera.height, camera.width, 2) px, film, the (x, y) at which each pixel is evaluated, None
-    for the centres; threshold_width: relative distance from a threshold within which a pixel is
-    marked in ``RenderedImage.near_threshold``: alpha from the cut and the clamp, transmittance
-    from the stop, rho^2 from extent^2, the peak (or entry) from the ray's origin, and, unless order
-    is ``"center"``, the sort keys of consecutive splats from each other.
+    (camera.height, camera.width, 2) px, film, the (x, y) at which each pixel is evaluated, None for
+    the centres; threshold_width: relative distance from a threshold within which a pixel is marked
+    in ``RenderedImage.near_threshold``: alpha from the cut and the clamp, transmittance from the
+    stop, rho^2 from extent^2, the peak (or entry) from the ray's origin, and, unless order is
+    ``"center"``, the sort keys of consecutive splats from each other.
 
     ``RenderedImage.depth`` sums the means' camera z for order ``"center"``, else that of the peaks.
-
     """
     positions = pixel_centers(camera) if positions is None else np.asarray(positions, np.float64)
     positions = positions if region is None else positions[region]

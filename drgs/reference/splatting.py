@@ -39,8 +39,7 @@ from numpy.typing import ArrayLike
 # splat T = 1 - 0.99, and a second one leaves (1 - 0.99)^2, which is just above 1e-4 with the
 # double nearest to 0.99, and 2e-6 (relative) below it with 0.99f. So every single-precision
 # rasterizer stops there, and so does this one.
-ALPHA_MAX = float(np.float32(0.99))
-"""Upper clamp of alpha (3DGS rasterizer)."""
+ALPHA_MAX = float(np.float32(0.99))  # upper clamp of alpha (3DGS rasterizer)
 
 ALPHA_CUT = float(np.float32(1.0) / np.float32(255.0))
 """A splat with a smaller alpha at a pixel does not exist there (3DGS rasterizer)."""
@@ -48,8 +47,7 @@ ALPHA_CUT = float(np.float32(1.0) / np.float32(255.0))
 TRANSMITTANCE_STOP = 1e-4
 """A pixel is finished before the splat that would take it below this (3DGS rasterizer)."""
 
-LOW_PASS = 0.3
-"""px^2 added to the diagonal of the covariance on the film (3DGS rasterizer)."""
+LOW_PASS = 0.3  # px^2 added to the diagonal of the covariance on the film (3DGS rasterizer)
 
 FRUSTUM_MARGIN = 0.3
 """The Jacobian's x/z and y/z may leave the frustum by this part of its half extents (3DGS)."""

@@ -125,12 +125,10 @@ class PixelCenters(SamplePositions):
     """The pixels' centres: rows and columns share their offsets."""
 
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
-        """x and y (px) of the 16 pixels."""
         x, y = Float(lanes.x) + 0.5, Float(lanes.y) + 0.5
         return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
 
     def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
-        """Grids of x and y, from a point of the film to the pixels, px."""
         t = types_of(type(x))
         first_x, first_y = t.Float(lanes.x) + 0.5 - x, t.Float(lanes.y) + 0.5 - y
         dx = [first_x + i for i in range(MICRO)]
@@ -138,7 +136,6 @@ class PixelCenters(SamplePositions):
         return [dx] * MICRO, [[d] * MICRO for d in dy]
 
     def sum(self, values: list[Float]) -> Float:
-        """Sum 16 values."""
         return total(self._rows(values))
 
     def sum_dx(self, values: list[Float], dx: list) -> Float:
@@ -147,11 +144,9 @@ class PixelCenters(SamplePositions):
         return _dot(columns, dx[0])
 
     def sum_dy(self, values: list[Float], dy: list) -> Float:
-        """Sum values times dy, which a row shares."""
         return _dot(self._rows(values), _first_of_rows(dy))
 
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
-        """Sum values times dy^2."""
         dy = _first_of_rows(dy)
         return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
 

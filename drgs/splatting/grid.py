@@ -10,17 +10,13 @@ from drgs.core.types import UInt32
 MICRO = 4
 """Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
 
-PIXELS = MICRO * MICRO
-"""Pixels of a micro-tile."""
+PIXELS = MICRO * MICRO  # pixels of a micro-tile
 
-GRID = 4
-"""Micro-tiles on a tile's side."""
+GRID = 4  # micro-tiles on a tile's side
 
-TILE = MICRO * GRID
-"""Pixels on a tile's side."""
+TILE = MICRO * GRID  # pixels on a tile's side
 
-MICROS = GRID * GRID
-"""Micro-tiles in a tile: the bits of an entry's mask."""
+MICROS = GRID * GRID  # micro-tiles in a tile: the bits of an entry's mask
 
 
 @dataclass(frozen=True)

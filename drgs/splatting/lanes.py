@@ -164,12 +164,10 @@ class EntriesBackToFront(Entries):
         return self._open(self.last, True)
 
     def pending(self, cursor: Cursor) -> Bool:
-        """Return lanes that may have entries left."""
         return (cursor.word != 0) | (cursor.group > self.first)
 
     @staticmethod
     def current(cursor: Cursor) -> tuple[UInt32, Bool]:
-        """The current sorted entry, and whether there is one (a word may be empty)."""
         return cursor.group * WORD + _highest_bit(cursor.word), cursor.word != 0
 
     def advance(self, cursor: Cursor) -> Cursor:

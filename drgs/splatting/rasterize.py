@@ -233,8 +233,7 @@ def largest(values: list[UInt32]) -> UInt32:
 # Adjoint
 # ----------------------------------------------------------------------------------------------
 
-ONE_SAMPLE = range(1)
-"""Samples of layers that have one."""
+ONE_SAMPLE = range(1)  # samples of layers that have one
 
 
 @dataclass(frozen=True)

@@ -472,8 +472,7 @@ def decode_nonfinite(fault: int) -> tuple[int, str] | None:
     return row, PARAMETER_NAMES[parameter]
 
 
-NO_FAULT = 2**32 - 1
-"""No row is at fault."""
+NO_FAULT = 2**32 - 1  # no row is at fault
 
 
 def frames_tangent(

@@ -29,8 +29,7 @@ from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
 from drgs.splatting.projection import Splats2D
 
-WORD = 32
-"""Entries in a word of the transposed masks."""
+WORD = 32  # entries in a word of the transposed masks
 
 
 @dataclass(frozen=True)
@@ -242,8 +241,7 @@ def _make_entries(
     return tile, entries
 
 
-_RANK_BITS = 26
-"""With 64 - 16 - 26 bits for the tile."""
+_RANK_BITS = 26  # with 64 - 16 - 26 bits for the tile
 
 
 def _pack(rank: UInt32, tile: UInt32, mask: UInt32) -> list[UInt32]:

@@ -39,7 +39,6 @@ CLASSES = {
         thin_prism_fisheye.ThinPrismFisheye,
         orthographic.Orthographic,
     ),
-    camera.Aperture: (thin_lens.RoundAperture,),
     camera.Shutter: (motion.MotionBlur, motion.RollingShutter),
     distortion.PlaneDistortion: (
         radial_tangential.RadialTangential,

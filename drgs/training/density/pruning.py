@@ -113,7 +113,6 @@ class Importance(Pruning):
         dr.eval(self.scores)
 
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
-        """Remove those of the lowest scores."""
         before = population.num_rows
         self.num_before = self.num_before or before
         scores = population.gather(self.scores)

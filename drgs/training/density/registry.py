@@ -68,7 +68,6 @@ class Phases(DensityStrategy):
                 phase.update_statistics(step)
 
     def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
-        """Return the terms of all phases."""
         return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:

@@ -71,7 +71,6 @@ class CameraRefinement(OptimisedEffect):
         self.numbers: dict[int, dict[str, dr.ArrayBase]] = {}  # of the step's sensors, by view
 
     def upload(self, view: View) -> _Start:
-        """Return the view's camera."""
         motion = None
         if view.motion is not None:
             between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)

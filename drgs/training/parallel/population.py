@@ -198,7 +198,6 @@ class ShardedPopulation(Population):
         return [np.array(term, np.float32) for term in compute(_AllRows(self))]
 
     def gather_gaussians(self, local: Gaussians) -> Gaussians:
-        """Return the Gaussians of all ranks on rank 0, and ``local`` on others."""
         columns = {name: getattr(local, name) for name in (*PARAMETER_NAMES, "smoothing")}
         columns = {name: rows for name, rows in columns.items() if rows is not None}
         gathered = {name: self.comm.gather_rows(rows) for name, rows in columns.items()}
@@ -207,7 +206,6 @@ class ShardedPopulation(Population):
     def gather_state(
         self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
     ) -> dict[str, np.ndarray]:
-        """Return a trainer's state with the rows of all ranks on rank 0."""
         for name in filter(is_by_row, state):
             array = state[name]
             rows = self.comm.gather_rows(array.reshape(self.num_local_rows, -1))
@@ -219,7 +217,6 @@ class ShardedPopulation(Population):
     def scatter_state(
         self, state: Mapping[str, np.ndarray], is_by_row: Callable[[str], bool]
     ) -> dict[str, np.ndarray]:
-        """Return the part of rank 0's state that this rank has; its rows are those of the state."""
         described = [[name, array.dtype.str, array.shape] for name, array in state.items()]
         described = json.loads(self.comm.broadcast_text(json.dumps(described)))
         (total,) = (shape[0] for name, _, shape in described if name == "means.value")
