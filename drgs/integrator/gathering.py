@@ -90,7 +90,7 @@ class Part(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered:
+class GatheredGaussians:
     """Gathered Gaussians and their parts."""
 
     parts: list[Part]  # detached
@@ -136,7 +136,7 @@ class Gathered:
         return _concatenate(found, self.gaussians.sh_degree)
 
 
-def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
+def gather(parts: Sequence[Part], last: GatheredGaussians | None) -> GatheredGaussians:
     """Return the Gaussians of all parts, in order and of the highest degree.
 
     last: the last result, returned again while nothing has changed. Features, coefficients and
@@ -149,7 +149,7 @@ def gather(parts: Sequence[Part], last: Gathered | None) -> Gathered:
     sizes = [(part.num_gaussians, part.sh_degree) for part in converted]
     gaussians = _concatenate(converted, max(degree for _, degree in sizes))
     dr.eval(gaussians)
-    return Gathered(parts, sizes, gaussians)
+    return GatheredGaussians(parts, sizes, gaussians)
 
 
 def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
@@ -240,24 +240,26 @@ def product(matrix: Float, vector: list[Float], start: int = 0) -> list[Float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Turn:
+class ShRotation:
     """A linear map of the coefficients of degree 1 to 3 by one matrix per degree."""
 
     matrices: Float  # (9 + 25 + 49,)
 
     @staticmethod
-    def from_rotation(rotation: np.ndarray) -> Turn:
+    def from_rotation(rotation: np.ndarray) -> ShRotation:
         """Return the rotation of spherical harmonics; rotation: (3, 3), x' = R x."""
-        return Turn._from_matrices(sh_rotation_matrices(rotation, 3))
+        return ShRotation._from_matrices(sh_rotation_matrices(rotation, 3))
 
     @staticmethod
-    def generators() -> list[Turn]:
+    def generators() -> list[ShRotation]:
         """Return derivatives of turned coefficients along rotations about x, y and z."""
-        return [Turn._from_matrices(matrices) for matrices in sh_rotation_generators(3)]
+        return [ShRotation._from_matrices(matrices) for matrices in sh_rotation_generators(3)]
 
     @staticmethod
-    def _from_matrices(matrices: Sequence[np.ndarray]) -> Turn:
-        return Turn(from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices])))
+    def _from_matrices(matrices: Sequence[np.ndarray]) -> ShRotation:
+        return ShRotation(
+            from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices]))
+        )
 
     def rotate_columns(self, columns: list[Float]) -> list[Float]:
         """Turn columns of the coefficients of degree 1 and above, three a coefficient."""
@@ -302,7 +304,7 @@ class Placement:
         turned = {
             "means": product(_device(place.scale * place.rotation), split["means"]),
             "quats": product(_device(left_multiplication_matrix(place.rotation)), split["quats"]),
-            "shN": Turn.from_rotation(place.rotation).rotate_columns(split["shN"]),
+            "shN": ShRotation.from_rotation(place.rotation).rotate_columns(split["shN"]),
         }
         scale = _device(np.array([place.scale, np.log(place.scale)]))
         log_scales = [c + entry(scale, 1) for c in _columns_of(arrays["log_scales"])]
@@ -342,7 +344,7 @@ class Placement:
         r, (real, *imaginary) = mi.Vector3f(arms["means"]), arms["quats"]
         v = mi.Vector3f(imaginary)
         about_axes = zip(
-            *(turn.rotate_columns(arms["shN"]) for turn in Turn.generators()), strict=True
+            *(turn.rotate_columns(arms["shN"]) for turn in ShRotation.generators()), strict=True
         )
         changes = {
             "means": list(scale * r + dr.cross(w, r) + shift),
@@ -423,7 +425,7 @@ class Conversion:
     """The arrays of a shape; see :class:`Part`."""
 
     values: ParameterArrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
-    fixed_inputs: Turn | None  # of the harmonics, not differentiated
+    fixed_inputs: ShRotation | None  # of the harmonics, not differentiated
 
     def detach(self) -> Conversion:
         return replace(self, values=dr.detach(self.values))
@@ -457,7 +459,7 @@ class Conversion:
         return dr.select(inside, dr.replace_grad(clamped, value), clamped)
 
 
-def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, Turn]) -> list[Conversion]:
+def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, ShRotation]) -> list[Conversion]:
     """Read shapes, attached; turns: by their ids, "": of all other shapes."""
     unknown = set(turns) - {shape.id() for shape in shapes} - {""}
     if unknown:

@@ -27,7 +27,7 @@ from drgs.integrator.rays import TransportIntegrator
 from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
-    from drgs.integrator.gathering import Turn
+    from drgs.integrator.gathering import ShRotation
 
 
 class Property(NamedTuple):
@@ -269,18 +269,18 @@ def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     return mi.TensorXf(value)
 
 
-def _turns_of_shapes(props: mi.Properties) -> dict[str, Turn]:
+def _turns_of_shapes(props: mi.Properties) -> dict[str, ShRotation]:
     """Return rotations of spherical harmonics by ids of shapes; "": all other shapes."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
         return {}
     from drgs.gaussians.similarity import Similarity
-    from drgs.integrator.gathering import Turn
+    from drgs.integrator.gathering import ShRotation
 
     turns = {}
     for name in names:
         shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
-        turns[shape] = Turn.from_rotation(
+        turns[shape] = ShRotation.from_rotation(
             Similarity.from_matrix(matrix(props, name), f"splats: {name}").rotation
         )
     return turns

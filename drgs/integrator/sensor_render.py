@@ -113,7 +113,7 @@ class SensorRender:
 
     def _channels_of(
         self,
-        behind: _Behind,
+        behind: _Background,
         planes: list[Float],
         layers: SurfaceLayers | None,
         color: mi.Color3f,
@@ -144,7 +144,7 @@ class SensorRender:
         self,
         planes: list[Float],
         whole: mi.Float,
-        behind: _Behind,
+        behind: _Background,
         color_behind: mi.Color3f,
         of_surfaces: Callable[[str], Channels | None] = lambda kind: None,
     ) -> Channels:
@@ -175,12 +175,12 @@ class SensorRender:
             channels += values
         return channels
 
-    def _render_behind(self, constant: mi.Color3f | None) -> _Behind:
+    def _render_behind(self, constant: mi.Color3f | None) -> _Background:
         splats = self.splats
         environment = None if splats.hide_emitters else self.scene.environment()
         if environment is None and constant is not None:
             nothing = repeat(repeat(None))
-            return _Behind(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
+            return _Background(repeat(repeat(constant)), is_radiance=False, radiance=nothing)
         behind = splats.background if environment is None else environment
         assert isinstance(behind, (mi.Emitter, mi.Texture)), "a colour would be constant"
         state = self._state()
@@ -191,7 +191,7 @@ class SensorRender:
         colors = radiance = background_radiance(film, behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
-        return _Behind(colors, environment is not None, radiance)
+        return _Background(colors, environment is not None, radiance)
 
     def _frames(self) -> list[list[rendering.Frame]]:
         """Return frames by time and by pass, from the cache where nothing has changed."""
@@ -273,7 +273,7 @@ def _mean(passes: Sequence[Passes]) -> Passes:
 
 
 @dataclass(frozen=True)
-class _Behind:
+class _Background:
     """The background of an image, at each sample."""
 
     colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below

@@ -26,9 +26,9 @@ from drgs.integrator.checks import check_degree, check_instances, check_shapes, 
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
-    from drgs.integrator.gathering import Gathered, Part, Placement, Turn
+    from drgs.integrator.gathering import GatheredGaussians, Part, Placement, ShRotation
 else:
-    Gathered = Turn = Any
+    GatheredGaussians = ShRotation = Any
 
 T = TypeVar("T")
 
@@ -70,7 +70,7 @@ class RenderCache:
 
     kept: dict[str, Cached[Any]] = field(default_factory=dict)  # by name
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
-    gathered: Gathered | None = None  # None: the own Gaussians alone, unmoved
+    gathered: GatheredGaussians | None = None  # None: the own Gaussians alone, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
     sensor: mi.Sensor | None = None  # rendered last
@@ -120,7 +120,7 @@ class SplatsState:
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
-    turns: dict[str, Turn]  # of harmonics, by shapes' ids; "": of all other shapes
+    turns: dict[str, ShRotation]  # of harmonics, by shapes' ids; "": of all other shapes
     background: mi.Color3f | mi.Texture  # in display space; or linear
     nested: mi.SamplingIntegrator | None  # of surfaces
     default_degree: int  # of spherical harmonics, where the scene has no other Gaussians
