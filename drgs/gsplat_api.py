@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
@@ -340,6 +341,7 @@ def _stack_cameras(parts: list[Float], shape: tuple[int, ...]) -> TensorXf:
 class _Planes(dr.CustomOp):
     """Planes of all cameras (transmittance, features), and each number of the backgrounds."""
 
+    @override
     def eval(
         self, views: list[_View], inputs: dict[str, TensorXf]
     ) -> tuple[list[list[Float]], list[Float]]:
@@ -348,11 +350,13 @@ class _Planes(dr.CustomOp):
         dr.eval(planes)  # or storing them would run the kernels once for each
         return planes, self._entries(inputs)
 
+    @override
     def forward(self) -> None:
         directions = cast(dict[str, TensorXf], self.grad_in("inputs"))
         tangents = [view.tangents(directions) for view in self.views]
         self.set_grad_out((tangents, self._entries(directions)))
 
+    @override
     def backward(self) -> None:
         grad_out: Any = self.grad_out()  # as of :meth:`eval`
         all_d_planes, d_backgrounds = grad_out
@@ -380,6 +384,7 @@ class _Planes(dr.CustomOp):
         places = [dr.opaque(types_of(type(flat)).UInt32, k) for k in range(dr.width(flat))]
         return [dr.gather(type(flat), flat, place) for place in places]
 
+    @override
     def name(self) -> str:
         return "rasterization"
 

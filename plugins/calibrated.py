@@ -8,6 +8,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import LENSES, Lens
@@ -97,6 +98,7 @@ class CalibratedSensor(mi.Sensor):
         self.shutter, self.shutter_samples = values["shutter"], values["shutter_samples"]
         refuse_unknown(props, (*KNOWN, *self.lens.coefficient_names()))
 
+    @override
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
         cb.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
@@ -106,18 +108,22 @@ class CalibratedSensor(mi.Sensor):
         if self.to_world_close is not None:
             cb.put("to_world_close", self.to_world_close, mi.ParamFlags.NonDifferentiable)
 
+    @override
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not keys or set(keys) & set(self.coefficients):
             values = {name: float(value[0]) for name, value in self.coefficients.items()}
             self.lens = _with_coefficients(type(self.lens), values) if values else self.lens
 
     def near_clip(self) -> float:
+        """Return the near clip distance, scene units."""
         return self.near
 
     def far_clip(self) -> float:
+        """Return the far clip distance, scene units."""
         return self.far
 
     def to_string(self) -> str:
+        """Return lens and film as text."""
         lens = ", ".join([type(self.lens).__name__, *map(str, self.coefficients)])
         return (
             f"CalibratedSensor[\n  fx = {self.fx}, fy = {self.fy},\n  cx = {self.cx}, "
@@ -126,14 +132,17 @@ class CalibratedSensor(mi.Sensor):
         )
 
     def camera_parameters(self) -> list[str]:
+        """Return the names of differentiable parameters."""
         moves = ["to_world_close"] if self.to_world_close is not None else []
         return ["to_world", *moves, "fx", "fy", "cx", "cy", *self.coefficients]
 
     def camera_from_state(self, state: SensorState) -> Camera:
+        """Return the camera with the sensor's lens."""
         camera = self._pinhole(state)
         return camera.with_lens(self.lens.with_coefficients(state.device))
 
     def num_poses(self) -> int:
+        """Return the number of poses whose images are averaged."""
         moves = self.to_world_close is not None and self.shutter == "global"
         return self.shutter_samples if moves else 1
 
@@ -150,10 +159,15 @@ class CalibratedSensor(mi.Sensor):
             return replace(camera, shutter=RollingShutter(*motion))
         return replace(camera, shutter=MotionBlur(*motion, self.shutter_samples))
 
+    @override
     def sample_ray(
-        self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
+        self,
+        time: Float,
+        sample1: Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
         active: Bool | bool = True,
-    ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
         del sample3
         place = sample2 * mi.Vector2f(self.film().crop_size())
         state = read_sensor(self, 0.0)
@@ -187,10 +201,15 @@ class CalibratedSensor(mi.Sensor):
             return mi.Float(0)
         return (mi.Float(time) - self.shutter_open()) / self.shutter_open_time()
 
+    @override
     def sample_ray_differential(
-        self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
+        self,
+        time: Float,
+        sample1: Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
         active: Bool | bool = True,
-    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:  # fmt: skip
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()
         beside = []
@@ -203,6 +222,7 @@ class CalibratedSensor(mi.Sensor):
         result.has_differentials = True
         return result, weight
 
+    @override
     def bbox(self) -> mi.ScalarBoundingBox3f:
         return mi.ScalarBoundingBox3f()
 

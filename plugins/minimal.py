@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEAR
@@ -37,10 +38,12 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
             setattr(self, name, getattr(gaussians, name))
         self.pipeline = Pipeline(gaussians.sh_degree)
 
+    @override
     def traverse(self, cb: mi.TraversalCallback) -> None:
         for name in PARAMETER_NAMES:
             cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
+    @override
     def render(
         self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
         develop: bool = True, evaluate: bool = True,
@@ -49,6 +52,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
             film, _, _, _, layers = self._composite(scene, sensor)
             return develop_pixels(film, _channels(film, layers.planes()), [])
 
+    @override
     def render_backward(
         self, scene: mi.Scene, params: object, grad_in: mi.TensorXf,
         sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,

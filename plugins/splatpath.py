@@ -61,6 +61,7 @@ class SplatPathIntegrator(RBIntegrator):
         self._transport: SplatTransport | None = None
 
     def use_transport(self, transport: SplatTransport | None) -> None:
+        """Set the transport through splats; None: there are none."""
         self._transport = transport
 
     @dr.syntax

@@ -13,6 +13,7 @@ from operator import attrgetter
 
 import drjit as dr
 import mitsuba as mi
+from typing_extensions import override
 
 from drgs.core.arrays import interleave
 from drgs.core.environment import check_variant
@@ -80,6 +81,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         self.last: BackwardResult | None = None
         self._lock = threading.RLock()  # of the cache and the film
 
+    @override
     def traverse(self, cb: mi.TraversalCallback) -> None:
         state, own = self.state, self.state.own
         found = {name: getattr(own.gaussians, name) for name in PARAMETER_NAMES}
@@ -95,6 +97,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         for name, value in found.items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
 
+    @override
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check that parameters fit together; forget frames, also after writes in place."""
         if list(keys) != ["background"]:
@@ -147,6 +150,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Project the Gaussians by another stage, such as one across several processes."""
         self.state.projection = stage
 
+    @override
     def aov_names(self) -> list[str]:
         return self.state.aov_names()
 
@@ -155,10 +159,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
         lines = ",\n".join(f"  {name} = {value}" for name, value in self.state.settings().items())
         return f"SplatsIntegrator[\n{lines}\n]"
 
+    @override
     def render(
-        self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
-        develop: bool = True, evaluate: bool = True,
-    ) -> mi.TensorXf:  # fmt: skip
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: int | mi.UInt32 = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
         sensor = _resolve_sensor(scene, sensor)
         with self._lock, dr.suspend_grad():
             self.state.cache.sensor = sensor
@@ -168,10 +178,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
                 dr.eval(image)
         return image if develop else mi.TensorXf()
 
+    @override
     def render_backward(
-        self, scene: mi.Scene, params: object, grad_in: mi.TensorXf,
-        sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        scene: mi.Scene,
+        params: object,
+        grad_in: mi.TensorXf,
+        sensor: int | mi.Sensor = 0,
+        seed: int | mi.UInt32 = 0,
+        spp: int = 0,
+    ) -> None:
         """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
         sensor = _resolve_sensor(scene, sensor)
         self._check_derivatives(scene, sensor, dr.ADMode.Backward)
@@ -191,10 +207,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
                     self.state.accumulate(scene, gradients.parameters)
             sensor.film().clear()  # it may hold an attached block
 
+    @override
     def render_forward(
-        self, scene: mi.Scene, params: object,
-        sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
-    ) -> mi.TensorXf:  # fmt: skip
+        self,
+        scene: mi.Scene,
+        params: object,
+        sensor: int | mi.Sensor = 0,
+        seed: int | mi.UInt32 = 0,
+        spp: int = 0,
+    ) -> mi.TensorXf:
         """Return the directional derivative of the image along gradients set on parameters."""
         sensor = _resolve_sensor(scene, sensor)
         self._check_derivatives(scene, sensor, dr.ADMode.Forward)
@@ -208,10 +229,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
             sensor.film().clear()  # it holds an attached block
         return d_image
 
+    @override
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]  called by keyword
-        self, *, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, active: Bool,
+        self,
+        *,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        active: Bool,
         **others: object,
-    ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:  # fmt: skip
+    ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float], None]:
         """Render along the rays of a whole image, for ``aov``: see ``drgs.integrator.aov_rays``."""
         from drgs.integrator.aov_rays import ImageRays
 

@@ -48,6 +48,7 @@ import math
 from dataclasses import dataclass, replace
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
@@ -173,13 +174,16 @@ class RayFalloff(GaussianFalloff):
     camera: Camera | None = None
 
     @property
+    @override
     def num_geometry(self) -> int:
         return 9
 
     @property
+    @override
     def num_moments(self) -> int:
         return 9
 
+    @override
     def for_camera(self, camera: Camera) -> RayFalloff:
         """Bind to a camera, whose film has the anchors; UnsupportedError unless it is a pinhole."""
         if not isinstance(camera.lens, Pinhole):
@@ -189,17 +193,20 @@ class RayFalloff(GaussianFalloff):
             )
         return RayFalloff(camera)
 
+    @override
     def geometry(self, splats: Splats2D) -> list[Float]:
         ray = splats.ray
         assert ray is not None, "as exact_shape makes them"
         own = [ray.tilt_x, ray.tilt_y, ray.spread / WHITENING_SCALE**2]
         return [*super().geometry(splats), *own]
 
+    @override
     def differentiable(self, splats: Splats2D) -> list[Float]:
         ray = splats.ray
         assert ray is not None, "as exact_shape makes them"
         return [*super().differentiable(splats), ray.tilt_x, ray.tilt_y, ray.spread]
 
+    @override
     def bounds(
         self, splats: Splats2D, geometry: list[Float], reach: Float
     ) -> tuple[Array2f, Array2f]:
@@ -208,6 +215,7 @@ class RayFalloff(GaussianFalloff):
         half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
         return Array2f(x, y), dr.sqrt(reach) * half_sizes
 
+    @override
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
         """Return centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat.
 
@@ -246,6 +254,7 @@ class RayFalloff(GaussianFalloff):
         ]
         return [dr.select(bounded, a, b) for a, b in zip(ellipse, everywhere, strict=True)]
 
+    @override
     def footprint(
         self, geometry: list[Float], offsets_from: Offsets, active: Bool | bool
     ) -> RayFootprint:
@@ -274,6 +283,7 @@ class RayFalloff(GaussianFalloff):
             from_anchor=from_anchor,
         )
 
+    @override
     def moments(
         self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
@@ -307,6 +317,7 @@ class RayFalloff(GaussianFalloff):
             positions.sum(bb),
         ]
 
+    @override
     def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
         """Turn moments into the derivatives of what :meth:`differentiable` lists.
 
@@ -327,10 +338,12 @@ class RayFalloff(GaussianFalloff):
             math.log(2) / WHITENING_SCALE**2 * bb,
         ]
 
+    @override
     def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
         count = super().num_geometry
         return super().pack_tangents(geometry, tangents[:count]) + list(tangents[count:])
 
+    @override
     def tangent(
         self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
     ) -> list[Float]:

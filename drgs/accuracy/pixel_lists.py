@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.accuracy.exact import RayFootprint, closest_on_film, ray_denominator
 from drgs.cameras.camera import Camera
@@ -111,6 +112,7 @@ class ParallelDepths(AffineDepths):
     """The same for rays that are parallel."""
 
     @staticmethod
+    @override
     def _depth_ratio(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
         kx, ky = keys[:2]
         return dr.fma(kx, u, dr.fma(ky, v, 1)), type(u)(1)
@@ -122,14 +124,17 @@ class RayDepths(AffineDepths):
 
     camera: Camera | None = None  # whose film has the anchors
 
+    @override
     def for_camera(self, camera: Camera) -> RayDepths:
         return replace(self, camera=camera)
 
+    @override
     def keys(self, splats: Splats2D) -> list[Float]:
         ray = splats.ray
         assert ray is not None and ray.scale is not None, "as exact_shape makes them"
         return [splats.depths * ray.scale]
 
+    @override
     def depth_ratio(
         self, falloff: GaussianFalloff, geometry: list[Float], keys: list[Float], x: Float, y: Float
     ) -> tuple[Float, Float]:
@@ -140,6 +145,7 @@ class RayDepths(AffineDepths):
         _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
         return a, denominator
 
+    @override
     def _pixel_depths(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
         del keys
         assert isinstance(footprint, RayFootprint), "made by RayFalloff"

@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.accuracy.exact import RayFalloff, ewa_with_depth
 from drgs.accuracy.pixel_lists import AffineDepths, PixelLists, RayDepths, WithAffineDepth
@@ -72,6 +73,7 @@ class PixelOrder(CenterOrder):
     depths: AffineDepths
 
     @classmethod
+    @override
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
     ) -> tuple[Projection, PixelOrder]:
@@ -82,15 +84,19 @@ class PixelOrder(CenterOrder):
             shape = ewa_with_depth
         return shape or WithAffineDepth(projection.shape), cls(approximations.order_window, depths)
 
+    @override
     def for_camera(self, camera: Camera) -> PixelOrder:
         return replace(self, depths=self.depths.for_camera(camera))
 
+    @override
     def keys(self, splats: Splats2D) -> list[Float]:
         return self.depths.keys(splats)
 
+    @override
     def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
         return _composite(bins, records, self)
 
+    @override
     def adjoint(
         self,
         bins: TileBins,
@@ -105,6 +111,7 @@ class PixelOrder(CenterOrder):
         inputs = _WalkInputs.from_lists(bins, records, layers.lists, self, samples)
         return _adjoint(inputs, layers, d_features, d_transmittance, before)
 
+    @override
     def tangent(
         self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
     ) -> Layers:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.core.constants import COLOR_MIN
@@ -38,14 +39,18 @@ class RayColors(SplatFeatures):
 
     @property
     def num_coefficients(self) -> int:
+        """The number of stored numbers of a Gaussian."""
         return CHANNELS * num_coefficients(self.sh_degree)
 
+    @override
     def num_planes(self, num_stored: int) -> int:
         return num_stored - self.num_coefficients + CHANNELS
 
+    @override
     def for_camera(self, camera: Camera) -> RayColors:
         return replace(self, camera=camera)
 
+    @override
     def check_differentiable_in_camera(self) -> None:
         if self.sh_degree == 0:
             return
@@ -53,9 +58,11 @@ class RayColors(SplatFeatures):
             "splats: sh_direction 'pixel' is not differentiable in the camera; use 'mean'"
         )
 
+    @override
     def with_weight_derivatives(self) -> RayColors:
         return Weighing(self.sh_degree, self.camera)
 
+    @override
     def bind(self, lanes: Lanes, positions: SamplePositions) -> RayColors:
         assert self.camera is not None, "bound by for_camera"
         points = positions.points(lanes, type(self.camera.near))
@@ -67,6 +74,7 @@ class RayColors(SplatFeatures):
         camera = self.camera.at_row(y)
         return dr.normalize(camera.rotation.T @ camera.lens.ray(camera, x, y))
 
+    @override
     def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
         colors = [
             dr.select(value < COLOR_MIN, COLOR_MIN, value) for value in self._sums(stored, pixel)
@@ -80,6 +88,7 @@ class RayColors(SplatFeatures):
             sums = [dr.fma(c, basis, total) for c, total in zip(coefficients, sums, strict=True)]
         return sums
 
+    @override
     def add_derivatives(
         self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
     ) -> list[Float]:
@@ -96,6 +105,7 @@ class RayColors(SplatFeatures):
             for total, derivative in zip(others, g[CHANNELS:], strict=True)
         ]
 
+    @override
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         d_colors = [type(d_stored[0])(0)] * CHANNELS
         for k, basis in enumerate(self.basis[pixel]):
@@ -111,6 +121,7 @@ class RayColors(SplatFeatures):
 class Weighing(RayColors):
     """The same, with the weights of compositing as derivatives of the first coefficient."""
 
+    @override
     def add_derivatives(
         self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
     ) -> list[Float]:

@@ -122,6 +122,7 @@ class AccuracyMeasurement:
 
     @property
     def root_mean_square(self) -> float:
+        """The root mean square error, in 0..1."""
         return 10 ** (-self.psnr / 20)
 
 
@@ -234,6 +235,7 @@ class RungRenderer:
 
     @staticmethod
     def from_rung(rung: Rung, subject: Subject, camera: reference.Camera) -> RungRenderer:
+        """Return the renderer of a subject in one of the accuracies."""
         Float = llvm.Float64 if rung.float64 else llvm.Float
         gaussians = subject.gaussians.to(llvm.TensorXf64 if rung.float64 else llvm.TensorXf)
         points = positions(rung.samples, camera, Float)

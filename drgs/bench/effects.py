@@ -183,11 +183,13 @@ class CaseRenderer:
         self.weights = mi.TensorXf(weights)
 
     def forward(self) -> None:
+        """Render an image."""
         with dr.suspend_grad():
             dr.eval(self._render())
         dr.sync_thread()
 
     def forward_and_backward(self) -> None:
+        """Render an image and its derivatives, or run an iteration."""
         for name in self.differentiated:
             dr.clear_grad(self.params[name])
         dr.backward(dr.sum(self._render() * self.weights, axis=None))
@@ -217,6 +219,7 @@ class CaseTrainer:
         """Do nothing: an iteration cannot be split."""
 
     def forward_and_backward(self) -> None:
+        """Render an image and its derivatives, or run an iteration."""
         self.trainer.step()
         dr.sync_thread()
 

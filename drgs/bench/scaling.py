@@ -49,6 +49,7 @@ class Point:
 
     @property
     def varied_number(self) -> int:
+        """The number that the sweep varies."""
         return {"pixels": self.size**2, "threads": self.threads}.get(self.sweep, self.count)
 
 
@@ -65,14 +66,17 @@ class Result:
 
     @property
     def device_mib(self) -> float:
+        """Peak of Dr.Jit's memory, MiB."""
         return self.device_bytes / 2**20
 
     @property
     def process_mib(self) -> float:
+        """Peak of resident memory, MiB."""
         return self.process_bytes / 2**20
 
     @property
     def bytes_per_gaussian(self) -> float:
+        """Peak of Dr.Jit's memory divided by the number of Gaussians."""
         return self.device_bytes / self.point.count
 
 

@@ -65,6 +65,7 @@ class IterationReport:
 
     @property
     def kernel_ms(self) -> float:
+        """Time in kernels, ms."""
         return sum(self.stage_ms.values())
 
     @property

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.cameras.distortion import (
     derivative,
@@ -54,6 +55,7 @@ class Fisheye(Lens):
     min_cosine: Scalar
 
     @classmethod
+    @override
     def from_coefficients(cls, **coefficients: float) -> Fisheye:
         """Return the lens with OpenCV's ``k1`` to ``k4``; what is not given is zero."""
         terms = trim_zeros(cls.groups["radial_terms"], usable_coefficients(coefficients))
@@ -61,19 +63,23 @@ class Fisheye(Lens):
         turn = math.sqrt(first_root(np.array(growth)))
         return cls(terms, math.cos(min(turn, MAX_ANGLE)))
 
+    @override
     def shows(self, position: Array3f) -> Bool:
         """Return whether a point's angle from the axis is within the model."""
         return position.z > self.min_cosine * dr.norm(position)
 
+    @override
     def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *place_of(position, self.radial_terms))
 
+    @override
     def projection_jacobian(
         self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
         directions = place_directions(camera, position, self.radial_terms)
         return [f * direction for f, direction in zip(camera.focal, directions, strict=True)]
 
+    @override
     def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         squared = dr.squared_norm(film)

@@ -17,6 +17,7 @@ from itertools import chain
 from typing import ClassVar
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.core.arrays import types_of
 from drgs.core.constants import MAX_COEFFICIENT, TAN_CLAMP
@@ -226,6 +227,7 @@ class Lens:
 class Perspective(Lens):
     """A lens that sees what is in front of it, and whose depth is z."""
 
+    @override
     def visibility(
         self, camera: CameraParameters, position: Array3f
     ) -> tuple[Bool, Array3f, Float]:
@@ -234,18 +236,22 @@ class Perspective(Lens):
         z = dr.select(seen, z, 1)
         return seen, type(position)(x, y, z), z
 
+    @override
     def true_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         return slopes_of(position)
 
+    @override
     def clamped_slopes(self, camera: CameraParameters, position: Array3f) -> list[Float] | None:
         start, end = self.frustum(camera)
         margin = TAN_CLAMP * (end - start) / 2
         bounds = zip(slopes_of(position), start - margin, end + margin, strict=True)
         return [dr.select(s < lo, lo, dr.select(s > hi, hi, s)) for s, lo, hi in bounds]
 
+    @override
     def depth_direction(self, camera: CameraParameters, position: Array3f) -> Array3f:
         return camera.rotation[2] / position.z
 
+    @override
     def ray_range(self, direction: Array3f, near: Float, far: Float) -> tuple[Float, Float]:
         return near / direction.z, far / direction.z
 
@@ -264,10 +270,12 @@ class Pinhole(Perspective):
 
     distorts: ClassVar[bool] = False
 
+    @override
     def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         x, y, z = position
         return camera.focal * types_of(type(z)).Array2f(x, y) / z + camera.principal
 
+    @override
     def projection_jacobian(
         self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
@@ -279,6 +287,7 @@ class Pinhole(Perspective):
             for axis, focal, slope in zip((right, down), camera.focal, slopes, strict=True)
         ]
 
+    @override
     def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         film = film_coordinates(camera, x, y)
         return types_of(type(x)).Array3f(film.x, film.y, 1)

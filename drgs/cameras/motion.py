@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera, Shutter
 from drgs.core.arrays import types_of
@@ -39,6 +40,7 @@ class Motion(Shutter):
         """
         return center - camera.center, rotation_vector(rotation @ camera.rotation.T)
 
+    @override
     def pose(self, camera: Camera, time: Scalar) -> Camera:
         turn = rotation_matrix(self.turn * time)
         return replace(
@@ -65,10 +67,12 @@ class MotionBlur(Motion):
 
     samples: int
 
+    @override
     def cameras(self, camera: Camera) -> list[Camera]:
         # In the middle of equal intervals of time.
         return [self.pose(camera, (k + 0.5) / self.samples) for k in range(self.samples)]
 
+    @override
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         raise ValueError("a camera that motion blurs has an image for each of its cameras_in_time")
 
@@ -79,9 +83,11 @@ class RollingShutter(Motion):
 
     label: ClassVar[str] = "rolling shutter"
 
+    @override
     def cameras(self, camera: Camera) -> list[Camera]:
         return [camera]
 
+    @override
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         """Return the camera when it reads the row of the film that shows a mean.
 

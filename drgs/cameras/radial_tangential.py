@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.distortion import (
     UNBOUNDED_SLOPE,
@@ -70,6 +71,7 @@ class RadialTangential(PlaneDistortion, Perspective):
     on_film: tuple[Array2f, Array2f] | None = None  # the least and the largest slopes on the film
 
     @classmethod
+    @override
     def from_coefficients(cls, **coefficients: float) -> RadialTangential:
         """Return the lens with OpenCV's ``k1`` to ``k6``, ``p1``, ``p2``; others are zero."""
         given = usable_coefficients(coefficients)
@@ -80,18 +82,22 @@ class RadialTangential(PlaneDistortion, Perspective):
         radius = largest_squared_radius(numerator, denominator, fall)
         return cls(numerator, denominator, tangential, radius)
 
+    @override
     def squared_limit(self) -> Scalar:
         return self.max_squared_radius
 
+    @override
     def radial(self, squared: Float) -> Scalar:
         return polynomial(self.numerator, squared) / polynomial(self.denominator, squared)
 
+    @override
     def radial_derivative(self, squared: Float) -> Scalar:
         denominator = polynomial(self.denominator, squared)
         change = derivative(self.numerator, squared)
         change = change - self.radial(squared) * derivative(self.denominator, squared)
         return change / denominator
 
+    @override
     def visibility(
         self, camera: CameraParameters, position: Array3f
     ) -> tuple[Bool, Array3f, Float]:
@@ -100,9 +106,11 @@ class RadialTangential(PlaneDistortion, Perspective):
         limit = self.max_squared_radius * z * z
         return with_unseen_on_axis(position, (z >= camera.near) & (x * x + y * y < limit))
 
+    @override
     def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *self.distort(*slopes_of(position)))
 
+    @override
     def projection_jacobian(
         self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
@@ -115,13 +123,16 @@ class RadialTangential(PlaneDistortion, Perspective):
         )
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
+    @override
     def for_camera(self, camera: CameraParameters) -> RadialTangential:
         return replace(self, on_film=_slopes_on_border(self, camera))
 
+    @override
     def frustum(self, camera: CameraParameters) -> tuple[Array2f, Array2f]:
         assert self.on_film is not None, "Camera.with_lens() sets it"
         return self.on_film
 
+    @override
     def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         return t.Array3f(*self.undistort(film.x, film.y), 1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.distortion import (
     PlaneDistortion,
@@ -54,6 +55,7 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
     prism: tuple[Scalar, ...] = ()  # sx1, sy1; or none
 
     @classmethod
+    @override
     def from_coefficients(cls, **coefficients: float) -> ThinPrismFisheye:
         """Return the lens with COLMAP's coefficients; what is not given is zero."""
         given, (radial, *pairs) = usable_coefficients(coefficients), cls.groups.values()
@@ -63,18 +65,23 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         angle = min(math.sqrt(largest_squared_radius(kept, (), fall)), MAX_ANGLE)
         return cls(kept, math.cos(angle), tangential, prism)
 
+    @override
     def squared_limit(self) -> Scalar:
         return dr.square(dr.acos(self.min_cosine))
 
+    @override
     def radial(self, squared: Float) -> Scalar:
         return polynomial(self.radial_terms, squared)
 
+    @override
     def radial_derivative(self, squared: Float) -> Scalar:
         return derivative(self.radial_terms, squared)
 
+    @override
     def is_radial(self) -> bool:
         return not (self.tangential or self.prism)
 
+    @override
     def distort(self, x: Float, y: Float) -> tuple[Float, Float]:
         shown_x, shown_y = super().distort(x, y)
         if not self.prism:
@@ -82,6 +89,7 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         squared, (sx1, sy1) = x * x + y * y, self.prism
         return shown_x + sx1 * squared, shown_y + sy1 * squared
 
+    @override
     def distortion_jacobian(self, x: Float, y: Float) -> tuple[Float, Float, Float, Float]:
         xx, xy, yx, yy = super().distortion_jacobian(x, y)
         if not self.prism:
@@ -89,9 +97,11 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         sx1, sy1 = self.prism
         return xx + 2 * sx1 * x, xy + 2 * sx1 * y, yx + 2 * sy1 * x, yy + 2 * sy1 * y
 
+    @override
     def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         return pixel_coordinates(camera, *self.distort(*place_of(position)))
 
+    @override
     def projection_jacobian(
         self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:
@@ -99,6 +109,7 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
         dx, dy = place_directions(camera, position)
         return [camera.focal.x * (xx * dx + xy * dy), camera.focal.y * (yx * dx + yy * dy)]
 
+    @override
     def ray(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
         t, film = types_of(type(x)), film_coordinates(camera, x, y)
         u, v = self.undistort(film.x, film.y)

@@ -13,6 +13,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
+from typing_extensions import override
+
 from drgs.cli.ending import (
     exit_on_interrupt,
     exit_on_user_error,
@@ -53,6 +55,7 @@ class CommandParser(argparse.ArgumentParser):
         """End the help with what ``text`` returns, called when the help is shown."""
         self._more_help = text
 
+    @override
     def format_help(self) -> str:
         more = self._more_help()
         return super().format_help() + (f"\n{more}\n" if more else "")
@@ -69,6 +72,7 @@ class CommandParser(argparse.ArgumentParser):
             description = f"{text[0].upper()}{text[1:]}."
             subparsers.add_parser(name, help=text, description=description, module=module)
 
+    @override
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]  # overloads
         self, args: Iterable[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
@@ -84,6 +88,7 @@ class CommandParser(argparse.ArgumentParser):
             self.error(f"there is no command {name}, only {', '.join(others)} and {last}{nearest}")
         return super().parse_known_args(words, namespace or argparse.Namespace())
 
+    @override
     def error(self, message: str) -> NoReturn:
         """Raise :class:`UserError`, which says in one line what is wrong with the command line.
 

@@ -10,6 +10,7 @@ from typing import get_args
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
+from typing_extensions import override
 
 from drgs.config.extensions import extension_keys
 from drgs.config.schema import FitConfig
@@ -89,6 +90,7 @@ class _Loader(yaml.SafeLoader):
     one section is an error (the first would be dropped silently).
     """
 
+    @override
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
         for key_node, _ in node.value:
@@ -129,8 +131,8 @@ def _validate(values: dict, where: str, folder: Path, overrides: Iterable[str]) 
         if isinstance(entries, dict) and isinstance(entries.get(leaf), (str, Path)):
             entries[leaf] = _absolute(folder, str(entries[leaf]), f"{where}: {key}")
     overridden = set()
-    for override in overrides:
-        key, value = _parse_override(override)
+    for assignment in overrides:
+        key, value = _parse_override(assignment)
         _insert(values, key, value)
         overridden.add(key)
     try:

@@ -16,6 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
+from typing_extensions import override
+
 
 class UserError(ValueError):
     """A wrong input: a configuration, a dataset, a file. Its text is all that the user needs."""
@@ -44,6 +46,7 @@ class Place(NamedTuple):
     unit: str  # byte, or line
     number: int
 
+    @override
     def __str__(self) -> str:
         return f"{self.path}: {self.unit} {self.number:,}"
 

@@ -27,6 +27,8 @@ from importlib.metadata import EntryPoint, entry_points
 from traceback import walk_tb
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
+from typing_extensions import override
+
 from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
 
 if TYPE_CHECKING:
@@ -164,6 +166,7 @@ Base = TypeVar("Base")
 class ClassRegistry(Registry[type[Base]]):
     """A registry of classes, each of which has its name as the attribute ``kind``."""
 
+    @override
     def register(
         self, name: str, section: type[BaseModel] | None = None
     ) -> Callable[[Registered], Registered]:

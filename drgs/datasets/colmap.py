@@ -16,6 +16,8 @@ import os
 from collections.abc import Collection
 from pathlib import Path
 
+from typing_extensions import override
+
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, format_names, one_line
@@ -44,10 +46,12 @@ PHOTOGRAPHS = FileKind("photographs", remedy="put the photographs there that COL
 class ColmapReader(DatasetReader):
     """Reads a model of COLMAP and its photographs."""
 
+    @override
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
         del names
         return find_model(folder) is not None
 
+    @override
     def photographs(self, config: DataConfig) -> Photographs:
         notes: list[str] = []
         root, folder = _root_and_model(config.path)
@@ -70,6 +74,7 @@ class ColmapReader(DatasetReader):
             cloud, note = None, f"{note}; points of the model ignored"
         return Photographs("COLMAP", folder, frames, lists, cloud, note, notes)
 
+    @override
     def image_files(self, config: DataConfig) -> list[Path]:
         """Return the photographs of all images, as large as they are there."""
         folder = model_folder(config.path)

@@ -14,6 +14,8 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
+from typing_extensions import override
+
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
@@ -42,10 +44,12 @@ UNUSED_KEYS = ("camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
 class NerfSyntheticReader(DatasetReader):
     """Reads folders of NeRF-synthetic."""
 
+    @override
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
         del folder
         return "transforms_train.json" in names
 
+    @override
     def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
         """Return split ``train``, and ``config.test_split`` (default: ``test`` or ``val``)."""
         if config.background is None:
@@ -74,6 +78,7 @@ class NerfSyntheticReader(DatasetReader):
             rendered=True,  # photographs have no alpha, and are refused
         )
 
+    @override
     def image_files(self, config: DataConfig) -> list[Path]:
         """Return the images of the training views."""
         return [frame.files["image"] for frame in _frames(config, "train", [])]

@@ -14,6 +14,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
+from typing_extensions import override
+
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.datasets.files import note_unnamed_masks
@@ -32,10 +34,12 @@ from drgs.datasets.transforms import (
 class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
+    @override
     def recognizes(self, folder: Path, names: Collection[str]) -> bool:
         del folder
         return "transforms.json" in names
 
+    @override
     def photographs(self, config: DataConfig) -> Photographs:
         notes: list[str] = []
         meta = read_transforms(config.path / "transforms.json")

@@ -76,6 +76,7 @@ class NamedFeature:
     name: str
 
     def __call__(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
+        """Return the feature's columns."""
         del splats, camera
         assert rows.features is not None, "a pipeline composites what there is"
         return list(rows.features[self.name])

@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.core.types import Float
@@ -49,6 +50,7 @@ class OccludedFeatures(SplatFeatures):
     grid: TileGrid
     bound: list[tuple] = field(default_factory=list)  # at the 16 pixels of a lane: (z, rest behind)
 
+    @override
     def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
         depth, end = num_stored - 1, self.num_planes(num_stored)
         fronts = range(end - len(self.surfaces), end)
@@ -61,15 +63,19 @@ class OccludedFeatures(SplatFeatures):
             for group in self.features.groups(num_stored - 1, size)
         ]
 
+    @override
     def num_planes(self, num_stored: int) -> int:
         return self.features.num_planes(num_stored - 1) + len(self.surfaces)
 
+    @override
     def for_camera(self, camera: Camera) -> OccludedFeatures:
         return replace(self, features=self.features.for_camera(camera))
 
+    @override
     def check_differentiable_in_camera(self) -> None:
         self.features.check_differentiable_in_camera()
 
+    @override
     def bind(self, lanes: Lanes, positions: SamplePositions) -> OccludedFeatures:
         rests, bound = [1.0] * PIXELS, []
         for surface in self.surfaces:
@@ -83,12 +89,14 @@ class OccludedFeatures(SplatFeatures):
             bound=list(zip(*bound, strict=True)),
         )
 
+    @override
     def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
         *others, depth = stored
         seen = self._transmitted_share(depth, pixel)
         values = [seen * value for value in self.features.pixel_values(others, pixel)]
         return values + self._in_front(type(depth)(1), depth, pixel)
 
+    @override
     def add(
         self, planes: list[Float], stored: list[Float], pixel: int, weight: Float
     ) -> list[Float]:
@@ -98,6 +106,7 @@ class OccludedFeatures(SplatFeatures):
         pairs = zip(fronts, self._in_front(weight, depth, pixel), strict=True)
         return [*seen, *(front + more for front, more in pairs)]
 
+    @override
     def feature_gradient(self, stored: list[Float], pixel: int, g: list[Float]) -> Float:
         *others, depth = stored
         own, fronts = self._split(g)
@@ -109,6 +118,7 @@ class OccludedFeatures(SplatFeatures):
             for (z, _), d_front in zip(self.bound[pixel], fronts, strict=True)
         )
 
+    @override
     def add_derivatives(
         self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
     ) -> list[Float]:
@@ -118,6 +128,7 @@ class OccludedFeatures(SplatFeatures):
         sums = self.features.add_derivatives(totals, others, pixel, weight, self._split(g)[0])
         return [*sums, nothing]
 
+    @override
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         *others, depth = stored
         seen = self._transmitted_share(depth, pixel)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.schema import InitConfig
 from drgs.core.errors import UserError
@@ -54,6 +55,7 @@ class Box:
         """Return uniform random points (count, 3) float64."""
         return self.center + rng.uniform(-self.half_extent, self.half_extent, (count, 3))
 
+    @override
     def __str__(self) -> str:
         if not self.center.any():
             return f"[-{self.half_extent:g}, {self.half_extent:g}]^3"

@@ -16,6 +16,7 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
 from drgs.core.errors import UnsupportedError
@@ -191,6 +192,7 @@ class DrawnSamples(CenterSamples):
         dr.eval([(p.x, p.y) for p in self.points])
         self.key = (seed, spp, str(sensor.sampler()))
 
+    @override
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
         film = self.film
         if film.rfilter().is_box_filter():
@@ -211,6 +213,7 @@ class DrawnSamples(CenterSamples):
         film.put_block(block)
         return film.develop()
 
+    @override
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
         if self.film.rfilter().is_box_filter():
             count = sum(point.samples for point in self.points)
@@ -246,6 +249,7 @@ class SamplePoints(SamplePositions):
     y: Float  # the same, from its upper border
     samples: int = 1
 
+    @override
     def bind(self, lanes: Lanes, grid: TileGrid) -> LanePoints:
         return LanePoints(load_pixels(self.x, lanes, grid), load_pixels(self.y, lanes, grid))
 
@@ -257,6 +261,7 @@ class LanePoints(SamplePositions):
     x: list[Float]  # in [0, 1): from the pixel's left border, px
     y: list[Float]  # the same, from its upper border
 
+    @override
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
         x, y = Float(lanes.x), Float(lanes.y)
         return [
@@ -264,6 +269,7 @@ class LanePoints(SamplePositions):
             for pixel, (px, py) in enumerate(zip(self.x, self.y, strict=True))
         ]
 
+    @override
     def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
         Float = types_of(type(x)).Float
         first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
@@ -271,15 +277,19 @@ class LanePoints(SamplePositions):
         dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.y)]
         return _grid(dx), _grid(dy)
 
+    @override
     def sum(self, values: list[Float]) -> Float:
         return total(values)
 
+    @override
     def sum_dx(self, values: list[Float], dx: list) -> Float:
         return total(_products(values, dx))
 
+    @override
     def sum_dy(self, values: list[Float], dy: list) -> Float:
         return total(_products(values, dy))
 
+    @override
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         return total(_products(_products(values, dy), dy))
 

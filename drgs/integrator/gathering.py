@@ -281,6 +281,7 @@ class Placement:
     fixed_inputs: str  # name of the parameter to_world, in messages
 
     def detach(self) -> Placement:
+        """Return a detached copy."""
         return replace(self, values=dr.detach(self.values))
 
     @staticmethod
@@ -428,9 +429,11 @@ class Conversion:
     fixed_inputs: ShRotation | None  # of the harmonics, not differentiated
 
     def detach(self) -> Conversion:
+        """Return a detached copy."""
         return replace(self, values=dr.detach(self.values))
 
     def gaussians(self) -> Gaussians:
+        """Convert the parameters to Gaussians."""
         num = dr.width(self.values["opacities"])
         data = columns(self.values["data"], ELLIPSOID_DATA_WIDTH)
         sh = columns(self.values["sh_coeffs"], dr.width(self.values["sh_coeffs"]) // num)

@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
+from typing_extensions import override
 
 from drgs.core.types import Bool, Float
 
@@ -150,17 +151,27 @@ def _sensor_type(variant: str) -> type:
             self.m_needs_sample_2 = sensor.needs_sample_2()
             self.m_needs_sample_3 = sensor.needs_sample_3()
 
+        @override
         def sample_ray(
-            self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
+            self,
+            time: Float,
+            sample1: Float,
+            sample2: mi.Point2f,
+            sample3: mi.Point2f,
             active: Bool | bool = True,
-        ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:
             ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
             return mi.Ray3f(ray), weight
 
+        @override
         def sample_ray_differential(
-            self, time: Float, sample1: Float, sample2: mi.Point2f, sample3: mi.Point2f,
+            self,
+            time: Float,
+            sample1: Float,
+            sample2: mi.Point2f,
+            sample3: mi.Point2f,
             active: Bool | bool = True,
-        ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:  # fmt: skip
+        ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
             # Not through the batch, whose virtual calls reach all sensors, this one included.
             place, found = sample2.x * len(self.sensors), None
             for k, sensor in enumerate(self.sensors):

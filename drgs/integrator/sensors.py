@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import types_of
@@ -61,9 +62,13 @@ class CameraSensor(Protocol):
         """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
         ...
 
-    def near_clip(self) -> float: ...
+    def near_clip(self) -> float:
+        """Return the near clip distance, scene units."""
+        ...
 
-    def far_clip(self) -> float: ...
+    def far_clip(self) -> float:
+        """Return the far clip distance, scene units."""
+        ...
 
 
 def num_poses(sensor: mi.Sensor) -> int:
@@ -283,6 +288,7 @@ def _children(batch: mi.Sensor) -> list[mi.Sensor]:
     """Return the sensors of a batch in their order; ``mi.traverse`` names each once."""
 
     class Children(mi.TraversalCallback):  # of the variant that is set
+        @override
         def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
             del name, flags, cpptype
             if isinstance(value, mi.Sensor):

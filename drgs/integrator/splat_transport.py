@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
@@ -65,7 +66,7 @@ ROULETTE_TRANSMITTANCE = 0.25  # to an emitter: below it, Russian roulette ends 
 
 
 @dataclass(frozen=True, eq=False)
-class RayTransport:
+class RayTransport(SplatTransport):
     """Transport along rays that pass the splats themselves."""
 
     splats: RaySplats
@@ -83,6 +84,7 @@ class RayTransport:
         exposure = dr.opaque(mi.Float, splats.exposure)
         return RayTransport(found.value, exposure, splats.light_samples)
 
+    @override
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
@@ -115,6 +117,7 @@ class RayTransport:
         whole = dr.select(is_open, 1, coverage)
         return whole * (a * mean + b * square + c * cube), coverage
 
+    @override
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """Estimate the transmittance of the splats along segments.
 
@@ -164,7 +167,7 @@ NO_PROBE = 0xFFFFFFFF  # number of a missing probe
 
 
 @dataclass(frozen=True, eq=False)
-class ProbeTransport:
+class ProbeTransport(SplatTransport):
     """Transport along rays that are looked up in probes."""
 
     probes: Probes
@@ -202,6 +205,7 @@ class ProbeTransport:
             unseen,
         )
 
+    @override
     def composite_segment(
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
@@ -217,6 +221,7 @@ class ProbeTransport:
         radiance = dr.select(is_reversed, 0, radiance)
         return radiance, dr.select(is_known, 1 - seen.coverage, T)
 
+    @override
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         seen, is_asked, _ = self._look(segment, active)
         return dr.select(is_asked & seen.is_known, 1 - seen.coverage, 1)

@@ -26,9 +26,17 @@ if TYPE_CHECKING:
         pipeline: Pipeline
         last: BackwardResult  # after a backward pass
 
-        def use_projection(self, stage: ProjectionStage) -> None: ...
-        def forget_frames(self) -> None: ...
-        def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str: ...
+        def use_projection(self, stage: ProjectionStage) -> None:
+            """Set the projection of the coming renders."""
+            ...
+
+        def forget_frames(self) -> None:
+            """Clear the cached frames."""
+            ...
+
+        def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
+            """Return a summary of the simulated effects."""
+            ...
 
 else:
     SplatsPlugin = Any

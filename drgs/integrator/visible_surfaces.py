@@ -32,6 +32,7 @@ class VisibleSurface(Surface):
     normal: mi.Normal3f | None  # world, times the coverage; None where no AOV needs it
 
     def gather(self, pixel: mi.UInt32) -> VisibleSurface:
+        """Return the surfaces of some pixels."""
         return VisibleSurface(
             dr.gather(mi.Float, self.depth, pixel),
             dr.gather(mi.Float, self.coverage, pixel),
@@ -43,6 +44,7 @@ class VisibleSurface(Surface):
         return self.coverage * (1 - front)
 
     def aov_values(self, kind: str, front: mi.Float) -> list[mi.Float] | None:
+        """Return the values of an AOV, or None for one that surfaces do not have."""
         if kind == "depth":
             return [self.share(front) * self.depth]
         if kind == "normal":

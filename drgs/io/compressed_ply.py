@@ -21,6 +21,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from typing_extensions import override
 
 from drgs.core.errors import UserError
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
@@ -233,12 +234,15 @@ class CompressedPly(FileFormat):
     description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
     metadata = None
 
+    @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         return read_gaussians(path)
 
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         return encode(gaussians, rendered_with)
 
+    @override
     def recognizes(self, path: Path) -> bool:
         """Return whether the vertices are packed."""
         return has_packed_vertices(path)

@@ -26,6 +26,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import AliasPath, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
+from typing_extensions import override
 
 from drgs.core.errors import Place, UserError, one_line
 from drgs.core.files import read_bytes
@@ -443,8 +444,10 @@ class Glb(FileFormat):
     up = "y"
     metadata = None
 
+    @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         return read_gaussians(path)
 
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         return encode(gaussians, rendered_with)

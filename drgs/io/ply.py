@@ -31,6 +31,7 @@ from typing import IO
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
+from typing_extensions import override
 
 from drgs.core.errors import UserError, UserNote, format_names, one_line
 from drgs.core.files import open_regular
@@ -400,12 +401,15 @@ class Ply(FileFormat):
     allows_nonfinite = True
     metadata = None
 
+    @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         return read_gaussians(path)
 
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         return encode(gaussians, rendered_with)
 
+    @override
     def recognizes(self, path: Path) -> bool:
         """Return whether the vertices are not packed."""
         return not has_packed_vertices(path)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from typing_extensions import override
 
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
@@ -103,8 +104,10 @@ class Splat(FileFormat):
     description = "antimatter15's .splat, for old viewers: no harmonics"
     has_harmonics = False
 
+    @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         return read_gaussians(path)
 
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         return encode(gaussians, rendered_with)

@@ -31,6 +31,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from typing_extensions import override
 
 from drgs.core.environment import require_module
 from drgs.core.errors import Place, UserError, UserNote, one_line
@@ -319,8 +320,10 @@ class Spz(FileFormat):
     up = "y"
     metadata = frozenset({"antialiased"})
 
+    @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         return read_gaussians(path)
 
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         return encode(gaussians, rendered_with)

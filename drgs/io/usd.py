@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import override
 
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError
@@ -85,5 +86,6 @@ class Usd(FileFormat):
     up = "z"
     metadata = frozenset(ORIGIN)
 
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         return encode(gaussians, rendered_with)

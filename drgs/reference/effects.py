@@ -33,6 +33,7 @@ from math import inf, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import override
 
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, Projection, RenderedImage
@@ -120,9 +121,11 @@ class Lens:
 class Pinhole(Lens):
     """film = (fx x/z + cx, fy y/z + cy)."""
 
+    @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         return _focal(camera) * points[:, :2] / points[:, 2:] + _principal(camera)
 
+    @override
     def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the slopes (2,), (2,) of the film's corners (0, 0) and (W, H)."""
         corners = np.array([[0.0, 0.0], [camera.width, camera.height]])
@@ -153,10 +156,12 @@ class OpenCV(Lens):
     p1: float = 0.0
     p2: float = 0.0
 
+    @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         slopes = points[:, :2] / points[:, 2:]
         return _focal(camera) * self.distort(slopes) + _principal(camera)
 
+    @override
     def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return (M,) bool: z >= near, and the slope's length is below ``valid_radius``.
 
@@ -167,6 +172,7 @@ class OpenCV(Lens):
         radii = np.linalg.norm(points[:, :2], axis=1) / z
         return in_front & (radii < self.valid_radius)
 
+    @override
     def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the bounding box of the undistorted slopes of the film's border.
 
@@ -243,6 +249,7 @@ class Fisheye(Lens):
     k3: float = 0.0
     k4: float = 0.0
 
+    @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         rho = np.linalg.norm(points[:, :2], axis=1)
         theta = np.arctan2(rho, points[:, 2])
@@ -254,10 +261,12 @@ class Fisheye(Lens):
         spread = (polynomial * theta_by_rho)[:, None]
         return _focal(camera) * spread * points[:, :2] + _principal(camera)
 
+    @override
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return (M,): distances from the camera's centre, world units."""
         return np.linalg.norm(points, axis=1)
 
+    @override
     def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return (M,) bool: the distance is >= near, the angle from the axis < ``valid_angle``."""
         angles = np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2])
@@ -290,6 +299,7 @@ class ThinPrismFisheye(Fisheye):
     sx1: float = 0.0
     sy1: float = 0.0
 
+    @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         rho = np.linalg.norm(points[:, :2], axis=1)
         theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
@@ -310,6 +320,7 @@ class ThinPrismFisheye(Fisheye):
         )
 
     @property
+    @override
     def valid_angle(self) -> float:
         """rad: an angle within which no two places are distorted to the same.
 
@@ -347,9 +358,11 @@ class ThinPrismFisheye(Fisheye):
 class Orthographic(Lens):
     """film = (fx x + cx, fy y + cy), with fx and fy in px per world unit."""
 
+    @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         return _focal(camera) * points[:, :2] + _principal(camera)
 
+    @override
     def view_directions(self, camera: Camera, means: np.ndarray) -> np.ndarray:
         """Return (N, 3), unit, world: the camera's forward axis for all."""
         forward = camera.rotation[2] / np.linalg.norm(camera.rotation[2])

@@ -19,6 +19,7 @@ from functools import partial
 from typing import ClassVar
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import FALLOFFS
@@ -124,10 +125,12 @@ class SamplePositions:
 class PixelCenters(SamplePositions):
     """The pixels' centres: rows and columns share their offsets."""
 
+    @override
     def points(self, lanes: Lanes, Float: type) -> list[tuple[Float, Float]]:
         x, y = Float(lanes.x) + 0.5, Float(lanes.y) + 0.5
         return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
 
+    @override
     def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
         t = types_of(type(x))
         first_x, first_y = t.Float(lanes.x) + 0.5 - x, t.Float(lanes.y) + 0.5 - y
@@ -135,17 +138,21 @@ class PixelCenters(SamplePositions):
         dy = [first_y + j for j in range(MICRO)]
         return [dx] * MICRO, [[d] * MICRO for d in dy]
 
+    @override
     def sum(self, values: list[Float]) -> Float:
         return total(self._rows(values))
 
+    @override
     def sum_dx(self, values: list[Float], dx: list) -> Float:
         """Sum values times dx: a column shares dx, so columns are summed first."""
         columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
         return _dot(columns, dx[0])
 
+    @override
     def sum_dy(self, values: list[Float], dy: list) -> Float:
         return _dot(self._rows(values), _first_of_rows(dy))
 
+    @override
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         dy = _first_of_rows(dy)
         return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)

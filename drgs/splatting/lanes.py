@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.core.arrays import divide, types_of, with_aligned_stack
 from drgs.core.types import Bool, Float, UInt32
@@ -159,17 +160,21 @@ class Entries:
 class EntriesBackToFront(Entries):
     """The same entries in the opposite order."""
 
+    @override
     def begin(self) -> Cursor:
         """The cursor at the last entry."""
         return self._open(self.last, True)
 
+    @override
     def pending(self, cursor: Cursor) -> Bool:
         return (cursor.word != 0) | (cursor.group > self.first)
 
     @staticmethod
+    @override
     def current(cursor: Cursor) -> tuple[UInt32, Bool]:
         return cursor.group * WORD + _highest_bit(cursor.word), cursor.word != 0
 
+    @override
     def advance(self, cursor: Cursor) -> Cursor:
         """Drop the current entry; open the group before when this one is used up."""
         bit = (type(cursor.word)(1) << (WORD - 1)) >> dr.lzcnt(cursor.word)

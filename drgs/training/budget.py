@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import override
 
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
@@ -35,6 +36,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.results.report import seconds_of_curves, seconds_of_results
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.effects.base import TrainingEffect
+from drgs.training.loop import StopCriterion
 from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.inputs import share_inputs
@@ -326,7 +328,7 @@ def plan_fit(
     return replace(plan, end=end)
 
 
-class Deadline:
+class Deadline(StopCriterion):
     """Ends a fit when its time is up.
 
     Ten times during the fit, the curve is scaled to the time taken so far, and the trainer's
@@ -341,6 +343,7 @@ class Deadline:
         self._next = self._start + REVISION_SHARE * (end - self._start)
         self._densify_share = config.densify.stop / config.iterations
 
+    @override
     def should_continue(self, trainer: Trainer) -> bool:
         """Return whether there is time; revises the trainer's configuration."""
         now, done = time.perf_counter(), trainer.iteration
@@ -356,6 +359,7 @@ class Deadline:
             trainer.reschedule(total, stop)
         return True
 
+    @override
     def num_iterations(self, trainer: Trainer) -> int:
         """Return the iterations in all: as planned, later by the curve and the time so far."""
         now, done = time.perf_counter(), trainer.iteration

@@ -13,9 +13,10 @@ from pathlib import Path
 from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]  # made at import
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
+from typing_extensions import override
 
 from drgs.results.history import HistoryRow
-from drgs.training.loop import History, Iteration
+from drgs.training.loop import History, Iteration, Observer
 from drgs.training.trainer import Trainer
 
 VERSION = "brain.Event:2"  # version of the format, in the first record
@@ -30,7 +31,7 @@ TAGS = {
 """Names of curves by column of ``history.csv``."""
 
 
-class EventLog:
+class EventLog(Observer):
     """Writes new rows of the history: see ``drgs.training.loop.Observer``.
 
     The file begins with existing rows, so that a fit that was stopped and resumed is one curve.
@@ -46,8 +47,10 @@ class EventLog:
         self._writer.flush()
 
     def close(self) -> None:
+        """Close the file."""
         self._writer.close()
 
+    @override
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:

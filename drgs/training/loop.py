@@ -10,6 +10,7 @@ from itertools import accumulate
 from typing import Protocol
 
 import numpy as np
+from typing_extensions import override
 
 from drgs.datasets.types import View
 from drgs.results.history import (
@@ -112,23 +113,26 @@ class StopCriterion(Protocol):
         ...
 
 
-class AllIterations:
+class AllIterations(StopCriterion):
     """Ends a fit after the number of iterations of its configuration."""
 
+    @override
     def should_continue(self, trainer: Trainer) -> bool:
         return trainer.iteration < trainer.config.iterations
 
+    @override
     def num_iterations(self, trainer: Trainer) -> int:
         return trainer.config.iterations
 
 
 @dataclass(frozen=True)
-class RootDecides:
+class RootDecides(StopCriterion):
     """Ends a fit, and revises it, on all ranks as the criterion of rank 0 does there."""
 
     criterion: StopCriterion  # of other ranks: is not consulted
     comm: Communicator
 
+    @override
     def should_continue(self, trainer: Trainer) -> bool:
         before, continues = trainer.config, True
         if self.comm.is_root:
@@ -140,6 +144,7 @@ class RootDecides:
             trainer.reschedule(*plan)
         return bool(continues)
 
+    @override
     def num_iterations(self, trainer: Trainer) -> int:
         return self.criterion.num_iterations(trainer)
 
@@ -185,13 +190,14 @@ def iterations(trainer: Trainer, history: History, criterion: StopCriterion) -> 
         yield Iteration(report, row, is_last=not continues)
 
 
-class HeldOutQuality:
+class HeldOutQuality(Observer):
     """Measures the PSNR of a few test views on the way, for the curve of the report."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: those of the test split; none on other ranks than 0."""
         self._views = measured_views(views)
 
+    @override
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.config.extensions import LOSS_TERMS, LOSSES, extensions_in_use, section_of
 from drgs.config.schema import FitConfig
@@ -140,6 +141,7 @@ class PhotometricLoss(Loss):
     dssim_weight: float = 0.2  # w, in [0, 1]
 
     @classmethod
+    @override
     def from_config(cls, config: FitConfig, section: None) -> PhotometricLoss:
         return cls(config.loss.dssim_weight)
 
@@ -150,9 +152,11 @@ class PhotometricLoss(Loss):
                 f"PhotometricLoss(): dssim_weight must be in [0, 1], got {self.dssim_weight}"
             )
 
+    @override
     def __call__(self, image: TensorXf, target: Target) -> Float:
         return self.with_squared_error(image, target)[0]
 
+    @override
     def with_squared_error(self, image: TensorXf, target: Target) -> tuple[Float, Float]:
         height, width = _film_size("PhotometricLoss()", image)
         if (height, width) != (target.height, target.width):
@@ -192,6 +196,7 @@ def l1_loss(image: TensorXf, target: TensorXf) -> Float:
 class _PhotometricOp(dr.CustomOp):
     """Evaluates the loss and SSIM's partials by two blur passes, the gradient by two more."""
 
+    @override
     def eval(self, image: TensorXf, target: Target, weight: float) -> tuple[Float, Float]:
         self.target, self.weight, self.shape = target, weight, image.shape
         self.tiling = _tiling(target)
@@ -208,15 +213,18 @@ class _PhotometricOp(dr.CustomOp):
         tiles = _assemble_gradient(self.tiling, blurred, self.values, self.target, self.weight)
         return self.tiling.from_tiles(tiles)
 
+    @override
     def backward(self) -> None:
         d_loss, _ = cast("tuple[Float, Float]", self.grad_out())
         flat = self.gradient() * d_loss
         self.set_grad_in("image", types_of(type(flat)).TensorXf(flat, self.shape))
 
+    @override
     def forward(self) -> None:
         tangent = dr.sum(self.gradient() * cast(TensorXf, self.grad_in("image")).array)
         self.set_grad_out((tangent, dr.zeros(type(tangent))))
 
+    @override
     def name(self) -> str:
         return "PhotometricLoss"
 

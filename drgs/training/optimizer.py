@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 from drjit.opt import Adam, LearningRate
+from typing_extensions import override
 
 from drgs.core.arrays import Array, types_of
 from drgs.core.private import new_rate_cache, same_memory
@@ -78,6 +79,7 @@ class LeanAdam(Adam):
         super().__init__(*arguments, **settings)
         self._moments: dict[str, _Moments] = {}
 
+    @override
     def step(
         self,
         *,

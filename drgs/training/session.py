@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mitsuba as mi
+from typing_extensions import override
 
 from drgs.cli.ending import StopRequest
 from drgs.cli.execution import select_variant
@@ -61,13 +62,14 @@ if TYPE_CHECKING:  # imported where it is needed
     from drgs.training.viewers import ForViewers
 
 
-class ProgressLine:
+class ProgressLine(Observer):
     """Draws the progress of a fit: see :class:`drgs.training.loop.Observer`."""
 
     def __init__(self, progress: RunProgress, criterion: StopCriterion) -> None:
         self._progress, self._criterion = progress, criterion
         self._psnr: float | None = None  # dB, smooth
 
+    @override
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:

@@ -213,21 +213,27 @@ class WholeGradients:
         self._sums: Mapping[str, Float] = {}
 
     def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
+        """Start a step of one view."""
         self._views = views
 
     def own_views(self) -> Sequence[StepView]:
+        """Return the step's view."""
         return self._views
 
     def end_view(self, weights: Mapping[str, Float]) -> None:
+        """Keep the weighted sums of the view."""
         last = self.integrator.last
         self._sums = {name: last.weighted_sums(plane) for name, plane in weights.items()}
 
     def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
+        """Return the view's gradients."""
         last = self.integrator.last
         return [ViewGradients(last.means2d_grad, last.visible, self._sums, last.first_nonfinite)]
 
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
+        """Return the losses of all views."""
         return list(losses.values())
 
     def share(self, view: StepView, value: Array) -> Array:
+        """Return the value."""
         return value

@@ -103,6 +103,7 @@ class LiveScene:
 
     @property
     def approximations(self) -> Approximations:
+        """The approximations of the render."""
         return self._model.approximations
 
     def frame(self, request: FrameRequest) -> ViewerFrame:

@@ -44,9 +44,11 @@ class RenderRequests:
         self._changed.set()
 
     def remove(self, client: int) -> None:
+        """Forget a client and its request."""
         self._pending.pop(client, None)
 
     def pause(self, paused: bool) -> None:
+        """Pause or continue the fit."""
         self.paused = paused
         self._changed.set()
 
@@ -57,6 +59,7 @@ class RenderRequests:
 
     @property
     def pending(self) -> dict[int, PendingRequest]:
+        """Return pending requests by client."""
         return dict(self._pending)
 
     def wait(self, seconds: float) -> None:

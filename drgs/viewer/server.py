@@ -24,6 +24,7 @@ import rich
 import viser
 import websockets.asyncio.server
 from msgspec import Meta
+from typing_extensions import override
 from viser import infra
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
@@ -44,6 +45,7 @@ FindControl = Callable[[str], Control | None]
 class LocalServer(viser.ViserServer):
     """A viser server that clients cannot publish."""
 
+    @override
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
 
@@ -279,6 +281,7 @@ class PageConnection(ServerConnection):
         super().__init__(*arguments, **settings)
         self._control, self._connections = control, connections
 
+    @override
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Abort connections beyond :data:`MAX_CONNECTIONS`."""
         if len(self._connections) >= MAX_CONNECTIONS:
@@ -287,11 +290,13 @@ class PageConnection(ServerConnection):
             self._connections.add(self)
             super().connection_made(transport)
 
+    @override
     def connection_lost(self, exc: Exception | None) -> None:
         if self in self._connections:
             self._connections.remove(self)
             super().connection_lost(exc)
 
+    @override
     async def recv(  # pyright: ignore[reportIncompatibleMethodOverride]  # overloads
         self, decode: bool | None = None
     ) -> bytes | str:

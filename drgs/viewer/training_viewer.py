@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.datasets.types import Dataset
 from drgs.results.history import HistoryRow
-from drgs.training.loop import History, Iteration, StopCriterion, exponential_mean
+from drgs.training.loop import History, Iteration, Observer, StopCriterion, exponential_mean
 from drgs.training.trainer import Trainer
 from drgs.viewer.frames import LiveScene
 from drgs.viewer.page import Page, StartView, event_handler
@@ -42,12 +43,13 @@ CURVES: dict[str, uplot.Series] = {
 }  # by title
 
 
-class EarlyStop:
+class EarlyStop(StopCriterion):
     """The stop criterion ``criterion``, or a viewer client's request to end."""
 
     def __init__(self, criterion: StopCriterion, requests: RenderRequests) -> None:
         self._criterion, self._requests = criterion, requests
 
+    @override
     def should_continue(self, trainer: Trainer) -> bool:
         done = trainer.iteration
         if self._requests.ended and 0 < done < trainer.config.iterations:
@@ -57,11 +59,12 @@ class EarlyStop:
             return False
         return self._criterion.should_continue(trainer)
 
+    @override
     def num_iterations(self, trainer: Trainer) -> int:
         return self._criterion.num_iterations(trainer)
 
 
-class TrainingViewer:
+class TrainingViewer(Observer):
     """Serves viewer clients during a fit: see :class:`drgs.training.loop.Observer`."""
 
     def __init__(
@@ -80,6 +83,7 @@ class TrainingViewer:
         self._progress_at = 0.0  # by time.monotonic
         self._fit_s = 0.0  # seconds that the fit's own kernels took here
 
+    @override
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
@@ -118,6 +122,7 @@ class TrainingViewer:
 class TrainingPage(Page):
     """The page of a fit."""
 
+    @override
     def add_controls(self) -> None:
         from viser import Icon
 

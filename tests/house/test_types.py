@@ -68,6 +68,7 @@ def test_a_type_checker_finds_nothing(tmp_path):
     write_stubs(tmp_path / "stubs")
     settings = {
         "typeCheckingMode": "standard",
+        "reportImplicitOverride": "error",
         "include": [str(REPOSITORY / "drgs"), str(REPOSITORY / "plugins")],
         "extraPaths": [str(REPOSITORY)],
         "stubPath": str(tmp_path / "stubs"),

@@ -16,6 +16,7 @@ from typing import cast
 import drjit as dr
 import numpy as np
 from scipy.special import expit
+from typing_extensions import override
 
 from drgs.config.density import SCHEDULES
 from drgs.config.extensions import STRATEGIES
@@ -47,20 +48,24 @@ class AdaptiveDensityControl(DensityStrategy):
     start_share, stop_share, rate_decay = SCHEDULES["adc"]
 
     @classmethod
+    @override
     def from_config(
         cls, config: FitConfig, dataset: Dataset | None, section: None
     ) -> AdaptiveDensityControl:
         is_white = dataset is not None and tuple(dataset.background) == (1.0, 1.0, 1.0)
         return cls(config.densify, is_white)
 
+    @override
     def begin(self, population: Population) -> None:
         float_type = type(population.value("means").array)
         self.gradient_norms = dr.zeros(float_type, population.num_local_rows)
         self.views = dr.zeros(float_type, population.num_local_rows)
 
+    @override
     def needs_statistics(self, iteration: int) -> bool:
         return iteration < self.config.stop
 
+    @override
     def update_statistics(self, step: StepInfo) -> None:
         """Add the gradients of one more view.
 
@@ -77,6 +82,7 @@ class AdaptiveDensityControl(DensityStrategy):
         self.views = self.views + dr.select(step.visible, 1, 0)
         dr.eval(self.gradient_norms, self.views)
 
+    @override
     def is_due(self, iteration: int) -> bool:
         return self.densifies(iteration) or self.resets(iteration)
 
@@ -94,6 +100,7 @@ class AdaptiveDensityControl(DensityStrategy):
         is_extra = self.white_background and iteration == adc.white_background_reset
         return iteration < self.config.stop and (iteration % adc.reset_every == 0 or is_extra)
 
+    @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Clone, split and prune, then lower opacities, each where it is due."""
         report = None
@@ -153,14 +160,17 @@ class AdaptiveDensityControl(DensityStrategy):
         logits = population.value("logit_opacities")
         population.replace("logit_opacities", dr.select(logits > ceiling, ceiling, logits))
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return {"gradient_norms": np.array(self.gradient_norms), "views": np.array(self.views)}
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         float_type = type(self.views)
         self.gradient_norms = from_host(float_type, state["gradient_norms"])
         self.views = from_host(float_type, state["views"])
 
+    @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return ``max_gaussians``, or fewer if changes that double the rows do not reach it."""
         config, last = self.config, min(iterations, self.config.stop - 1)

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 from scipy.special import expit, logit
+from typing_extensions import override
 
 from drgs.config.density import SCHEDULES, DensifyConfig
 from drgs.config.extensions import STRATEGIES
@@ -69,16 +70,19 @@ class GrowthToNumber(DensityStrategy):
     start_share, stop_share, rate_decay = SCHEDULES["budget"]
 
     @classmethod
+    @override
     def from_config(
         cls, config: FitConfig, dataset: Dataset | None, section: None
     ) -> GrowthToNumber:
         return cls(config.densify, config.coarse or ())
 
+    @override
     def begin(self, population: Population) -> None:
         float_type = type(population.value("means").array)
         self.first = self.first or population.num_rows
         self.errors = dr.zeros(float_type, population.num_local_rows)
 
+    @override
     def needs_statistics(self, iteration: int) -> bool:
         """Return whether errors count: every so many views, at least once before a change."""
         every, stop = self.config.budget.error_every, self.config.stop
@@ -87,18 +91,22 @@ class GrowthToNumber(DensityStrategy):
         last_change = (iteration - 1) // self.config.every * self.config.every
         return self.is_due(iteration) and (iteration - 1) // every * every <= last_change
 
+    @override
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
         return {"errors": absolute_errors}
 
+    @override
     def update_statistics(self, step: StepInfo) -> None:
         self.errors = self.errors + step.weighted_sums["errors"]
         dr.eval(self.errors)
 
+    @override
     def is_due(self, iteration: int) -> bool:
         config = self.config
         turn = iteration % config.every == 0 or iteration == config.stop
         return config.start < iteration <= config.stop and turn
 
+    @override
     def refine(self, population: Population, iteration: int) -> DensityReport:
         """Remove what is transparent, and split where errors are."""
         before, least = population.num_rows, self.config.budget.prune_opacity
@@ -144,13 +152,16 @@ class GrowthToNumber(DensityStrategy):
         final = max(self.config.budget.gaussians, self.first)
         return self.first + round((final - self.first) * math.sqrt(u) / r ** (2 - u))
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return {"errors": np.array(self.errors), "first": np.array(self.first)}
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self.errors = from_host(type(self.errors), state["errors"])
         self.first = int(state["first"])
 
+    @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 from scipy.special import comb, expit, logit
+from typing_extensions import override
 
 from drgs.config.density import SCHEDULES, DensifyConfig
 from drgs.config.extensions import STRATEGIES
@@ -54,9 +55,11 @@ class MarkovChain(DensityStrategy):
     start_share, stop_share, rate_decay = SCHEDULES["mcmc"]
 
     @classmethod
+    @override
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> MarkovChain:
         return cls(config.densify)
 
+    @override
     def begin(self, population: Population) -> None:
         self.extent = population.extent
 
@@ -65,6 +68,7 @@ class MarkovChain(DensityStrategy):
         """Gaussians that the population grows to; one that starts with more stays as it is."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
+    @override
     def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         """Yield the paper's equation 10: mean opacity, and mean scale in scene extents."""
         config, logits = self.config.mcmc, parameters["logit_opacities"]
@@ -74,6 +78,7 @@ class MarkovChain(DensityStrategy):
         if config.scale_weight > 0:
             yield _mean(dr.exp(log_scales), config.scale_weight / self.extent, 3 * num_rows)
 
+    @override
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
         """Add noise to the means (the paper's equation 8), which keep their moments.
 
@@ -101,10 +106,12 @@ class MarkovChain(DensityStrategy):
         moved = dr.select(dr.isfinite(shift), mean + shift, mean)  # scales may have no square
         population.set_values("means", type(means)(dr.ravel(moved), means.shape))
 
+    @override
     def is_due(self, iteration: int) -> bool:
         config = self.config
         return config.start < iteration < config.stop and iteration % config.every == 0
 
+    @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Relocate transparent Gaussians, and let the population grow.
 
@@ -145,6 +152,7 @@ class MarkovChain(DensityStrategy):
             pruned=before - num_alive - relocated,
         )
 
+    @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the cap, or the number at the start."""
         return max(start, self.cap)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
@@ -73,6 +74,7 @@ class Pruning(DensityStrategy):
     """A last phase; subclasses choose the Gaussians that are removed."""
 
     @classmethod
+    @override
     def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Pruning:
         return cls(config)
 
@@ -81,6 +83,7 @@ class Pruning(DensityStrategy):
         self.prune = config.densify.prune
         self.num_before = 0  # Gaussians, at the first change
 
+    @override
     def is_due(self, iteration: int) -> bool:
         return self.phase.is_due(iteration)
 
@@ -98,20 +101,25 @@ class Importance(Pruning):
     by_row = ("weights",)
     scores: Float = NOT_BEGUN  # (N,)
 
+    @override
     def begin(self, population: Population) -> None:
         float_type = type(population.value("means").array)
         self.scores = dr.zeros(float_type, population.num_local_rows)
 
+    @override
     def needs_statistics(self, iteration: int) -> bool:
         return self.phase.contains(iteration)
 
+    @override
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
         return {"coverage": _ones}
 
+    @override
     def update_statistics(self, step: StepInfo) -> None:
         self.scores = self.scores + step.weighted_sums["coverage"]
         dr.eval(self.scores)
 
+    @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
         before = population.num_rows
         self.num_before = self.num_before or before
@@ -125,9 +133,11 @@ class Importance(Pruning):
         self.scores = from_host(type(self.scores), left)
         return report
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return {"pruned_from": np.array(self.num_before), "weights": np.array(self.scores)}
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self.num_before = int(state["pruned_from"])
         self.scores = from_host(type(self.scores), state["weights"])
@@ -143,15 +153,18 @@ class NaturalSelection(Pruning):
 
     num_left = 0  # Gaussians after the last change
 
+    @override
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
         phase = self.phase
         under_pressure = self.num_left > phase.to and phase.contains(iteration)
         return {"logit_opacities": self.prune.opacity_rate if under_pressure else 1.0}
 
+    @override
     def is_due(self, iteration: int) -> bool:
         is_over = 0 < self.num_left <= self.phase.to
         return super().is_due(iteration) and not is_over
 
+    @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Lower all logits, and remove Gaussians that are then below the threshold.
 
@@ -177,9 +190,11 @@ class NaturalSelection(Pruning):
         self.num_left = count
         return keep_best(population, logits, count)
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return {"pruned_from": np.array(self.num_before), "pruned_to": np.array(self.num_left)}
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self.num_before, self.num_left = int(state["pruned_from"]), int(state["pruned_to"])
 

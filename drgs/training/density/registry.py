@@ -8,6 +8,7 @@ from itertools import chain
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
@@ -51,25 +52,31 @@ class Phases(DensityStrategy):
         self.phases = phases
         self.by_row = [name for phase in phases for name in phase.by_row]
 
+    @override
     def begin(self, population: Population) -> None:
         for phase in self.phases:
             phase.begin(population)
 
+    @override
     def needs_statistics(self, iteration: int) -> bool:
         return any(phase.needs_statistics(iteration) for phase in self.phases)
 
+    @override
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
         needed = [phase for phase in self.phases if phase.needs_statistics(iteration)]
         return {k: v for phase in needed for k, v in phase.pixel_weights(iteration).items()}
 
+    @override
     def update_statistics(self, step: StepInfo) -> None:
         for phase in self.phases:
             if phase.needs_statistics(step.iteration):
                 phase.update_statistics(step)
 
+    @override
     def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
 
+    @override
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
         product: dict[str, float] = {}
         for phase in self.phases:
@@ -77,13 +84,16 @@ class Phases(DensityStrategy):
                 product[name] = product.get(name, 1.0) * factor
         return product
 
+    @override
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
         for phase in self.phases:
             phase.perturb(population, iteration, means_lr)
 
+    @override
     def is_due(self, iteration: int) -> bool:
         return any(phase.is_due(iteration) for phase in self.phases)
 
+    @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Let the phases that are due act, one after the other; return the sum of the reports."""
         total: DensityReport | None = None
@@ -96,13 +106,16 @@ class Phases(DensityStrategy):
                 total = report if total is None else _sum(total, report)
         return total
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return {name: v for phase in self.phases for name, v in phase.state().items()}
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         for phase in self.phases:
             phase.restore(state)
 
+    @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the largest number: each phase may begin with that of the one before."""
         most = start

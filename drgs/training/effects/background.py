@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
@@ -38,6 +39,7 @@ class RandomBackground(TrainingEffect):
     upload_bytes = 12
 
     @classmethod
+    @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> RandomBackground:
         if any(view.alpha is None for view in dataset.train):
             raise UserError(
@@ -55,6 +57,7 @@ class RandomBackground(TrainingEffect):
         """
         self.seed, self.background, self.window = seed, np.array(background), (window, sigma)
 
+    @override
     def upload(self, view: View) -> TensorXf:
         """Return 1 - alpha, (H, W, 3); 0 where a mask leaves the background out as well."""
         transparent = 1 - np.asarray(view.alpha)
@@ -62,6 +65,7 @@ class RandomBackground(TrainingEffect):
             transparent = transparent * np.asarray(view.mask)
         return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
 
+    @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
         rng = np.random.default_rng([self.seed, RANDOM_STREAM, fit.iteration])
         color = rng.uniform(size=3)
@@ -75,6 +79,7 @@ class RandomBackground(TrainingEffect):
         image = view.photograph.image.array + transparent.array * shift
         view.replacement = prepare_target(type(transparent)(image, transparent.shape), *self.window)
 
+    @override
     def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:

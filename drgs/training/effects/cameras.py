@@ -16,6 +16,7 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.motion import rotation_matrix
@@ -55,6 +56,7 @@ class CameraRefinement(OptimisedEffect):
     moves_sensors = True
 
     @classmethod
+    @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> CameraRefinement:
         return cls(config.cameras, len(dataset.train), dataset.extent)
 
@@ -70,6 +72,7 @@ class CameraRefinement(OptimisedEffect):
         self.parameters = ViewParameters(values, rates | shared)
         self.numbers: dict[int, dict[str, dr.ArrayBase]] = {}  # of the step's sensors, by view
 
+    @override
     def upload(self, view: View) -> _Start:
         motion = None
         if view.motion is not None:
@@ -84,6 +87,7 @@ class CameraRefinement(OptimisedEffect):
         dr.make_opaque(start)
         return start
 
+    @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
         # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
         self.numbers[view.index] = numbers = dr.detach(self._camera_of(view))
@@ -94,12 +98,15 @@ class CameraRefinement(OptimisedEffect):
     def _has_begun(self, fit: FitState) -> bool:
         return fit.iterations_of_step[0] > self.first
 
+    @override
     def place(self, view: TrainingView) -> None:
         _put(view.sensor, dr.detach(self._camera_of(view)))
 
+    @override
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         return self.numbers[view.index]
 
+    @override
     def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
@@ -175,10 +182,12 @@ class CameraRefinement(OptimisedEffect):
             changes["principal"] = tuple(numbers["shifts"].tolist())
         return LensChange(**changes)
 
+    @override
     def correct_views(self, views: tuple[View, ...]) -> tuple[View, ...]:
         """Return the views with the refined lens; their poses are known no better than before."""
         return tuple(map(self.lens_change.apply, views))
 
+    @override
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
         with atomic_path(folder / CAMERAS) as temporary:

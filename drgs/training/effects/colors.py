@@ -17,6 +17,7 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import ColorConfig, FitConfig
@@ -40,6 +41,7 @@ class ColorCorrection(OptimisedEffect):
     upload_bytes = 12
 
     @classmethod
+    @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> ColorCorrection:
         return cls(config.colors, len(dataset.train))
 
@@ -54,26 +56,31 @@ class ColorCorrection(OptimisedEffect):
         self.share = 1 / num_views
         self.matrix: Float  # (12,), of the view that is rendered
 
+    @override
     def upload(self, view: View) -> TensorXf | None:
         """Return the photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
         if view.alpha is None:
             return None
         return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
 
+    @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
         self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
 
+    @override
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the rendering with the colours of the photograph."""
         seen = transform_colors(image, type(image)(self.matrix, (3, 4)))
         opaque = view.uploads[self.name]
         return seen if opaque is None else image + opaque * (seen - image)
 
+    @override
     def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield the mean square by which the transform differs from the identity."""
         difference = self.matrix - as_numbers(IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
 
+    @override
     def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
@@ -90,13 +97,16 @@ class ColorCorrection(OptimisedEffect):
         matrices = self.parameters.numpy()["matrices"] - np.array(self.common)
         return matrices.reshape(-1, 3, 4)
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return {**super().state(), "common": np.array(self.common)}
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         super().restore(state)
         self.common = as_numbers(state["common"])
 
+    @override
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``colors.json``: the transform of each training view, 3 x 4, by name."""
         found = zip(dataset.train, self.transforms(), strict=True)
@@ -114,10 +124,12 @@ def transform_colors(image: TensorXf, matrix: TensorXf) -> TensorXf:
 
 
 class _TransformColors(dr.CustomOp):
+    @override
     def eval(self, image: TensorXf, matrix: TensorXf) -> TensorXf:
         self.image, self.matrix = dr.detach(image), dr.detach(matrix)
         return self._transform(planes_of(image), self._rows(self.matrix))
 
+    @override
     def forward(self) -> None:
         d_image, d_matrix = (cast(TensorXf, self.grad_in(name)) for name in ("image", "matrix"))
         rows = [[*row[:3], 0] for row in self._rows(self.matrix)]
@@ -125,6 +137,7 @@ class _TransformColors(dr.CustomOp):
         turned = self._transform(planes_of(self.image), self._rows(d_matrix))
         self.set_grad_out(moved + turned)
 
+    @override
     def backward(self) -> None:
         g = planes_of(cast(TensorXf, self.grad_out()))
         rows, inputs = self._rows(self.matrix), planes_of(self.image)

@@ -11,6 +11,7 @@ from typing import cast
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.schema import FitConfig
@@ -35,6 +36,7 @@ class DepthSupervision(TrainingEffect):
     upload_bytes = 8
 
     @classmethod
+    @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> DepthSupervision:
         return cls(config.loss.depth_weight, dataset.extent)
 
@@ -43,6 +45,7 @@ class DepthSupervision(TrainingEffect):
         self.weight = weight / extent
         self.depths: TensorXf  # depth and alpha, of the view that is rendered
 
+    @override
     def upload(self, view: View) -> tuple[Float, Float] | None:
         """Return depths, and weights of the pixels; None where a view has none that counts."""
         if view.depth is None:
@@ -56,11 +59,13 @@ class DepthSupervision(TrainingEffect):
         weights = self.weight * known / known.sum()
         return as_numbers(depth), as_numbers(weights)
 
+    @override
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the colours; depth and alpha are kept for the penalty."""
         image, self.depths = split(image, 3)
         return image
 
+    @override
     def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield the difference in depth."""
         if (known := view.uploads[self.name]) is not None:
@@ -73,14 +78,17 @@ def split(image: TensorXf, count: int) -> tuple[TensorXf, TensorXf]:
 
 
 class _Split(dr.CustomOp):
+    @override
     def eval(self, image: TensorXf, count: int) -> tuple[TensorXf, TensorXf]:
         self.count = count
         planes = planes_of(image)
         return image_of(planes[:count], image), image_of(planes[count:], image)
 
+    @override
     def forward(self) -> None:
         self.set_grad_out(self.eval(cast(TensorXf, self.grad_in("image")), self.count))
 
+    @override
     def backward(self) -> None:
         first, rest = cast("tuple[TensorXf, TensorXf]", self.grad_out())
         self.set_grad_in("image", image_of(planes_of(first) + planes_of(rest), first))
@@ -97,6 +105,7 @@ def depth_error(depths: TensorXf, target: Float, weights: Float) -> Float:
 
 
 class _DepthError(dr.CustomOp):
+    @override
     def eval(self, depths: TensorXf, target: Float, weights: Float) -> Float:
         self.like, self.target, self.weights = dr.detach(depths), target, weights
         depth, alpha = planes_of(depths)
@@ -104,10 +113,12 @@ class _DepthError(dr.CustomOp):
         self.slope = weights * dr.select(difference == 0, 0, dr.sign(difference))
         return dr.sum(weights * dr.abs(difference))
 
+    @override
     def forward(self) -> None:
         d_depth, d_alpha = planes_of(cast(TensorXf, self.grad_in("depths")))
         self.set_grad_out(dr.sum(self.slope * dr.fma(-d_alpha, self.target, d_depth)))
 
+    @override
     def backward(self) -> None:
         g = self.slope * cast(Float, self.grad_out())
         self.set_grad_in("depths", image_of([g, -g * self.target], self.like))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
 from drgs.core.types import TensorXf
@@ -21,15 +22,18 @@ class Masks(TrainingEffect):
     name = "masks"
     upload_bytes = 12
 
+    @override
     def upload(self, view: View) -> TensorXf | None:
         """Return the mask, (H, W, 3); None where a view has none."""
         if view.mask is None:
             return None
         return as_tensor(np.repeat(np.asarray(view.mask)[:, :, None], 3, axis=2))
 
+    @override
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
         return image if view.mask is None else image * np.asarray(view.mask)[:, :, None]
 
+    @override
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
         """Return the rendering without what the mask leaves out."""
         mask = view.uploads[self.name]

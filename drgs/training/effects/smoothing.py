@@ -7,6 +7,7 @@ from typing import cast
 
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
 from drgs.core.types import Float
@@ -29,22 +30,27 @@ class TrainingSmoothing(TrainingEffect):
     def __init__(self) -> None:
         self.filter: Float | None = None
 
+    @override
     def begin(self, fit: FitState) -> None:
         is_due = any(iteration % UPDATE_EVERY == 1 for iteration in fit.iterations_of_step)
         if self.filter is None or fit.begins_stage or is_due:
             self.filter = _smoothing(fit)
         fit.integrator.smoothing = self.filter
 
+    @override
     def finish(self, fit: FitState) -> None:
         """Set the filter of the means as they are; the fit goes on with the former one."""
         fit.integrator.smoothing = _smoothing(fit)
 
+    @override
     def on_population_change(self, fit: FitState) -> None:
         self.filter = fit.integrator.smoothing = None
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return {} if self.filter is None else {"filter": np.array(self.filter)}
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self.filter = cast(Float, mi.Float(state["filter"])) if "filter" in state else None
 

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
+from typing_extensions import override
 
 from drgs.core.types import Float
 from drgs.training.effects.base import TrainingEffect
@@ -80,17 +81,22 @@ class OptimisedEffect(TrainingEffect):
 
     parameters: ViewParameters
 
+    @override
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         return self.parameters.leaves(view.index)
 
+    @override
     def numbers_of(self, view: TrainingView) -> dict[str, Float]:
         return self.parameters.numbers(view.index)
 
+    @override
     def values(self) -> dict[str, np.ndarray]:
         return self.parameters.values()
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
         return self.parameters.state()
 
+    @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self.parameters.restore(state)

@@ -44,9 +44,11 @@ class SingleProcess:
     """The used part of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
 
     def Get_rank(self) -> int:
+        """Return 0."""
         return 0
 
     def Get_size(self) -> int:
+        """Return 1."""
         return 1
 
     def Ibcast(self, array: np.ndarray, root: int) -> None:

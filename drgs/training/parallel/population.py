@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
@@ -111,22 +112,28 @@ class ShardedPopulation(Population):
     shard: Shard  # what this process has
 
     @property
+    @override
     def num_rows(self) -> int:
         return self.shard.total
 
     @property
+    @override
     def first_row(self) -> int:
         return self.shard.local.start
 
+    @override
     def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
         return self.comm.all_gather_rows(np.array(values)).astype(np.float64)
 
+    @override
     def local(self, values: np.ndarray) -> np.ndarray:
         return values[self.shard.local]
 
+    @override
     def row_numbers(self) -> UInt32:
         return super().row_numbers() + dr.opaque(self._index_type, self.first_row)
 
+    @override
     def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
         wanted = np.array(rows)
         owners = self.shard.owners(wanted)
@@ -140,6 +147,7 @@ class ShardedPopulation(Population):
             taken[name] = _on_device(values, result)
         return taken
 
+    @override
     def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
         kept, optimizer = np.array(keep), self.optimizer
         num_appended = 0 if append is None else append["means"].shape[0]
@@ -186,6 +194,7 @@ class ShardedPopulation(Population):
 
         return move
 
+    @override
     def gather_terms(
         self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
     ) -> list[np.ndarray]:
@@ -197,12 +206,14 @@ class ShardedPopulation(Population):
             return []
         return [np.array(term, np.float32) for term in compute(_AllRows(self))]
 
+    @override
     def gather_gaussians(self, local: Gaussians) -> Gaussians:
         columns = {name: getattr(local, name) for name in (*PARAMETER_NAMES, "smoothing")}
         columns = {name: rows for name, rows in columns.items() if rows is not None}
         gathered = {name: self.comm.gather_rows(rows) for name, rows in columns.items()}
         return replace(local, **gathered) if self.comm.is_root else local
 
+    @override
     def gather_state(
         self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
     ) -> dict[str, np.ndarray]:
@@ -214,6 +225,7 @@ class ShardedPopulation(Population):
                 state[name] = rows.reshape(shape)
         return state
 
+    @override
     def scatter_state(
         self, state: Mapping[str, np.ndarray], is_by_row: Callable[[str], bool]
     ) -> dict[str, np.ndarray]:
