@@ -30,29 +30,29 @@ from drgs.splatting.rendering import ProjectionStage
 class SplatsIntegrator(mi.CppADIntegrator):
     """3D Gaussian splatting, composited front to back over each pixel (Kerbl et al. 2023).
 
-    Types and details are in ``docs/mitsuba.md``; "Default: none" is off.
+    Details of the parameters are in ``docs/mitsuba.md``; "Default: none" is off.
 
-    - ``filename``: PLY file of the 3DGS layout, compressed PLY, SPZ, ``.glb`` or ``.splat``.
-    - ``means``, ``quats``, ``log_scales``, ``logit_opacities``, ``sh0``, ``shN``: tensors instead.
-    - ``feature_...``: numbers of the Gaussians (N, C) under a name of your own, for ``aovs``.
-    - ``smoothing``: standard deviation of the 3D smoothing filter (N,). (Default: the file's)
-    - ``to_world``: similarity that places the Gaussians. (Default: none)
-    - ``shapes_to_world``, ``shapes_to_world_...``: turns harmonics of shapes. (Default: none)
-    - ``sh_degree``: highest degree that is evaluated, 0 to 3. (Default: the highest there is)
-    - ``background``: colour in display space, or a texture over the film. (Default: black)
-    - ``hide_emitters``: hide an environment behind the splats. (Default: false)
+    - ``filename`` (string): PLY, compressed PLY, SPZ, ``.glb`` or ``.splat`` with the Gaussians.
+    - ``means``, ``quats``, ``log_scales``, ``logit_opacities``, ``sh0``, ``shN`` (tensor): instead.
+    - ``feature_...`` (tensor): numbers (N, C) of the Gaussians under your name, for ``aovs``.
+    - ``smoothing`` (tensor): deviations (N,) of the 3D smoothing filter. (Default: the file's)
+    - ``to_world`` (transform): similarity that places the Gaussians. (Default: none)
+    - ``shapes_to_world``, ``shapes_to_world_...`` (transform): turn shapes' SH. (Default: none)
+    - ``sh_degree`` (int): highest degree that is evaluated, 0 to 3. (Default: the Gaussians')
+    - ``background`` (rgb or texture): in display space, behind the splats. (Default: black)
+    - ``hide_emitters`` (bool): hide an environment behind the splats. (Default: false)
     - a nested integrator: renders surfaces; of type ``splats``: a splat object. (Default: ``path``)
-    - ``nested_spp``: samples of the nested integrator. (Default: as many as of the splats)
-    - ``light``: ``none``, ``probe``, ``rays``: how splats light surfaces. (Default: ``none``)
-    - ``probes``: ids of shapes and emitters that have one. (Default: none)
-    - ``unseen``: ``none``, ``rays``: for rays that probes have no answer for. (Default: ``none``)
-    - ``light_samples``: splats that a ray draws; 0: it composites all. (Default: 4)
-    - ``exposure``: radiance of white splats where surfaces see them. (Default: 1)
-    - ``shadows``: ids of shapes that shade splats. (Default: none)
-    - ``near``: near plane, scene units. (Default: 0.01)
-    - ``srgb_primitives``: linear radiance, or false for display space. (Default: true)
-    - ``aovs``: ``name:type``, of ``depth``, ``alpha``, ``normal``, ``feature_...``. (Default: none)
-    - ``ignore``: list of ``distortion``, ``defocus``, ``motion``, ``smoothing``. (Default: none)
+    - ``nested_spp`` (int): samples of the nested integrator. (Default: as many as of the splats)
+    - ``light`` (string): ``none``, ``probe``, ``rays``: how splats light surfaces. (Default: none)
+    - ``probes`` (string): ids of shapes and emitters that have a probe. (Default: none)
+    - ``unseen`` (string): ``none``, ``rays``: beyond the sight of probes. (Default: ``none``)
+    - ``light_samples`` (int): splats that a ray draws; 0: it composites all. (Default: 4)
+    - ``exposure`` (float): radiance of white splats where surfaces see them. (Default: 1)
+    - ``shadows`` (string): ids of shapes that shade splats. (Default: none)
+    - ``near`` (float): near plane, scene units. (Default: 0.01)
+    - ``srgb_primitives`` (bool): linear radiance, or false for display space. (Default: true)
+    - ``aovs`` (string): ``name:depth``, ``:alpha``, ``:normal``, ``:feature_...``. (Default: none)
+    - ``ignore`` (string): ``distortion``, ``defocus``, ``motion``, ``smoothing``. (Default: none)
     - ``projection``, ``falloff``, ``order``, ``order_window``, ``sh_direction``, ``alpha_max``,
       ``alpha_cut``, ``transmittance_stop``, ``extent``, ``low_pass``, ``antialiased``: see
       :class:`drgs.config.approximations.Approximations`.

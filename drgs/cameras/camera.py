@@ -18,6 +18,8 @@ from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar, UInt32
 
 if TYPE_CHECKING:
     from drgs.cameras.thin_lens import RoundAperture
+else:
+    RoundAperture = object  # Dr.Jit resolves the annotation; cameras without blur import nothing
 
 MAX_RAY_ERROR_PX = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
