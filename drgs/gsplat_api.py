@@ -50,11 +50,6 @@ MITSUBA_CAMERAS = (
     "with the integrator splats"
 )
 
-MITSUBA_CAMERA_ARGUMENTS = (
-    "camera_model radial_coeffs tangential_coeffs thin_prism_coeffs ftheta_coeffs rolling_shutter "
-    "viewmats_rs"
-).split()
-
 UNSUPPORTED_GSPLAT_ARGUMENTS = {
     "far_plane": "leave out the Gaussians beyond it",
     "radius_clip": "leave it out: small splats cost little",
@@ -68,7 +63,13 @@ UNSUPPORTED_GSPLAT_ARGUMENTS = {
     "channel_chunk": "leave it out",
     "distributed": "leave it out",
     "segmented": "leave it out",
-    **dict.fromkeys(MITSUBA_CAMERA_ARGUMENTS, MITSUBA_CAMERAS),
+    "camera_model": MITSUBA_CAMERAS,
+    "radial_coeffs": MITSUBA_CAMERAS,
+    "tangential_coeffs": MITSUBA_CAMERAS,
+    "thin_prism_coeffs": MITSUBA_CAMERAS,
+    "ftheta_coeffs": MITSUBA_CAMERAS,
+    "rolling_shutter": MITSUBA_CAMERAS,
+    "viewmats_rs": MITSUBA_CAMERAS,
 }
 """Parameters of gsplat that drgs does not have, and remedies."""
 
