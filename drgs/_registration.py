@@ -1,7 +1,6 @@
-"""Keeps the plugins registered for whichever Mitsuba variant is active.
+"""Registration of the plugins for every Mitsuba variant, as its plugin registry belongs to one.
 
-The only global state of drgs: Mitsuba's plugin registry belongs to a variant. Mitsuba 3.10 finds
-:mod:`drgs.plugins` by its entry point as well; whichever comes first registers them.
+Mitsuba 3.10 also finds :mod:`drgs.plugins` by its entry point; the first of both registers them.
 """
 
 from __future__ import annotations
@@ -11,8 +10,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-BACKENDS = ("scalar_", "llvm_", "cuda_", "metal_")
-"""Beginnings of the names of Mitsuba's variants."""
+BACKENDS = ("scalar_", "llvm_", "cuda_", "metal_")  # prefixes of Mitsuba's variants
 
 
 def register_plugins() -> None:

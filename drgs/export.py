@@ -1,8 +1,7 @@
 """``python -m drgs.export RUN_OR_FILE --format NAME``: Gaussians for other programs.
 
-Of a fit's output folder, the file that is meant for other programs is taken: see
-``drgs.training.viewers``. The formats are those of ``drgs.io.formats``. Models can be cropped and
-filtered on the way, and turned upright.
+Exports a file, or a fit's file for other programs (``drgs.training.viewers``), in the formats of
+``drgs.io.formats``; crops, filters and turns it upright.
 """
 
 from __future__ import annotations
@@ -36,20 +35,12 @@ from drgs.results.viewer import HONOURED, DisplaySettings, InitialView, viewer_p
 
 COMMAND = "export"
 
-Z_UP = np.array([0.0, 0.0, 1.0])
-"""Up in datasets, and in what ``Gaussians.save`` expects for formats with axes of their own."""
+Z_UP = np.array([0.0, 0.0, 1.0])  # of datasets, and of Gaussians that formats with axes encode
+Y_DOWN = np.array([0.0, -1.0, 0.0])  # of formats without axes: COLMAP's, hence the reference's
 
-Y_DOWN = np.array([0.0, -1.0, 0.0])
-"""Up in formats that define none, as programs take it: that of COLMAP's worlds, in which the 3DGS
-reference fits."""
+PLAYCANVAS_LOW_PASS = 0.075  # px^2, of PlayCanvas and SuperSplat; others add 0.3
 
-PLAYCANVAS = "compressed-ply"
-
-PLAYCANVAS_LOW_PASS = 0.075
-"""Square pixels that the viewers of that format add to splats, where others add 0.3."""
-
-MIN_SNAP_COSINE = np.cos(np.radians(5))
-"""Cosine of the angle to an axis within which the training cameras' up is that axis."""
+MIN_SNAP_COSINE = np.cos(np.radians(5))  # angle below which the cameras' up is snapped to an axis
 
 
 @dataclass(frozen=True)
@@ -59,16 +50,14 @@ class ExportSource:
     gaussians: Gaussians[np.ndarray]  # without a smoothing filter
     path: Path  # of the file
     folder: Path | None  # of the fit; None: a file was named
-    is_turned: bool = False  # then the fit's cameras are no longer where they were
+    is_turned: bool = False  # then the fit's cameras no longer match
 
 
 Honoured = Callable[[Approximations], frozenset[str]]
-"""Function of the approximations that Gaussians were fitted with: the names of those that they are
-shown with, or nearly."""
+"""Function from fitted approximations to the names of those that a program honours, about."""
 
 
 def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:
-    """A low-pass that is nearer to PlayCanvas's than to that of others, with its compensation."""
     ours = abs(fitted.low_pass - PLAYCANVAS_LOW_PASS)
     return HONOURED if ours < abs(fitted.low_pass - LOW_PASS) else frozenset()
 
@@ -78,15 +67,15 @@ class ExportTarget:
     """A format that ``--format`` names."""
 
     suffix: str  # of files, in small letters
-    text: str  # what it is, one phrase
-    encode: Callable[[ExportSource], bytes]  # equal Gaussians give equal bytes
-    up: np.ndarray  # (3,) what programs take for up
-    has_axes: bool = False  # whether the format says so: then models are always turned
-    honoured: Honoured | None = None  # None: nothing is
+    text: str  # description, one phrase
+    encode: Callable[[ExportSource], bytes]  # deterministic
+    up: np.ndarray  # (3,) in programs
+    has_axes: bool = False  # whether the format defines up: then models are always turned
+    honoured: Honoured | None = None  # None: none
 
 
 def targets() -> dict[str, ExportTarget]:
-    """Return what ``--format`` takes, by name: the file formats, and the page."""
+    """Return the targets of ``--format`` by name: file formats, and the page."""
     found = {
         each.name: ExportTarget(
             suffix=each.value.suffix,
@@ -94,7 +83,7 @@ def targets() -> dict[str, ExportTarget]:
             encode=lambda source, name=each.name: source.gaussians.to_bytes(name),
             up=Y_DOWN if each.value.up is None else Z_UP,
             has_axes=each.value.up is not None,
-            honoured=_honoured_by_playcanvas if each.name == PLAYCANVAS else None,
+            honoured=_honoured_by_playcanvas if each.name == "compressed-ply" else None,
         )
         for each in file_formats()
     }
@@ -102,7 +91,7 @@ def targets() -> dict[str, ExportTarget]:
 
 
 def _page(source: ExportSource) -> bytes:
-    """Encode a page with the first view and the background of the fit; black if there is none."""
+    """Encode a page with the first view and the background of the fit; else black."""
     gaussians, folder = source.gaussians, source.folder
     title, background, cameras = source.path.name, (0.0, 0.0, 0.0), None
     if folder is not None:
@@ -117,13 +106,8 @@ def _page(source: ExportSource) -> bytes:
     return viewer_page(title, shown, initial_view, background)
 
 
-PAGE = ExportTarget(
-    ".html",
-    "a page to walk around in, for any browser",
-    _page,
-    Z_UP,
-    honoured=lambda _: HONOURED,
-)
+_PAGE_TEXT = "a page to walk around in, for any browser"
+PAGE = ExportTarget(".html", _PAGE_TEXT, _page, Z_UP, honoured=lambda _: HONOURED)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -228,11 +212,10 @@ def run(args: argparse.Namespace) -> None:
 
 
 def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
-    """Load the Gaussians of a fit's folder that are meant for other programs, or those of a file.
+    """Load a file, or a fit's Gaussians for other programs, and bake in a smoothing filter.
 
-    honoured: by the target. The fit's own Gaussians are taken where that is all that they need.
-    Approximations of a file that other programs would not make are a :class:`UserNote`; defaults
-    are dropped. A smoothing filter is baked in.
+    honoured: by the target; if that is enough, the fit's own Gaussians are loaded. Other
+    non-default approximations of the file give a :class:`UserNote`.
     """
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")
@@ -250,9 +233,9 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
             shows_own = fitted.non_default.keys() <= honoured(fitted)
         path = what / (names[-1] if shows_own else names[0])
     gaussians = Gaussians.load(path)
-    said = from_ply_header(str(path), gaussians.rendered_with or {})
-    others = {name: value for name, value in said.items() if value != DECLARED[name].default}
-    shown = frozenset() if honoured is None else honoured(Approximations.from_values(said))
+    recorded = from_ply_header(str(path), gaussians.rendered_with or {})
+    others = {name: value for name, value in recorded.items() if value != DECLARED[name].default}
+    shown = frozenset() if honoured is None else honoured(Approximations.from_values(recorded))
     if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
         beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
         note = (
@@ -267,7 +250,7 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
 def _destination(args: argparse.Namespace) -> tuple[str, Path]:
     name = args.format
     if name is None and args.out is not None:
-        name = _target_of(args.out)
+        name = _target_name(args.out)
     known = targets()
     if name not in known:
         got = f"got {one_line(name, 40)}{did_you_mean(name, known)}" if name else "got none"
@@ -277,7 +260,7 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
         read_as = format_for(args.what)
         stem = args.what.name[: -len(read_as.value.suffix)] if read_as else args.what.resolve().name
         return name, args.what.resolve().with_name(f"{stem}{suffix}")
-    if (found := _target_of(args.out)) != name:  # as a.compressed.ply is no name for a plain PLY
+    if (found := _target_name(args.out)) != name:  # as a.compressed.ply is no name for a plain PLY
         raise UserError(
             f"--out {args.out}: the name of a {name} file must end in {suffix}, got that of "
             f"{f'a {found}' if found else 'no known'} file"
@@ -285,7 +268,7 @@ def _destination(args: argparse.Namespace) -> tuple[str, Path]:
     return name, args.out
 
 
-def _target_of(path: Path) -> str | None:
+def _target_name(path: Path) -> str | None:
     if path.name.lower().endswith(PAGE.suffix):
         return "html"
     found = format_for(path)
@@ -298,10 +281,9 @@ def find_kept(
     min_opacity: float | None = None,
     max_scale: float | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return which Gaussians (N,) each criterion that is given keeps.
+    """Return the mask (N,) of the Gaussians that each given criterion keeps.
 
-    box: two opposite corners, world, of the means; max_scale: largest standard
-    deviation, world units.
+    box: two opposite corners, world, of the means; max_scale: standard deviation, world units.
     """
     kept = {}
     if box is not None:
@@ -317,7 +299,7 @@ def find_kept(
 
 
 def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:
-    """Return some of the Gaussians; rows: indices, or (N,) of truth values."""
+    """Return some of the Gaussians; rows: indices, or a mask (N,)."""
     values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
     arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
     features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
@@ -339,7 +321,7 @@ def _select(source: ExportSource, args: argparse.Namespace) -> Gaussians[np.ndar
 def _up_direction(
     args: argparse.Namespace, source: ExportSource, target: ExportTarget
 ) -> np.ndarray | None:
-    """Return the direction (3,) that is up, and print it; None: the model is not to be turned."""
+    """Return and print the up direction (3,); None: do not turn the model."""
     words = args.up
     if words is None and not target.has_axes:
         return None

@@ -1,7 +1,6 @@
 """``python -m drgs.fit CONFIG.yml|FOLDER``: fit Gaussians to photographs.
 
-Reads the configuration, or makes one that suits the folder, and runs
-:class:`drgs.training.session.FitSession`, which writes the output folder.
+Runs :class:`drgs.training.session.FitSession` with a given or a default configuration.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ from drgs.training.session import FitSession
 if TYPE_CHECKING:  # imported with --view
     from drgs.viewer.server import LocalServer
 
-LOADING_SECONDS = 1.2
-"""Before :func:`run`, for the interpreter and the libraries; ``--budget`` counts them."""
+LOADING_SECONDS = 1.2  # before run(), for imports; --budget includes them
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -139,7 +137,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def communicator(args: argparse.Namespace) -> Communicator:
-    """Return the processes that share the fit: this one, or those that ``mpiexec`` has started."""
+    """Return the communicator of this process, or of those that ``mpiexec`` has started."""
     if process_number() is None:
         return Communicator()
     start_mpi()
@@ -156,7 +154,7 @@ def communicator(args: argparse.Namespace) -> Communicator:
 def add_observers(
     args: argparse.Namespace, server: LocalServer | None, blocks: ExitStack, session: FitSession
 ) -> None:
-    """Let TensorBoard and the server's page follow the fit; blocks: end with the command."""
+    """Add observers for TensorBoard and the server's page; blocks: closed with the command."""
     if args.tensorboard:
         from drgs.training.event_log import EventLog
 
@@ -167,18 +165,14 @@ def add_observers(
         from drgs.viewer.server import url
         from drgs.viewer.training_viewer import watch
 
-        watching, session.criterion = watch(
-            server, session.trainer, session.trainer.dataset, session.criterion
-        )
-        session.observers.append(watching)
+        trainer = session.trainer
+        viewer, session.criterion = watch(server, trainer, trainer.dataset, session.criterion)
+        session.observers.append(viewer)
         print(f"look on at {url(server)}", flush=True)
 
 
 def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
-    """Return the server of ``--view``'s page; None without it.
-
-    Raises ``UserError`` where it cannot be served, before anything is read or written.
-    """
+    """Return the server of ``--view``'s page; None without it."""
     if not args.view:
         for name in ("address", "port"):
             if getattr(args, f"view_{name}") is not None:

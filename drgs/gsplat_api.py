@@ -1,7 +1,6 @@
-"""Images of Gaussians as one function of arrays, with gsplat's names and conventions.
+""":func:`rasterization`, with gsplat's names and conventions.
 
-No Mitsuba: :func:`rasterization` composes the stages of ``drgs.splatting`` for cameras given as
-matrices, and hands their adjoint and tangent to Dr.Jit as a custom operation.
+Composes the stages of ``drgs.splatting``, without Mitsuba, as a custom operation of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -41,14 +40,10 @@ Array = np.ndarray | TensorXf  # arrays of the caller: numpy arrays, or tensors 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 
-LEAST_ALPHA = 1e-10  # smallest divisor of expected depths, as in gsplat
-
-MAX_SKEW = 1e-6  # rounding, relative to the largest number in K, where a pinhole without skew has 0
-
-LEAST_SCALE = 1e-18
-"""World units: a smaller standard deviation is taken as this one, whose square float32 holds."""
-
-OPAQUE_LOGIT = 100.0  # its sigmoid is 1 in float64: the opacity is then what it is multiplied by
+MIN_ALPHA = 1e-10  # divisor of expected depths, as in gsplat
+MIN_SCALE = 1e-18  # world units: its square is not 0 in float32
+MAX_SKEW = 1e-6  # relative to the largest number in K: rounding
+OPAQUE_LOGIT = 100.0  # its sigmoid is 1 in float64
 
 MITSUBA_CAMERAS = (
     "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render takes "
@@ -88,7 +83,7 @@ SHAPES: dict[str, list[tuple[str | int, ...]]] = {
     "colors": [("N", "D"), ("C", "N", "D")],
     "backgrounds": [("C", "D")],
 }
-"""Shapes that arrays may have; a letter is the same number everywhere, set where it is first."""
+"""Allowed shapes; a letter is the same number everywhere."""
 
 COEFFICIENTS: list[tuple[str | int, ...]] = [("N", "K", 3), ("C", "N", "K", 3)]
 """Shapes of ``colors`` with ``sh_degree``."""
@@ -235,7 +230,7 @@ def _tensor_type(means: Array) -> type[TensorXf]:
 
 
 def _tensor(name: str, value: Any, tensor_type: type[TensorXf]) -> TensorXf:
-    """Return ``value``, an array of any kind, as a tensor, still attached."""
+    """Return an array of any kind as a tensor, still attached."""
     if type(value) is tensor_type:
         return value
     flat_type = dr.array_t(tensor_type)
@@ -276,7 +271,7 @@ def _fits(got: tuple[int, ...], shape: tuple[int | str, ...]) -> bool:
 
 
 def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
-    """Raise ValueError for a matrix that is no pinhole's, or that has no inverse."""
+    """Raise ValueError for a K that is no pinhole's, or a singular viewmat."""
     for index, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         fits = np.abs(K - pinhole).max() <= MAX_SKEW * np.abs(K).max() or np.isnan(K).any()
@@ -288,11 +283,11 @@ def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
 
 
 def use_activated(rows: GaussianRows) -> GaussianRows:
-    """Take scales and opacities of Gaussians as they are, from their features."""
+    """Use the activated scales and opacities in the features."""
     assert rows.features is not None, "see _View._gaussians"
     t = types_of(type(rows.logit_opacities))
     sizes = [dr.abs(scale) for scale in rows.features["scales"]]
-    logs = [dr.log(dr.select(size > LEAST_SCALE, size, LEAST_SCALE)) for size in sizes]
+    logs = [dr.log(dr.select(size > MIN_SCALE, size, MIN_SCALE)) for size in sizes]
     return replace(
         rows, log_scales=t.Array3f(logs), opacity_compensation=rows.features["opacities"][0]
     )
@@ -321,9 +316,7 @@ def _images(
             channels = [dr.fma(transmittance, b, c) for b, c in zip(behind, channels, strict=True)]
         alpha = 1 - transmittance
         if mode.endswith("ED"):
-            depths = [
-                depth / dr.select(alpha > LEAST_ALPHA, alpha, LEAST_ALPHA) for depth in depths
-            ]
+            depths = [depth / dr.select(alpha > MIN_ALPHA, alpha, MIN_ALPHA) for depth in depths]
         channels += depths
         images.append(channels[0] if len(channels) == 1 else interleave(channels))
         alphas.append(alpha)
@@ -333,13 +326,13 @@ def _images(
 
 
 def _stack_cameras(parts: list[Float], shape: tuple[int, ...]) -> TensorXf:
-    """Return one flat array per camera as a tensor of this shape and one axis more."""
+    """Concatenate one flat array per camera to a tensor of this shape and one more axis."""
     flat = parts[0] if len(parts) == 1 else dr.concat(parts)
     return types_of(type(flat)).TensorXf(flat, (*shape, dr.width(flat) // math.prod(shape)))
 
 
 class _Planes(dr.CustomOp):
-    """Planes of all cameras (transmittance, features), and each number of the backgrounds."""
+    """Custom operation: planes of all cameras (transmittance, features), and background numbers."""
 
     @override
     def eval(
@@ -398,7 +391,7 @@ class _View:
         """Render; inputs: detached; index: of the camera among them."""
         self.film, self.pipeline, self.inputs, self.index = film, pipeline, inputs, index
         self.types = types_of(type(inputs["means"].array))
-        # The few numbers of a camera are read to the host: its centre is found in float64 there.
+        # On the host, to compute the centre in float64.
         self.viewmat = np.array(inputs["viewmats"], np.float64)[index]
         self.center = -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
         rotation, K = self.viewmat[:3, :3], np.array(inputs["Ks"], np.float64)[index]
@@ -408,7 +401,7 @@ class _View:
         self.frame = render(self.gaussians, camera, pipeline)
 
     def tangents(self, directions: Mapping[str, TensorXf]) -> list[Float]:
-        """Return directional derivatives of the planes along tangents of the inputs."""
+        """Return tangents of the planes from those of the inputs."""
         d_gaussians = self._gaussians(directions)
         d_camera = self._camera_tangents(directions) if self.film.is_camera_attached else None
         (d_planes,) = frames_tangent(self.gaussians, [self.frame], d_gaussians, d_camera)
@@ -416,7 +409,7 @@ class _View:
         return d_planes
 
     def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
-        """Return derivatives with respect to the inputs from those with respect to the planes."""
+        """Return gradients of the inputs from those of the planes."""
         dr.eval(d_planes)
         found = frames_adjoint(
             self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
@@ -437,7 +430,7 @@ class _View:
         return gradients
 
     def _gaussians(self, values: Mapping[str, TensorXf]) -> Gaussians:
-        """Return values, or tangents, of the Gaussians that the kernels see."""
+        """Return values, or tangents, of the Gaussians."""
         num, t, colors = values["means"].shape[0], self.types, values["colors"]
         if len(colors.shape) == (3 if self.film.sh_degree is None else 4):
             colors = colors[self.index]
@@ -458,10 +451,7 @@ class _View:
         )
 
     def _camera_gradients(self, numbers: np.ndarray) -> dict[str, Float]:
-        """Return derivatives with respect to the matrices from those of a camera's numbers.
-
-        The centre is c = -R^-1 t, hence dc = -R^-1 (dt + dR c).
-        """
+        """Return gradients of the matrices; c = -R^-1 t, hence dc = -R^-1 (dt + dR c)."""
         rotation, d_center, focal, principal = np.split(numbers, [9, 12, 14])
         d_translation = -np.linalg.solve(self.viewmat[:3, :3].T, d_center)
         d_viewmat, d_K = np.zeros((4, 4)), np.zeros((3, 3))

@@ -1,17 +1,12 @@
 """``python -m drgs.render WHAT --out DIR``: images of Gaussians, of a fit, of a Mitsuba scene.
 
-``WHAT`` is one of
+``WHAT`` is a file of Gaussians (``drgs.io.formats``), the output folder of a fit
+(``point_cloud.ply`` and ``config.yml``) or a Mitsuba scene (``.xml``; Mitsuba's own binary cannot
+load Python plugins). Cameras of Gaussians are the photographs' (``--split``, with metrics), an
+orbit (``--orbit``), a file's (``--camera``) or one (``--origin``).
 
-- ``MODEL``: a file of Gaussians: PLY, or another of ``drgs.io.formats``
-- ``OUT_DIR``: the output folder of a fit; its ``point_cloud.ply`` under its own ``config.yml``
-- ``SCENE.xml``: any Mitsuba scene; Mitsuba's own binary cannot load the plugins, which are Python
-
-Gaussians are seen from the photographs' cameras (``--split``; the images are then measured against
-the photographs), from an orbit (``--orbit``), from the cameras of a file (``--camera``) or from one
-placed by hand (``--origin``). A Mitsuba scene has its own sensors.
-
-The output folder then contains one PNG per image, and ``metrics.json`` (``--split``), an animation
-``orbit.webp`` and ``orbit.gif`` (``--orbit``), or one EXR per image (scenes).
+Writes a PNG per image, and ``metrics.json`` (``--split``), ``orbit.webp`` and ``orbit.gif``
+(``--orbit``), or an EXR per image (scenes).
 """
 
 from __future__ import annotations
@@ -68,8 +63,7 @@ from drgs.results.refined_cameras import training_cameras
 DEFAULT_SIZE = (400, 400)  # px, where nothing else decides how large an image is
 UP = (0.0, 0.0, 1.0)  # world: the convention of both dataset layouts
 
-MAX_FRAMES = 10_000
-"""Frames of an orbit: one every two arc minutes. All cameras are made before the first is seen."""
+MAX_FRAMES = 10_000  # of an orbit: all cameras are created first
 
 CAMERA_OPTIONS = {
     "split": set(),
@@ -214,7 +208,11 @@ def run_with_arguments(args: argparse.Namespace, render: Render) -> None:
         if args.what.suffix.lower() == ".xml":
             render_mitsuba_scene(args.what, folder, dict(args.define or ()))
         else:
-            render_model(args, _load_model(args, render), folder)
+            data = [] if args.data is None else [f"data.path={args.data}"]
+            overrides, background = [*(args.set or ()), *data], parse_background(args.background)
+            effects = args.ignore or ()
+            model = load_model(args.what, args.scene, overrides, background, effects, render)
+            render_model(args, model, folder)
         print(f"written: {args.out}")
 
 
@@ -229,19 +227,6 @@ def render_model(args: argparse.Namespace, model: Model, folder: ImageFolder) ->
             pass
     else:
         render_split(model, args.split or "test", folder)
-
-
-def _load_model(args: argparse.Namespace, render: Render) -> Model:
-    overrides: list[str] = list(args.set or ())
-    if args.data is not None:
-        overrides.append(f"data.path={args.data}")
-    background = parse_background(args.background)
-    return load_model(args.what, args.scene, overrides, background, args.ignore or (), render)
-
-
-# ----------------------------------------------------------------------------------------------
-# What is rendered
-# ----------------------------------------------------------------------------------------------
 
 
 def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
@@ -304,7 +289,7 @@ def _orbited_views(
 def render_cameras(
     model: Model, viewpoints: Sequence[Viewpoint], folder: ImageFolder, others: Sequence[str] = ()
 ) -> Iterator[np.ndarray]:
-    """Write and yield images without photographs; others: files written besides."""
+    """Write and yield images without photographs; others: further files to be written."""
     images = model.images(viewpoints, folder, others, "give a smaller --size")
     for camera, image in zip(viewpoints, images, strict=True):
         write_png(folder.path / f"{camera.name}.png", image)
@@ -328,10 +313,8 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
 def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str, str]) -> None:
     """Render every sensor of a Mitsuba scene with the scene's own integrator.
 
-    definitions: values for the parameters ($name) of the scene file.
-
-    The EXR contains all channels of the film, the PNG the colours alone, sRGB-encoded. A ``splats``
-    integrator with ``srgb_primitives`` false, also inside ``aov``, returns display space already.
+    definitions: values for the parameters ($name) of the scene file. The EXR contains all channels
+    of the film, the PNG the colours, sRGB-encoded.
     """
     try:
         scene = load_scene_file(path, **definitions)
@@ -339,11 +322,7 @@ def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str,
         raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
     if not isinstance(scene, mi.Scene) or scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
-    is_linear, stem, count = (
-        _is_linear(scene.integrator()),
-        shorten_stem(path.stem),
-        len(scene.sensors()),
-    )
+    stem, count = shorten_stem(path.stem), len(scene.sensors())
     names = [stem] if count == 1 else [f"{stem}_{index}" for index in range(count)]
     files = [f"{name}.{suffix}" for name in names for suffix in ("exr", "png")]
     bitmaps = folder.claim(files, _render_sensors(path, scene))
@@ -352,7 +331,9 @@ def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str,
         write_exr(folder.path / f"{name}.exr", bitmap)
         # As floats: Mitsuba's own conversion to 8 bits rounds down.
         colors = bitmap.split()[0][1].convert(
-            mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=is_linear
+            mi.Bitmap.PixelFormat.RGB,
+            mi.Struct.Type.Float32,
+            srgb_gamma=_is_linear(scene.integrator()),
         )
         # NaN in a scene's light is black in the PNG, and kept in the EXR.
         write_png(folder.path / f"{name}.png", np.nan_to_num(np.array(colors)))
@@ -360,10 +341,7 @@ def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str,
 
 
 def _is_linear(integrator: mi.Integrator) -> bool:
-    """Return whether an integrator and all that are nested in it return radiance.
-
-    Those of primitives (``splats``, ``volprim_rf_basic``) choose it by ``srgb_primitives``.
-    """
+    """Return whether no nested integrator (``splats``, ``volprim_rf_basic``) encodes colours."""
     nested = mi.traverse(integrator).hierarchy
     return all(getattr(each, "srgb_primitives", True) for each in nested)
 
@@ -381,13 +359,8 @@ def _render_sensors(path: Path, scene: mi.Scene) -> Iterator[mi.Bitmap]:
         raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
 
 
-# ----------------------------------------------------------------------------------------------
-# Arguments, messages, files
-# ----------------------------------------------------------------------------------------------
-
-
 def _check(args: argparse.Namespace) -> None:
-    """Refuse arguments that do not go together, before anything is read or written."""
+    """Refuse arguments that conflict, before anything is read or written."""
     what = args.what
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")

@@ -1,8 +1,7 @@
 """``python -m drgs.view WHAT``: look at Gaussians in a browser, rendered by our own kernels.
 
-``WHAT`` is a file of Gaussians or the output folder of a fit. A page on this machine shows what its
-camera sees, small while it moves and whole when it is still: through any lens, with depths, normals
-and opacities, under most approximations, each with the time that it takes. Ctrl-C ends it.
+``WHAT`` is a file of Gaussians or the output folder of a fit. The page has lenses, depths, normals,
+opacities, approximations and rendering times; its resolution adapts while the camera moves.
 """
 
 from __future__ import annotations
@@ -94,7 +93,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
-    """Return a fit's training cameras, refined if it has refined them; else one that sees all."""
+    """Return a fit's training cameras, refined if there are such; else one that sees all."""
     origin = model.gaussians.origin
     if args.what.is_dir() and (views := training_cameras(args.what, origin)) is not None:
         return views
@@ -103,7 +102,7 @@ def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:
 
 
 def start_of(args: argparse.Namespace, model: Model, views: Sequence[Viewpoint]) -> StartView:
-    """Return the page's first camera, and what is up."""
+    """Return the page's first camera and up direction."""
     start = StartView.from_views(views, np.median(model.gaussians.numpy().means, axis=0))
     return start if args.up is None else start.upright(np.array(args.up))
 

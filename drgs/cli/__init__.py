@@ -1,4 +1,4 @@
-"""Parts of all commands: arguments, execution, progress, their ends.
+"""Arguments, execution, progress and exit of all commands.
 
 May import ``core``.
 """

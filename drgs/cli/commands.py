@@ -27,23 +27,18 @@ from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.processes import end_job_on_error, process_count, root_output_only
 from drgs.core.registry import reporting_extensions
 
-MAX_ERROR = 500  # characters of what is wrong with a command line, which may quote all of it
-
-MAX_PORT = 65535  # largest port of TCP
+MAX_PORT = 65535  # of TCP
 
 
 class Subcommand(NamedTuple):
-    """A command among several: what it does, and the module that does it."""
+    """A command among several."""
 
-    text: str  # one phrase, in small letters
+    text: str  # what it does, one phrase in small letters
     module: str  # has a function add_arguments(parser), which sets run(args) as a default
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser that asks ``module`` for its arguments when it has something to parse.
-
-    A list of commands with their help therefore imports none of them.
-    """
+    """A parser that imports ``module``, which adds its arguments, when it parses."""
 
     def __init__(self, *, module: str | None = None, **settings: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
@@ -76,7 +71,6 @@ class CommandParser(argparse.ArgumentParser):
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]  # overloads
         self, args: Iterable[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse as argparse does; called for a subcommand as well, once it has been named."""
         if self._module is not None:
             module, self._module = self._module, None
             import_module(module).add_arguments(self)
@@ -90,14 +84,11 @@ class CommandParser(argparse.ArgumentParser):
 
     @override
     def error(self, message: str) -> NoReturn:
-        """Raise :class:`UserError`, which says in one line what is wrong with the command line.
-
-        An option that wants several words is shown with them.
-        """
+        """Raise :class:`UserError`; an option of several words is shown with them."""
         found = re.fullmatch(r"argument (?:\S+/)?(--\S+): expected \d+ arguments", message)
         if found and isinstance(metavar := self._option_string_actions[found[1]].metavar, tuple):
             message = f"{message}: {found[1]} {' '.join(metavar)}"
-        raise UserError(f"{one_line(message, MAX_ERROR)}; see {self.prog} --help")
+        raise UserError(f"{one_line(message, 500)}; see {self.prog} --help")
 
 
 def run_command(
@@ -105,12 +96,11 @@ def run_command(
     prog: str,
     arguments: Sequence[str] | None = None,
 ) -> None:
-    """Parse a command line and run what it names, as :mod:`drgs.cli.ending` ends commands.
+    """Parse a command line, run its command, and exit as :mod:`drgs.cli.ending` defines.
 
-    add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones,
-    which also hold the whole line as ``command``; and ``is_shared``, where several processes may
-    run it together.
-    prog: how the command is called. arguments: its words; None: those of this process.
+    add_arguments: adds the command's arguments, and sets ``run``, a function of the parsed ones
+    with the whole line as ``command``, and ``is_shared`` if several processes may run it together.
+    prog: the command's name. arguments: its words; None: those of this process.
     """
     with (
         end_job_on_error(),
@@ -136,10 +126,7 @@ def run_command(
 
 
 def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable[[str], int]:
-    """Return the type of an argument that is a whole number, ``minimum`` to ``maximum``.
-
-    reason: for ``maximum``, where the error is to name it.
-    """
+    """Return a parser of whole numbers from ``minimum`` to ``maximum``; reason: for ``maximum``."""
 
     def whole_number(text: str) -> int:
         # Python converts no more than 4,300 digits.
@@ -156,7 +143,7 @@ def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable
 
 
 def file_or_folder(text: str) -> Path:
-    """Return the path of an argument that is a file or folder, which need not exist."""
+    """Parse a path, which need not exist."""
     if "\0" in text:
         raise argparse.ArgumentTypeError("a path has no zero byte")
     try:
@@ -166,7 +153,7 @@ def file_or_folder(text: str) -> Path:
 
 
 def finite_number(text: str) -> float:
-    """Return the value of an argument that is a finite number."""
+    """Parse a finite number."""
     with suppress(ValueError):
         if math.isfinite(number := float(text)):
             return number
@@ -175,7 +162,7 @@ def finite_number(text: str) -> float:
 
 
 def degrees(text: str) -> float:
-    """Return the value of an argument that is a field of view: degrees, as Mitsuba's ``fov``."""
+    """Parse a field of view in degrees, as Mitsuba's ``fov``."""
     angle = finite_number(text)
     if not 0 < angle < 180:
         raise argparse.ArgumentTypeError(f"must be between 0 and 180 degrees, got {text}")

@@ -1,4 +1,4 @@
-"""The end and the output of a command: a user's error, Ctrl-C, SIGTERM; notes; any encoding."""
+"""Exit and output of commands: user errors, Ctrl-C, SIGTERM, notes, encodings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from types import FrameType
-from typing import NoReturn, TextIO
+from typing import TextIO
 
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import refusal_reason
@@ -19,27 +19,21 @@ from drgs.core.llvm import LLVMVersionError
 from drgs.core.memory import out_of_memory_reason
 from drgs.core.processes import process_number
 
+# Exit statuses: argparse's for errors of the user; shells' 128 + signal.
 USER_ERROR_STATUS = 2
-"""Exit status of a command that the user has to call differently (as argparse's)."""
-
 INTERRUPTED_STATUS = 130
-"""Exit status of a command that was stopped by Ctrl-C: 128 + SIGINT, as shells report it."""
+BROKEN_PIPE_STATUS = 141
+TERMINATED_STATUS = 143
 
-BROKEN_PIPE_STATUS = 141  # the same for SIGPIPE
-
-TERMINATED_STATUS = 143  # the same for SIGTERM, as ``kill``, ``timeout`` and batch systems send it
-
-MAX_ERROR_CHARACTERS = 800
-"""Names of files may have thousands; where and what to do are at an error's ends."""
+MAX_ERROR_CHARACTERS = 800  # place and remedy are at an error's ends; file names may be long
 
 
 @contextmanager
 def exit_on_user_error() -> Iterator[None]:
-    """Print an error of the block, or of the decorated command, in a line, and exit with 2.
+    """Print an error of the block in one line, and exit with status 2.
 
-    Only errors that the user can repair, packages that cannot be imported, exhausted memory, and
-    what the file system refuses of a file that it names; any other keeps its traceback. Where
-    nobody reads the output any more, as behind ``| head``, it ends without a word.
+    Only user errors, missing packages, exhausted memory and OSErrors with a file; others keep their
+    traceback. Exit silently when the output is closed, as by ``| head``.
     """
     try:
         yield
@@ -59,7 +53,7 @@ def exit_on_user_error() -> Iterator[None]:
 
 
 def _user_message(error: Exception) -> str | None:
-    """Return the message for the user; None: the error is a fault of the program."""
+    """Return the message for the user; None for a defect of the program."""
     if isinstance(error, (UserError, LLVMVersionError)):
         return str(error)
     if (reason := out_of_memory_reason(error)) is not None:
@@ -93,14 +87,14 @@ class StopRequest:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM has arrived: files that are half written are removed, as after Ctrl-C."""
+    """SIGTERM, raised so that half-written files are removed as after Ctrl-C."""
 
 
 @contextmanager
 def exit_on_interrupt() -> Iterator[None]:
-    """End the block on Ctrl-C with status 130, on SIGTERM with 143, without a traceback.
+    """Exit on Ctrl-C with status 130, on SIGTERM with 143, without a traceback.
 
-    Not SIGTERM where it is one of several processes: with it, ``mpiexec`` ends those that wait.
+    SIGTERM stays unhandled in processes of ``mpiexec``, which ends waiting ones by it.
     """
     previous = signal.getsignal(signal.SIGTERM)
     is_main = threading.current_thread() is threading.main_thread()  # others have no signals
@@ -112,7 +106,13 @@ def exit_on_interrupt() -> Iterator[None]:
     except (Exception, KeyboardInterrupt) as error:
         if (cause := _interrupt_after(error)) is None:
             raise
-        _exit_interrupted(cause)
+        for number in (signal.SIGINT, signal.SIGTERM):  # a second one ends the clean-up silently
+            signal.signal(number, signal.SIG_DFL)
+        # After an interrupt within exec() (dataclasses), CPython exits by SIGINT: clear that.
+        exec("")
+        is_terminated = isinstance(cause, Terminated)
+        print("terminated" if is_terminated else "interrupted", file=sys.stderr)
+        sys.exit(TERMINATED_STATUS if is_terminated else INTERRUPTED_STATUS)
     finally:
         if is_taken:
             signal.signal(signal.SIGTERM, previous)
@@ -122,8 +122,7 @@ def exit_on_interrupt() -> Iterator[None]:
 def interruptible_imports() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM end the process at once while the block imports.
 
-    Extension modules may abort, or hide what was raised, where it is raised while they are
-    imported. To be used where nothing is being written.
+    Extension modules that are being imported may abort on, or hide, a raised interrupt.
     """
     handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _terminate}
     taken = {n: h for n, h in handlers.items() if signal.getsignal(n) == h}
@@ -148,7 +147,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _interrupt_after(error: BaseException | None) -> KeyboardInterrupt | None:
-    """Return the interrupt, if there is one: Dr.Jit raises errors of its own for one."""
+    """Return the interrupt among an error's causes: Dr.Jit wraps it in an error of its own."""
     causes: list[BaseException] = []
     while error is not None and error not in causes:
         if isinstance(error, KeyboardInterrupt):
@@ -158,23 +157,9 @@ def _interrupt_after(error: BaseException | None) -> KeyboardInterrupt | None:
     return None
 
 
-def _exit_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
-    for number in (signal.SIGINT, signal.SIGTERM):  # a further one is no error of the clean-up
-        signal.signal(number, signal.SIG_DFL)
-    # Where it came within one, as dataclasses use them, CPython ends by SIGINT: this forgets it.
-    exec("")
-    is_terminated = isinstance(interrupt, Terminated)
-    print("terminated" if is_terminated else "interrupted", file=sys.stderr)
-    sys.exit(TERMINATED_STATUS if is_terminated else INTERRUPTED_STATUS)
-
-
 @contextmanager
 def printable_anywhere() -> Iterator[None]:
-    """Print escaped, within the block, what the standard streams' encoding cannot express.
-
-    Names of files may be no UTF-8, and a terminal may know nothing but ASCII: neither is a reason
-    to end a fit.
-    """
+    """Escape, within the block, characters that the standard streams' encoding lacks."""
     streams = [s for s in (sys.stdout, sys.stderr) if isinstance(s, TextIOWrapper)]
     before = [stream.errors for stream in streams]
     for stream in streams:
@@ -189,7 +174,7 @@ def printable_anywhere() -> Iterator[None]:
 
 @contextmanager
 def notes_printed() -> Iterator[None]:
-    """Print each :class:`UserNote` of the block as a line; leave out Pillow's warnings."""
+    """Print each :class:`UserNote` of the block as a line; ignore Pillow's warnings."""
     with warnings.catch_warnings():
         show = warnings.showwarning
 

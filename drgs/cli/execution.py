@@ -1,8 +1,4 @@
-"""Settings of Dr.Jit for a command: the number of threads, and range checks.
-
-The bytes of a result depend on neither. These are settings of the process and of the calling
-thread; a command gives them back when it ends.
-"""
+"""Settings of Dr.Jit for a command: threads and range checks, neither of which changes results."""
 
 from __future__ import annotations
 
@@ -21,16 +17,13 @@ from drgs.core.environment import VARIANTS, denormals_flushed
 from drgs.core.errors import UserError, one_line
 from drgs.core.memory import out_of_memory_reason
 
-MAX_THREADS = 4096  # dr.Jit starts a thread for each, whatever there is to do
+MAX_THREADS = 4096  # Dr.Jit starts all of them
 
 
 def add_execution_arguments(
     parser: argparse.ArgumentParser, variants: Sequence[str] | None = VARIANTS
 ) -> None:
-    """Add ``--variant``, ``--threads`` and ``--debug``.
-
-    variants: those that can be chosen; None: any, which the command has to check.
-    """
+    """Add ``--variant``, ``--threads`` and ``--debug``; variants: choices, None: any."""
     add_variant_argument(parser, variants)
     parser.add_argument(
         "--threads",
@@ -68,8 +61,8 @@ def select_variant(name: str) -> None:
 def execution_settings(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
     """Run the block on ``threads`` threads (None: as many as now), with range checks if ``debug``.
 
-    Yields a function that raises :class:`UserError` if an access was out of range so far; leaving
-    the block does so as well.
+    Yields a function, also called at the end, that raises :class:`UserError` after an access out of
+    range.
     """
     with _thread_count(threads), denormals_flushed():
         if not debug:
@@ -101,10 +94,7 @@ def _thread_count(count: int | None) -> Iterator[None]:
 
 
 class _RangeReports:
-    """Stands before a text stream, and remembers what Dr.Jit reports of accesses out of range.
-
-    Dr.Jit masks such an access, says so on the standard error output and goes on.
-    """
+    """A text stream that records Dr.Jit's reports of accesses out of range, which it masks."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -117,7 +107,6 @@ class _RangeReports:
         return self._stream.write(text)
 
     def __getattr__(self, name: str) -> object:
-        """Everything else is the stream's."""
         return getattr(self._stream, name)
 
     def check(self) -> None:

@@ -1,4 +1,4 @@
-"""Progress of a long run, on a terminal, in a notebook and in a log file."""
+"""Progress of a long run, on a terminal, in a notebook or in a log file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ LOG_SECONDS = 10.0  # seconds between two lines where no bar can be drawn
 
 
 def draws_bars(stream: TextIO) -> bool:
-    """Return whether ``stream`` is a terminal on which a line can be drawn again.
+    """Return whether ``stream`` is a terminal that can redraw a line.
 
-    Not rich's ``is_terminal``, which believes FORCE_COLOR, as notebooks and continuous integration
-    set it. What a notebook starts with ``!`` has a terminal that keeps each line ever drawn.
+    rich's ``is_terminal`` trusts FORCE_COLOR, which notebooks and CI set. The terminal of a
+    notebook's ``!`` commands cannot redraw.
     """
     variables = os.environ.get
     in_notebook = "JPY_PARENT_PID" in os.environ or "inline" in variables("MPLBACKEND", "")
@@ -27,15 +27,13 @@ def draws_bars(stream: TextIO) -> bool:
 class RunProgress:
     """A progress bar where :func:`draws_bars`; elsewhere a line every ten seconds, and the last.
 
-    A context manager: leaving it restores the terminal.
-
-    what: is counted, in the singular. total: how many there will be. done: how many there are.
+    A context manager. what: name of the counted items, singular; total, done: their numbers.
     """
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
         self._what = what
         self._last_line = time.monotonic()
-        self._first: tuple[int, float] | None = None  # how many were done, and when
+        self._first: tuple[int, float] | None = None  # (done, time) at the first update
         self._bar = None
         if draws_bars(sys.stdout):
             self._bar = Progress(
@@ -59,7 +57,7 @@ class RunProgress:
             self._bar.stop()
 
     def update(self, done: int, total: int, status: str = "") -> None:
-        """Show that ``done`` of ``total`` are done, and ``status`` beside it."""
+        """Show ``done`` of ``total``, and ``status`` beside it."""
         if self._bar is not None:
             self._bar.update(self._task, completed=done, total=total, status=status)
             return
@@ -72,7 +70,7 @@ class RunProgress:
             print("  ".join(part for part in parts if part), flush=True)
 
     def _left(self, done: int, total: int, now: float) -> str:
-        """Time that is left at the pace since the first update, which pays for compiling."""
+        """Estimate the time left from the pace since the first update, so without compiling."""
         first, started = self._first or (done, now)
         if first == done < total:
             return ""

@@ -1,8 +1,8 @@
-"""The approximations that an image is made with, declared once.
+"""The approximations of an image, declared once.
 
-:data:`DECLARED` lists them for the section ``model`` of a configuration (``drgs.config.schema``),
-the properties of the plugin ``splats`` (``drgs.integrator.properties``) and the test of that
-plugin's documentation. ``drgs.accuracy.pipeline`` turns :class:`Approximations` into what renders.
+:data:`DECLARED` lists them for the section ``model`` of a configuration (``drgs.config.schema``)
+and the properties of the plugin ``splats`` (``drgs.integrator.properties``).
+``drgs.accuracy.pipeline`` implements :class:`Approximations`.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ Value = bool | int | float | str
 
 @dataclass(frozen=True)
 class Limits:
-    """The numbers that a value may be; None: no such limit."""
+    """Limits of a number; None: no such limit."""
 
-    words: str  # as messages name them
+    words: str  # for messages
     gt: float | None = None
     ge: float | None = None
     lt: float | None = None
     le: float | None = None
-    or_infinite: bool = False  # whether infinity may be beyond ``le``
+    or_infinite: bool = False  # whether infinity is allowed beyond ``le``
 
     def hold_for(self, value: float) -> bool:
-        """Return whether they hold in single precision, in which kernels compute; NaN: never."""
+        """Return whether ``value``, in single precision as in kernels, is allowed; NaN never is."""
         if self.or_infinite and value == math.inf:
             return True
         with np.errstate(over="ignore"):
@@ -49,7 +49,7 @@ class Limits:
 
     @property
     def finite(self) -> dict[str, float]:
-        """Limits that are given and finite, by name."""
+        """The finite limits by name."""
         given = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le")}
         return {k: v for k, v in given.items() if v is not None and math.isfinite(v)}
 
@@ -91,12 +91,12 @@ class Declared:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The texts that a value may be, those of installed packages included."""
+        """The texts that a value may be, including names of installed extensions."""
         return self.given_words if self.registry is None else tuple(self.registry.names())
 
     @property
     def expected_values(self) -> str:
-        """The values that are allowed, as messages name them after "must be"."""
+        """The allowed values, for messages after "must be"."""
         if self.limits is not None:
             return self.limits.words
         others = f" ({HOW_TO_INSTALL})" if self.registry else ""
@@ -129,11 +129,9 @@ def _declare(
 
 @dataclass(frozen=True)
 class Approximations:
-    """The approximations that an image is made with; the defaults are those of 3DGS.
+    """The approximations of an image, by default those of 3DGS; :data:`DECLARED` describes each.
 
-    :data:`DECLARED` describes each, as does the section ``model`` of a configuration.
-
-    Raises ValueError for a value that is outside of its limits.
+    Raises ValueError for a value outside of its limits.
     """
 
     projection: str = _declare(
@@ -199,7 +197,6 @@ class Approximations:
     )
 
     def __post_init__(self) -> None:
-        """Check all values."""
         for name, declared in DECLARED.items():
             value = getattr(self, name)
             if not declared.allows(value):
@@ -207,34 +204,30 @@ class Approximations:
 
     @staticmethod
     def from_values(values: Mapping[str, Value | None]) -> Approximations:
-        """Return those among ``values``; None, and a default that is not rounded: the default."""
+        """Return those among ``values``; None and unrounded defaults give the default."""
         given = {name: value for name, value in values.items() if name in DECLARED}
         changes = {k: v for k, v in given.items() if v not in (None, DECLARED[k].unrounded)}
         return replace(Approximations(), **changes)
 
     @property
     def non_default(self) -> dict[str, Value]:
-        """The values that are not the default, by name."""
+        """The values that differ from the default, by name."""
         values = {name: getattr(self, name) for name in DECLARED}
         return {name: value for name, value in values.items() if value != DECLARED[name].default}
 
     @property
     def is_default(self) -> bool:
-        """True if viewers of 3DGS files render with the same."""
+        """True if all values are those of 3DGS."""
         return not self.non_default
 
 
-DECLARED: dict[str, Declared] = {
-    each.name: each.metadata["declared"] for each in fields(Approximations)
-}
-"""All approximations by name, in the order in which they are listed."""
+DECLARED: dict[str, Declared] = {f.name: f.metadata["declared"] for f in fields(Approximations)}
 
 
 def from_ply_header(where: str, values: Mapping[str, Value]) -> dict[str, Value]:
     """Return the approximations among ``values`` of a file, each of its declared type.
 
-    where: the file, for messages. A name that is not known, of a later version perhaps, is noted
-    and left out.
+    where: the file, for messages. Unknown names, as of a later version, give a :class:`UserNote`.
 
     Raises :class:`UserError` for a value of another type or outside of its limits.
     """

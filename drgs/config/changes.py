@@ -1,8 +1,7 @@
-"""The same fit in fewer or more iterations, or with other values.
+"""Changes of a configuration: values by name, and the number of iterations.
 
-What a configuration says in iterations (when the population may change, when opacities are reset,
-when the degree of the spherical harmonics rises, where coarse stages end) keeps its share of the
-whole.
+Iterations at which something happens (the population may change, opacities are reset, the degree of
+the spherical harmonics rises, coarse stages end) keep their share of the whole.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _COUNTS = (
 
 
 def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
-    """Set values by names such as ``densify.every``; the result is checked like a file's."""
+    """Set values by names such as ``densify.every``, and check the result."""
     values = config.model_dump()
     for key, value in changes.items():
         *sections, name = key.split(".")
@@ -40,8 +39,8 @@ def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
 def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     """Change the number of iterations, and everything else in proportion.
 
-    The iterations between two changes of the population (``densify.every``) stay: what a change
-    needs to know is gathered over views. The means' rate falls until the end, without revisions.
+    ``densify.every`` stays, as statistics are gathered over views. Revisions of the means' rate and
+    of growth are dropped.
     """
     share = iterations / config.iterations
 
@@ -64,7 +63,7 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
 
 
 OPEN = ("data.background", "model.near")
-"""Values that are null until the dataset has decided: see ``drgs.initialization.defaults``."""
+"""Values that depend on the dataset if they are null: see ``drgs.initialization.defaults``."""
 
 OPEN_AT_START = (
     *OPEN,
@@ -77,12 +76,12 @@ OPEN_AT_START = (
 
 
 def is_open(config: FitConfig) -> bool:
-    """Return whether the dataset has not decided yet what a rendering needs."""
+    """Return whether a value that rendering needs depends on the dataset."""
     return any(_value(config, key) is None for key in OPEN)
 
 
 def with_decisions(config: FitConfig, other: FitConfig) -> FitConfig:
-    """Set the values that ``config`` leaves to the dataset as ``other`` has them."""
+    """Set the values that ``config`` leaves to the dataset to those of ``other``."""
     changes = {key: _value(other, key) for key in OPEN_AT_START if _value(config, key) is None}
     return with_changes(config, changes)
 

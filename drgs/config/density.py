@@ -1,7 +1,4 @@
-"""The section ``densify`` of a configuration: which strategy changes the population, and how.
-
-Each strategy has a section of its own in it; what all of them share stands beside these.
-"""
+"""The section ``densify`` of a configuration, with a section for each density strategy."""
 
 from __future__ import annotations
 
@@ -218,9 +215,9 @@ class DensifyConfig(Section):
         return aims
 
     def prune_window(self, iterations: int) -> tuple[int, int]:
-        """Return the iteration after which the last phase begins, and that of its last change.
+        """Return the iteration after which pruning begins, and that of its last change.
 
-        iterations: of the fit. A phase that would begin behind its end does not take place.
+        iterations: of the fit. There is no pruning if it would begin after its end.
         """
         start = max(self.stop, self.prune.start or 0)
         return start, self.prune.stop or (start + iterations + 1) // 2

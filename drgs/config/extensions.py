@@ -1,8 +1,8 @@
 """Extension points of a fit, and the section ``extensions`` of a configuration.
 
-``extensions`` contains the sections of extensions by name, each checked by the pydantic model that
-the extension has registered. An effect and a term of the loss take part in a fit if their section
-is there, be it empty. A strategy is chosen by ``densify.strategy``, a loss by ``loss.type``.
+``extensions`` contains a section for each extension, checked by its pydantic model. Effects and
+loss terms are active if their section exists, be it empty; ``densify.strategy`` and ``loss.type``
+select a strategy and a loss.
 """
 
 from __future__ import annotations
@@ -64,8 +64,6 @@ GROWTH = ("adc", "budget", "mcmc")
 
 
 def _name_check(registry: Registry, shipped: tuple[str, ...]) -> AfterValidator:
-    """Return a validator for the name of an extension: one of ``shipped``, or installed."""
-
     def check(name: str) -> str:
         if name not in shipped:
             known = [*shipped, *(extension.name for extension in registry.installed_extensions())]
@@ -137,7 +135,7 @@ def extension_keys() -> list[str]:
 
 
 def section_of(extension: Extension, sections: Mapping[str, BaseModel | None]) -> BaseModel | None:
-    """Return the section of an extension, with defaults where there is none; None: it has none."""
+    """Return the section of an extension, with defaults if it is not set; None: it has no model."""
     section = sections.get(extension.name)
     return extension.section() if section is None and extension.section else section
 

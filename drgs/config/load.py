@@ -18,22 +18,18 @@ from drgs.config.section import expectation, shown_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import atomic_path, read_text
 
-PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")
-"""Values that are made absolute when a configuration is loaded."""
+PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")  # made absolute
 
-MAX_BYTES = 1 << 20
-"""Largest configuration file: a thousand times what every value with a comment takes."""
+MAX_BYTES = 1 << 20  # of a file: a thousand times all values with comments
 
-MAX_EXPLAINED = 3  # wrong values that an error names; the rest are counted
+MAX_EXPLAINED = 3  # wrong values in an error; the rest are counted
 
 
 def load_config(path: str | Path, overrides: Iterable[str] = ()) -> FitConfig:
     """Read a YAML configuration; ``overrides`` are ``section.key=VALUE`` with VALUE in YAML.
 
-    Relative paths in the file are relative to the file's folder; in ``overrides``, which are
-    typed in a shell and need not be YAML, to the current folder. The result holds absolute paths.
-
-    Raises :class:`UserError` that names the wrong keys, the first of many, in one line.
+    Relative paths are relative to the file's folder, in ``overrides`` (not in YAML) to the current
+    folder. Raises :class:`UserError` with the first wrong keys.
     """
     path = Path(path)
     return _validate(_read_yaml(path), str(path), path.resolve().parent, overrides)
@@ -44,8 +40,8 @@ def config_from(
 ) -> FitConfig:
     """Return a configuration from nested mappings, with the keys of the YAML file.
 
-    where: the beginning of errors. Paths, text or ``Path``, are relative to the current folder.
-    overrides, and what is raised: see :func:`load_config`.
+    where: the beginning of errors. Paths are relative to the current folder. See
+    :func:`load_config`.
     """
     values = {
         key: dict(section) if isinstance(section, Mapping) else section
@@ -55,7 +51,7 @@ def config_from(
 
 
 def dump_config(config: FitConfig, path: str | Path) -> None:
-    """Write every value of ``config`` as YAML; :func:`load_config` reads an equal one back."""
+    """Write all values of ``config`` as YAML for :func:`load_config`."""
     text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -75,7 +71,7 @@ def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 
 
 def _section(annotation: object) -> type[BaseModel] | None:
-    """Return the section that a value is, or that the elements of a list are."""
+    """Return the section model in a type, also of a list's elements."""
     if arguments := get_args(annotation):
         return next(filter(None, map(_section, arguments)), None)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -84,11 +80,7 @@ def _section(annotation: object) -> type[BaseModel] | None:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with two changes.
-
-    1e-15 is a number (YAML 1.1 wants 1.0e-15 and would read text). A key that is given twice in
-    one section is an error (the first would be dropped silently).
-    """
+    """YAML 1.1 in which 1e-15 is a number, not text, and a key given twice is an error."""
 
     @override
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
@@ -133,8 +125,14 @@ def _validate(values: dict, where: str, folder: Path, overrides: Iterable[str]) 
     overridden = set()
     for assignment in overrides:
         key, value = _parse_override(assignment)
-        _insert(values, key, value)
         overridden.add(key)
+        *sections, leaf = key.split(".")
+        target = values
+        for name in sections:
+            if not isinstance(target.get(name), dict):
+                target[name] = {}
+            target = target[name]
+        target[leaf] = value
     try:
         return FitConfig.model_validate(values)
     except ValidationError as error:
@@ -161,20 +159,11 @@ def _parse_override(override: str) -> tuple[str, object]:
         raise UserError(f"--set {key}: not a YAML value: {one_line(text)}") from None
 
 
-def _insert(values: dict, key: str, value: object) -> None:
-    *sections, leaf = key.split(".")
-    for section in sections:
-        if not isinstance(values.get(section), dict):
-            values[section] = {}
-        values = values[section]
-    values[leaf] = value
-
-
 def _absolute(folder: Path, text: str, where: str) -> str:
     try:
         path = str((folder / Path(text).expanduser()).resolve())
-        path.encode()  # what UTF-8 cannot express could not be written to config.yml
-    except (OSError, ValueError, RuntimeError) as error:  # of these, RuntimeError: no such user
+        path.encode()  # config.yml is UTF-8
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: no such user
         raise UserError(
             f"{where} must be a path in UTF-8, got {shown_value(text)} ({one_line(error, 100)})"
         ) from None
@@ -182,7 +171,7 @@ def _absolute(folder: Path, text: str, where: str) -> str:
 
 
 def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
-    """Return a line for one of pydantic's errors: where, name, expected, got, remedy."""
+    """Describe one of pydantic's errors in a line."""
     key = one_line(".".join(str(part) for part in item["loc"]), limit=60)
     given = [k for k in overridden if key == k or key.startswith(f"{k}.")]
     where = f"--set {given[0]}" if given else file

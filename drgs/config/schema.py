@@ -1,9 +1,7 @@
-"""The typed configuration of a fit: YAML -> :class:`FitConfig`.
+"""The typed configuration of a fit, :class:`FitConfig`; frozen.
 
-The defaults are a recipe that was chosen by measurement (``scenes/studies/recipes.py``);
-``scenes/lego_paper.yml`` spells out that of the paper (Kerbl et al. 2023, section 7, and its
-released code). Each field names its unit and range. A configuration is frozen: what a run used is
-what :func:`dump_config` writes.
+The defaults were chosen by measurement (``scenes/studies/recipes.py``). ``scenes/lego_paper.yml``
+has those of the paper (Kerbl et al. 2023, section 7, and its released code).
 """
 
 from __future__ import annotations
@@ -40,15 +38,11 @@ Color = str | tuple[float, float, float]
 
 NAMED_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
-DEFAULT_BACKGROUND = "white"  # background where there are no photographs to ask
-
 NEAR_LIMITS = (1e-9, 1e9)  # scene units, of near planes
-
 REFERENCE_NEAR = 0.2  # scene units: the reference's near plane, of scenes that are about 4 wide
 
-LATEST_DEGREE = 1000  # iterations: the reference's schedule, for 30,000
-
-DEGREE_SHARE = 1 / 40  # iterations between rises of the harmonics' degree, in parts of all
+LATEST_DEGREE = 1000  # iterations between degrees of harmonics: the reference's, for 30,000
+DEGREE_SHARE = 1 / 40  # the same, as a share of all iterations
 
 
 def _color(value: object) -> Color | None:
@@ -61,18 +55,16 @@ def _color(value: object) -> Color | None:
     raise ValueError("must be white, black or three numbers in 0..1")
 
 
-def _color_to_yaml(color: Color | None) -> str | list[float] | None:
-    return list(color) if isinstance(color, tuple) else color
-
-
-ColorField = Annotated[Color | None, PlainValidator(_color), PlainSerializer(_color_to_yaml)]
+ColorField = Annotated[
+    Color | None,
+    PlainValidator(_color),
+    PlainSerializer(lambda color: list(color) if isinstance(color, tuple) else color),
+]
 PathField = Annotated[Path, Field(strict=False)]
 
-CameraRate = Annotated[float, Field(le=1)]
-"""The same: a radian, a scene's extent, a factor e of focal lengths, an image's size."""
+CameraRate = Annotated[float, Field(le=1)]  # radians, scene extents, log focal lengths, image sizes
 
-Decay = Annotated[float, Field(ge=0, le=0.999999)]
-"""A mean over a million steps; float32 knows few numbers between this and 1."""
+Decay = Annotated[float, Field(ge=0, le=0.999999)]  # float32 has few numbers between this and 1
 
 
 class DataConfig(Section):
@@ -147,7 +139,7 @@ class DataConfig(Section):
     @property
     def background_rgb(self) -> tuple[float, float, float]:
         """The background's display-space colour, three numbers in 0..1; white if it is null."""
-        background = self.background or DEFAULT_BACKGROUND
+        background = self.background or "white"
         return NAMED_COLORS[background] if isinstance(background, str) else background
 
 
@@ -227,8 +219,7 @@ class _Model(Section):
 
 
 FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
-"""Approximations that fits make by default, where images of files make others: they gave the best
-images of views that were not trained on. What was fitted says so in its file."""
+"""Default approximations of fits, with the best images of test views. Files record them."""
 
 
 def _as_field(name: str, declared: Declared) -> tuple[object, FieldInfo]:
@@ -262,7 +253,6 @@ class ModelConfig(_ModelWithApproximations):
     @field_validator(*(name for name, d in DECLARED.items() if d.limits or d.registry))
     @classmethod
     def _check(cls, value: Value | None, field: ValidationInfo) -> Value | None:
-        """Check names, and numbers in single precision: they may be rounded onto a limit."""
         assert field.field_name is not None, "validators of fields have one"
         declared = DECLARED[field.field_name]
         if value is not None and not declared.allows(value):
@@ -271,18 +261,18 @@ class ModelConfig(_ModelWithApproximations):
 
     @property
     def near_plane(self) -> float:
-        """Scene units; the reference's where it is null."""
+        """The near plane, scene units; the reference's if it is null."""
         return REFERENCE_NEAR if self.near is None else self.near
 
     def of_file(self) -> ModelConfig:
-        """Return the model for files that specify none: as 3DGS, but for what is given here."""
+        """Return the model for files that record none: 3DGS's where a value is not given."""
         usual = {name: DECLARED[name].default for name in FITTED_WITH}
         given = self.model_fields_set
         return self.model_copy(update={k: v for k, v in usual.items() if k not in given})
 
     @property
     def approximations(self) -> Approximations:
-        """The approximations that are configured."""
+        """The configured approximations."""
         return Approximations.from_values(vars(self))
 
 
@@ -440,7 +430,6 @@ class CoarseStage(Section):
 
 
 def _is_open(section: BaseModel, name: str) -> bool:
-    """Return whether a value of the schedule follows from the number of iterations."""
     return name not in section.model_fields_set or getattr(section, name) is None
 
 
@@ -487,17 +476,17 @@ class FitConfig(Section):
 
     @property
     def data_for_training(self) -> DataConfig:
-        """``data``, without the depths that a loss of weight 0 would not look at."""
+        """``data``, without depth if its loss has no weight."""
         return self.data if self.loss.depth_weight > 0 else self.data_for_rendering
 
     @property
     def data_for_rendering(self) -> DataConfig:
-        """``data``, without what only a loss looks at."""
+        """``data``, without depth."""
         return self.data.model_copy(update={"ignore_depth": True})
 
     @model_validator(mode="after")
     def _follow_from_iterations(self) -> FitConfig:
-        """The part of the schedule that is not given."""
+        """Resolve the part of the schedule that is not given."""
         model, densify, n = self.model, self.densify, self.iterations
         if _is_open(model, "sh_increase_every"):
             every = max(1, min(LATEST_DEGREE, round(DEGREE_SHARE * n)))
@@ -572,7 +561,7 @@ class FitConfig(Section):
         return self
 
     def _check_last_phase(self) -> None:
-        """Check that it takes place, unless a plan was revised: then time may be up before."""
+        """Check that pruning takes place, unless ``--budget`` has revised the plan."""
         prune, n = self.densify.prune, self.iterations
         start = self.densify.prune_window(n)[0]
         expected = f"densify.prune.stop must be > densify.stop and densify.prune.start ({start})"

@@ -1,4 +1,4 @@
-"""Sections of a configuration: their base, numbers with limits, and messages about wrong values."""
+"""Base and number types of a configuration's sections, and messages about wrong values."""
 
 from __future__ import annotations
 
@@ -20,21 +20,16 @@ if TYPE_CHECKING:
     Resolved = Annotated[T, "null before"]
 else:
     Resolved = Optional
-"""A value that may be null in a file. Once the configuration is resolved, which it is wherever it
-is used, it has the type in brackets."""
+"""A value that may be null in a file, and has the type in brackets in a resolved configuration."""
 
 UNRESOLVED: Any = None  # default of a value that follows from others, or from the dataset
 
-Rate = Annotated[float, Field(le=10)]
-"""A step of Adam is about as long as its rate: ten units of a logarithm or a logit go from next to
-nothing to everything."""
-
-Weight = Annotated[float, Field(ge=0, le=1e6)]
-"""Weight of a term of the loss, beside terms of weight 1."""
+Rate = Annotated[float, Field(le=10)]  # about the length of Adam's steps, also of logits
+Weight = Annotated[float, Field(ge=0, le=1e6)]  # of a term of the loss, beside terms of weight 1
 
 
 class Section(BaseModel):
-    """Frozen; unknown keys, infinities and silent conversions ("3" for 3) are refused."""
+    """A frozen section without unknown keys, infinities or silent conversions ("3" for 3)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -49,7 +44,7 @@ def subsection(model: type[SectionType]) -> SectionType:
 
 _RELATIONS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
-_EXPECTED = {
+_EXPECTED = {  # by the first word of pydantic's type of error
     "int": "an integer",
     "float": "a number",
     "finite": "a finite number",
@@ -59,11 +54,10 @@ _EXPECTED = {
     "list": "a list",
     "model": "a section of keys",
 }
-"""Expected values by the first word of pydantic's type of error."""
 
 
 def expectation(error: ErrorDetails) -> str:
-    """Return one of pydantic's errors as ``must be >= 1``; that of a validator of ours as it is."""
+    """Return one of pydantic's errors as ``must be >= 1``, and our validators' as they are."""
     kind, context = error["type"], error.get("ctx", {})
     if kind == "value_error":
         return str(context["error"])
@@ -76,7 +70,7 @@ def expectation(error: ErrorDetails) -> str:
 
 
 def shown_value(value: object) -> str:
-    """Return the value as YAML writes it, on one line and shortened."""
+    """Return the value in YAML, on one line and shortened."""
     if isinstance(value, str):
         return one_line(repr(value), limit=60)
     try:

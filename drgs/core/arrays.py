@@ -76,10 +76,9 @@ def reinterpret(dtype: type[Array], value: dr.ArrayBase) -> Array:
 
 
 def from_host(flat_type: type[Array], values: ArrayLike) -> Array:
-    """Copy numbers of the host to memory that is aligned as Dr.Jit's own is.
+    """Copy numbers of the host to aligned memory.
 
-    Dr.Jit wraps numpy's memory on the CPU, and loads from memory that is not aligned are another
-    kernel: whether one has to be compiled would depend on where numpy put the numbers.
+    Dr.Jit wraps numpy's memory on the CPU, and compiles another kernel for unaligned loads.
     """
     values = np.asarray(values, dtype=_NUMPY_TYPES[dr.type_v(flat_type)])
     aligned = empty_on_host(flat_type, (values.size,))
@@ -97,14 +96,11 @@ def empty_on_host(flat_type: type, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def wrap_numpy(flat_type: type[Array], values: np.ndarray) -> Array:
-    """Return an array of numbers which Dr.Jit does not copy on the CPU: nobody may change them.
-
-    values: from :func:`empty_on_host`.
-    """
+    """Return an array that shares, on the CPU, the memory of values from :func:`empty_on_host`."""
     return flat_type(values.reshape(-1))
 
 
-_ALIGNMENT = 64  # bytes: what the widest vectors ask for
+_ALIGNMENT = 64  # bytes, of the widest vectors
 
 _NUMPY_TYPES = {
     dr.VarType.Float32: np.float32,
@@ -126,10 +122,7 @@ def quotient(index: Array, divisor: int) -> Array:
 
 
 def divide(index: Array, divisor: int, parts: int) -> tuple[Array, Array]:
-    """Return index // divisor, which is below ``parts``, and the rest; for one part a literal zero.
-
-    That makes later products and sums vanish from the kernel.
-    """
+    """Return index // divisor, below ``parts``, and the rest; for one part a literal zero."""
     if parts == 1:
         return type(index)(0), index
     part = quotient(index, divisor)
@@ -137,10 +130,7 @@ def divide(index: Array, divisor: int, parts: int) -> tuple[Array, Array]:
 
 
 def repeat_array(values: Array, count: int, step: int = 0) -> Array:
-    """Return ``count`` copies of an array, each by ``step`` more than the one before it.
-
-    Not evaluated, if there are several.
-    """
+    """Return ``count`` copies of an array, each by ``step`` more than the one before it."""
     if count == 1:
         return values
     UInt32, size = types_of(type(values)).UInt32, dr.width(values)
@@ -172,11 +162,10 @@ def scatter_rows(columns: Sequence[Array], rows: UInt32, num_rows: int) -> Array
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of numbers such that a lane loads or stores several of them at once, in packets.
+    """Rows of numbers that a lane loads or stores in packets.
 
-    A packet of 8 numbers costs a lane less than two of 4, and these less than four of 2; and what
-    is not stored need not come from memory. Rows of 9 are therefore stored as an array of packets
-    of 8 and one of single numbers, where they are read in order.
+    A packet of 8 numbers costs less than two of 4, and these less than four of 2. Rows of 9 are
+    therefore stored as an array of packets of 8 and one of single numbers.
     """
 
     blocks: tuple[types.Float, ...]  # flat, row-major: the next columns of all rows
@@ -221,10 +210,7 @@ class Rows:
 
 
 def block_widths(width: int) -> tuple[int, ...]:
-    """Return the numbers of a row in each block of :class:`Rows`: whole packets, of 8 if possible.
-
-    Three numbers are a packet of 4.
-    """
+    """Return the numbers of a row in each block of :class:`Rows`; three are a packet of 4."""
     rest = width % 8 + (width % 8 in (3, 7))
     widths = (width // 8 * 8, *(rest & packet for packet in (8, 4, 2, 1)))
     return tuple(each for each in widths if each)
@@ -240,14 +226,16 @@ def load_columns(
 
     num_rows: (1,), evaluated, the number of rows of ``flat``.
 
-    Such rows begin anywhere in a packet: all packets that a row has part in are loaded, and its
-    numbers are moved to their places. That takes less than half the time of single loads.
+    A row may begin anywhere in a packet: all its packets are loaded, and the numbers are shifted.
+    That takes less than half the time of single loads.
     """
     whole = (dr.width(flat) - 1) // PACKET
     if whole == 0 or width < PACKET:
         return [dr.gather(type(flat), flat, row * stride + k) for k in range(width)]
     if stride % PACKET == 0:
-        return _load_packets(flat, row * (stride // PACKET), width)
+        packet, first = types_of(type(flat)).Array4f, row * (stride // PACKET)
+        loaded = [dr.gather(packet, flat, first + k) for k in range(-(-width // PACKET))]
+        return [number for each in loaded for number in each][:width]
     packets = _Packets(flat, first_numbers(flat, whole * PACKET), num_rows * stride)
     begin, shift = row * stride // PACKET, row * stride % PACKET
     always_whole = (stride - 1) // PACKET  # so many packets of a row, wherever it begins
@@ -263,9 +251,8 @@ def load_columns(
 def store_columns(columns: Sequence[Array]) -> Array:
     """Return the same as :func:`interleave`, in a third of the time where there are many columns.
 
-    Packets that a row fills alone are stored as such, what is left at its ends number by number.
-    The array may have up to three numbers more, undefined, for its last packet to be whole:
-    :func:`first_numbers` leaves them out once it is evaluated.
+    Packets that a row fills alone are stored whole, the numbers at its ends one by one. Up to three
+    undefined numbers may pad the last packet; :func:`first_numbers` removes them after evaluation.
     """
     columns, flat_type = list(columns), type(columns[0])
     width, num_rows = len(columns), dr.width(columns)
@@ -308,18 +295,11 @@ def _store_shifted(flat: Array, columns: list[Array]) -> None:
         dr.scatter(flat, numbers[k], begin * PACKET + k, is_own, mode=alone)
 
 
-def _load_packets(flat: Array, index: UInt32, width: int) -> list[Array]:
-    packet = types_of(type(flat)).Array4f
-    packets = [dr.gather(packet, flat, index + k) for k in range(-(-width // PACKET))]
-    return [number for each in packets for number in each][:width]
-
-
 @dataclass(frozen=True)
 class _Packets(Generic[Array]):
-    """An array of any size as packets, the last of which may be a part of one.
+    """Packets of an array of any size; Dr.Jit loads packets only from arrays of whole packets.
 
-    Dr.Jit loads packets from arrays alone that are whole packets. The last one is loaded number by
-    number at any size, which is no literal: neither the size nor its remainder is in a kernel.
+    The last packet is loaded number by number, for any size: no kernel contains the size.
     """
 
     flat: Array
@@ -345,9 +325,9 @@ class _Packets(Generic[Array]):
 def with_aligned_stack(value: Array) -> Array:
     """Return ``value`` such that kernels keep aligned what registers do not hold; not evaluated.
 
-    LLVM aligns a function's stack as its variables ask for, but not for vectors that it puts there
-    when it runs out of registers: such a vector lies in two cache lines. Here the value goes by way
-    of a variable on the stack: written and read at places that are the same, which only we know.
+    LLVM aligns a function's stack for its variables, but not for vectors that it spills, which then
+    cross two cache lines. A variable on the stack, written and read at the same opaque index, makes
+    it align the stack.
     """
     UInt32 = types_of(type(value)).UInt32
     variable = dr.alloc_local(type(value), 2)

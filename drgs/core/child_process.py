@@ -1,8 +1,4 @@
-"""A function that runs in a process of its own, which ends with its caller.
-
-For libraries that leave no room to Ctrl-C, or that may abort: what happens to the child, the parent
-says in a sentence.
-"""
+"""Run a function in a child process: for libraries that ignore Ctrl-C, or that may abort."""
 
 from __future__ import annotations
 
@@ -26,13 +22,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class ChildEndedError(RuntimeError):
-    """The child was ended by a signal; the message names it, and what the child said last."""
+    """A signal ended the child; the message has its name and the child's last output."""
 
 
 class DeferredInterrupts:
-    """A context manager within which Ctrl-C and SIGTERM wait until its end.
+    """A context manager that defers Ctrl-C and SIGTERM to its end, or to :meth:`raise_interrupts`.
 
-    Only :meth:`raise_interrupts` raises them, so cleaning up and moving files is not interrupted.
     Outside of the main thread, which receives the signals, it does nothing.
     """
 
@@ -51,7 +46,7 @@ class DeferredInterrupts:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Give the signals back, and send again what arrived."""
+        """Restore the handlers, and send again what arrived."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         if self._arrived is not None:
@@ -93,9 +88,9 @@ def run_in_child(
     # Not -m, which would look for modules in the current folder first.
     code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
     pipe = subprocess.PIPE
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as stderr:
         child = subprocess.Popen(
-            [sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=said,
+            [sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=stderr,
             start_new_session=True,
         )  # fmt: skip
         assert child.stdin is not None and child.stdout is not None, "both are pipes"
@@ -112,8 +107,8 @@ def run_in_child(
                 watch(*content)
         except (EOFError, pickle.UnpicklingError):  # at its end, or within a message
             status = child.wait()
-            said.seek(0)
-            text = said.read().decode(errors="replace")
+            stderr.seek(0)
+            text = stderr.read().decode(errors="replace")
         finally:
             child.kill()
             with suppress(BrokenPipeError):
@@ -126,14 +121,19 @@ def run_in_child(
 
 
 def serve() -> None:
-    """Do in the child what :func:`run_in_child` sends."""
+    """Run in the child what :func:`run_in_child` sends."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries may print
     function, arguments = pickle.load(sys.stdin.buffer)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def end_with_parent() -> None:
+        os.read(sys.stdin.fileno(), 1)  # until the parent, which holds the input open, ends
+        os._exit(1)
 
     def report(*content: object) -> None:
         _send(answers, ("report", content))
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
     try:
         answer = "result", function(*arguments, report)
@@ -146,9 +146,3 @@ def serve() -> None:
 def _send(stream: IO[bytes], message: object) -> None:
     stream.write(pickle.dumps(message))
     stream.flush()
-
-
-def _end_with_parent() -> None:
-    """Wait for the end of the input, which the parent holds open."""
-    os.read(sys.stdin.fileno(), 1)
-    os._exit(1)

@@ -1,9 +1,8 @@
-"""The numbers that define the image model, each with its source.
+"""The numbers that define the image model, each with its source and gradient.
 
-Nothing here is tuned: a value either comes from the 3DGS paper and its reference implementation
-(Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering") or states the
-numerical reason for which it exists. Where a number limits another, the gradient of that limit is
-stated beside it: none of the decisions themselves is differentiated.
+The source is the 3DGS paper and its reference implementation (Kerbl et al. 2023, "3D Gaussian
+Splatting for Real-Time Radiance Field Rendering"), or a numerical reason. Nothing is tuned, and no
+decision is differentiated.
 """
 
 from __future__ import annotations

@@ -25,19 +25,17 @@ def check_variant(plugin: str, variant: str | None) -> None:
         )
 
 
-def require_module(module: str, extra: str, asker: str) -> ModuleType:
+def require_module(module: str, extra: str, feature: str) -> ModuleType:
     """Import and return a module of an extra of ``pyproject.toml``.
 
-    asker: what needs it, as the user has written it: ``--view``.
-
-    Raises :class:`UserError` with the line that installs it, where it is not there.
+    feature: what needs it, for the message: ``--view``. Raises :class:`UserError` if it is missing.
     """
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
         missing = (error.name or module).partition(".")[0]
         raise UserError(
-            f"{asker}: needs {missing}, which is not installed; pip install 'drgs[{extra}]'"
+            f"{feature}: needs {missing}, which is not installed; pip install 'drgs[{extra}]'"
         ) from None
 
 
@@ -51,35 +49,30 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-_FLUSH = 0x8040
-"""Bits FTZ and DAZ of x86's register MXCSR (Intel, Software Developer's Manual 1, 10.2.3)."""
+_FLUSH_BITS = 0x8040  # FTZ and DAZ of x86's MXCSR (Intel, Software Developer's Manual 1, 10.2.3)
 
 
 @contextmanager
 def denormals_flushed() -> Iterator[None]:
-    """Take denormal numbers for zero on this thread within the block, as Dr.Jit's workers do.
+    """Flush denormal numbers to zero on this thread within the block, as Dr.Jit's workers do.
 
-    Only where the C library is glibc on x86-64. Dr.Jit leaves the calling thread's mode as it is,
-    and runs what is small there, or everything if there is no worker: bits of Adam's moments, and
-    soon all of a fit, would depend on the number of threads.
+    Only with glibc on x86-64. Dr.Jit runs small kernels, or all without workers, on the calling
+    thread: without this, bits of a fit would depend on the number of threads.
     """
-    with _mode(lambda bits: bits | _FLUSH):
+    with _mode(lambda bits: bits | _FLUSH_BITS):
         yield
 
 
 @contextmanager
 def denormals_kept() -> Iterator[None]:
-    """Compute with denormal numbers on this thread within the block.
-
-    For code that relies on the smallest number above zero not being zero.
-    """
-    with _mode(lambda bits: bits & ~_FLUSH):
+    """Keep denormal numbers on this thread within the block."""
+    with _mode(lambda bits: bits & ~_FLUSH_BITS):
         yield
 
 
 @contextmanager
 def _mode(change: Callable[[int], int]) -> Iterator[None]:
-    """Within the block, MXCSR is what ``change`` makes of it."""
+    """Change MXCSR within the block."""
     if (platform.libc_ver()[0], platform.machine()) != ("glibc", "x86_64"):
         yield
         return

@@ -1,7 +1,6 @@
-"""Errors that a user can repair, and how commands report them.
+"""Errors that a user can repair, with place, name, expected and got values, and remedy.
 
-A message says where, which name, what was expected, what was got and what to do: ``scenes/lego.yml:
-densify.every must be >= 1, got 0``.
+For example, ``scenes/lego.yml: densify.every must be >= 1, got 0``.
 """
 
 from __future__ import annotations
@@ -52,15 +51,13 @@ class Place(NamedTuple):
 
 
 def one_line(text: object, limit: int = 300) -> str:
-    """``text`` as one line of at most ``limit`` characters: what a library's error says, or a value
-    from a file, within a message of ours.
-    """
+    """Return ``text`` as one line of at most ``limit`` characters."""
     line = " ".join(str(text).split())
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
 
 
 def root_cause(error: BaseException) -> BaseException:
-    """The exception that a chain of exceptions started with."""
+    """Return the exception that a chain of exceptions started with."""
     while before := error.__cause__ or error.__context__:
         error = before
     return error
@@ -75,16 +72,15 @@ def reason_of_mitsuba(error: Exception) -> str:
 
 
 def format_names(names: Sequence[object], most: int = 3, separator: str = ", ") -> str:
-    """The first ``most`` of ``names``, and how many there are besides: ``a, b, c and 4 more``."""
+    """Return the first ``most`` of ``names``, and the number of others: ``a, b and 4 more``."""
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
     return separator.join(str(name) for name in names[:most]) + more
 
 
 def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> str:
-    """``"; did you mean X?"`` with the candidate nearest to ``name``, or ``""`` if none is near.
+    """Return ``"; did you mean X?"`` with the candidate nearest to ``name``, or ``""``.
 
-    cutoff: how near, 0 to 1 (``difflib``'s ratio). Of dotted names, one whose last part is near
-    will do: a key in the wrong section.
+    cutoff: least similarity, 0 to 1 (``difflib``'s ratio), also of the last part of dotted names.
     """
     candidates = list(candidates)
     nearest = difflib.get_close_matches(name, candidates, n=1, cutoff=cutoff)
@@ -96,11 +92,10 @@ def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> s
 
 
 def show_causes_last() -> None:
-    """Print a user's error once more after the traceback of what was raised because of it.
+    """Print a user's error again after the traceback of the RuntimeError that it caused.
 
-    Dr.Jit raises errors of an image, a loop or a frozen function again, as a RuntimeError whose
-    text is "see above", which may be pages away. In scripts and, where this is called from one, in
-    notebooks.
+    Dr.Jit wraps errors in a RuntimeError that refers to a text "above", which may be pages away.
+    Works in scripts and, if called from one, in notebooks.
     """
     if getattr(sys.excepthook, "func", None) is _show_with_cause:
         return
@@ -126,7 +121,6 @@ def _show_in_notebook(
     tb: TracebackType | None,
     tb_offset: int | None = None,
 ) -> None:
-    """Handle a notebook's RuntimeErrors, called by IPython."""
     shell.showtraceback((kind, error, tb), tb_offset=tb_offset)
     _show_cause(error)
 

@@ -1,7 +1,6 @@
-"""Reading regular files of a bounded size, and writing so that a reader never sees half of a file.
+"""Reading regular files of a bounded size, and atomic writing.
 
-What the file system refuses becomes a :class:`drgs.core.errors.UserError`: a missing folder, a
-lacking permission or a full disk is the user's to repair.
+Errors of the file system become a :class:`drgs.core.errors.UserError`.
 """
 
 from __future__ import annotations
@@ -37,38 +36,42 @@ _REMEDIES = {
 }
 
 
-STEM_BYTES = 200  # bytes of a file's name that is made of another: numbers and suffixes follow
+STEM_BYTES = 200  # of a derived file name, before numbers and suffixes
 
 
 def shorten_stem(stem: str) -> str:
-    """The beginning of ``stem``, or all of it: as much as a file's name has room for."""
+    """Return ``stem``, cut to ``STEM_BYTES`` bytes."""
     encoded = os.fsencode(stem)
     if len(encoded) <= STEM_BYTES:
         return stem
     return encoded[:STEM_BYTES].decode("utf-8", "ignore")
 
 
-_SPECIAL = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socket"}
-"""Names of irregular files, by the first letter of ``ls -l``."""
+# By the first letter of ``ls -l``.
+_IRREGULAR_FILES = {"p": "a named pipe", "c": "a device", "b": "a device", "s": "a socket"}
 
 
 def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = None) -> IO[bytes]:
-    """Open a regular file for reading; ``what`` it should be stands in the errors.
+    """Open a regular file for reading; what: its kind, for messages.
 
-    A pipe would wait for a writer for ever, and a device need not end: neither is read.
+    Pipes, which may wait for a writer, and devices, which need not end, are not opened.
 
-    Raises :class:`UserError` where it cannot be opened, is something else, or has more than
+    Raises :class:`UserError` if it cannot be opened, is no regular file, or has more than
     ``max_bytes``.
     """
+
+    def open_without_waiting(path: str, flags: int) -> int:
+        return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
     try:
-        file = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115  (the caller closes it)
+        file = open(path, "rb", opener=open_without_waiting)  # noqa: SIM115  (the caller closes it)
     except (OSError, ValueError) as error:  # the latter: a name with a zero byte
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{one_line(path)}: cannot read the {what}: {reason}") from None
     status = os.fstat(file.fileno())
     reason = None
     if not stat.S_ISREG(status.st_mode):
-        kind = _SPECIAL.get(stat.filemode(status.st_mode)[0], "something else")
+        kind = _IRREGULAR_FILES.get(stat.filemode(status.st_mode)[0], "something else")
         reason = f"must be a regular file, got {kind}"
     elif max_bytes is not None and status.st_size > max_bytes:
         reason = f"more than {max_bytes:,} bytes"
@@ -78,23 +81,17 @@ def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = N
     return file
 
 
-def _open_without_waiting(path: str, flags: int) -> int:
-    """Open a file; that of a pipe would otherwise wait for its other end."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
-
-
 def read_bytes(path: Path, what: str, max_bytes: int, memory_ratio: int = 1) -> bytes:
-    """The content of a regular file; ``what`` it should be stands in the errors.
+    """Return the content of a regular file; what: its kind, for messages.
 
-    memory_ratio: how many times the file's size the caller takes.
+    memory_ratio: memory that the caller needs, in file sizes.
 
-    Raises :class:`UserError` where it cannot be read, is longer than ``max_bytes``, or takes more
+    Raises :class:`UserError` if it cannot be read, is longer than ``max_bytes``, or takes more
     memory than is available.
     """
     try:
         with open_regular(path, what, max_bytes) as file:
-            # No more is asked for than there is: so much memory is allocated beforehand. Files of
-            # the system claim to be empty.
+            # read() allocates all that it may return. Files of the system have a size of 0.
             size = max(os.fstat(file.fileno()).st_size, 1 << 16)
             require_memory(path, memory_ratio * size, f"the {what}")
             content = file.read(min(size, max_bytes) + 1)
@@ -106,10 +103,7 @@ def read_bytes(path: Path, what: str, max_bytes: int, memory_ratio: int = 1) -> 
 
 
 def read_text(path: Path, what: str, max_bytes: int, memory_ratio: int = 2) -> str:
-    """The text of a UTF-8 file, without the mark of byte order that some editors write first.
-
-    Raises :class:`UserError` as :func:`read_bytes` does, and where the file is not UTF-8.
-    """
+    """Return the text of a UTF-8 file, without a byte order mark; see :func:`read_bytes`."""
     try:
         return read_bytes(path, what, max_bytes, memory_ratio).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -119,10 +113,7 @@ def read_text(path: Path, what: str, max_bytes: int, memory_ratio: int = 2) -> s
 
 
 def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
-    """Return the arrays of an ``.npz`` file that ``np.savez`` wrote; what: as for the above.
-
-    Raises :class:`UserError` for a file that cannot be read, is damaged, or too large for memory.
-    """
+    """Return the arrays of an ``.npz`` file of ``np.savez``; see :func:`read_bytes`."""
     import numpy as np  # a list of commands needs none
 
     with open_regular(path, what) as file:
@@ -148,12 +139,11 @@ _TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d{1,9})\.tmp(\.[^.]*)?")
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that replaces it when the block ends without an error.
+    """Yield a temporary path beside ``path`` that replaces it when the block ends without an error.
 
-    Missing parent folders are created. After an error the old file is still there, unchanged, and
-    the temporary one is gone.
+    Missing parent folders are created. After an error the old file is unchanged.
 
-    Raises :class:`UserError` where the file system refuses, also within the block.
+    Raises :class:`UserError` for an OSError, also within the block.
     """
     path = Path(path)
     # The suffix stays last: image writers choose the format by it.
@@ -170,7 +160,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def remove_stale_temporaries(folder: Path) -> None:
-    """Remove what writers that were killed have left behind, in ``folder`` and below it."""
+    """Remove temporary files of killed writers in ``folder`` and below it."""
     for path in folder.rglob(".*.tmp*"):
         if is_temporary(path.name):
             with suppress(OSError):
@@ -178,10 +168,7 @@ def remove_stale_temporaries(folder: Path) -> None:
 
 
 def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
-    """Remove what writers of the files ``names`` that were killed have left behind in ``folder``.
-
-    Those that still run keep theirs, and so do writers of other files.
-    """
+    """Remove temporary files in ``folder`` for the files ``names``, unless their writers run."""
     wanted = {(shorten_stem(path.stem), path.suffix) for path in map(Path, names)}
     for path in folder.glob(".*.tmp*"):
         found = _TEMPORARY_NAME.fullmatch(path.name)
@@ -191,12 +178,12 @@ def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a file of this name is one that :func:`atomic_path` was writing."""
+    """Return whether a file of this name is a temporary one of :func:`atomic_path`."""
     return _TEMPORARY_NAME.fullmatch(name) is not None
 
 
 def refusal_reason(error: OSError) -> str:
-    """Return the file system's reason, and what to do about it where that is known."""
+    """Return the file system's reason and, if known, a remedy."""
     reason = error.strerror or str(error) or type(error).__name__
     remedy = _REMEDIES.get(error.errno or 0)
     return f"{reason}; {remedy}" if remedy else reason

@@ -1,9 +1,8 @@
-"""Folders that commands write into: one writer at a time, and no file of others is replaced.
+"""Output folders: one writer at a time, and no foreign file is replaced.
 
-The record is a hidden file in the folder itself, so that it moves with it. It names a file before
-the file is written, and says by a digest what the file was when the command had ended. A file that
-is in the way and that the record does not name, or that has other bytes, belongs to others. A lock
-keeps a folder for one process and ends with it, however that ends.
+A record, a hidden file in the folder, names each file before it is written, and has its digest once
+the command has ended. A file that the record does not name, or that has other bytes, is foreign. A
+lock keeps a folder for one process and ends with it.
 """
 
 from __future__ import annotations
@@ -21,14 +20,11 @@ from pydantic import BaseModel, ConfigDict
 from drgs.core.errors import UserError, format_names
 from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
 
-MAX_BYTES = 1 << 26
-"""Largest record: 67 MB, two hundred bytes for each of a third of a million files."""
-
-_CHUNK = 1 << 20
+MAX_BYTES = 1 << 26  # of a record: 200 bytes for each of a third of a million files
 
 
 class _Content(BaseModel):
-    """Content of the file. Names are relative to the folder, with slashes."""
+    """Content of a record. Names are relative to the folder, with slashes."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
     files: dict[str, str | None] = {}  # digests; None: being written
@@ -39,27 +35,24 @@ class FolderRecord:
     """The record that ``command`` keeps of ``folder``."""
 
     def __init__(self, folder: Path, command: str) -> None:
-        """command: one word; each command knows its own files only.
-
-        Raises :class:`UserError` where the record cannot be read.
-        """
+        """command: one word. Raises :class:`UserError` if the record cannot be read."""
         self.folder, self.path = folder, folder / f".drgs-{command}.json"
         self.exists = os.path.lexists(self.path)
         self._content = _read(self.path) if self.exists else _Content()
 
     @property
     def paths(self) -> Mapping[str, str]:
-        """Paths that were kept besides, relative to the folder, by key of a configuration."""
+        """Paths relative to the folder, by key of a configuration."""
         return self._content.paths
 
     def strangers(self, names: Iterable[str]) -> list[str]:
-        """Return the ``names`` (relative to the folder) of files that belong to others."""
+        """Return those ``names``, relative to the folder, whose files are foreign."""
         return [name for name in names if self._is_strange(name)]
 
     def check(self, names: Iterable[str], earlier: Collection[str] = ()) -> None:
-        """Raise :class:`UserError` where one of the files ``names`` is somebody else's.
+        """Raise :class:`UserError` if one of the files ``names`` is foreign.
 
-        earlier: those of a version that kept no record; looked at where there is none.
+        earlier: files of a version without records, accepted if there is no record.
         """
         known = () if self.exists else earlier
         strangers = [name for name in self.strangers(names) if name not in known]
@@ -76,9 +69,9 @@ class FolderRecord:
         paths: Mapping[str, str] | None = None,
         earlier: Collection[str] = (),
     ) -> None:
-        """Note that the files ``names`` are written from now on; remove half-written ones.
+        """Record that the files ``names`` will be written, after :meth:`check`.
 
-        paths: kept besides, see :attr:`paths`; earlier: as for :meth:`check`, which comes first.
+        Removes half-written ones. paths: added to :attr:`paths`; earlier: see :meth:`check`.
         """
         names = list(names)
         self.check(names, earlier)
@@ -88,7 +81,7 @@ class FolderRecord:
         self._write(_Content(files=claimed, paths={**self.paths, **(paths or {})}))
 
     def seal(self) -> None:
-        """Note what the files are, now that all of them are written."""
+        """Record the digests of the files, once all of them are written."""
         if not self.exists:
             return
         there = [name for name in self._content.files if (self.folder / name).is_file()]
@@ -99,7 +92,7 @@ class FolderRecord:
             self._write(_Content(files=files, paths=dict(self.paths)))
 
     def remove(self) -> None:
-        """Forget all of it."""
+        """Remove the record."""
         self.path.unlink(missing_ok=True)
         self.exists, self._content = False, _Content()
 
@@ -121,10 +114,10 @@ class FolderRecord:
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, as text; :class:`UserError` where it cannot be read."""
+    """Return the SHA-256 of a file, in hexadecimal."""
     found = hashlib.sha256()
     with open_regular(path) as file:
-        while chunk := file.read(_CHUNK):
+        while chunk := file.read(1 << 20):
             found.update(chunk)
     return found.hexdigest()
 
@@ -143,19 +136,18 @@ def _read(path: Path) -> _Content:
 
 @contextmanager
 def sole_writer(folder: Path) -> Iterator[Callable[[], bool]]:
-    """Keep ``folder`` for the block: at once if it is there, else when it is made.
+    """Lock ``folder`` for the block, if it exists.
 
-    Yields a function that makes the folder and keeps it, before anything is written into it, and
-    returns whether it is kept. The lock (``flock``) is on the folder itself: there is no file that
-    a killed process could leave behind. Where the system has no such locks, or the folder cannot
-    be made or opened, nothing is kept, and what writes to the folder says why it cannot.
+    Yields a function that makes and locks the folder, to be called before anything is written, and
+    returns whether it is locked. The lock (``flock``) is on the folder itself, so a killed process
+    leaves no lock file. Without locks in the system, and for folders that cannot be made or opened,
+    there is no lock.
 
-    Raises :class:`UserError` while another process, or another block of this one, keeps it; so does
-    the function.
+    Both raise :class:`UserError` while another process, or another block of this one, has the lock.
     """
     descriptor: int | None = None
 
-    def keep() -> bool:
+    def lock() -> bool:
         nonlocal descriptor
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -165,14 +157,14 @@ def sole_writer(folder: Path) -> Iterator[Callable[[], bool]]:
 
     try:
         descriptor = _lock_folder(folder)
-        yield keep
+        yield lock
     finally:
         if descriptor is not None:
             os.close(descriptor)
 
 
 def _lock_folder(folder: Path) -> int | None:
-    """A descriptor of the folder that holds its lock; None where that cannot be had."""
+    """Return a descriptor of the folder that has its lock; None if there is none."""
     try:
         import fcntl
 

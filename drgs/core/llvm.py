@@ -1,14 +1,13 @@
-"""The libLLVM that Dr.Jit compiles with: choosing it, and refusing one that would crash.
+"""Choice of the libLLVM that Dr.Jit compiles with, and refusal of versions that crash.
 
-LLVM 14 to 16 end the whole process as soon as a kernel contains ``dr.minimum``, ``dr.maximum`` or
-``dr.clip`` ("Cannot select: fminimum"), so the version is checked before any kernel exists.
+LLVM 14 to 16 end the process on a kernel with ``dr.minimum``, ``dr.maximum`` or ``dr.clip``
+("Cannot select: fminimum"), so the version is checked before any kernel exists.
 
-How Dr.Jit 1.5 finds the library, while ``import drjit`` runs: a libLLVM that the process has
-loaded already; else the file that ``DRJIT_LIBLLVM_PATH`` names; else ``libLLVM.so`` on the
-loader's path, whatever its version; else, on Linux, the last of
-``/usr/lib/{x86_64-linux-gnu,aarch64-linux-gnu,wsl/lib}/libLLVM*.so.*`` in numeric order, where
-symbolic links count only if there is nothing else. A newer library that is a link (LLVM's own
-packages), or that lives in another folder (Fedora), therefore loses against an old one.
+Dr.Jit 1.5, when imported, takes the first of: a libLLVM that the process has loaded; the file that
+``DRJIT_LIBLLVM_PATH`` names; ``libLLVM.so`` on the loader's path; on Linux, the last of
+``/usr/lib/{x86_64-linux-gnu,aarch64-linux-gnu,wsl/lib}/libLLVM*.so.*`` in numeric order, links only
+if there is nothing else. A newer library that is a link (LLVM's own packages), or in another folder
+(Fedora), therefore loses against an old one.
 """
 
 from __future__ import annotations
@@ -23,8 +22,7 @@ from pathlib import Path
 
 MINIMUM_VERSION = 17  # first major version that compiles every kernel
 
-TESTED_VERSION = 19
-"""First major version that drgs is tested with (19 and 22 are); earlier ones give a warning."""
+TESTED_VERSION = 19  # first major version that drgs is tested with; earlier ones give a warning
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
@@ -34,16 +32,14 @@ Version = tuple[int, ...]
 class LLVMVersionError(ImportError, RuntimeError):
     """There is no libLLVM that drgs can run with.
 
-    An ImportError, so that ``mi.set_variant("llvm_ad_rgb", "scalar_rgb")`` goes on to its next
-    choice, as it does where libLLVM is missing.
+    An ImportError, so that ``mi.set_variant("llvm_ad_rgb", "scalar_rgb")`` tries its next choice.
     """
 
 
 def select_newest_llvm() -> None:
-    """Point Dr.Jit at the newest usable libLLVM, unless the user or an earlier import chose one.
+    """Set ``DRJIT_LIBLLVM_PATH`` to the newest usable libLLVM, for this process and its children.
 
-    Sets ``DRJIT_LIBLLVM_PATH`` for this process and its children. Without effect once Dr.Jit
-    was imported, when the variable is set, and where no usable library is found.
+    Without effect if the variable is set, Dr.Jit is imported, or no usable library is found.
     """
     if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
         return
@@ -54,10 +50,7 @@ def select_newest_llvm() -> None:
 
 
 def ensure_usable_llvm() -> None:
-    """Raise :class:`LLVMVersionError` unless Dr.Jit's libLLVM is recent enough.
-
-    Warns for versions that drgs is not tested with. Compiles nothing.
-    """
+    """Raise :class:`LLVMVersionError` unless Dr.Jit's libLLVM is recent enough; warn if old."""
     version = loaded_version()
     if version is None or version[0] < MINIMUM_VERSION:
         raise LLVMVersionError(_refusal(version))
@@ -72,18 +65,15 @@ def ensure_usable_llvm() -> None:
 def check_llvm_variants() -> None:
     """Run :func:`ensure_usable_llvm` when Mitsuba first loads one of its ``llvm_*`` variants.
 
-    An import hook, because ``mi.set_variant`` tells its callbacks of a variant only after it has
-    loaded it, and fails before that, with a misleading message, if Dr.Jit refused the library.
+    Installs an import hook: ``mi.set_variant`` fails with a misleading message before it runs its
+    callbacks if Dr.Jit refused the library.
     """
     if not any(isinstance(finder, _VariantCheck) for finder in sys.meta_path):
         sys.meta_path.insert(0, _VariantCheck())
 
 
 def loaded_version() -> Version | None:
-    """Return the version of the libLLVM in use, such as (19, 1, 7); None if Dr.Jit has none.
-
-    Waits for Dr.Jit's start-up, which a thread of its own performs.
-    """
+    """Return the version of the libLLVM in use, such as (19, 1, 7); None if Dr.Jit has none."""
     from drgs.core.private import llvm_version
 
     version = llvm_version()
@@ -93,8 +83,7 @@ def loaded_version() -> Version | None:
 def installed_libraries() -> list[tuple[Version, str]]:
     """Return (version, path) of every libLLVM in the usual places, the newest first.
 
-    Versions are read from file names: loading the libraries to ask them would be slow, and two
-    of them in one process get in each other's way.
+    Versions come from file names: loading is slow, and two libLLVM in one process conflict.
     """
     found = set()
     for folder in _library_folders():

@@ -1,8 +1,4 @@
-"""Available memory, and refusals of what it cannot hold.
-
-Linux ends a process that takes more than there is, without a word. What may become large is
-therefore estimated before it is allocated.
-"""
+"""Available memory, and checks before large allocations, for which Linux kills processes."""
 
 from __future__ import annotations
 
@@ -16,10 +12,9 @@ import psutil
 
 from drgs.core.errors import UserError, one_line
 
-FREE_MEMORY = (
+FREE_MEMORY = (  # remedy in messages
     "close other programs, raise the limit (ulimit -v, or the container's), or use smaller input"
 )
-"""Remedy in messages."""
 
 _EXHAUSTED = re.compile(
     "out of memory|std::bad_alloc|cannot allocate memory|failed to map segment", re.IGNORECASE
@@ -27,40 +22,28 @@ _EXHAUSTED = re.compile(
 
 MAX_LANES = 2**32 - 1  # entries of an array of Dr.Jit, which counts them in 32 bits
 
-IMAGE_BYTES = 250
-"""Bytes for a pixel, about: splats in its tile, planes, the film's block, the image, its copy on
-the host."""
+IMAGE_BYTES = (
+    250  # a pixel: tile entries, planes, the film's block, the image, its copy on the host
+)
+SAMPLE_BYTES = 80  # a further sample of a pixel: planes
+CHANNEL_BYTES = 24  # a channel besides colour: plane, block, image, copy
 
-SAMPLE_BYTES = 80  # bytes for each further sample of a pixel, whose planes are kept as well
-
-CHANNEL_BYTES = 24
-"""Bytes for each channel of the film besides colour: its plane, and its part of the block, of
-the image and of the copy."""
-
-UNASKED_FILE_BYTES = 1 << 24
-"""A file that takes less is read without asking: a fit reads hundreds of photographs."""
-
-UNASKED_BYTES = 1 << 28
-"""An image that needs less is rendered without asking what there is, which may take a millisecond:
-fits render hundreds in a second."""
+UNASKED_FILE_BYTES = 1 << 24  # read without a check: a fit reads hundreds of photographs
+UNASKED_BYTES = 1 << 28  # rendered without a check, which may take a millisecond
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
-_UNLIMITED_BYTES = 1 << 60
-"""Bytes; what version 1 of control groups calls a limit where there is none is more."""
+_UNLIMITED_BYTES = 1 << 60  # below what version 1 of control groups has for no limit
 
 
 def available_memory() -> int:
-    """Bytes that this process can still take.
-
-    The least of what the machine, the process's control groups and its own limit leave it.
-    """
+    """Return the bytes that the machine, control groups and the process's limit leave."""
     machine = psutil.virtual_memory().available
     return max(0, min(machine, _of_control_groups(), _of_process()))
 
 
 def release_unused_memory() -> None:
-    """Give back to the system what Dr.Jit holds for its next arrays, and what glibc has free."""
+    """Free Dr.Jit's cache of memory, and glibc's."""
     _flush_cache_of_drjit()
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # other C libraries have none
@@ -69,12 +52,12 @@ def release_unused_memory() -> None:
 
 
 def resident_memory() -> int:
-    """Bytes of memory that this process has."""
+    """Return the resident memory of this process, bytes."""
     return psutil.Process().memory_info().rss
 
 
 def readable(count: float) -> str:
-    """A number of bytes as messages write it: ``3.2 GB``."""
+    """Format a number of bytes: ``3.2 GB``."""
     unit, size = next(
         ((u, s) for u, s in (("GB", 1e9), ("MB", 1e6)) if count >= 0.9995 * s), ("kB", 1e3)
     )
@@ -82,10 +65,7 @@ def readable(count: float) -> str:
 
 
 def require_memory(path: str | Path, needed: int, what: str) -> None:
-    """Raise :class:`UserError` unless ``needed`` bytes are available for ``what`` a file contains.
-
-    Called before they are allocated.
-    """
+    """Raise :class:`UserError` unless ``needed`` bytes are available for ``what`` is in a file."""
     available = _if_insufficient(needed, UNASKED_FILE_BYTES)
     if available is not None:
         raise UserError(
@@ -95,10 +75,9 @@ def require_memory(path: str | Path, needed: int, what: str) -> None:
 
 
 def _if_insufficient(needed: int, unasked: int) -> int | None:
-    """Return the available bytes if they are fewer than ``needed``; None: there are enough.
+    """Return the available bytes if they are fewer than ``needed``, else None.
 
-    unasked: bytes that are granted without asking. Memory that Dr.Jit holds for its next arrays
-    counts as available.
+    unasked: bytes that are granted without a check. Dr.Jit's cache counts as available.
     """
     if needed <= unasked or needed <= available_memory():
         return None
@@ -108,10 +87,9 @@ def _if_insufficient(needed: int, unasked: int) -> int | None:
 
 
 def out_of_memory_reason(error: BaseException) -> str | None:
-    """Return what to tell the user where an error means that memory is exhausted, else None.
+    """Return the message for an error that means exhausted memory, else None.
 
-    Python and NumPy raise MemoryError, Dr.Jit a RuntimeError, and the loader of libraries an
-    ImportError or an OSError.
+    Python and NumPy raise MemoryError, Dr.Jit RuntimeError, the loader ImportError or OSError.
     """
     text = one_line(error)
     is_of_system = isinstance(error, OSError) and error.errno == errno.ENOMEM
@@ -145,7 +123,6 @@ def too_large_reason(width: int, height: int, channels: int = 3, samples: int = 
 
 
 def _flush_cache_of_drjit() -> None:
-    """Free what Dr.Jit, where it is loaded, holds for its next arrays: as good as available."""
     if drjit := sys.modules.get("drjit"):
         drjit.flush_malloc_cache()
 
@@ -159,7 +136,7 @@ def _of_process() -> int:
 
 
 def _of_control_groups() -> int:
-    """Bytes that the limits of the process's control groups leave; both versions."""
+    """Return the bytes that the process's control groups leave; versions 1 and 2."""
     rooms = [_UNLIMITED_BYTES]
     for line in _lines(_PROC / "self" / "cgroup"):
         _, controllers, path = line.split(":", 2)
@@ -177,18 +154,16 @@ def _of_control_groups() -> int:
 
 
 def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
-    """Bytes that a control group has left; files that it keeps in memory can be dropped."""
+    """Return the bytes that a control group has left, with its file cache."""
     most, used = (next(iter(_lines(group / name)), "") for name in (limit, usage))
     if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED_BYTES:
         return _UNLIMITED_BYTES
-    cached = [
-        line.split()[1] for line in _lines(group / "memory.stat") if line.split()[0] == reclaimable
-    ]
-    return int(most) - int(used) + sum(map(int, cached))
+    statistics = dict(line.split()[:2] for line in _lines(group / "memory.stat"))
+    return int(most) - int(used) + int(statistics.get(reclaimable, 0))
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines of a file of the kernel; none where there is no such file."""
+    """Return the lines of a file of the kernel; none if it is missing."""
     try:
         return path.read_text().splitlines()
     except OSError:

@@ -1,8 +1,4 @@
-"""Functions that Dr.Jit and Mitsuba do not document: the only module that calls them.
-
-Each does what its docstring says in Dr.Jit 1.5.0 and Mitsuba 3.9.1. A newer version that removes or
-changes one of them is met here.
-"""
+"""All calls of undocumented functions of Dr.Jit (1.5.0) and Mitsuba (3.9.1)."""
 
 from __future__ import annotations
 
@@ -23,8 +19,7 @@ if TYPE_CHECKING:
 def bucket_order(buckets: UInt32, block_size: int, num_buckets: int) -> UInt32:
     """Return a permutation (N,) that orders the lanes of each block stably by their bucket.
 
-    buckets: (N,), evaluated, each below ``num_buckets``; block_size: lanes that are ordered
-    together.
+    buckets: (N,), evaluated, each below ``num_buckets``; block_size: lanes of a block.
 
     Relies on ``dr.detail.block_mkperm`` being stable.
     """
@@ -36,19 +31,15 @@ def bucket_order(buckets: UInt32, block_size: int, num_buckets: int) -> UInt32:
 def same_variables(tree: object, other: object) -> bool:
     """Return whether two PyTrees consist of the same Dr.Jit variables, in the same order.
 
-    Both are held, so that equal indices mean the same variable. Evaluates nothing.
-
     Relies on ``dr.detail.collect_indices``.
     """
     return dr.detail.collect_indices(tree) == dr.detail.collect_indices(other)
 
 
 def same_memory(array: dr.ArrayBase) -> dr.ArrayBase:
-    """Return an evaluated array that Dr.Jit takes for another one, of the same memory; LLVM only.
+    """Return another evaluated array of the same memory; LLVM only. Waits for the device.
 
-    What is scattered to one of them is in the other, too. Waits for the device.
-
-    Relies on numpy and Dr.Jit giving each other arrays without copying them.
+    Relies on numpy and Dr.Jit sharing memory.
     """
     other = type(array)(array.numpy())
     if other.numpy().ctypes.data != array.numpy().ctypes.data:
@@ -57,7 +48,7 @@ def same_memory(array: dr.ArrayBase) -> dr.ArrayBase:
 
 
 def llvm_version() -> tuple[int, ...]:
-    """Version of the libLLVM that Dr.Jit has loaded, such as (19, 1, 7); (-1, ...) without one.
+    """Return the version of the loaded libLLVM, such as (19, 1, 7); (-1, ...) without one.
 
     Relies on ``dr.detail.llvm_version`` waiting for Dr.Jit's start-up.
     """
@@ -67,8 +58,7 @@ def llvm_version() -> tuple[int, ...]:
 def llvm_vector_width() -> int:
     """Return the lanes of the vectors that Dr.Jit compiles for; 0 if this build has no such query.
 
-    Relies on ``jit_llvm_vector_width`` of drjit-core, which Dr.Jit's Python interface does not
-    offer.
+    Relies on ``jit_llvm_vector_width`` of drjit-core.
     """
     llvm_version()  # waits until the backend knows its processor
     try:
@@ -80,10 +70,9 @@ def llvm_vector_width() -> int:
 def disable_avx512() -> None:
     """Compile from now on for this processor as if it had AVX2 and no AVX-512.
 
-    To be called before the first kernel. Raises :class:`UserError` where there is no AVX-512, or no
-    way to leave it out.
+    To be called before the first kernel. Raises :class:`UserError` if that is not possible.
 
-    Relies on ``jit_llvm_set_target`` of drjit-core, which Dr.Jit's Python interface does not offer.
+    Relies on ``jit_llvm_set_target`` of drjit-core.
     """
     llvm_version()  # waits until the backend knows its processor
     place = "jit_llvm_set_target(): cannot leave out AVX-512"

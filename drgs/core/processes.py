@@ -1,10 +1,7 @@
-"""Processes of a job that ``mpiexec`` starts: its start, its output and its end.
+"""Start, output and end of the processes of an ``mpiexec`` job.
 
-Launchers describe a job by variables of the environment. MPI itself is imported by
-:func:`start_mpi` and by ``drgs.training.parallel`` alone.
-
-A process that fails ends the whole job, with its own exit status. Where all fail alike, the first
-one is heard: the others wait before they speak, and are ended meanwhile.
+Only :func:`start_mpi` and ``drgs.training.parallel`` import MPI. A process that fails ends the job
+with its exit status. If all fail alike, only the first one prints: the others wait before.
 """
 
 from __future__ import annotations
@@ -22,36 +19,33 @@ from typing import NoReturn
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, one_line
 
-LAUNCHERS = (
+LAUNCHERS = (  # environment variables of a process's number, from 0, and the number of processes
     ("PMI_RANK", "PMI_SIZE"),  # MPICH
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),  # Open MPI
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS"),  # Slurm
 )
-"""Variables that hold the number of a process, from 0, and the number of processes."""
 
 MPICH_SOCKET = "PMI_FD"
-"""Variable that holds the file descriptor to MPICH's launcher, which reads lines of PMI-1 from it.
-MPICH's launcher goes on when a process fails before MPI has started; others end the job."""
+"""Environment variable of the file descriptor from which MPICH's launcher reads lines of PMI-1. It
+goes on when a process fails before MPI has started; other launchers end the job."""
 
 PATIENCE_S, PATIENCE_PER_PROCESS_S, MAX_PATIENCE_S = 2.0, 0.4, 8.0
-"""A failed process waits so long for the first one, and for those of lower numbers, to speak."""
+"""Delays before a failed process prints, so that those of lower numbers print first."""
 
-OUTPUT_S, ABORT_S = 0.2, 1.0
-"""Time for a launcher to pass on what was printed, and to end the job: it takes milliseconds."""
+OUTPUT_S, ABORT_S = 0.2, 1.0  # for a launcher to pass on output, and to end the job
 
 
 def process_number() -> int | None:
-    """Return the number that a launcher of MPI has given this process; None: there is none."""
-    return _from_launcher(0)
+    """Return the number that a launcher of MPI has given this process; None without one."""
+    return _launcher_variable(0)
 
 
 def process_count() -> int | None:
-    """Return the number of processes that the launcher has started; None: it is not known."""
-    return _from_launcher(1)
+    """Return the number of processes that the launcher has started; None if unknown."""
+    return _launcher_variable(1)
 
 
-def _from_launcher(index: int) -> int | None:
-    """Return the number in a variable of the launcher that has numbered this process."""
+def _launcher_variable(index: int) -> int | None:
     names = next((each for each in LAUNCHERS if os.environ.get(each[0], "").isdecimal()), None)
     text = os.environ.get(names[index], "") if names else ""
     return int(text) if text.isdecimal() else None
@@ -59,10 +53,10 @@ def _from_launcher(index: int) -> int | None:
 
 @contextmanager
 def root_output_only() -> Iterator[None]:
-    """Let only the first process print within the block; others, once they have failed alone.
+    """Let only the first process print within the block.
 
-    An error that leaves the block on another process does so after that one's patience, by which
-    time an error of the first process has ended the job. Whoever prints it continues a line.
+    On other processes, an error leaves the block after a delay, by which time an error of the first
+    process has ended the job.
     """
     number = process_number()
     if not number:
@@ -80,7 +74,7 @@ def root_output_only() -> Iterator[None]:
 
 @contextmanager
 def end_job_on_error() -> Iterator[None]:
-    """End all processes of the job where an error ends the block on this one."""
+    """End all processes of the job if an error ends the block on this one."""
     if process_number() is None:
         yield
         return
@@ -96,10 +90,10 @@ def end_job_on_error() -> Iterator[None]:
 
 
 def end_job(status: int) -> NoReturn:
-    """End all processes at once, with this exit status; nothing is cleaned up.
+    """End all processes at once, with this exit status and without clean-up.
 
-    ``MPI_Abort`` of MPICH has the others call ``exit``, which threads of C++ do not survive; its
-    launcher ends them without.
+    After MPICH's ``MPI_Abort``, the others call ``exit``, which crashes C++ threads; its launcher
+    kills them.
     """
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # the reader has gone, or the stream was closed
@@ -117,10 +111,7 @@ def end_job(status: int) -> NoReturn:
 
 
 def start_mpi() -> None:
-    """Start MPI, for which all processes of the job wait for each other.
-
-    Raises :class:`UserError` where there is no MPI, or another one than that of ``mpiexec``.
-    """
+    """Start MPI on all processes; raise :class:`UserError` if there is none, or not mpiexec's."""
     require_module("mpi4py", "mpi", "mpiexec")
     try:
         mpi = import_module("mpi4py.MPI")

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from traceback import walk_tb
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
@@ -34,10 +34,8 @@ from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-ENTRY_POINT_GROUP = "drgs"  # group of the entry points whose modules register extensions
-
+ENTRY_POINT_GROUP = "drgs"
 HOW_TO_INSTALL = 'others come with installed packages that have an entry point of the group "drgs"'
-"""Completes messages that list the extensions that exist."""
 
 T = TypeVar("T")
 Registered = TypeVar("Registered")
@@ -74,9 +72,9 @@ class Extension(Generic[T]):
 
     @contextmanager
     def reporting(self) -> Iterator[None]:
-        """Within the block, raise errors of the extension as :class:`ExtensionError`.
+        """Raise errors of installed extensions within the block as :class:`ExtensionError`.
 
-        Errors of extensions that drgs ships, and every ``UserError``, pass unchanged.
+        A ``UserError`` passes unchanged.
         """
         try:
             yield
@@ -124,7 +122,6 @@ class Registry(Generic[T]):
         return decorate
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is an extension of this name; installed packages are asked last."""
         return name in self._shipped or name in self._extensions or name in self.names()
 
     @property
@@ -170,7 +167,6 @@ class ClassRegistry(Registry[type[Base]]):
     def register(
         self, name: str, section: type[BaseModel] | None = None
     ) -> Callable[[Registered], Registered]:
-        """Return a decorator that registers a class under ``name``; see :class:`Registry`."""
         decorate = super().register(name, section)
 
         def register_class(cls: Registered) -> Registered:
@@ -180,7 +176,7 @@ class ClassRegistry(Registry[type[Base]]):
         return register_class
 
 
-_registries: list[Registry] = []  # all registries: what is registered is global by its nature
+_registries: list[Registry] = []
 
 
 def all_extensions() -> list[Extension]:
@@ -211,28 +207,21 @@ def reporting_extensions() -> Iterator[None]:
         raise
 
 
-_loaded: set[str] = set()
-"""Entry points whose modules have been imported: they register at import, once."""
+_loaded: set[str] = set()  # entry points whose modules have been imported
 
 
 def _load_installed() -> None:
-    """Import the modules of the entry points of the group ``drgs``.
-
-    Raises :class:`ExtensionError` naming the entry point if one cannot be imported.
-    """
+    """Import the modules of the entry points; :class:`ExtensionError` if that fails."""
     for point in entry_points(group=ENTRY_POINT_GROUP):
-        if point.value not in _loaded:
-            _load(point)
-            _loaded.add(point.value)
-
-
-def _load(point: EntryPoint) -> None:
-    try:
-        point.load()
-    except Exception as error:
-        package = "" if point.dist is None else f" of the package {point.dist.name}"
-        cause = one_line(f"{type(error).__name__}: {error}")
-        raise ExtensionError(
-            f'cannot load the extension "{point.name}"{package} ({point.value}): {cause}; repair '
-            "or uninstall it"
-        ) from error
+        if point.value in _loaded:
+            continue
+        try:
+            point.load()
+        except Exception as error:
+            package = "" if point.dist is None else f" of the package {point.dist.name}"
+            cause = one_line(f"{type(error).__name__}: {error}")
+            raise ExtensionError(
+                f'cannot load the extension "{point.name}"{package} ({point.value}): {cause}; '
+                "repair or uninstall it"
+            ) from error
+        _loaded.add(point.value)

@@ -32,22 +32,3 @@ else:
     Bool = Float = Int32 = Matrix3f = Matrix4f = TensorXf = UInt32 = UInt64 = Any
 
 Scalar = Float | float  # A Dr.Jit scalar or a number of the host
-
-__all__ = [
-    "Array2f",
-    "Array2u",
-    "Array3f",
-    "Array3u",
-    "Array4f",
-    "Array4u",
-    "ArrayXf",
-    "Bool",
-    "Float",
-    "Int32",
-    "Matrix3f",
-    "Matrix4f",
-    "Scalar",
-    "TensorXf",
-    "UInt32",
-    "UInt64",
-]
