@@ -7,7 +7,7 @@ sensor's transform is never read back to the host.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import numpy as np
@@ -16,12 +16,28 @@ from drgs.cameras.lens import PINHOLE, CameraParameters, Lens
 from drgs.core.arrays import types_of
 from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar, UInt32
 
-if TYPE_CHECKING:
-    from drgs.cameras.thin_lens import RoundAperture
-else:
-    RoundAperture = object  # Dr.Jit resolves the annotation; cameras without blur import nothing
-
 MAX_RAY_ERROR_PX = 0.01  # px: largest distance of the point of a ray from the place of the ray
+
+
+class Aperture(Protocol):
+    """The aperture of a lens that blurs: see ``drgs.cameras.thin_lens``."""
+
+    @property
+    def radius(self) -> Float:
+        """Radius, scene units."""
+        ...
+
+    def variance(self, camera: Camera, depth: Float) -> Float:
+        """Return the variance along either axis, px^2, of the blur of a point at ``depth``."""
+        ...
+
+    def rays(self, camera: Camera, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool]:
+        """Return directions (world) of ``count`` rays of each place (px), and validity."""
+        ...
+
+    def in_focus(self, origin: Array3f, direction: Array3f) -> Array3f:
+        """Return the point of a ray (camera axes) where all rays of its place meet."""
+        ...
 
 
 class Shutter(Protocol):
@@ -49,7 +65,7 @@ class Camera(CameraParameters):
     width: int
     height: int
     lens: Lens = PINHOLE
-    aperture: RoundAperture | None = None  # of a lens that blurs
+    aperture: Aperture | None = None  # of a lens that blurs
     shutter: Shutter | None = None  # of a camera that moves while it is open
 
     @staticmethod

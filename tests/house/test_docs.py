@@ -69,7 +69,7 @@ def table(plugin) -> list[Row]:
 
 def names_in_docstring(plugin) -> set[str]:
     documentation = source(plugin).split('    """')[1]
-    items = re.findall(r"^    - ((?:``[\w.]+``,?\s*)+): ", documentation, re.M)
+    items = re.findall(r"^    - ((?:``[\w.]+``,?\s*)+)(?: ?\([\w ]+\))?: ", documentation, re.M)
     return {name for item in items for name in re.findall(r"``([\w.]+)``", item)}
 
 

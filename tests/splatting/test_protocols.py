@@ -32,6 +32,7 @@ CLASSES = {
         pixel_lists.ParallelDepths,
         pixel_lists.RayDepths,
     ),
+    camera.Aperture: (thin_lens.RoundAperture,),
     lens.Lens: (
         lens.Pinhole,
         radial_tangential.RadialTangential,
