@@ -112,7 +112,7 @@ def _add_viewing(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
+    """Fit what the command line names; exit with status 130 if Ctrl-C stopped it."""
     started = time.perf_counter() - LOADING_SECONDS
     comm = communicator(args)
     budget = None if args.budget is None else Budget(args.budget, started + args.budget)

@@ -78,12 +78,12 @@ def run_in_child(
 ) -> Result:
     """Return ``function(*arguments, report)``, called in a new process.
 
-    function, arguments: can be pickled. watch: is called here with what the child gives to
-    ``report``. interrupts: end the child, which Ctrl-C itself does not reach; it also ends when
-    this process does, however that ends.
+    function, arguments: can be pickled. watch: called here with the arguments of the child's
+    ``report``. interrupts: end the child, which Ctrl-C does not reach and which ends with this
+    process.
 
-    Raises the child's :class:`UserError` or OSError, :class:`ChildEndedError` where a signal ended
-    it, and RuntimeError with its traceback for any other error.
+    Raises the child's :class:`UserError` or OSError, :class:`ChildEndedError` after a signal, and
+    RuntimeError with the child's traceback for other errors.
     """
     # Not -m, which would look for modules in the current folder first.
     code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
