@@ -6,6 +6,9 @@
 >>> fitted.gaussians.save("lego.ply")
 >>> image, alpha, _ = drgs.rasterization(means, quats, scales, opacities, colors, ...)
 
+:class:`Gaussians` is a scene, :func:`load_dataset` reads photographs with their cameras,
+:func:`train` fits Gaussians to them, and :func:`rasterization` renders differentiably.
+
 Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
 and for every later one. Public names are imported when they are first used.
 """
