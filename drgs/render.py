@@ -24,7 +24,7 @@ import numpy as np
 
 from drgs.cli.commands import (
     CommandParser,
-    at_least,
+    bounded_int,
     degrees,
     file_or_folder,
     finite_number,
@@ -124,7 +124,7 @@ def _add_cameras(parser: CommandParser) -> None:
     )
     one_of(
         "--orbit",
-        type=at_least(1, MAX_FRAMES),
+        type=bounded_int(1, MAX_FRAMES),
         metavar="N",
         help="N frames around the scene, and an animation",
     )
@@ -146,7 +146,7 @@ def _add_cameras(parser: CommandParser) -> None:
     )
     add(
         "--size",
-        type=at_least(1),
+        type=bounded_int(1),
         nargs=2,
         metavar=("W", "H"),
         help="px (default: 400 400; of --orbit, the photographs', within that)",

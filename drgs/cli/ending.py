@@ -158,7 +158,7 @@ def _interrupt_after(error: BaseException | None) -> KeyboardInterrupt | None:
 
 
 @contextmanager
-def printable_anywhere() -> Iterator[None]:
+def escape_unencodable() -> Iterator[None]:
     """Escape, within the block, characters that the standard streams' encoding lacks."""
     streams = [s for s in (sys.stdout, sys.stderr) if isinstance(s, TextIOWrapper)]
     before = [stream.errors for stream in streams]
@@ -173,7 +173,7 @@ def printable_anywhere() -> Iterator[None]:
 
 
 @contextmanager
-def notes_printed() -> Iterator[None]:
+def print_notes() -> Iterator[None]:
     """Print each :class:`UserNote` of the block as a line; ignore Pillow's warnings."""
     with warnings.catch_warnings():
         show = warnings.showwarning

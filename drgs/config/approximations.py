@@ -33,7 +33,7 @@ class Limits:
     le: float | None = None
     or_infinite: bool = False  # whether infinity is allowed beyond ``le``
 
-    def hold_for(self, value: float) -> bool:
+    def allow(self, value: float) -> bool:
         """Return whether ``value``, in single precision as in kernels, is allowed; NaN never is."""
         if self.or_infinite and value == math.inf:
             return True
@@ -105,7 +105,7 @@ class Declared:
     def allows(self, value: Value) -> bool:
         """Return whether a value of this kind is within the limits."""
         if self.limits is not None:
-            return not isinstance(value, str) and self.limits.hold_for(value)
+            return not isinstance(value, str) and self.limits.allow(value)
         if self.registry is not None:
             return value in self.registry
         return not self.words or value in self.words

@@ -218,7 +218,7 @@ class DensifyConfig(Section):
         start = max(self.stop, self.prune.start or 0)
         return start, self.prune.stop or (start + iterations + 1) // 2
 
-    def settled_iteration(self, iterations: int) -> int:
+    def first_fixed_iteration(self, iterations: int) -> int:
         """Return the iteration from which on no row is added or removed; iterations: of the fit."""
         last = self.stop if self.prune.to is None else self.prune_window(iterations)[1]
         return max(self.stop, last) + 1

@@ -255,7 +255,7 @@ class ModelConfig(_ModelWithApproximations):
         """The near plane, scene units; the reference's if it is null."""
         return REFERENCE_NEAR if self.near is None else self.near
 
-    def of_file(self) -> ModelConfig:
+    def with_3dgs_defaults(self) -> ModelConfig:
         """Return the model for files that record none: 3DGS's where a value is not given."""
         usual = {name: DECLARED[name].default for name in FITTED_WITH}
         given = self.model_fields_set

@@ -26,7 +26,7 @@ LOW_PASS = 0.3
 """px^2 added to the diagonal of the projected covariance (3DGS reference rasterizer): every
 splat is at least about a pixel wide. It also bounds the conic by 1 / LOW_PASS."""
 
-LEAST_LOW_PASS = 1e-18
+MIN_LOW_PASS_PX2 = 1e-18
 """px^2, where the low-pass is switched off: keeps the conic of a flat splat finite, also squared
 and times a film's width."""
 
