@@ -311,10 +311,9 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
 
 
 def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str, str]) -> None:
-    """Render every sensor of a Mitsuba scene with the scene's own integrator.
+    """Render every sensor of a Mitsuba scene to EXR (all channels) and PNG (colours in sRGB).
 
-    definitions: values for the parameters ($name) of the scene file. The EXR contains all channels
-    of the film, the PNG the colours, sRGB-encoded.
+    definitions: values for the parameters ($name) of the scene file.
     """
     try:
         scene = load_scene_file(path, **definitions)

@@ -120,10 +120,7 @@ def exit_on_interrupt() -> Iterator[None]:
 
 @contextmanager
 def interruptible_imports() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end the process at once while the block imports.
-
-    Extension modules that are being imported may abort on, or hide, a raised interrupt.
-    """
+    """Let Ctrl-C and SIGTERM end the process at once: imports may abort on, or hide, interrupts."""
     handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _terminate}
     taken = {n: h for n, h in handlers.items() if signal.getsignal(n) == h}
     if threading.current_thread() is not threading.main_thread():

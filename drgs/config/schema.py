@@ -24,12 +24,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value
-from drgs.config.density import (
-    REFERENCE_START,
-    REFERENCE_STOP,
-    DensifyConfig,
-    schedule_of,
-)
+from drgs.config.density import REFERENCE_START, REFERENCE_STOP, DensifyConfig, schedule_of
 from drgs.config.extensions import LossName, ReaderName, Sections
 from drgs.config.section import UNRESOLVED, Count, Rate, Resolved, Section, Weight, subsection
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
@@ -532,9 +527,8 @@ class FitConfig(Section):
         for before, after in pairwise(self.coarse or ()):
             is_in_order = before.until < after.until and before.factor > after.factor
             got = f"{_format_section(before)} before {_format_section(after)}"
-            _require(
-                is_in_order, "coarse must be stages with growing until and falling factor", got
-            )
+            expected = "coarse must be stages with growing until and falling factor"
+            _require(is_in_order, expected, got)
         aims = optimizer.means_lr_aims
         starts = [aim.after for aim in aims]
         is_growing = starts == sorted(set(starts)) and all(aim.end > aim.after for aim in aims)

@@ -158,10 +158,9 @@ def scatter_rows(columns: Sequence[Array], rows: UInt32, num_rows: int) -> Array
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of numbers that a lane loads or stores in packets.
+    """Rows of numbers in packets of a power of two: 9 are an array of packets of 8, and one of 1.
 
-    A packet of 8 numbers costs less than two of 4, and these less than four of 2. Rows of 9 are
-    therefore stored as an array of packets of 8 and one of single numbers.
+    A packet of 8 numbers costs less than two of 4, and these less than four of 2.
     """
 
     blocks: tuple[types.Float, ...]  # flat, row-major: the next columns of all rows
@@ -319,11 +318,9 @@ class _Packets(Generic[Array]):
 
 
 def with_aligned_stack(value: Array) -> Array:
-    """Return ``value`` such that kernels keep aligned what registers do not hold; not evaluated.
+    """Return ``value``, not evaluated, by way of a stack variable, written and read at one index.
 
-    LLVM aligns a function's stack for its variables, but not for vectors that it spills, which then
-    cross two cache lines. A variable on the stack, written and read at the same opaque index, makes
-    it align the stack.
+    LLVM aligns the stack for variables, but not for spilled vectors, which then cross cache lines.
     """
     UInt32 = types_of(type(value)).UInt32
     variable = dr.alloc_local(type(value), 2)

@@ -18,8 +18,6 @@ from drgs.core.errors import UserError, one_line
 
 Result = TypeVar("Result")
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 class ChildEndedError(RuntimeError):
     """A signal ended the child; the message has its name and the child's last output."""
@@ -39,7 +37,7 @@ class DeferredInterrupts:
     def __enter__(self) -> DeferredInterrupts:
         """Take over the signals, unless they are ignored."""
         if threading.current_thread() is threading.main_thread():
-            handlers = {number: signal.getsignal(number) for number in SIGNALS}
+            handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
             self._previous = {n: h for n, h in handlers.items() if h not in (signal.SIG_IGN, None)}
             for number in self._previous:
                 signal.signal(number, self._handle)

@@ -138,12 +138,10 @@ def _read(path: Path) -> _Content:
 def sole_writer(folder: Path) -> Iterator[Callable[[], bool]]:
     """Lock ``folder`` for the block, if it exists.
 
-    Yields a function that makes and locks the folder, to be called before anything is written, and
-    returns whether it is locked. The lock (``flock``) is on the folder itself, so a killed process
-    leaves no lock file. Without locks in the system, and for folders that cannot be made or opened,
-    there is no lock.
-
-    Both raise :class:`UserError` while another process, or another block of this one, has the lock.
+    Yields a function that makes and locks the folder, to be called before anything is written; it
+    returns whether it is locked (``flock``): not without locks in the system, nor for folders that
+    cannot be made or opened. Both raise :class:`UserError` while another process, or another block
+    of this one, has the lock.
     """
     descriptor: int | None = None
 

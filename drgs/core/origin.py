@@ -34,10 +34,7 @@ def choose_origin(middle: ArrayLike, size: float) -> Origin:
 
 
 def recenter_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
-    """Return positions (N, 3) float64, and the origin that they are relative to.
-
-    means: (N, 3) float64, world.
-    """
+    """Return world positions (N, 3), float64, relative to an origin near most, and this origin."""
     middle = np.median(means, axis=0)
     origin = choose_origin(middle, float(np.median(np.linalg.norm(means - middle, axis=1))))
     return means - origin, origin
