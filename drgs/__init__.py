@@ -6,12 +6,11 @@
 >>> fitted.gaussians.save("lego.ply")
 >>> image, alpha, _ = drgs.rasterization(means, quats, scales, opacities, colors, ...)
 
-:class:`Gaussians`: a scene, from and to files and numpy arrays; :func:`load_dataset`:
-photographs with their cameras; :func:`train`: fits Gaussians to them; :func:`rasterization`:
-differentiable images, with gsplat's names and conventions.
+:class:`Gaussians` is a scene, :func:`load_dataset` reads photographs with their cameras,
+:func:`train` fits Gaussians to them, and :func:`rasterization` renders differentiably.
 
 Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
-and for every later one; these names are imported when they are first used.
+and for every later one. Public names are imported when they are first used.
 """
 
 from __future__ import annotations

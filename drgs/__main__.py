@@ -19,10 +19,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None, prog: str = "drgs") -> None:
-    """Entry point of the console script.
-
-    arguments: the words of the command line; None: those of this process. prog: how it is called.
-    """
+    """Entry point of the console script; see :func:`drgs.cli.commands.run_command`."""
     run_command(add_arguments, prog, arguments)
 
 

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.cli.commands import MAX_PORT, CommandParser, at_least, file_or_folder, run_command
+from drgs.cli.commands import MAX_PORT, CommandParser, bounded_int, file_or_folder, run_command
 from drgs.cli.ending import INTERRUPTED_STATUS
 from drgs.cli.execution import add_execution_arguments, execution_settings
 from drgs.config.extensions import describe_extensions
@@ -51,7 +51,7 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s scenes/photos.yml --data DIR --out out/mine",
         "%(prog)s --resume out/mine",
     )
-    parser.end_help_with(describe_extensions)
+    parser.set_help_footer(describe_extensions)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "config",
@@ -102,7 +102,10 @@ def _add_viewing(parser: CommandParser) -> None:
         help="where the page is (default: 127.0.0.1, for this machine alone)",
     )
     group.add_argument(
-        "--view-port", type=at_least(1, MAX_PORT), metavar="N", help="(default: the first free one)"
+        "--view-port",
+        type=bounded_int(1, MAX_PORT),
+        metavar="N",
+        help="(default: the first free one)",
     )
     group.add_argument(
         "--tensorboard",
@@ -112,7 +115,7 @@ def _add_viewing(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Fit what the command line names; end the process with status 130 if Ctrl-C stopped it."""
+    """Fit what the command line names; exit with status 130 if Ctrl-C stopped it."""
     started = time.perf_counter() - LOADING_SECONDS
     comm = communicator(args)
     budget = None if args.budget is None else Budget(args.budget, started + args.budget)

@@ -110,9 +110,8 @@ def rasterization(
 ) -> tuple[Array, Array, dict[str, Any]]:
     """Render N Gaussians through C pinhole cameras: (colors, alphas, meta).
 
-    Names, defaults, conventions and the order of results are those of gsplat 1.x. Arrays are numpy
-    arrays (results then are) or Dr.Jit tensors; all is computed in the type of ``means``, float32
-    or float64.
+    Names, defaults, conventions and the order of results are those of gsplat 1.x. Arrays and
+    results are numpy arrays or Dr.Jit tensors, in the type of ``means``, float32 or float64.
 
     means: (N, 3) world; quats: (N, 4) wxyz, of any norm; scales: (N, 3) standard deviations, world
     units; opacities: (N,) in 0..1; colors: (N, D) or, for each camera, (C, N, D), D up to 64; with

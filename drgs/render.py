@@ -24,7 +24,7 @@ import numpy as np
 
 from drgs.cli.commands import (
     CommandParser,
-    at_least,
+    bounded_int,
     degrees,
     file_or_folder,
     finite_number,
@@ -124,7 +124,7 @@ def _add_cameras(parser: CommandParser) -> None:
     )
     one_of(
         "--orbit",
-        type=at_least(1, MAX_FRAMES),
+        type=bounded_int(1, MAX_FRAMES),
         metavar="N",
         help="N frames around the scene, and an animation",
     )
@@ -146,7 +146,7 @@ def _add_cameras(parser: CommandParser) -> None:
     )
     add(
         "--size",
-        type=at_least(1),
+        type=bounded_int(1),
         nargs=2,
         metavar=("W", "H"),
         help="px (default: 400 400; of --orbit, the photographs', within that)",
@@ -311,10 +311,9 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
 
 
 def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str, str]) -> None:
-    """Render every sensor of a Mitsuba scene with the scene's own integrator.
+    """Render every sensor of a Mitsuba scene to EXR (all channels) and PNG (colours in sRGB).
 
-    definitions: values for the parameters ($name) of the scene file. The EXR contains all channels
-    of the film, the PNG the colours, sRGB-encoded.
+    definitions: values for the parameters ($name) of the scene file.
     """
     try:
         scene = load_scene_file(path, **definitions)

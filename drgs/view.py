@@ -14,7 +14,7 @@ import numpy as np
 from drgs.cli.commands import (
     MAX_PORT,
     CommandParser,
-    at_least,
+    bounded_int,
     file_or_folder,
     finite_number,
     run_command,
@@ -59,7 +59,7 @@ def add_arguments(parser: CommandParser) -> None:
         "--address", metavar="ADDRESS", help="of the page (default: 127.0.0.1, this machine alone)"
     )
     parser.add_argument(
-        "--port", type=at_least(1, MAX_PORT), metavar="N", help="(default: the first free one)"
+        "--port", type=bounded_int(1, MAX_PORT), metavar="N", help="(default: the first free one)"
     )
     add_execution_arguments(parser)
     parser.set_defaults(run=run)

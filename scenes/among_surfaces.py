@@ -13,7 +13,7 @@ import numpy as np
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.bench.output import markdown_table
-from drgs.cli.commands import at_least
+from drgs.cli.commands import bounded_int
 from drgs.reference.splatting import C_00, Gaussians
 
 PATHS = 64
@@ -50,8 +50,8 @@ LAMPS = {
 def main() -> None:
     """Entry point of the command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--size", type=at_least(1), default=32, help="px (default: 32)")
-    parser.add_argument("--splats", type=at_least(1), default=4000, help="of the ball")
+    parser.add_argument("--size", type=bounded_int(1), default=32, help="px (default: 32)")
+    parser.add_argument("--splats", type=bounded_int(1), default=4000, help="of the ball")
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     print(furnace_table(args.size))

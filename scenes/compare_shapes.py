@@ -19,7 +19,7 @@ import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import machine
-from drgs.cli.commands import at_least
+from drgs.cli.commands import bounded_int
 from drgs.cli.ending import exit_on_user_error
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.gaussians.parameters import Gaussians
@@ -47,7 +47,7 @@ def main() -> None:
     """Entry point of the command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("model", type=Path, nargs="?", metavar="MODEL.ply")
-    parser.add_argument("--size", type=at_least(1), default=400, help="px (default: 400)")
+    parser.add_argument("--size", type=bounded_int(1), default=400, help="px (default: 400)")
     parser.add_argument(
         "--out",
         type=Path,

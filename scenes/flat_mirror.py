@@ -14,7 +14,7 @@ import numpy as np
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.bench.output import markdown_table
-from drgs.cli.commands import at_least
+from drgs.cli.commands import bounded_int
 from drgs.reference import light as reference
 from drgs.reference.splatting import Gaussians
 from drgs.results import metrics
@@ -36,8 +36,8 @@ PATHS = 64
 def main() -> None:
     """Entry point of the command."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--size", type=at_least(1), default=64, help="px (default: 64)")
-    parser.add_argument("--splats", type=at_least(1), default=300, help="(default: 300)")
+    parser.add_argument("--size", type=bounded_int(1), default=64, help="px (default: 64)")
+    parser.add_argument("--splats", type=bounded_int(1), default=300, help="(default: 300)")
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     splats = cloud(args.splats)

@@ -140,7 +140,7 @@ def trainer_of(
 
 def bench_config(gaussians: Gaussians) -> FitConfig:
     """Return the configuration of a fit that renders as 3DGS and keeps the population."""
-    model = ModelConfig(sh_degree=gaussians.sh_degree, sh_increase_every=1).of_file()
+    model = ModelConfig(sh_degree=gaussians.sh_degree, sh_increase_every=1).with_3dgs_defaults()
     values = {
         "data": {"path": "."},
         "model": model.model_dump(),

@@ -158,7 +158,7 @@ class Problem:
 
 def drgs_renderer(problem: Problem) -> TimedRenderer:
     """Return the ``splats`` integrator, called by ``mi.render``."""
-    scene = make_scene(problem.gaussians, ModelConfig().of_file(), (1.0, 1.0, 1.0))
+    scene = make_scene(problem.gaussians, ModelConfig().with_3dgs_defaults(), (1.0, 1.0, 1.0))
     return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
 
 

@@ -22,7 +22,7 @@ from drgs.capture.dataset import POINTS, CaptureFolder
 from drgs.capture.path_tracing import CaptureSettings, load_scene, refuse_splats, require_sight
 from drgs.cli.commands import (
     CommandParser,
-    at_least,
+    bounded_int,
     degrees,
     file_or_folder,
     finite_number,
@@ -63,13 +63,13 @@ def add_arguments(parser: CommandParser) -> None:
     for name, (least, most, text) in WHOLE_NUMBERS.items():
         add(
             f"--{name.replace('_', '-')}",
-            type=at_least(least, most),
+            type=bounded_int(least, most),
             metavar="N",
             help=f"{text} (default: {getattr(CaptureSettings, name)})",
         )
     add(
         "--size",
-        type=at_least(1),
+        type=bounded_int(1),
         nargs=2,
         metavar=("W", "H"),
         help="px (default: 400 400); their background is transparent",

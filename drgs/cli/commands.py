@@ -16,11 +16,11 @@ from typing import Any, NamedTuple, NoReturn
 from typing_extensions import override
 
 from drgs.cli.ending import (
+    escape_unencodable,
     exit_on_interrupt,
     exit_on_user_error,
     interruptible_imports,
-    notes_printed,
-    printable_anywhere,
+    print_notes,
 )
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import UserError, did_you_mean, one_line
@@ -46,7 +46,7 @@ class CommandParser(argparse.ArgumentParser):
         self._subcommands: tuple[str, ...] = ()
         self._more_help: Callable[[], str] = str
 
-    def end_help_with(self, text: Callable[[], str]) -> None:
+    def set_help_footer(self, text: Callable[[], str]) -> None:
         """End the help with what ``text`` returns, called when the help is shown."""
         self._more_help = text
 
@@ -104,11 +104,11 @@ def run_command(
     """
     with (
         end_job_on_error(),
-        printable_anywhere(),
+        escape_unencodable(),
         exit_on_interrupt(),
         exit_on_user_error(),
         root_output_only(),
-        notes_printed(),
+        print_notes(),
     ):
         parser = CommandParser(prog=prog)
         parser.set_defaults(is_shared=False)
@@ -125,7 +125,7 @@ def run_command(
             args.run(args)
 
 
-def at_least(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable[[str], int]:
+def bounded_int(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable[[str], int]:
     """Return a parser of whole numbers from ``minimum`` to ``maximum``; reason: for ``maximum``."""
 
     def whole_number(text: str) -> int:

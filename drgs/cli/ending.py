@@ -120,10 +120,7 @@ def exit_on_interrupt() -> Iterator[None]:
 
 @contextmanager
 def interruptible_imports() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end the process at once while the block imports.
-
-    Extension modules that are being imported may abort on, or hide, a raised interrupt.
-    """
+    """Let Ctrl-C and SIGTERM end the process at once: imports may abort on, or hide, interrupts."""
     handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _terminate}
     taken = {n: h for n, h in handlers.items() if signal.getsignal(n) == h}
     if threading.current_thread() is not threading.main_thread():
@@ -158,7 +155,7 @@ def _interrupt_after(error: BaseException | None) -> KeyboardInterrupt | None:
 
 
 @contextmanager
-def printable_anywhere() -> Iterator[None]:
+def escape_unencodable() -> Iterator[None]:
     """Escape, within the block, characters that the standard streams' encoding lacks."""
     streams = [s for s in (sys.stdout, sys.stderr) if isinstance(s, TextIOWrapper)]
     before = [stream.errors for stream in streams]
@@ -173,7 +170,7 @@ def printable_anywhere() -> Iterator[None]:
 
 
 @contextmanager
-def notes_printed() -> Iterator[None]:
+def print_notes() -> Iterator[None]:
     """Print each :class:`UserNote` of the block as a line; ignore Pillow's warnings."""
     with warnings.catch_warnings():
         show = warnings.showwarning

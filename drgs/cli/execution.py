@@ -11,7 +11,7 @@ from typing import TextIO, cast
 import drjit as dr
 import mitsuba as mi
 
-from drgs.cli.commands import at_least
+from drgs.cli.commands import bounded_int
 from drgs.cli.ending import interruptible_imports
 from drgs.core.environment import VARIANTS, denormals_flushed
 from drgs.core.errors import UserError, one_line
@@ -27,7 +27,7 @@ def add_execution_arguments(
     add_variant_argument(parser, variants)
     parser.add_argument(
         "--threads",
-        type=at_least(1, MAX_THREADS, "no machine has more cores"),
+        type=bounded_int(1, MAX_THREADS, "no machine has more cores"),
         metavar="N",
         help="CPU threads to use (default: one a core)",
     )

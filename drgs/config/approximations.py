@@ -33,7 +33,7 @@ class Limits:
     le: float | None = None
     or_infinite: bool = False  # whether infinity is allowed beyond ``le``
 
-    def hold_for(self, value: float) -> bool:
+    def allow(self, value: float) -> bool:
         """Return whether ``value``, in single precision as in kernels, is allowed; NaN never is."""
         if self.or_infinite and value == math.inf:
             return True
@@ -105,7 +105,7 @@ class Declared:
     def allows(self, value: Value) -> bool:
         """Return whether a value of this kind is within the limits."""
         if self.limits is not None:
-            return not isinstance(value, str) and self.limits.hold_for(value)
+            return not isinstance(value, str) and self.limits.allow(value)
         if self.registry is not None:
             return value in self.registry
         return not self.words or value in self.words
@@ -136,20 +136,19 @@ class Approximations:
 
     projection: str = _declare(
         "ewa",
-        "How a Gaussian comes to the film. ewa: by the affine approximation at its mean; "
-        "unscented: by the mean and covariance of projected sigma points; exact: by its peak along "
-        "each pixel's ray.",
+        "Projection of a Gaussian. ewa: affine approximation at its mean; unscented: mean and "
+        "covariance of projected sigma points; exact: its peak along each pixel's ray.",
         registry=PROJECTIONS,
     )
     falloff: str = _declare(
         "gaussian",
-        "How alpha falls off around a splat. gaussian: as the projected Gaussian does.",
+        "Falloff of alpha around a splat. gaussian: the projected Gaussian's.",
         registry=FALLOFFS,
     )
     order: str = _declare(
         "center",
-        "In which splats are composited. center: by the depth of their means; pixel: by that of "
-        "their peaks along each pixel's ray.",
+        "Order of compositing. center: depth of the means; pixel: depth of the peaks along each "
+        "pixel's ray.",
         registry=ORDERS,
     )
     order_window: int = _declare(
@@ -159,8 +158,7 @@ class Approximations:
     )
     sh_direction: str = _declare(
         "mean",
-        "In which colours are seen. mean: towards the mean of a Gaussian; pixel: along each "
-        "pixel's ray.",
+        "Direction of colours. mean: towards a Gaussian's mean; pixel: along each pixel's ray.",
         given_words=("mean", "pixel"),
     )
     alpha_max: float = _declare(

@@ -77,14 +77,13 @@ class BudgetConfig(Section):
     gaussians: Resolved[Count] = Field(
         UNRESOLVED,
         ge=4,
-        description="How many there are to be at densify.stop. null: as many as suit the images' "
-        "size, 250 times the square root of the number of their pixels: 100,000 for 400 x 400 px.",
+        description="Number at densify.stop. null: 250 times the square root of an image's number "
+        "of pixels, 100,000 for 400 x 400 px.",
     )
     error_every: Count = Field(
         10,
         ge=1,
-        description="Iterations between those whose errors count. Each of them takes half as long "
-        "again.",
+        description="Iterations between measured errors, which take half an iteration.",
     )
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
 
@@ -102,8 +101,8 @@ class McmcConfig(Section):
         1.0,
         ge=0,
         le=10,
-        description="How far copies lie from what they are copies of, in standard deviations; 0 in "
-        "the paper: there, they part only by noise and by what happens to be in front.",
+        description="Distance of copies from their originals, in standard deviations; 0 in the "
+        "paper.",
     )
     min_opacity: float = Field(
         0.005, gt=0, lt=1, description="Gaussians that are not more opaque are moved elsewhere."
@@ -113,8 +112,7 @@ class McmcConfig(Section):
         ge=0,
         le=1e12,
         description="Of the noise on means, times their rate and the covariance in squared scene "
-        "extents. The paper's would be 1e7, at its scenes' extents; in small images, where "
-        "Gaussians are large, that costs 2 dB.",
+        "extents. The paper's, about 1e7, costs 2 dB in small images.",
     )
     opacity_weight: float = Field(
         0.01, ge=0, le=1e6, description="Of the mean opacity, in the loss."
@@ -132,19 +130,18 @@ class PruneConfig(Section):
     )
     method: Literal["selection", "importance"] = Field(
         "selection",
-        description="selection: opacities are lowered until what the photographs do not defend is "
-        "transparent. importance: what contributes least to images goes.",
+        description="selection: opacities are lowered against the loss until enough Gaussians are "
+        "transparent. importance: those that contribute least to images are removed.",
     )
     start: Count | None = Field(
         None,
         ge=1,
-        description="The phase begins after this iteration, and not before densify.stop. null: "
-        "at densify.stop.",
+        description="Begin after this iteration and densify.stop. null: after densify.stop.",
     )
     stop: Count | None = Field(
         None,
         ge=2,
-        description="The iteration of the last change. null: half of what is left for the phase.",
+        description="Iteration of the last change. null: half of the remaining ones.",
     )
     every: Count = Field(50, ge=1, description="Iterations between two changes.")
     opacity: float = Field(
@@ -188,9 +185,8 @@ class DensifyConfig(Section):
     )
     stop_aims: list[StopAim] = Field(
         default_factory=list,
-        description="Earlier values of stop, where --budget has revised the plan and growth "
-        "followed a curve to each: a list of {after: iteration, stop: iteration}; empty: there "
-        "were none.",
+        description="Earlier values of stop, before revisions of --budget: a list of "
+        "{after: iteration, stop: iteration}.",
     )
     every: Count = Field(100, ge=1, description="Iterations between two changes.")
     max_gaussians: int = Field(
@@ -222,7 +218,7 @@ class DensifyConfig(Section):
         start = max(self.stop, self.prune.start or 0)
         return start, self.prune.stop or (start + iterations + 1) // 2
 
-    def settled_iteration(self, iterations: int) -> int:
+    def first_fixed_iteration(self, iterations: int) -> int:
         """Return the iteration from which on no row is added or removed; iterations: of the fit."""
         last = self.stop if self.prune.to is None else self.prune_window(iterations)[1]
         return max(self.stop, last) + 1

@@ -12,7 +12,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, SerializeAsAny, ValidationError
 
-from drgs.config.section import Section, expectation, shown_value
+from drgs.config.section import Section, expectation, format_value
 from drgs.core.errors import did_you_mean
 from drgs.core.registry import HOW_TO_INSTALL, Extension, Registry, all_extensions
 
@@ -116,7 +116,7 @@ def _check_section(name: str, values: object) -> BaseModel | None:
         if first["type"] == "extra_forbidden":
             hint = did_you_mean(str(first["loc"][-1]), section.model_fields)
             raise ValueError(f"unknown key {key}{hint}") from None
-        text = f"{key} {expectation(first)}, got {shown_value(first['input'])}"
+        text = f"{key} {expectation(first)}, got {format_value(first['input'])}"
         raise ValueError(text) from None
 
 

@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from drgs.config.extensions import extension_keys
 from drgs.config.schema import FitConfig
-from drgs.config.section import expectation, shown_value
+from drgs.config.section import expectation, format_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import atomic_path, read_text
 
@@ -112,7 +112,7 @@ def _read_yaml(path: Path) -> dict:
         reason = one_line(error) or type(error).__name__
         raise UserError(f"{path}: not valid YAML: {reason}") from None
     if not isinstance(values, dict):
-        raise UserError(f"{path}: must hold sections such as 'data:', got {shown_value(values)}")
+        raise UserError(f"{path}: must hold sections such as 'data:', got {format_value(values)}")
     return values
 
 
@@ -165,7 +165,7 @@ def _absolute(folder: Path, text: str, where: str) -> str:
         path.encode()  # config.yml is UTF-8
     except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: no such user
         raise UserError(
-            f"{where} must be a path in UTF-8, got {shown_value(text)} ({one_line(error, 100)})"
+            f"{where} must be a path in UTF-8, got {format_value(text)} ({one_line(error, 100)})"
         ) from None
     return path
 
@@ -184,7 +184,7 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file
         return f"{origin}: {context['error']}"
-    return f"{where}: {key} {expectation(item)}, got {shown_value(item['input'])}"
+    return f"{where}: {key} {expectation(item)}, got {format_value(item['input'])}"
 
 
 def _description(key: str) -> str:

@@ -24,12 +24,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value
-from drgs.config.density import (
-    REFERENCE_START,
-    REFERENCE_STOP,
-    DensifyConfig,
-    schedule_of,
-)
+from drgs.config.density import REFERENCE_START, REFERENCE_STOP, DensifyConfig, schedule_of
 from drgs.config.extensions import LossName, ReaderName, Sections
 from drgs.config.section import UNRESOLVED, Count, Rate, Resolved, Section, Weight, subsection
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
@@ -76,9 +71,8 @@ class DataConfig(Section):
     )
     type: ReaderName = Field(
         "auto",
-        description="Layout of the folder. auto: nerf_synthetic if there is a "
-        "transforms_train.json, nerfstudio if there is a transforms.json, colmap if there is a "
-        "model in sparse/0, sparse, colmap/sparse/0 or dense/0, or beside the photographs.",
+        description="Layout of the folder. auto: by transforms_train.json, transforms.json, or a "
+        "COLMAP model in sparse/0, sparse, colmap/sparse/0, dense/0 or beside the photographs.",
     )
     image_size: Count | None = Field(
         None,
@@ -88,8 +82,8 @@ class DataConfig(Section):
     )
     downscale: Literal[1, 2, 4, 8] | None = Field(
         None,
-        description="COLMAP's layout: read the images of images, images_2, images_4 or images_8; "
-        "null: the smallest that are not smaller than image_size.",
+        description="COLMAP's layout: read images, images_2, images_4 or images_8; null: the "
+        "smallest that are not smaller than image_size.",
     )
     test_split: Literal["train", "val", "test"] | None = Field(
         None,
@@ -110,31 +104,24 @@ class DataConfig(Section):
     )
     random_background: bool = Field(
         False,
-        description="Each iteration puts another colour behind the transparent images and the "
-        "splats, so that splats cannot pass for the background.",
+        description="A random colour behind transparent images and splats in each iteration.",
     )
     ignore_distortion: bool = Field(
         False, description="Treat images with lens distortion as those of a pinhole camera."
     )
-    ignore_motion: bool = Field(
-        False, description="Treat cameras that move while a photograph is taken as if they did not."
-    )
+    ignore_motion: bool = Field(False, description="Ignore motion of the camera during exposure.")
     shutter_samples: int = Field(
         SHUTTER_SAMPLES,
         ge=1,
         le=MAX_SHUTTER_SAMPLES,
-        description="Times at which an image is rendered that a moving camera with a global "
-        "shutter blurs; each takes as much memory and time as an image.",
+        description="Images averaged for a moving camera with a global shutter; each takes the "
+        "memory and time of one.",
     )
     ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
     ignore_depth: bool = Field(
-        False, description="Do not open files of depth; nor are they where loss.depth_weight is 0."
+        False, description="Do not read depth, as with a loss.depth_weight of 0."
     )
-
-    ignore_points: bool = Field(
-        False,
-        description="Start from random points where the dataset names a point cloud of its own.",
-    )
+    ignore_points: bool = Field(False, description="Do not use the dataset's own point cloud.")
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
@@ -175,8 +162,7 @@ class InitConfig(Section):
         1.0,
         ge=1e-3,
         le=1e3,
-        description="Its standard deviation, in units of the root mean square distance to the "
-        "three nearest others.",
+        description="Its standard deviation, per RMS distance to the three nearest others.",
     )
     point_cloud: PathField | None = Field(
         None,
@@ -188,13 +174,13 @@ class InitConfig(Section):
         None,
         ge=0,
         le=1e9,
-        description="px: of COLMAP's points, those with a larger mean reprojection error are left "
-        "out, and those whose error is not known (-1) are not; null: none.",
+        description="px: leave out COLMAP's points with a larger mean reprojection error, but not "
+        "those of unknown error (-1); null: none.",
     )
     min_track_length: Count | None = Field(
         None,
         ge=0,
-        description="Of COLMAP's points, those that fewer images observe are left out; null: none.",
+        description="Leave out COLMAP's points that fewer images observe; null: none.",
     )
 
 
@@ -264,7 +250,7 @@ class ModelConfig(_ModelWithApproximations):
         """The near plane, scene units; the reference's if it is null."""
         return REFERENCE_NEAR if self.near is None else self.near
 
-    def of_file(self) -> ModelConfig:
+    def with_3dgs_defaults(self) -> ModelConfig:
         """Return the model for files that record none: 3DGS's where a value is not given."""
         usual = {name: DECLARED[name].default for name in FITTED_WITH}
         given = self.model_fields_set
@@ -294,9 +280,8 @@ class OptimizerConfig(Section):
     )
     means_lr_aims: list[RateAim] = Field(
         default_factory=list,
-        description="When the means' rate is to be the last one, as a plan was revised: a list of "
-        "{after: iteration, end: iteration}; empty: at the last iteration. It falls when images "
-        "are no longer coarse.",
+        description="When the means' rate ends, after revisions of --budget: a list of "
+        "{after: iteration, end: iteration}; empty: at the last iteration.",
     )
     sh0_lr: Rate = Field(5e-3, ge=0, description="Degree-0 colour coefficients.")
     shN_lr: Rate = Field(1e-3, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
@@ -309,36 +294,34 @@ class OptimizerConfig(Section):
         UNRESOLVED,
         ge=1e-6,
         le=1,
-        description="What the rates but that of the means have fallen to at the last iteration, in "
-        "parts of what they begin with. null: 0.1; with the strategy adc 1, as in the paper.",
+        description="Last rates, other than of means, in parts of the first ones. null: 0.1; with "
+        "the strategy adc 1, as in the paper.",
     )
     decay_from: float = Field(
         0.5,
         ge=0,
         lt=1,
-        description="When they begin to fall, in parts of the iterations behind coarse stages.",
+        description="When they begin to fall, in parts of the iterations after coarse stages.",
     )
     views_per_step: int = Field(
         1,
         ge=1,
         le=1000,
-        description="Views B that see the same Gaussians, whose mean gradient is a step; an "
-        "iteration still renders one. Rates are multiplied by the root of B, beta_1 and beta_2 "
-        "become powers of B. What several processes share are the views of a step.",
+        description="Views B whose mean gradient is a step, an iteration each, shared by several "
+        "processes. Rates are multiplied by the root of B, beta_1 and beta_2 become powers of B.",
     )
     views: int = Field(
         1,
         ge=1,
         le=1000,
-        description="Views whose gradients are averaged for a step late in the fit, with rates as "
-        "they are; at most views_per_step, or a multiple of it.",
+        description="Views of a step late in the fit, with unchanged rates; at most "
+        "views_per_step, or a multiple of it.",
     )
     views_from: float = Field(
         0.75,
         ge=0,
         lt=1,
-        description="When that begins, in parts of the same, and not before the population's last "
-        "change.",
+        description="When that begins, in the same unit; not before the population is final.",
     )
     beta_1: Decay = Field(0.9, description="Decay of the first moment.")
     beta_2: Decay = Field(0.999, description="Decay of the second moment.")
@@ -359,8 +342,7 @@ class LossConfig(Section):
     sigma: float = Field(1.5, ge=0.1, le=1000, description="px: its standard deviation.")
     depth_weight: Weight = Field(
         0.2,
-        description="Of the mean difference in depth, in scene extents, where the data has depth; "
-        "0 leaves it out.",
+        description="Of the mean difference in depth, in scene extents, if the data has depth.",
     )
 
 
@@ -379,10 +361,9 @@ class ColorConfig(Section):
 
 
 class CamerasConfig(Section):
-    """Refinement of the training cameras; first rates per step, which fall as that of the means.
+    """Refinement of the training cameras; first rates, for 30,000 iterations, fall as the means'.
 
-    A camera's pose gets a step when its image is drawn: of 7,000 iterations with 100 images 70.
-    Fits that short need higher rates than 30,000 iterations, which these are for.
+    A pose has one step per use of its image: 70 in 7,000 iterations of 100 images.
     """
 
     optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
@@ -407,14 +388,12 @@ class OutputConfig(Section):
     )
     bake_smoothing: bool = Field(
         False,
-        description="Write point_cloud.ply with the smoothing of model.smoothing in its scales and "
-        "opacities, for viewers that know nothing of it.",
+        description="Apply model.smoothing to scales and opacities of point_cloud.ply.",
     )
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
     report: bool = Field(
         True,
-        description="Write report.html, viewer.html, side_by_side/, curves.png and the orbit, and "
-        "measure test views on the way for them.",
+        description="Write report.html, viewer.html, side_by_side/, curves.png and the orbit.",
     )
     history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
     checkpoint_every: Count | None = Field(
@@ -457,8 +436,7 @@ class FitConfig(Section):
     iterations: Count = Field(
         30_000,
         ge=1,
-        description="Views that are rendered; each is a step of the optimizer, unless "
-        "optimizer.views_per_step or optimizer.views says otherwise.",
+        description="Rendered views; each is a step, but for optimizer.views_per_step and .views.",
     )
     coarse: Resolved[list[CoarseStage]] = Field(
         UNRESOLVED,
@@ -470,8 +448,8 @@ class FitConfig(Section):
     seed: Count = Field(0, ge=0, description="Seed of everything random.")
     extensions: Sections = Field(
         default_factory=dict,
-        description="Sections of extensions, by name. An effect or a term of the loss takes part "
-        "if it has one, be it empty.",
+        description="Sections of extensions, by name; one, be it empty, activates an effect or a "
+        "term of the loss.",
     )
 
     @property
@@ -549,9 +527,8 @@ class FitConfig(Section):
         for before, after in pairwise(self.coarse or ()):
             is_in_order = before.until < after.until and before.factor > after.factor
             got = f"{_format_section(before)} before {_format_section(after)}"
-            _require(
-                is_in_order, "coarse must be stages with growing until and falling factor", got
-            )
+            expected = "coarse must be stages with growing until and falling factor"
+            _require(is_in_order, expected, got)
         aims = optimizer.means_lr_aims
         starts = [aim.after for aim in aims]
         is_growing = starts == sorted(set(starts)) and all(aim.end > aim.after for aim in aims)

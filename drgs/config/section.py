@@ -69,7 +69,7 @@ def expectation(error: ErrorDetails) -> str:
     return f"must be {_EXPECTED.get(kind.split('_')[0], error['msg'])}"
 
 
-def shown_value(value: object) -> str:
+def format_value(value: object) -> str:
     """Return the value in YAML, on one line and shortened."""
     if isinstance(value, str):
         return one_line(repr(value), limit=60)

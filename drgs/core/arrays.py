@@ -1,8 +1,6 @@
-"""Dr.Jit types that belong together, and row access to flat arrays.
+"""Dr.Jit types of a backend and precision, and row access to flat arrays.
 
-Every stage is written once for all array types (float32 and float64, LLVM and CUDA): it gets the
-companions of its float type from this module. Signatures name the types of ``drgs.core.types``; a
-comment gives shape and unit.
+Every stage is written once for all array types (float32 and float64, LLVM and CUDA).
 """
 
 from __future__ import annotations
@@ -112,9 +110,8 @@ _NUMPY_TYPES = {
 def quotient(index: Array, divisor: int) -> Array:
     """Return index // divisor, by a divisor that is not compiled into the kernel.
 
-    No machine divides vectors of integers. The product in double precision is off by less than
-    2^-52 of itself, hence by less than 2^-20 / divisor, and (index + 1/2) / divisor is at least
-    1 / (2 divisor) from an integer.
+    The product in double precision is off by less than 2^-52 of itself, hence by less than
+    2^-20 / divisor, and (index + 1/2) / divisor is at least 1 / (2 divisor) from an integer.
     """
     Float64 = cast(type[Float], dr.float64_array_t(type(index)))
     reciprocal = dr.opaque(Float64, 1 / divisor)
@@ -142,8 +139,7 @@ def repeat_array(values: Array, count: int, step: int = 0) -> Array:
 def interleave(columns: Sequence[Array]) -> Array:
     """Return columns of equal length as one row-major flat array, not evaluated.
 
-    Loop results must be evaluated before: storing them unevaluated runs the loop once more for
-    each column.
+    Unevaluated loop results would run the loop once for each column.
     """
     num_rows = dr.width(columns)
     return scatter_rows(columns, dr.arange(types_of(type(columns[0])).UInt32, num_rows), num_rows)
@@ -152,8 +148,8 @@ def interleave(columns: Sequence[Array]) -> Array:
 def scatter_rows(columns: Sequence[Array], rows: UInt32, num_rows: int) -> Array:
     """Store columns as one row-major flat array of ``num_rows`` rows; lane i fills row ``rows[i]``.
 
-    Rows that no lane fills are undefined; no two lanes may fill the same row. The same holds
-    for loop results as in :func:`interleave`.
+    Rows that no lane fills are undefined; no two lanes may fill the same row. Loop results: see
+    :func:`interleave`.
     """
     flat = dr.empty(type(columns[0]), num_rows * len(columns))
     dr.scatter(flat, _dynamic_vector(columns), rows)
@@ -162,10 +158,9 @@ def scatter_rows(columns: Sequence[Array], rows: UInt32, num_rows: int) -> Array
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of numbers that a lane loads or stores in packets.
+    """Rows of numbers in packets of a power of two: 9 are an array of packets of 8, and one of 1.
 
-    A packet of 8 numbers costs less than two of 4, and these less than four of 2. Rows of 9 are
-    therefore stored as an array of packets of 8 and one of single numbers.
+    A packet of 8 numbers costs less than two of 4, and these less than four of 2.
     """
 
     blocks: tuple[types.Float, ...]  # flat, row-major: the next columns of all rows
@@ -323,11 +318,9 @@ class _Packets(Generic[Array]):
 
 
 def with_aligned_stack(value: Array) -> Array:
-    """Return ``value`` such that kernels keep aligned what registers do not hold; not evaluated.
+    """Return ``value``, not evaluated, by way of a stack variable, written and read at one index.
 
-    LLVM aligns a function's stack for its variables, but not for vectors that it spills, which then
-    cross two cache lines. A variable on the stack, written and read at the same opaque index, makes
-    it align the stack.
+    LLVM aligns the stack for variables, but not for spilled vectors, which then cross cache lines.
     """
     UInt32 = types_of(type(value)).UInt32
     variable = dr.alloc_local(type(value), 2)

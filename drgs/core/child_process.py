@@ -18,8 +18,6 @@ from drgs.core.errors import UserError, one_line
 
 Result = TypeVar("Result")
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 class ChildEndedError(RuntimeError):
     """A signal ended the child; the message has its name and the child's last output."""
@@ -39,7 +37,7 @@ class DeferredInterrupts:
     def __enter__(self) -> DeferredInterrupts:
         """Take over the signals, unless they are ignored."""
         if threading.current_thread() is threading.main_thread():
-            handlers = {number: signal.getsignal(number) for number in SIGNALS}
+            handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
             self._previous = {n: h for n, h in handlers.items() if h not in (signal.SIG_IGN, None)}
             for number in self._previous:
                 signal.signal(number, self._handle)
@@ -78,12 +76,12 @@ def run_in_child(
 ) -> Result:
     """Return ``function(*arguments, report)``, called in a new process.
 
-    function, arguments: can be pickled. watch: is called here with what the child gives to
-    ``report``. interrupts: end the child, which Ctrl-C itself does not reach; it also ends when
-    this process does, however that ends.
+    function, arguments: can be pickled. watch: called here with the arguments of the child's
+    ``report``. interrupts: end the child, which Ctrl-C does not reach and which ends with this
+    process.
 
-    Raises the child's :class:`UserError` or OSError, :class:`ChildEndedError` where a signal ended
-    it, and RuntimeError with its traceback for any other error.
+    Raises the child's :class:`UserError` or OSError, :class:`ChildEndedError` after a signal, and
+    RuntimeError with the child's traceback for other errors.
     """
     # Not -m, which would look for modules in the current folder first.
     code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"

@@ -11,15 +11,12 @@ import math
 
 ALPHA_MAX = 0.9900000095367432
 """Upper clamp of a splat's alpha (3DGS reference rasterizer): keeps 1 / (1 - alpha) below 100.
-The value is 0.99 rounded to float32, in both precisions: behind two clamped splats the
-transmittance, (1 - 0.99)^2, is TRANSMITTANCE_STOP but for that rounding, and float64 would
-otherwise decide differently. Gradient: where alpha is clamped, its derivative is zero; that of the
-colour is not."""
+0.99 rounded to float32, in both precisions: the transmittance of two clamped splats, (1 - 0.99)^2,
+is TRANSMITTANCE_STOP but for that rounding. Gradient: zero in a clamped alpha, not in colours."""
 
 ALPHA_CUT = 0.003921568859368563
-"""A splat contributes to a pixel only where its alpha reaches this value (3DGS reference
-rasterizer; 1/255 rounded to float32): below it an 8-bit image cannot tell. Gradient: a pair that
-is cut has none, and the jump at the cut is not differentiated."""
+"""Smallest alpha with which a splat contributes to a pixel (3DGS reference rasterizer; 1/255 in
+float32). Gradient: a pair that is cut has none; the jump is not differentiated."""
 
 TRANSMITTANCE_STOP = 1e-4
 """A pixel is finished *before* the splat that would take its transmittance below this value
@@ -29,9 +26,9 @@ LOW_PASS = 0.3
 """px^2 added to the diagonal of the projected covariance (3DGS reference rasterizer): every
 splat is at least about a pixel wide. It also bounds the conic by 1 / LOW_PASS."""
 
-LEAST_LOW_PASS = 1e-18
-"""px^2: what is left of the low-pass where it is switched off. A splat is at least a billionth of a
-pixel wide, so that the conic of a flat one stays finite, also squared and times a film's width."""
+MIN_LOW_PASS_PX2 = 1e-18
+"""px^2, where the low-pass is switched off: keeps the conic of a flat splat finite, also squared
+and times a film's width."""
 
 TAN_CLAMP = 0.3
 """In the projection's Jacobian only, x/z and y/z are clamped to the frustum widened by this
@@ -48,17 +45,13 @@ COLOR_MIN = 0.0
 """Colours from spherical harmonics are not negative (3DGS reference). Gradient: zero where a colour
 is clamped; at exactly this value it passes, so that black splats can learn."""
 
-SHUTTER_SAMPLES = 8
-"""Times at which an image is rendered that a moving camera blurs, the default of the sensor
-``calibrated``: each covers an eighth of the motion, and costs an image."""
+SHUTTER_SAMPLES = 8  # images of a moving camera, default of the sensor ``calibrated``
 
-MAX_SHUTTER_SAMPLES = 1000
-"""Each time's image is kept for the derivatives: a thousand of the smallest film take 90 MB, a
-hundred thousand 9 GB."""
+MAX_SHUTTER_SAMPLES = 1000  # whose images are kept for derivatives: 90 MB of the smallest film
 
 NEGLIGIBLE_ALPHA = 2.0**-60
-"""Where alpha is not cut, splats end here: thousands of layers of such an alpha change no rounding,
-in either precision, and the short exp2 of the kernels is exact to well below it."""
+"""Alpha at which splats end where it is not cut: thousands of layers change no rounding, in either
+precision, and the short exp2 of the kernels is exact well below it."""
 
 CULL_MARGIN = 1e-3
 """Added to the exponent (base 2) when a splat is tested against tiles, so that rounding in the
@@ -79,10 +72,8 @@ MAX_INT = 2**31 - 1  # the counters of Mitsuba and Dr.Jit are of 32 bits
 MAX_COEFFICIENT = 1e6  # A coefficient of distortion, in size: calibrations give less than 1e3
 
 MAX_FEATURES = 64
-"""Numbers that an image composites besides RGB, or instead of it: see
-:mod:`drgs.splatting.feature_groups`. The kernels of 64 and their derivatives compile in 8 s with
-AVX2, in either precision, once: Dr.Jit keeps them."""
+"""Channels that an image composites, with RGB or without: see :mod:`drgs.splatting.feature_groups`.
+The kernels of 64 and their derivatives compile in 8 s with AVX2, once."""
 
 SH_C0 = 0.28209479177387814
-"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): a base colour in display space is
-0.5 + SH_C0 sh0."""
+"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); display-space colour: 0.5 + SH_C0 sh0."""

@@ -54,10 +54,9 @@ _FLUSH_BITS = 0x8040  # FTZ and DAZ of x86's MXCSR (Intel, Software Developer's 
 
 @contextmanager
 def denormals_flushed() -> Iterator[None]:
-    """Flush denormal numbers to zero on this thread within the block, as Dr.Jit's workers do.
+    """Flush denormal numbers to zero on this thread, as on Dr.Jit's workers; glibc on x86-64 only.
 
-    Only with glibc on x86-64. Dr.Jit runs small kernels, or all without workers, on the calling
-    thread: without this, bits of a fit would depend on the number of threads.
+    Else bits of a fit would depend on the number of threads: Dr.Jit runs small kernels here.
     """
     with _mode(lambda bits: bits | _FLUSH_BITS):
         yield

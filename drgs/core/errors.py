@@ -92,10 +92,9 @@ def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> s
 
 
 def show_causes_last() -> None:
-    """Print a user's error again after the traceback of the RuntimeError that it caused.
+    """Print a user's error again after the traceback of the RuntimeError that Dr.Jit made of it.
 
-    Dr.Jit wraps errors in a RuntimeError that refers to a text "above", which may be pages away.
-    Works in scripts and, if called from one, in notebooks.
+    Its text "see above" may be pages away. Works in scripts and, if called there, in notebooks.
     """
     if getattr(sys.excepthook, "func", None) is _show_with_cause:
         return

@@ -54,10 +54,8 @@ _IRREGULAR_FILES = {"p": "a named pipe", "c": "a device", "b": "a device", "s": 
 def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = None) -> IO[bytes]:
     """Open a regular file for reading; what: its kind, for messages.
 
-    Pipes, which may wait for a writer, and devices, which need not end, are not opened.
-
-    Raises :class:`UserError` if it cannot be opened, is no regular file, or has more than
-    ``max_bytes``.
+    Raises :class:`UserError` if it cannot be opened, is no regular file (a pipe may wait for a
+    writer, a device need not end), or has more than ``max_bytes``.
     """
 
     def open_without_waiting(path: str, flags: int) -> int:
@@ -84,10 +82,8 @@ def open_regular(path: str | Path, what: str = "file", max_bytes: int | None = N
 def read_bytes(path: Path, what: str, max_bytes: int, memory_ratio: int = 1) -> bytes:
     """Return the content of a regular file; what: its kind, for messages.
 
-    memory_ratio: memory that the caller needs, in file sizes.
-
-    Raises :class:`UserError` if it cannot be read, is longer than ``max_bytes``, or takes more
-    memory than is available.
+    memory_ratio: memory that the caller needs, in file sizes. Raises :class:`UserError` if it
+    cannot be read, has more than ``max_bytes``, or takes more memory than is available.
     """
     try:
         with open_regular(path, what, max_bytes) as file:

@@ -45,9 +45,9 @@ class FolderRecord:
         """Paths relative to the folder, by key of a configuration."""
         return self._content.paths
 
-    def strangers(self, names: Iterable[str]) -> list[str]:
+    def foreign_files(self, names: Iterable[str]) -> list[str]:
         """Return those ``names``, relative to the folder, whose files are foreign."""
-        return [name for name in names if self._is_strange(name)]
+        return [name for name in names if self._is_foreign(name)]
 
     def check(self, names: Iterable[str], earlier: Collection[str] = ()) -> None:
         """Raise :class:`UserError` if one of the files ``names`` is foreign.
@@ -55,10 +55,10 @@ class FolderRecord:
         earlier: files of a version without records, accepted if there is no record.
         """
         known = () if self.exists else earlier
-        strangers = [name for name in self.strangers(names) if name not in known]
-        if strangers:
+        foreign = [name for name in self.foreign_files(names) if name not in known]
+        if foreign:
             raise UserError(
-                f"{self.folder}: holds {format_names(strangers)}, which this command would replace "
+                f"{self.folder}: holds {format_names(foreign)}, which this command would replace "
                 "and has not written, or which changed since; move that away, or choose another "
                 "folder"
             )
@@ -96,7 +96,7 @@ class FolderRecord:
         self.path.unlink(missing_ok=True)
         self.exists, self._content = False, _Content()
 
-    def _is_strange(self, name: str) -> bool:
+    def _is_foreign(self, name: str) -> bool:
         path = self.folder / name
         if not os.path.lexists(path):
             return False
@@ -138,12 +138,10 @@ def _read(path: Path) -> _Content:
 def sole_writer(folder: Path) -> Iterator[Callable[[], bool]]:
     """Lock ``folder`` for the block, if it exists.
 
-    Yields a function that makes and locks the folder, to be called before anything is written, and
-    returns whether it is locked. The lock (``flock``) is on the folder itself, so a killed process
-    leaves no lock file. Without locks in the system, and for folders that cannot be made or opened,
-    there is no lock.
-
-    Both raise :class:`UserError` while another process, or another block of this one, has the lock.
+    Yields a function that makes and locks the folder, to be called before anything is written; it
+    returns whether it is locked (``flock``): not without locks in the system, nor for folders that
+    cannot be made or opened. Both raise :class:`UserError` while another process, or another block
+    of this one, has the lock.
     """
     descriptor: int | None = None
 

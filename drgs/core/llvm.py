@@ -63,10 +63,9 @@ def ensure_usable_llvm() -> None:
 
 
 def check_llvm_variants() -> None:
-    """Run :func:`ensure_usable_llvm` when Mitsuba first loads one of its ``llvm_*`` variants.
+    """Install an import hook that runs :func:`ensure_usable_llvm` for ``mitsuba.llvm_*``.
 
-    Installs an import hook: ``mi.set_variant`` fails with a misleading message before it runs its
-    callbacks if Dr.Jit refused the library.
+    Callbacks of ``mi.set_variant`` come too late: it fails before, with a misleading message.
     """
     if not any(isinstance(finder, _VariantCheck) for finder in sys.meta_path):
         sys.meta_path.insert(0, _VariantCheck())

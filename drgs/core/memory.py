@@ -39,7 +39,7 @@ _UNLIMITED_BYTES = 1 << 60  # below what version 1 of control groups has for no 
 def available_memory() -> int:
     """Return the bytes that the machine, control groups and the process's limit leave."""
     machine = psutil.virtual_memory().available
-    return max(0, min(machine, _of_control_groups(), _of_process()))
+    return max(0, min(machine, _control_group_limit(), _process_limit()))
 
 
 def release_unused_memory() -> None:
@@ -56,7 +56,7 @@ def resident_memory() -> int:
     return psutil.Process().memory_info().rss
 
 
-def readable(count: float) -> str:
+def format_bytes(count: float) -> str:
     """Format a number of bytes: ``3.2 GB``."""
     unit, size = next(
         ((u, s) for u, s in (("GB", 1e9), ("MB", 1e6)) if count >= 0.9995 * s), ("kB", 1e3)
@@ -66,15 +66,15 @@ def readable(count: float) -> str:
 
 def require_memory(path: str | Path, needed: int, what: str) -> None:
     """Raise :class:`UserError` unless ``needed`` bytes are available for ``what`` is in a file."""
-    available = _if_insufficient(needed, UNASKED_FILE_BYTES)
+    available = _check_available(needed, UNASKED_FILE_BYTES)
     if available is not None:
         raise UserError(
-            f"{path}: {what} takes about {readable(needed)} of memory, of which "
-            f"{readable(available)} are available; {FREE_MEMORY}"
+            f"{path}: {what} takes about {format_bytes(needed)} of memory, of which "
+            f"{format_bytes(available)} are available; {FREE_MEMORY}"
         )
 
 
-def _if_insufficient(needed: int, unasked: int) -> int | None:
+def _check_available(needed: int, unasked: int) -> int | None:
     """Return the available bytes if they are fewer than ``needed``, else None.
 
     unasked: bytes that are granted without a check. Dr.Jit's cache counts as available.
@@ -95,7 +95,8 @@ def out_of_memory_reason(error: BaseException) -> str | None:
     is_of_system = isinstance(error, OSError) and error.errno == errno.ENOMEM
     if isinstance(error, MemoryError) or is_of_system or _EXHAUSTED.search(text):
         reason = f" ({text})" if text else ""
-        return f"out of memory{reason}: {readable(available_memory())} are available; {FREE_MEMORY}"
+        available = format_bytes(available_memory())
+        return f"out of memory{reason}: {available} are available; {FREE_MEMORY}"
     return None
 
 
@@ -113,12 +114,12 @@ def too_large_reason(width: int, height: int, channels: int = 3, samples: int = 
         )
     of_channels = CHANNEL_BYTES * (channels - 3)
     of_pixel = IMAGE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
-    available = _if_insufficient(pixels * of_pixel, UNASKED_BYTES)
+    available = _check_available(pixels * of_pixel, UNASKED_BYTES)
     if available is None:
         return None
     return (
-        f"{asked} need about {readable(pixels * of_pixel)} of memory, of which "
-        f"{readable(available)} are available; at most {available // of_pixel:,} pixels fit"
+        f"{asked} need about {format_bytes(pixels * of_pixel)} of memory, of which "
+        f"{format_bytes(available)} are available; at most {available // of_pixel:,} pixels fit"
     )
 
 
@@ -127,7 +128,7 @@ def _flush_cache_of_drjit() -> None:
         drjit.flush_malloc_cache()
 
 
-def _of_process() -> int:
+def _process_limit() -> int:
     process = psutil.Process()
     if not hasattr(psutil, "RLIMIT_AS"):  # not Linux
         return _UNLIMITED_BYTES
@@ -135,7 +136,7 @@ def _of_process() -> int:
     return _UNLIMITED_BYTES if limit == psutil.RLIM_INFINITY else limit - process.memory_info().vms
 
 
-def _of_control_groups() -> int:
+def _control_group_limit() -> int:
     """Return the bytes that the process's control groups leave; versions 1 and 2."""
     rooms = [_UNLIMITED_BYTES]
     for line in _lines(_PROC / "self" / "cgroup"):
@@ -149,11 +150,11 @@ def _of_control_groups() -> int:
             continue
         group = root / path.strip("/")
         # In a container, its own group is mounted as the root.
-        rooms += [_room(folder, *names) for folder in (group, *group.parents, root)]
+        rooms += [_group_limit(folder, *names) for folder in (group, *group.parents, root)]
     return min(rooms)
 
 
-def _room(group: Path, limit: str, usage: str, reclaimable: str) -> int:
+def _group_limit(group: Path, limit: str, usage: str, reclaimable: str) -> int:
     """Return the bytes that a control group has left, with its file cache."""
     most, used = (next(iter(_lines(group / name)), "") for name in (limit, usage))
     if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED_BYTES:

@@ -20,7 +20,7 @@ MAX_SCENE_SIZES = 1000
 of the size there. Three times as far costs a fit 0.3 dB, a million times 5 dB; this far: none."""
 
 
-def near_origin(middle: ArrayLike, size: float) -> Origin:
+def choose_origin(middle: ArrayLike, size: float) -> Origin:
     """Return :data:`WORLD`, or, for a scene far from it, ``middle`` rounded beside ``size``.
 
     middle: (3,) world; size: of the scene, world units.
@@ -33,16 +33,13 @@ def near_origin(middle: ArrayLike, size: float) -> Origin:
     return x, y, z
 
 
-def near_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
-    """Return positions (N, 3) float64, and the origin that they are relative to.
-
-    means: (N, 3) float64, world.
-    """
+def recenter_means(means: np.ndarray) -> tuple[np.ndarray, Origin]:
+    """Return world positions (N, 3), float64, relative to an origin near most, and this origin."""
     middle = np.median(means, axis=0)
-    origin = near_origin(middle, float(np.median(np.linalg.norm(means - middle, axis=1))))
+    origin = choose_origin(middle, float(np.median(np.linalg.norm(means - middle, axis=1))))
     return means - origin, origin
 
 
-def shown_origin(origin: Origin) -> str:
+def format_origin(origin: Origin) -> str:
     """Format the origin as messages write it."""
     return f"({', '.join(f'{value:.15g}' for value in origin)})"

@@ -29,10 +29,7 @@ def bucket_order(buckets: UInt32, block_size: int, num_buckets: int) -> UInt32:
 
 
 def same_variables(tree: object, other: object) -> bool:
-    """Return whether two PyTrees consist of the same Dr.Jit variables, in the same order.
-
-    Relies on ``dr.detail.collect_indices``.
-    """
+    """Return whether two PyTrees consist of the same Dr.Jit variables, in the same order."""
     return dr.detail.collect_indices(tree) == dr.detail.collect_indices(other)
 
 
@@ -56,10 +53,7 @@ def llvm_version() -> tuple[int, ...]:
 
 
 def llvm_vector_width() -> int:
-    """Return the lanes of the vectors that Dr.Jit compiles for; 0 if this build has no such query.
-
-    Relies on ``jit_llvm_vector_width`` of drjit-core.
-    """
+    """Return the lanes of the vectors that Dr.Jit compiles for; 0 if unknown."""
     llvm_version()  # waits until the backend knows its processor
     try:
         return _llvm_function("_Z21jit_llvm_vector_widthv", ctypes.c_uint32)()
@@ -71,8 +65,6 @@ def disable_avx512() -> None:
     """Compile from now on for this processor as if it had AVX2 and no AVX-512.
 
     To be called before the first kernel. Raises :class:`UserError` if that is not possible.
-
-    Relies on ``jit_llvm_set_target`` of drjit-core.
     """
     llvm_version()  # waits until the backend knows its processor
     place = "jit_llvm_set_target(): cannot leave out AVX-512"
@@ -105,10 +97,7 @@ def clear_memory_peak() -> None:
 
 
 def memory_peak() -> int:
-    """Return the most memory, bytes, that arrays of the LLVM backend had since the last clearing.
-
-    Relies on ``dr.detail.malloc_watermark``.
-    """
+    """Return the peak memory, bytes, of the LLVM backend's arrays since the last clearing."""
     return dr.detail.malloc_watermark(dr.JitBackend.LLVM)
 
 
@@ -120,10 +109,7 @@ def new_rate_cache() -> _LRCache:
 
 
 def call_on_variant_change(callback: Callable[[str | None, str | None], None]) -> None:
-    """Have Mitsuba call ``callback(old, new)`` after each change of its variant.
-
-    Relies on ``mi.detail.add_variant_callback``, which Mitsuba's own Python plugins use.
-    """
+    """Have Mitsuba call ``callback(old, new)`` after each change of its variant."""
     import mitsuba as mi
 
     mi.detail.add_variant_callback(callback)

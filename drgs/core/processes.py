@@ -53,10 +53,9 @@ def _launcher_variable(index: int) -> int | None:
 
 @contextmanager
 def root_output_only() -> Iterator[None]:
-    """Let only the first process print within the block.
+    """Let only the first process print within the block; on others, errors leave it after a delay.
 
-    On other processes, an error leaves the block after a delay, by which time an error of the first
-    process has ended the job.
+    By then, an error of the first process has ended the job.
     """
     number = process_number()
     if not number:

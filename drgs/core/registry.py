@@ -1,7 +1,6 @@
 """Registries of extensions: implementations by name, shipped ones and those of other packages.
 
-A registry holds the implementations of one extension point. A class or function enters it by a
-decorator, with the pydantic model of its own configuration section, if it has one::
+A decorator registers a class or function, with the pydantic model of its configuration section::
 
     from drgs.training.density import STRATEGIES
 
@@ -11,10 +10,9 @@ decorator, with the pydantic model of its own configuration section, if it has o
     @STRATEGIES.register("my_strategy", section=Settings)
     class MyStrategy(DensityStrategy): ...
 
-Shipped implementations enter by the same decorator; their modules are imported when they are used.
-An installed package makes its extensions known by an entry point of the group ``drgs``, whose value
-is the module that contains the decorators. A configuration names extensions and can set their
-sections under ``extensions``; it cannot name modules, so that reading one runs no code.
+Shipped implementations use it, too; their modules are imported when they are used. An installed
+package has an entry point of the group ``drgs``, whose value is the module with the decorators. A
+configuration names extensions, not modules, so that reading one runs no code.
 """
 
 from __future__ import annotations
@@ -101,8 +99,7 @@ class Registry(Generic[T]):
     ) -> Callable[[Registered], Registered]:
         """Return a decorator that registers a class or function under ``name``.
 
-        section: model of its configuration section, which a configuration sets under
-        ``extensions.NAME``.
+        section: model of the section ``extensions.NAME`` of a configuration.
 
         Raises ValueError if another module has registered the name.
         """
@@ -139,11 +136,10 @@ class Registry(Generic[T]):
         return [*self._shipped, *(extension.name for extension in self.installed_extensions())]
 
     def get(self, name: str, place: str = "") -> Extension[T]:
-        """Return the extension of this name, importing what defines it.
+        """Import and return the extension of this name.
 
-        place: of the name, such as ``scenes/lego.yml: densify.strategy``, for the message.
-
-        Raises :class:`UserError` for an unknown name; it lists those that exist.
+        place: of the name, such as ``scenes/lego.yml: densify.strategy``, for the
+        :class:`UserError` for an unknown name.
         """
         if name not in self._extensions and name in self._shipped:
             import_module(self._shipped[name])

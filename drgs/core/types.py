@@ -1,8 +1,6 @@
-"""Names of Dr.Jit's array types for signatures and fields.
+"""Names of Dr.Jit's array types for signatures and fields, of any backend and precision.
 
-The code works with every backend and precision: type checkers see the types of ``drjit.auto.ad``,
-and at run time the names stand for any type. Use :func:`drgs.core.arrays.types_of` to create
-arrays.
+Type checkers see ``drjit.auto.ad``. :func:`drgs.core.arrays.types_of` has types to create arrays.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
-from drgs.core.origin import WORLD, near_origin, shown_origin
+from drgs.core.origin import WORLD, choose_origin, format_origin
 from drgs.datasets.types import Dataset, Keeps, View, Viewpoint, all_views
 
 __all__ = ["Dataset", "View", "Viewpoint", "load_dataset"]
@@ -48,8 +48,8 @@ def load_dataset(
     if not dataset.train:
         return dataset
     middle = np.mean([view.center for view in dataset.train], axis=0)
-    origin = near_origin(middle, dataset.extent)
+    origin = choose_origin(middle, dataset.extent)
     if origin == WORLD:
         return dataset
-    note = f"; far from the origin: coordinates are relative to {shown_origin(origin)}"
+    note = f"; far from the origin: coordinates are relative to {format_origin(origin)}"
     return replace(dataset.relative_to(origin), description=dataset.description + note)

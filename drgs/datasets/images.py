@@ -14,7 +14,7 @@ import numpy as np
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular
-from drgs.core.memory import available_memory, readable, require_memory
+from drgs.core.memory import available_memory, format_bytes, require_memory
 from drgs.datasets.types import LazyImage, Pixels, View
 from drgs.io.images import (
     BITS,
@@ -275,8 +275,8 @@ def check_room(files: Sequence[Path], max_width: int | None) -> None:
         needed += min(4 * new_size, 2 * new_size if is_fractional else size)
     if needed > (available := available_memory()):
         raise UserError(
-            f"{files[0].parent}: {len(files):,} photographs take {readable(needed)} of memory as "
-            f"they are kept, and {readable(available)} are available; set a smaller "
+            f"{files[0].parent}: {len(files):,} photographs take {format_bytes(needed)} of memory "
+            f"as they are kept, and {format_bytes(available)} are available; set a smaller "
             "data.image_size, or use fewer of them"
         )
 

@@ -20,7 +20,7 @@ import numpy as np
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
-from drgs.core.origin import WORLD, Origin, shown_origin
+from drgs.core.origin import WORLD, Origin, format_origin
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.core.types import TensorXf
 
@@ -98,7 +98,7 @@ class Gaussians(Generic[Tensor]):
         lost = ["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else []
         lost += [f"{key} {value}" for key, value in values.items() if not chosen.holds(key)]
         if self.origin != WORLD and not chosen.holds(ORIGIN[0]):
-            lost.append(f"the origin {shown_origin(self.origin)} of its coordinates")
+            lost.append(f"the origin {format_origin(self.origin)} of its coordinates")
         if lost:
             note = f"the format {name} has no room for {', '.join(lost)}: left out"
             warnings.warn(UserNote(note), stacklevel=2)

@@ -19,7 +19,7 @@ import numpy as np
 from drgs.config.approximations import DECLARED, Approximations, Value, from_ply_header
 from drgs.core.constants import MAX_INT, NEAR
 from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
-from drgs.core.origin import WORLD, shown_origin
+from drgs.core.origin import WORLD, format_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.checks import check_shapes
@@ -252,7 +252,7 @@ def _load_gaussians(path: str) -> Gaussians:
     gaussians = Gaussians.load(path)
     if gaussians.origin != WORLD:
         note = (
-            f"{path}: positions are relative to {shown_origin(gaussians.origin)}; place sensors "
+            f"{path}: positions are relative to {format_origin(gaussians.origin)}; place sensors "
             "and shapes relative to that"
         )
         warnings.warn(UserNote(note), stacklevel=2)

@@ -30,7 +30,7 @@ from typing_extensions import override
 
 from drgs.core.errors import Place, UserError, one_line
 from drgs.core.files import read_bytes
-from drgs.core.origin import WORLD, Origin, near_means
+from drgs.core.origin import WORLD, Origin, recenter_means
 from drgs.io.formats import FORMATS, MAX_ORIGIN, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
 from drgs.io.ply import STATEMENT
 from drgs.io.quantization import (
@@ -198,7 +198,7 @@ def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]
         "sh0": harmonics[:, :1],
         "shN": harmonics[:, 1:],
     }
-    arrays["means"], origin = near_means(means + document.translation)
+    arrays["means"], origin = recenter_means(means + document.translation)
     settings = document.rendered_with
     if origin != WORLD:  # exactly what the file has, not what would do
         arrays["means"], settings = (

@@ -36,7 +36,7 @@ from typing_extensions import override
 from drgs.core.errors import UserError, UserNote, format_names, one_line
 from drgs.core.files import open_regular
 from drgs.core.memory import require_memory
-from drgs.core.origin import WORLD, near_means
+from drgs.core.origin import WORLD, recenter_means
 from drgs.io.formats import FORMATS, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
 from drgs.io.quantization import LARGEST_LOGIT, SMALLEST_LOGIT
 
@@ -85,7 +85,7 @@ def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, S
     means = _columns(vertex, POSITION, np.float64)
     if vertex.dtype["x"] == np.float64:
         with np.errstate(invalid="ignore", over="ignore"):  # of what is refused later
-            means, origin = near_means(means)
+            means, origin = recenter_means(means)
         if origin != WORLD:
             statements |= zip(ORIGIN, origin, strict=True)
     sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)

@@ -215,24 +215,24 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
 def _check_removable(
     folder: Path,
     record: FolderRecord,
-    strangers: list[str],
+    foreign: list[str],
     files: list[str],
     images: Sequence[str],
 ) -> None:
-    """Raise :class:`UserError` for the names ``strangers`` and files that no fit has written."""
+    """Raise :class:`UserError` for the names ``foreign`` and files that no fit has written."""
     if record.exists:
-        strangers += record.strangers(files)
+        foreign += record.foreign_files(files)
     else:
         known = set(_file_names(images))
         for name in files:
             path = folder / name
             if name not in known or path.is_symlink() or not path.is_file():
-                strangers.append(name)
+                foreign.append(name)
     if not _is_unmodified(folder / CONFIG):
-        strangers.append(CONFIG)
-    if strangers:
+        foreign.append(CONFIG)
+    if foreign:
         raise UserError(
-            f"{folder}: must hold nothing but a run to be replaced, got {format_names(strangers)}; "
+            f"{folder}: must hold nothing but a run to be replaced, got {format_names(foreign)}; "
             "move that away, or choose another folder with --out"
         )
 

@@ -67,7 +67,7 @@ class ImageFolder:
         if not self.path.is_dir() or not self.path.resolve().is_relative_to(dataset.resolve()):
             return
         images = [n for n in sorted(os.listdir(self.path)) if n.lower().endswith(PHOTOGRAPHS)]
-        if photographs := FolderRecord(self.path, COMMAND).strangers(images):
+        if photographs := FolderRecord(self.path, COMMAND).foreign_files(images):
             raise UserError(
                 f"--out {self.path}: holds images of the dataset ({format_names(photographs)}); "
                 "choose a folder of its own"
@@ -173,7 +173,7 @@ def load_model(
     if config is not None:
         settings, default_background = config.model, config.data.background_rgb
     else:
-        settings = ModelConfig(near=near_plane_of(gaussians)).of_file()
+        settings = ModelConfig(near=near_plane_of(gaussians)).with_3dgs_defaults()
         default_background = NAMED_COLORS["black"]
     # Precedence: overrides, the file's header, the configuration.
     given = {override.partition("=")[0].strip() for override in overrides}
@@ -201,7 +201,7 @@ def load_open_config(
         # Also composites photographs with alpha.
         overrides = [*overrides, f"data.background={list(background)}"]
     config = load_config(path, overrides)
-    config = config.model_copy(update={"model": config.model.of_file()})
+    config = config.model_copy(update={"model": config.model.with_3dgs_defaults()})
     if not is_open(config):
         return config
     return resolve_defaults(

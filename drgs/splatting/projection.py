@@ -21,7 +21,7 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import load_columns, types_of
-from drgs.core.constants import LEAST_LOW_PASS, LOW_PASS, NEGLIGIBLE_ALPHA
+from drgs.core.constants import LOW_PASS, MIN_LOW_PASS_PX2, NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, TensorXf
 from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
@@ -182,7 +182,7 @@ def project(
     """
     offset = rows.means - camera.center
     seen, position, depth = camera.lens.visibility(camera, camera.rotation @ offset)
-    low_pass = max(low_pass, LEAST_LOW_PASS)
+    low_pass = max(low_pass, MIN_LOW_PASS_PX2)
     film = (shape or ewa)(rows, camera, position, low_pass)
     opacities = opacity_rule(
         _sigmoid(rows.logit_opacities), film.determinant, film.added_determinant

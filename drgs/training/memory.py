@@ -17,7 +17,7 @@ import numpy as np
 from drgs.config.schema import FitConfig
 from drgs.core.constants import ALPHA_CUT, LOW_PASS, TRANSMITTANCE_STOP
 from drgs.core.errors import UserError
-from drgs.core.memory import available_memory, readable, resident_memory
+from drgs.core.memory import available_memory, format_bytes, resident_memory
 from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
@@ -212,11 +212,11 @@ def _refusal(
     who = "the fit" if share == WHOLE_SHARE else "a process of the fit"
     part = "" if share.processes == 1 else f"1/{share.processes} of "
     return (
-        f"memory: {who} needs about {readable(memory.required_bytes)} "
-        f"({readable(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
-        f"{readable(memory.gaussians)} for {part}{count:,} Gaussians, "
-        f"{readable(memory.splats + memory.pixels)} for an image of them), and may take "
-        f"{readable(usable)}, nine tenths of what is available; {advice}"
+        f"memory: {who} needs about {format_bytes(memory.required_bytes)} "
+        f"({format_bytes(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
+        f"{format_bytes(memory.gaussians)} for {part}{count:,} Gaussians, "
+        f"{format_bytes(memory.splats + memory.pixels)} for an image of them), and may take "
+        f"{format_bytes(usable)}, nine tenths of what is available; {advice}"
     )
 
 

@@ -142,7 +142,7 @@ def plan_step(
     first, last = iterations[0], iterations[-1]
     stage = next(stage for stage in stages if first <= stage.until)
     is_late = rates.means.progress(first) > config.optimizer.views_from
-    is_settled = first >= config.densify.settled_iteration(config.iterations)
+    is_settled = first >= config.densify.first_fixed_iteration(config.iterations)
     late_views = config.optimizer.views if is_late and is_settled else 1
     order = len(stage.views), config.seed, views_per_step
     return Step(

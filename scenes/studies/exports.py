@@ -57,7 +57,7 @@ def main() -> None:
     gaussians = replace(load_source(folder).gaussians, rendered_with=None)
     config = load_config(folder / CONFIG)
     dataset = load_dataset(config.data)
-    model = ModelConfig(near=config.model.near).of_file()
+    model = ModelConfig(near=config.model.near).with_3dgs_defaults()
 
     def render(model_gaussians: Gaussians) -> list[np.ndarray]:
         scene = make_scene(model_gaussians, model, dataset.background)

@@ -9,7 +9,7 @@ from drgs import __main__ as commands
 from drgs import fit, render
 from drgs.bench import __main__ as bench
 from drgs.capture import __main__ as capture
-from drgs.cli.commands import CommandParser, at_least, finite_number, run_command
+from drgs.cli.commands import CommandParser, bounded_int, finite_number, run_command
 
 NAMES = [*commands.COMMANDS, *(f"bench {name}" for name in bench.COMMANDS)]
 
@@ -105,8 +105,8 @@ def test_arguments_are_added_once():
 @pytest.mark.parametrize("text", ["", "0", "-3", "1.5", "two", "1e3"])
 def test_numbers_that_are_not_whole_or_too_small_are_refused(text):
     with pytest.raises(argparse.ArgumentTypeError, match="must be a whole number >= 1, got"):
-        at_least(1)(text)
-    assert at_least(0)("0") == 0 and at_least(1)("+7") == 7
+        bounded_int(1)(text)
+    assert bounded_int(0)("0") == 0 and bounded_int(1)("+7") == 7
 
 
 @pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e999", "x"])

@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 from support.commands import run_in_process
 
-from drgs.cli.commands import at_least, file_or_folder, run_command
-from drgs.cli.ending import exit_on_interrupt, printable_anywhere
+from drgs.cli.commands import bounded_int, file_or_folder, run_command
+from drgs.cli.ending import escape_unencodable, exit_on_interrupt
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.io.images import image_size, write_png
@@ -26,7 +26,7 @@ def command(act):
     """``main`` of a command that does nothing else."""
 
     def add_arguments(parser):
-        parser.add_argument("--size", type=at_least(1, 4096, "as large as anything is"))
+        parser.add_argument("--size", type=bounded_int(1, 4096, "as large as anything is"))
         parser.set_defaults(run=lambda args: act())
 
     return lambda words: run_command(add_arguments, "some command", words)
@@ -60,7 +60,7 @@ def test_names_are_printed_in_any_encoding(name):
 
 def test_a_closed_stream_is_left_alone():
     out, err = ascii_streams()
-    with redirect_stdout(out), redirect_stderr(err), printable_anywhere():
+    with redirect_stdout(out), redirect_stderr(err), escape_unencodable():
         out.close()
 
 

@@ -43,7 +43,7 @@ def refused(main, out, *arguments):
 
 
 def gigabytes(pixels):
-    return memory.readable(pixels * memory.IMAGE_BYTES)
+    return memory.format_bytes(pixels * memory.IMAGE_BYTES)
 
 
 def test_a_size_that_cannot_be_held_is_refused(model, tmp_path):

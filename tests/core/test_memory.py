@@ -27,7 +27,7 @@ def kernel(tmp_path, monkeypatch):
     """A folder with the kernel's files: of a machine with 8 GB to give, and no control group."""
     monkeypatch.setattr(memory, "_PROC", tmp_path / "proc")
     monkeypatch.setattr(memory, "_CGROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(memory, "_of_process", lambda: memory._UNLIMITED_BYTES)
+    monkeypatch.setattr(memory, "_process_limit", lambda: memory._UNLIMITED_BYTES)
     machine = SimpleNamespace(available=8_000_000 * 1024)
     monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: machine)
     write(tmp_path / "proc" / "self", cgroup="")
@@ -110,7 +110,7 @@ def test_a_limit_of_the_process_counts():
     [(24.06e9, "24.1 GB"), (999.9e6, "1 GB"), (5e12, "5,000 GB"), (123_456, "123 kB")],
 )
 def test_numbers_are_written_with_three_digits(count, text):
-    assert memory.readable(count) == text
+    assert memory.format_bytes(count) == text
 
 
 @pytest.fixture

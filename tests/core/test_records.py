@@ -50,14 +50,14 @@ def test_what_changed_since_is_somebody_elses(tmp_path):
     record(tmp_path).seal()
     write(tmp_path, b="theirs")
     assert "holds b, which this command would replace" in refusal(record(tmp_path).claim, "ab")
-    assert not record(tmp_path).strangers(["a", "c"])
+    assert not record(tmp_path).foreign_files(["a", "c"])
 
 
 def test_what_is_gone_may_be_anybodys(tmp_path):
     record(tmp_path).claim(["a"])
     record(tmp_path).seal()
     write(tmp_path, a="theirs")
-    assert record(tmp_path).strangers(["a"]) == ["a"]
+    assert record(tmp_path).foreign_files(["a"]) == ["a"]
 
 
 def test_a_link_or_a_folder_in_the_way_is_somebody_elses(tmp_path):
@@ -65,13 +65,13 @@ def test_a_link_or_a_folder_in_the_way_is_somebody_elses(tmp_path):
     write(tmp_path, photograph="mine")
     (tmp_path / "a").symlink_to(tmp_path / "photograph")
     (tmp_path / "b").mkdir()
-    assert record(tmp_path).strangers(["a", "b"]) == ["a", "b"]
+    assert record(tmp_path).foreign_files(["a", "b"]) == ["a", "b"]
 
 
 def test_files_of_another_command_are_somebody_elses(tmp_path):
     record(tmp_path, "fit").claim(["a"])
     write(tmp_path, a="of a fit")
-    assert record(tmp_path).strangers(["a"]) == ["a"]
+    assert record(tmp_path).foreign_files(["a"]) == ["a"]
 
 
 def test_files_of_a_version_without_records_are_known_once(tmp_path):
@@ -89,7 +89,7 @@ def test_names_of_any_bytes_and_paths_are_kept(tmp_path):
     record(tmp_path).seal()
     assert record(tmp_path).paths == {"data.path": "../data"}
     assert json.loads(record(tmp_path).path.read_text())["files"] == {name: digest(tmp_path / name)}
-    assert not record(tmp_path).strangers([name])
+    assert not record(tmp_path).foreign_files([name])
 
 
 @pytest.mark.parametrize(

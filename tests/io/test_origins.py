@@ -10,7 +10,7 @@ from plyfile import PlyData, PlyElement
 from support.small_capture import blobs
 
 from drgs.core.errors import UserError, UserNote
-from drgs.core.origin import MAX_SCENE_SIZES, WORLD, near_origin
+from drgs.core.origin import MAX_SCENE_SIZES, WORLD, choose_origin
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.ply import read_points
 
@@ -35,15 +35,15 @@ def written_as_float64(path, source, offset):
 
 
 def test_what_is_near_stays_and_what_is_far_gets_a_short_origin():
-    assert near_origin((0.9 * MAX_SCENE_SIZES * 4.8, 0, 0), 4.8) == WORLD
-    assert near_origin((1.1 * MAX_SCENE_SIZES * 4.8, 0, 0), 4.8) == (
+    assert choose_origin((0.9 * MAX_SCENE_SIZES * 4.8, 0, 0), 4.8) == WORLD
+    assert choose_origin((1.1 * MAX_SCENE_SIZES * 4.8, 0, 0), 4.8) == (
         1.1 * MAX_SCENE_SIZES * 4.8,
         0,
         0,
     )
-    assert near_origin((4200003.21, 170000.6, 1e-9), 4.8) == (4200003.0, 170001.0, 0.0)
-    assert near_origin((4.2e6, 17, 0), 480.0) == (4200000.0, 0.0, 0.0)
-    assert near_origin((-5.4321e-3, 0, 0), 1.3e-7) == (-5.4321e-3, 0.0, 0.0)
+    assert choose_origin((4200003.21, 170000.6, 1e-9), 4.8) == (4200003.0, 170001.0, 0.0)
+    assert choose_origin((4.2e6, 17, 0), 480.0) == (4200000.0, 0.0, 0.0)
+    assert choose_origin((-5.4321e-3, 0, 0), 1.3e-7) == (-5.4321e-3, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])

@@ -225,5 +225,5 @@ def test_the_phase_keeps_its_share_of_a_longer_fit():
     assert config.densify.prune_window(8000) == (5000, 6000)
     config = with_iterations(config_of(to=5), 8000)
     assert config.densify.prune_window(8000) == (4000, 6000)
-    assert config.densify.settled_iteration(8000) == 6001
-    assert config_of().densify.settled_iteration(4000) == 2001  # growth may end at 2000
+    assert config.densify.first_fixed_iteration(8000) == 6001
+    assert config_of().densify.first_fixed_iteration(4000) == 2001  # growth may end at 2000
