@@ -42,7 +42,7 @@ class BackwardResult:
 
     means2d_grad: TensorXf  # (N, 2): derivative of the loss, per px on the film
     visible: Bool  # (N,): the Gaussian's extent touches the film
-    first_nonfinite: UInt32  # (1,): of all derivatives, for rendering.decode_fault
+    first_nonfinite: UInt32  # (1,): of all derivatives, for rendering.decode_nonfinite
     frames: list[rendering.Frame]  # of the last view; none once a parameter has changed
 
     def weighted_sums(self, plane: Float) -> Float:

@@ -157,7 +157,7 @@ class Records:
 def composite(bins: TileBins, records: Records) -> Layers:
     """Composite the features of all splats.
 
-    bins: from ``bin_footprints``; records: ``Records.of(bins, bins.rows.load)``.
+    bins: from ``bin_footprints``; records: ``Records.from_ranks(bins, bins.rows.load)``.
     """
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)

@@ -233,7 +233,7 @@ class GaussianGradients:
     parameters: Gaussians | None  # None: the splats came from elsewhere, where theirs are found
     means2d: Array2f  # (N,): loss per px
     visible: Bool  # (N,): the Gaussian's extent touches the film
-    first_nonfinite: UInt32  # (1,): of ``parameters``, see :func:`decode_fault`
+    first_nonfinite: UInt32  # (1,): of ``parameters``, see :func:`decode_nonfinite`
     camera: list[Float] | None = None  # (1,) each: of ``camera.numbers()``, where found here
 
 

@@ -35,7 +35,7 @@ class WatchedIteration:
     number: int
     view: str
     loss: Float  # (1,)
-    first_nonfinite: UInt32  # (1,), of the gradients: see drgs.splatting.rendering.decode_fault
+    first_nonfinite: UInt32  # (1,), of the gradients: see drgs.splatting.rendering.decode_nonfinite
     numbers: Mapping[str, dr.ArrayBase]  # by name: of the view, optimised by effects
 
     def faults(self) -> Iterator[str]:

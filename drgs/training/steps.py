@@ -192,7 +192,7 @@ class ViewGradients:
     means2d_grad: Array2f | TensorXf  # (N, 2): derivative of the step's loss, per px
     visible: Bool  # (N,): the splat's extent touches the film
     weighted_sums: Mapping[str, Float]  # (N,), by name: see DensityStrategy.pixel_weights
-    first_nonfinite: UInt32  # (1,): see drgs.splatting.rendering.decode_fault
+    first_nonfinite: UInt32  # (1,): see drgs.splatting.rendering.decode_nonfinite
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import importlib
 import json
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import mitsuba as mi
@@ -26,7 +27,7 @@ EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "numpy_poses.py"
 def example(monkeypatch):
     """The module of the example, found as that of an installed package is."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)
-    point = registry.EntryPoint("numpy_poses", "numpy_poses", registry.ENTRY_POINT_GROUP)
+    point = EntryPoint("numpy_poses", "numpy_poses", registry.ENTRY_POINT_GROUP)
     monkeypatch.setattr(registry, "entry_points", lambda group: [point])
     yield importlib.import_module("numpy_poses")
     for each in registry._registries:

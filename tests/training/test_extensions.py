@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import drjit as dr
@@ -28,7 +29,7 @@ def examples(monkeypatch):
     """The modules of the examples, found as those of an installed package are."""
     mi.set_variant("llvm_ad_rgb")
     monkeypatch.syspath_prepend(EXAMPLES)
-    points = [registry.EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in NAMES]
+    points = [EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in NAMES]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     yield {name: importlib.import_module(name) for name in NAMES}
     for each in registry._registries:
