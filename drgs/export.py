@@ -25,7 +25,7 @@ from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.orbits import up_of
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.similarity import turned_towards
+from drgs.gaussians.similarity import rotation_towards
 from drgs.io.formats import file_formats, format_for
 from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
@@ -200,7 +200,7 @@ def run(args: argparse.Namespace) -> None:
     up = _up_direction(args, source, target)
     gaussians = _select(source, args)
     if up is not None:
-        gaussians = turned_towards(gaussians, up, target.up)
+        gaussians = rotation_towards(gaussians, up, target.up)
     if args.order == "morton":
         gaussians = take(gaussians, morton_order(gaussians.means))
     content = target.encode(replace(source, gaussians=gaussians, is_turned=up is not None))

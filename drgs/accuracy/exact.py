@@ -75,14 +75,14 @@ from drgs.splatting.projection import (
     film_axes,
 )
 
-MOST_ECCENTRIC = 0.99
+MAX_ECCENTRICITY = 0.99
 """Outlines whose squared eccentricity is larger are taken to be everywhere: an ellipse ten times as
 long as wide, whose size is known to 1e-5 in single precision. The same for t h, the share of the
 way to the camera."""
 
 _UNBOUNDED_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
 
-LARGEST_EXPONENT = 1e4  # 2^-1e4 is 0 in either precision
+MAX_EXPONENT = 1e4  # 2^-1e4 is 0 in either precision
 
 
 def exact_shape(
@@ -232,11 +232,11 @@ class RayFalloff(GaussianFalloff):
         ky = -dr.fma(r, kx, sign * gy) / s
         p, r, s = p / at_mean, r / at_mean, s / at_mean
         depth = 1 - reach * h
-        bounded = depth > 1 - MOST_ECCENTRIC
+        bounded = depth > 1 - MAX_ECCENTRICITY
         q = reach / dr.select(bounded, depth, 1)
         squared = 1 - q * dr.fma(kx, kx, ky * ky)
         # Written such that NaN is unbounded.
-        bounded = bounded & (squared > 1 - MOST_ECCENTRIC)
+        bounded = bounded & (squared > 1 - MAX_ECCENTRICITY)
         squared = dr.select(bounded, squared, 1)
         v00 = dr.sqrt(dr.select(bounded, 1 - q * kx * kx, 1))
         v01, v11 = -q * kx * ky / v00, dr.sqrt(squared) / v00
@@ -267,7 +267,7 @@ class RayFalloff(GaussianFalloff):
         for u, v, x, y in pixels:
             squared, a, denominator = ray_denominator(geometry, u, v, x, y)
             # Elsewhere alpha is 0, and its derivatives' factors have to be finite.
-            shows = (a > 0) & (squared < LARGEST_EXPONENT * denominator)
+            shows = (a > 0) & (squared < MAX_EXPONENT * denominator)
             inverse = dr.select(shows, 1 / denominator, 0)
             along.append(a * inverse)
             exponent.append(squared * inverse)

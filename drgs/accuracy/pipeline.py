@@ -15,7 +15,7 @@ from drgs.splatting.projection import (
 )
 from drgs.splatting.rendering import Feature, Pipeline, color_features
 
-LEAST_STOP = 1e-30  # stop where none is set: past it float32 has no transmittance to go back from
+MIN_STOP = 1e-30  # stop where none is set: past it float32 has no transmittance to go back from
 
 
 def pipeline_of(
@@ -24,7 +24,7 @@ def pipeline_of(
     features: tuple[Feature, ...] = (color_features,),
 ) -> Pipeline:
     """Create the pipeline that renders ``features``; sh_degree: of colours, 0 to 3."""
-    stop = max(approximations.transmittance_stop, LEAST_STOP)
+    stop = max(approximations.transmittance_stop, MIN_STOP)
     cutoffs = Cutoffs(
         approximations.alpha_max, approximations.alpha_cut, stop, approximations.extent
     )

@@ -228,7 +228,7 @@ def without_masks(files: Sequence[Path]) -> list[Path]:
     return [file for file in files if _photograph_key(_mask_key(file.as_posix())) not in keys]
 
 
-def note_unnamed_masks(folder: Path, notes: list[str]) -> None:
+def warn_of_unnamed_masks(folder: Path, notes: list[str]) -> None:
     """Add a note where there are masks, but no ``mask_path``: none counts, as in nerfstudio."""
     if files := _mask_files(folder):
         notes.append(

@@ -18,7 +18,7 @@ from typing_extensions import override
 
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
-from drgs.datasets.files import note_unnamed_masks
+from drgs.datasets.files import warn_of_unnamed_masks
 from drgs.datasets.reader import DatasetReader, Photographs
 from drgs.datasets.splits import Lists, listed_frames, unlisted_splits
 from drgs.datasets.transforms import (
@@ -48,7 +48,7 @@ class NerfstudioReader(DatasetReader):
         if meta.unread:
             notes.append(note_unread(meta.path, meta.unread))
         if not config.ignore_masks and not any("mask" in frame.files for frame in frames):
-            note_unnamed_masks(config.path, notes)
+            warn_of_unnamed_masks(config.path, notes)
         is_ignored = meta.point_cloud is not None and config.ignore_points
         note = "; point cloud (ply_file_path) ignored" if is_ignored else ""
         lists = _lists(meta, notes)

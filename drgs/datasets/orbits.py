@@ -26,7 +26,7 @@ OPAQUE, SPREAD = 0.5, 0.98
 """Opacity from which Gaussians decide where an orbit without cameras looks; and the share of them
 that it keeps in the image. The others may be outliers."""
 
-LARGEST_GAP = math.radians(100)
+MAX_GAP = math.radians(100)
 """Azimuth between two neighbouring cameras of a capture from all sides. What is beyond a larger gap
 was not photographed."""
 
@@ -172,7 +172,7 @@ def _covered_arc(azimuths: np.ndarray) -> tuple[float, float | None]:
     azimuths = np.sort(azimuths)
     gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
     widest = int(np.argmax(gaps))
-    if gaps[widest] <= LARGEST_GAP:
+    if gaps[widest] <= MAX_GAP:
         return 0.0, None
     arc = 2 * math.pi - gaps[widest]
     first = azimuths[(widest + 1) % len(azimuths)]

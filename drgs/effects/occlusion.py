@@ -153,9 +153,7 @@ class OccludedFeatures(SplatFeatures):
         return [dr.select(depth <= z, value, 0) for z, _ in self.bound[pixel]]
 
 
-def occluded_by(
-    model: FootprintModel, surfaces: Sequence[Surface], camera: Camera
-) -> FootprintModel:
+def occlude(model: FootprintModel, surfaces: Sequence[Surface], camera: Camera) -> FootprintModel:
     """Return an image model of splats that the surfaces may hide; nearest surface first."""
     grid = TileGrid(camera.width, camera.height)
     return replace(model, features=OccludedFeatures(model.features, tuple(surfaces), grid))

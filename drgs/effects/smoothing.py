@@ -47,8 +47,8 @@ def apply_smoothing(rows: GaussianRows) -> GaussianRows:
     assert rows.smoothing is not None, "composed where there is a filter"
     variance = dr.square(rows.smoothing)
     log_scales = dr.log(dr.exp(2 * rows.log_scales) + variance) / 2
-    dimming = dr.exp(dr.sum(rows.log_scales - log_scales))
-    return replace(rows, log_scales=log_scales, smoothing=None, opacity_compensation=dimming)
+    compensation = dr.exp(dr.sum(rows.log_scales - log_scales))
+    return replace(rows, log_scales=log_scales, smoothing=None, opacity_compensation=compensation)
 
 
 def smoothing_of(means: TensorXf, cameras: Iterable[Camera]) -> Float:

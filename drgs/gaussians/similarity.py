@@ -70,7 +70,7 @@ class Similarity:
         return replace(g, **{name: to_float32(name, getattr(g, name)) for name in names})
 
 
-def turned_towards(
+def rotation_towards(
     gaussians: Gaussians[np.ndarray], direction: np.ndarray, towards: np.ndarray
 ) -> Gaussians[np.ndarray]:
     """Return the model (numpy) turned, the shortest way, so that ``direction`` becomes ``towards``.
@@ -83,7 +83,7 @@ def turned_towards(
 
 
 def shortest_rotation(direction: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Return the rotation R (3, 3) with R direction = towards: see :func:`turned_towards`.
+    """Return the rotation R (3, 3) with R direction = towards: see :func:`rotation_towards`.
 
     Two reflections (Householder), by the plane between both and by ``direction``'s own.
     """

@@ -31,7 +31,7 @@ SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
 COARSE_SHARE = 0.35
 """Share of a fit's iterations with photographs at half their size: see ``bench recipes``."""
 
-LEAST_COARSE_SIDE_PX = 100
+MIN_COARSE_SIDE_PX = 100
 """Smallest side of photographs that are made smaller still. SSIM's window is 11 px wide."""
 
 NUM_ALPHA_VIEWS = 15  # images, at most, by which a dataset is judged to be cut out
@@ -95,7 +95,7 @@ def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
     """
     until = round(COARSE_SHARE * config.iterations)
     sides = [min(view.width, view.height) for view in dataset.train]
-    is_small = min(sides, default=0) < LEAST_COARSE_SIDE_PX
+    is_small = min(sides, default=0) < MIN_COARSE_SIDE_PX
     if config.densify.strategy == "adc" or until < 1 or is_small or _is_cut_out(dataset):
         return []
     return [{"until": until, "factor": 2}]
@@ -103,12 +103,12 @@ def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
 
 def _is_cut_out(dataset: Dataset) -> bool:
     """Return whether most of some images are transparent in part."""
-    from drgs.initialization.visual_hull import LEAST_TRANSPARENT, MAX_EMPTY_ALPHA
+    from drgs.initialization.visual_hull import MAX_EMPTY_ALPHA, MIN_TRANSPARENT_SHARE
 
     some = dataset.train[:: -(-len(dataset.train) // NUM_ALPHA_VIEWS) or 1]
     alphas = [np.asarray(view.alpha) for view in some if view.alpha is not None]
     shares = [float(np.mean(alpha <= MAX_EMPTY_ALPHA)) for alpha in alphas]
-    return sum(share >= LEAST_TRANSPARENT for share in shares) > len(some) / 2
+    return sum(share >= MIN_TRANSPARENT_SHARE for share in shares) > len(some) / 2
 
 
 def _viewing_distance(dataset: Dataset) -> float:

@@ -19,7 +19,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start_box import (
     FARTHEST,
-    LEAST_LOOKING,
+    MIN_FACING_SHARE,
     box_looked_at,
     box_to_start_in,
     focus_of,
@@ -280,7 +280,7 @@ def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Da
             f"{file}: must hold at most densify.max_gaussians ({max_gaussians}) points, got {num}"
         )
     looking = num_views_facing(points, views)
-    if looking < LEAST_LOOKING * len(views):
+    if looking < MIN_FACING_SHARE * len(views):
         raise UserError(
             f"{file}: must hold what the cameras look at{focus_text(dataset)}, in their frame "
             f"of reference, but only {looking} of {len(views)} have any of its {num:,} points in "

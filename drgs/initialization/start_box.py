@@ -31,11 +31,11 @@ cameras look, 1.3 / (4.03 tan(0.69 / 2))."""
 
 FILL_RANGE = (0.5, 2.0)  # shares of half of an image's width at which that box is taken as it is
 
-LEAST_LOOKING = 0.5  # share of the cameras that must look at where a fit starts
+MIN_FACING_SHARE = 0.5  # share of the cameras that must look at where a fit starts
 
 CENTRAL_SHARE = 0.5  # share of an image's width and height that contains what its camera looks at
 
-LEAST_COVERED = 0.005
+MIN_COVERED_SHARE = 0.005
 """Share of an image (the median) that a box must cover: what is around it starts without points."""
 
 NUM_SAMPLES, NUM_CELLS = 2000, 32
@@ -180,9 +180,9 @@ def check_box(box: Box, dataset: Dataset) -> None:
     points, views = box.points(NUM_SAMPLES, np.random.default_rng(0)), dataset.train
     looking = num_views_facing(points, views)
     covered = float(np.median([_coverage(points, view) for view in views]))
-    if looking < LEAST_LOOKING * len(views):
+    if looking < MIN_FACING_SHARE * len(views):
         reason = f"only {looking} of {len(views)} have it in the middle of their images"
-    elif covered < LEAST_COVERED:
+    elif covered < MIN_COVERED_SHARE:
         reason = f"it covers only {100 * covered:.2g} % of an image (the median)"
     else:
         return

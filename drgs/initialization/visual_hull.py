@@ -30,7 +30,7 @@ MIN_POINT_ALPHA = 0.5
 """Least alpha of pixels that show points: others are mostly beside what there is. Parts that are
 nowhere more opaque are found as thin parts are."""
 
-LEAST_TRANSPARENT = 0.02
+MIN_TRANSPARENT_SHARE = 0.02
 """Transparent share of an image whose alpha is a mask. Corners that are empty since distortion was
 removed are less of most."""
 
@@ -41,7 +41,7 @@ they see."""
 MAX_VIEWS, MAX_SIDE = 120, 512
 """Number of silhouettes, and pixels along their sides: of larger images, pixels are merged."""
 
-LEAST_SEEN = 0.5  # share of the views that must see a cube: others cannot show it empty
+MIN_SEEN_SHARE = 0.5  # share of the views that must see a cube: others cannot show it empty
 
 ROOT_CUBES_PER_SIDE = 16  # cubes along the longest side of the box that is divided first
 
@@ -115,7 +115,7 @@ def _any_of(pixels: np.ndarray, scale: int) -> np.ndarray:
 
 def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
     """Return the number of those of partly transparent images."""
-    return sum(s.transparent >= LEAST_TRANSPARENT for s in silhouettes)
+    return sum(s.transparent >= MIN_TRANSPARENT_SHARE for s in silhouettes)
 
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
@@ -240,7 +240,7 @@ def _shown_by_all(
             kept.append(some[~empty])
         rows = np.concatenate(kept)
     result = np.zeros(len(centers), bool)
-    result[rows] = seen[rows] >= LEAST_SEEN * len(silhouettes)
+    result[rows] = seen[rows] >= MIN_SEEN_SHARE * len(silhouettes)
     return result
 
 

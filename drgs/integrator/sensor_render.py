@@ -297,11 +297,10 @@ def _render(
     pipeline = with_effects(pipeline, gaussians, camera)
     models = [replace(pipeline.model, positions=points) for points in positions]
     if surfaces is not None:
-        from drgs.effects.occlusion import occluded_by
+        from drgs.effects.occlusion import occlude
 
         models = [
-            occluded_by(model, layers, camera)
-            for model, layers in zip(models, surfaces, strict=True)
+            occlude(model, layers, camera) for model, layers in zip(models, surfaces, strict=True)
         ]
         pipeline = replace(pipeline, features=(*pipeline.features, rendering.depth_feature))
     first, *others = models

@@ -38,7 +38,7 @@ from drgs.core.files import open_regular
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD, recenter_means
 from drgs.io.formats import FORMATS, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
-from drgs.io.quantization import LARGEST_LOGIT, SMALLEST_LOGIT
+from drgs.io.quantization import MAX_LOGIT, MIN_LOGIT
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -354,10 +354,10 @@ def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
     if count := np.count_nonzero(np.isinf(logits)):
         note = (
             f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats of 8 "
-            f"bits leave them for 1 and 0; read as {LARGEST_LOGIT:.2f} and {SMALLEST_LOGIT:.2f}"
+            f"bits leave them for 1 and 0; read as {MAX_LOGIT:.2f} and {MIN_LOGIT:.2f}"
         )
         warnings.warn(UserNote(note), stacklevel=2)
-    largest, smallest = float(np.float32(LARGEST_LOGIT)), float(np.float32(SMALLEST_LOGIT))
+    largest, smallest = float(np.float32(MAX_LOGIT)), float(np.float32(MIN_LOGIT))
     return np.nan_to_num(logits, nan=np.nan, posinf=largest, neginf=smallest)
 
 

@@ -13,13 +13,13 @@ import numpy as np
 from drgs.core.constants import SH_C0
 from drgs.core.memory import require_memory
 
-LARGEST_LOGIT = 23 * math.log(2)
+MAX_LOGIT = 23 * math.log(2)
 """Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
 
-SMALLEST_LOGIT = -125 * math.log(2)
+MIN_LOGIT = -125 * math.log(2)
 """Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
 
-SMALLEST_LOG_SCALE = -126 * math.log(2)
+MIN_LOG_SCALE = -126 * math.log(2)
 """Logarithm of the smallest normal float32: what a scale of 0 becomes."""
 
 _REMAINING_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -53,14 +53,14 @@ def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
     opacities = opacities.astype(np.float64)
     with np.errstate(divide="ignore"):
         logits = np.log(opacities) - np.log1p(-opacities)
-    return np.clip(logits, SMALLEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
+    return np.clip(logits, MIN_LOGIT, MAX_LOGIT).astype(np.float32)
 
 
 def log_scales_from_scales(scales: np.ndarray) -> np.ndarray:
     """Return finite logarithms (N, 3) float32 of standard deviations (N, 3) >= 0."""
     with np.errstate(divide="ignore"):
         logarithms = np.log(scales.astype(np.float64))
-    return np.maximum(logarithms, SMALLEST_LOG_SCALE).astype(np.float32)
+    return np.maximum(logarithms, MIN_LOG_SCALE).astype(np.float32)
 
 
 def colors_from_sh0(sh0: np.ndarray) -> np.ndarray:

@@ -61,9 +61,9 @@ ANTIALIASED, EXTENSIONS = 1, 2  # flags
 POSITION_BITS = 24
 FRACTIONAL_BITS = 12
 """Bits of the reference implementation; more where positions would have fewer than
-:data:`LEAST_BITS` of their own, fewer where they would not fit."""
+:data:`MIN_FRACTIONAL_BITS` of their own, fewer where they would not fit."""
 
-LEAST_BITS = 16
+MIN_FRACTIONAL_BITS = 16
 
 COLOR_SCALE = 0.15
 SCALE_STEPS, LOG_SCALE_LOW = 16, -10
@@ -127,7 +127,7 @@ def _fractional_bits(means: np.ndarray) -> int:
             f"{extent:g}; crop or scale the scene"
         )
     finest = POSITION_BITS - 1 - whole
-    return min(finest, max(FRACTIONAL_BITS, LEAST_BITS - whole), POSITION_BITS)
+    return min(finest, max(FRACTIONAL_BITS, MIN_FRACTIONAL_BITS - whole), POSITION_BITS)
 
 
 def _packed_positions(means: np.ndarray, bits: int) -> np.ndarray:

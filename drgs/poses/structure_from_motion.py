@@ -56,7 +56,7 @@ PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # per call of COLMAP, which uses all
 MAX_SIDE_PX = 3200
 """Features are extracted from photographs scaled down to this, which is COLMAP's default."""
 
-LEAST_PLACED = 3  # photographs with which there is a model at all
+MIN_PHOTOGRAPHS = 3  # photographs with which there is a model at all
 
 COMMAND = "poses"
 
@@ -261,15 +261,15 @@ class _Reconstruction:
 
     def largest(self) -> tuple[pycolmap.Reconstruction, int]:
         """Return the largest reconstruction, and the number of all."""
-        if len(self.names) < LEAST_PLACED:
+        if len(self.names) < MIN_PHOTOGRAPHS:
             raise UserError(
-                f"{self.photographs}: at least {LEAST_PLACED} photographs, got {len(self.names)}; "
-                "take 30 or more, each showing most of what its neighbours show"
+                f"{self.photographs}: at least {MIN_PHOTOGRAPHS} photographs, got "
+                f"{len(self.names)}; take 30 or more, each showing most of what its neighbours show"
             )
         self._extract()
         self._match()
         models = self._map()
-        if not models or max(m.num_reg_images() for m in models) < LEAST_PLACED:
+        if not models or max(m.num_reg_images() for m in models) < MIN_PHOTOGRAPHS:
             raise UserError(
                 f"{self.photographs}: no cameras were found; take more photographs, neither "
                 "blurred nor of something plain, each showing most of what its neighbours show, "

@@ -60,7 +60,7 @@ by the eighth power of (step / distance to the nearest pole), and by rounding / 
 CENTRAL_WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 """Central differences of order 8: f'(x) h = sum_j w_j (f(x + j h) - f(x - j h)), j = 1 to 4."""
 
-LEAST_CUT = 2.0**-60
+MIN_CUT = 2.0**-60
 """An alpha that changes no sum: the cut of splats however dim they are out of focus."""
 
 SMOOTHING_VARIANCE = 0.2
@@ -538,8 +538,8 @@ def project(
         cov2d, dets, _ = _widen(axes2d, widening + radii**2 / 4)
         singular = dets == 0
         dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
-        opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, LEAST_CUT)
-        above_cut &= opacities > LEAST_CUT
+        opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, MIN_CUT)
+        above_cut &= opacities > MIN_CUT
     return Projection(
         means2d=lens.film_points(camera, points),
         cov2d=cov2d,

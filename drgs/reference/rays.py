@@ -65,7 +65,7 @@ MIN_RELATIVE_STD = 1e-30
 its depth (with one): far below rounding, so that it changes nothing, and far from overflow in the
 fourth powers of its inverse. It gives a disc of thickness zero its limit."""
 
-NEAREST_POINT = 1 / 3
+MIN_POINT_DEPTH = 1 / 3
 """Sigma points nearer than this part of the mean's depth say nothing about a splat."""
 
 OPEN_CONE = 1e-6
@@ -314,14 +314,14 @@ def _unscented_transform(
 
     They are the mean and, for each half axis a_i, m +- sqrt(3) a_i: UT with n = 3, alpha = 1,
     beta = 2, kappa = 0, hence lambda = 0, weights of the mean 0 and 1/6, and of the covariance 2
-    and 1/6. Splats that have a point nearer than ``NEAREST_POINT`` of their depth, or whose slope
+    and 1/6. Splats that have a point nearer than ``MIN_POINT_DEPTH`` of their depth, or whose slope
     is clamped, are projected by the affine approximation. means2d: projections of the means.
     """
     steps = np.sqrt(3.0) * np.swapaxes(affine.axes, 1, 2)
     means = affine.means[:, None]
     points = np.concatenate([means, means + steps, means - steps], axis=1)
     nearest = points[..., 2].min(axis=1)
-    usable = affine.unclamped.all(axis=1) & (nearest >= NEAREST_POINT * affine.means[:, 2])
+    usable = affine.unclamped.all(axis=1) & (nearest >= MIN_POINT_DEPTH * affine.means[:, 2])
     film = _film_positions(np.where(usable[:, None, None], points, means), camera)
     centers = np.sum(film[:, 1:], axis=1) / 6
     weights = np.array([2.0] + 6 * [1 / 6])

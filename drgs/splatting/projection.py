@@ -176,7 +176,7 @@ def project(
     :func:`compensated_opacity`; shape: how mean and covariance are projected, by default
     :func:`ewa`; color: what is known of a splat's colour, by default :func:`color_at_mean`;
     low_pass: px^2 added to the covariance; least_alpha: Gaussians whose opacity, before the shape's
-    dimming, does not reach it are not visible.
+    opacity compensation, does not reach it are not visible.
 
     Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
     """

@@ -67,7 +67,7 @@ from drgs.splatting.reduction import (
     CompositedPairs,
     Slots,
     assign_slots,
-    bands_of,
+    split_bands,
     sum_entries,
     sum_runs,
 )
@@ -278,7 +278,7 @@ def composite_adjoint(
     the decisions (cut, clamp, stop).
     """
     pairs = CompositedPairs.find(bins, layers.stop, samples)
-    bands = bands_of(bins, pairs)
+    bands = split_bands(bins, pairs)
     sums = Rows.empty(bins.rows.Float, bins.num_sums, max(pairs.num_rows, 1))
     for band in bands:
         slots = assign_slots(pairs, band)

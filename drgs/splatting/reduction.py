@@ -92,7 +92,7 @@ class Band:
         return range(first, max(-(-self.entries.stop // WORD), first + 1))
 
 
-def bands_of(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
+def split_bands(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
     """Cut the film of each sample into bands; the host reads the slots and entries of each tile."""
     t, count = types_of(bins.rows.Float), len(pairs.samples)
     running = dr.cumsum(dr.popcnt(pairs.masks))

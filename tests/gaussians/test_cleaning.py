@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from support.formats import distance_of_ellipsoids, gaussians_within_ranges
 
 from drgs.export import find_kept, take
-from drgs.gaussians.similarity import shortest_rotation, turned_towards
+from drgs.gaussians.similarity import rotation_towards, shortest_rotation
 
 
 def test_a_selection_keeps_what_is_within_its_limits():
@@ -51,7 +51,7 @@ def test_the_shortest_rotation_is_about_what_is_perpendicular(direction, towards
 
 def test_a_model_is_turned_as_a_whole():
     g = gaussians_within_ranges(50)
-    found = turned_towards(g, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    found = rotation_towards(g, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
     x, y, z = g.means.T
     np.testing.assert_allclose(found.means, np.column_stack([x, z, -y]), atol=1e-6)
     about_x = Rotation.from_euler("x", -90, degrees=True)

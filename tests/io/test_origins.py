@@ -127,10 +127,10 @@ def test_an_origin_that_is_no_three_numbers_is_refused(tmp_path, line):
 
 
 def test_turning_turns_the_origin_as_well():
-    from drgs.gaussians.similarity import turned_towards
+    from drgs.gaussians.similarity import rotation_towards
 
     far = replace(blobs(), origin=EARTH)
-    turned = turned_towards(far, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    turned = rotation_towards(far, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
     rotation = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # -y becomes z
     np.testing.assert_allclose(world(turned), world(far) @ rotation.T, atol=1e-5)
 

@@ -53,7 +53,7 @@ STAGES = ("composite_adjoint", "composite_tangent")
 
 RESPONSE_DERIVATIVES = ("moments", "derivatives", "pack_tangents", "tangent")
 
-SUMS = ("CompositedPairs", "bands_of", "assign_slots", "sum_entries", "sum_runs")
+SUMS = ("CompositedPairs", "split_bands", "assign_slots", "sum_entries", "sum_runs")
 
 
 # ----------------------------------------------------------------------------------------------

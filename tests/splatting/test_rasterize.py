@@ -33,7 +33,7 @@ from drgs.splatting import lanes as lanes_module
 from drgs.splatting import reduction as slots_module
 from drgs.splatting.grid import MICROS, TileGrid
 from drgs.splatting.rasterize import ONE_SAMPLE, composite_adjoint
-from drgs.splatting.reduction import CompositedPairs, assign_slots, bands_of
+from drgs.splatting.reduction import CompositedPairs, assign_slots, split_bands
 
 # float64: some hundred terms of the size of the result. float32: an exponent of up to 8 carries
 # 1e-6, so alpha 1e-6 and a pixel a few of them; measured 1e-6. In the adjoint, S is the
@@ -305,7 +305,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
     scene = SCENES["opaque"]
     bins, _, layers = scene.composite(precision)
     composited_pairs = CompositedPairs.find(bins, layers.stop, ONE_SAMPLE)
-    (band,) = bands_of(bins, composited_pairs)
+    (band,) = split_bands(bins, composited_pairs)
     slots, composited = assign_slots(composited_pairs, band), np.array(composited_pairs.masks)
     pairs = np.array(slots.pairs).astype(np.int64).reshape(-1, MICROS, 2)
     tiles, stop = np.array(bins.tiles), np.array(layers.stop).reshape(-1, MICROS)
@@ -354,9 +354,9 @@ def test_bands_make_no_difference(band_slots, monkeypatch):
         return [np.array(column).tobytes() for column in found.geometry + found.features]
 
     pairs = CompositedPairs.find(bins, layers.stop, ONE_SAMPLE)
-    (whole,), expected = bands_of(bins, pairs), gradients()
+    (whole,), expected = split_bands(bins, pairs), gradients()
     monkeypatch.setattr(slots_module, "BAND_SLOTS", band_slots)
-    bands = bands_of(bins, pairs)
+    bands = split_bands(bins, pairs)
     assert len(bands) > 1 and sum(band.num_slots for band in bands) == whole.num_slots
     assert [tile for band in bands for tile in band.tiles] == [*whole.tiles]
     assert gradients() == expected
