@@ -131,7 +131,7 @@ def add_arguments(parser: CommandParser) -> None:
     )
     names = "; ".join(f"{name}: {target.text}" for name, target in targets().items())
     parser.add_argument(
-        "--format", metavar="NAME", help=f"{names} (default: what the suffix of --out says)"
+        "--format", metavar="NAME", help=f"{names} (default: by the suffix of --out)"
     )
     parser.add_argument(
         "--out",
@@ -190,7 +190,7 @@ def _size(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Export what the command line names."""
+    """Export the model of the command line."""
     name, out = _destination(args)
     target = targets()[name]
     source = load_source(args.what, target.honoured)

@@ -61,7 +61,7 @@ def add_arguments(parser: CommandParser) -> None:
         help="what to fit, and how; or the folder of a dataset, to have that chosen",
     )
     what.add_argument(
-        "--resume", type=file_or_folder, metavar="OUT_DIR", help="go on with a fit that was stopped"
+        "--resume", type=file_or_folder, metavar="OUT_DIR", help="continue a fit that was stopped"
     )
     parser.add_argument(
         "--data", metavar="DIR", help="dataset folder (data.path), also one that was moved"
@@ -90,7 +90,7 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def _add_viewing(parser: CommandParser) -> None:
-    group = parser.add_argument_group("looking on", "The result has the same bytes without these.")
+    group = parser.add_argument_group("viewing", "The result has the same bytes without these.")
     group.add_argument(
         "--view",
         action="store_true",
@@ -115,7 +115,7 @@ def _add_viewing(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Fit what the command line names; exit with status 130 if Ctrl-C stopped it."""
+    """Fit the dataset of the command line; exit with status 130 if Ctrl-C stopped it."""
     started = time.perf_counter() - LOADING_SECONDS
     comm = communicator(args)
     budget = None if args.budget is None else Budget(args.budget, started + args.budget)

@@ -190,7 +190,7 @@ def add_background(parser: argparse._ActionsContainer) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Render what the command line names."""
+    """Render the images of the command line."""
     if process_number() is None:
         run_with_arguments(args, render_views)
         return

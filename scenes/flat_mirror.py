@@ -102,7 +102,7 @@ def mirrored_camera(splats: Gaussians, size: int) -> np.ndarray:
     towards = (forward + x[..., None] * right + y[..., None] * up).reshape(-1, 3)
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     starts = origin - (origin[1] / towards[:, 1])[:, None] * towards
-    seen = reference.pass_splats(splats, starts, towards, np.full(len(towards), np.inf))
+    seen = reference.composite_segments(splats, starts, towards, np.full(len(towards), np.inf))
     coverage = 1 - seen.transmittances[:, None]
     color = seen.colors / np.where(coverage > 0, coverage, 1)
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)

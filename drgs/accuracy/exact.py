@@ -151,7 +151,7 @@ def _seen_along(
 
 @dataclass(frozen=True)
 class RayFootprint(Footprint):
-    """The same, with what the derivatives of |e|^2 / D need, at the 16 pixels."""
+    """The same, with the inputs of the derivatives of |e|^2 / D, at the 16 pixels."""
 
     along: list[Float]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
     exponent: list[Float]  # B = |e|^2 / D, base 2
@@ -319,7 +319,7 @@ class RayFalloff(GaussianFalloff):
 
     @override
     def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
-        """Turn moments into the derivatives of what :meth:`differentiable` lists.
+        """Turn moments into derivatives with respect to :meth:`differentiable`.
 
         log2_alpha = log2_opacity - f, e = (p dx + r dy, s dy), dx = x - mean, a = +-1 + g (x - c).
         """

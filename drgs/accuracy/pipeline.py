@@ -1,4 +1,4 @@
-"""Pipelines that render with given approximations; imports what is chosen."""
+"""Pipelines that render with given approximations, imported when they are chosen."""
 
 from __future__ import annotations
 

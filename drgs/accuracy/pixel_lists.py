@@ -89,7 +89,7 @@ class AffineDepths:
 
 @dataclass(frozen=True)
 class WithAffineDepth:
-    """A projection, and what :class:`AffineDepths` need: the affine covariance with the depth."""
+    """A projection with the input of :class:`AffineDepths`: the affine covariance with depth."""
 
     shape: Projection
 

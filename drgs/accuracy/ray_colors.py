@@ -24,7 +24,7 @@ CHANNELS = 3
 
 
 def stored_coefficients(rows: GaussianRows, direction: Array3f, sh_degree: int) -> list[Float]:
-    """Return what is stored of a splat's colour: its coefficients, three colours each."""
+    """Return the stored numbers of a splat's colour: its coefficients, three colours each."""
     del direction
     return [value for c in rows.sh[: num_coefficients(sh_degree)] for value in c]
 
@@ -60,7 +60,7 @@ class RayColors(SplatFeatures):
 
     @override
     def with_weight_derivatives(self) -> RayColors:
-        return Weighing(self.sh_degree, self.camera)
+        return WithWeightDerivatives(self.sh_degree, self.camera)
 
     @override
     def bind(self, lanes: Lanes, positions: SamplePositions) -> RayColors:
@@ -118,7 +118,7 @@ class RayColors(SplatFeatures):
         return d_colors + d_stored[self.num_coefficients :]
 
 
-class Weighing(RayColors):
+class WithWeightDerivatives(RayColors):
     """The same, with the weights of compositing as derivatives of the first coefficient."""
 
     @override

@@ -57,7 +57,7 @@ class Fisheye(Lens):
     @classmethod
     @override
     def from_coefficients(cls, **coefficients: float) -> Fisheye:
-        """Return the lens with OpenCV's ``k1`` to ``k4``; what is not given is zero."""
+        """Return the lens with OpenCV's ``k1`` to ``k4``; missing ones are zero."""
         terms = trim_zeros(cls.groups["radial_terms"], usable_coefficients(coefficients))
         growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(terms))]
         turn = math.sqrt(first_root(np.array(growth)))

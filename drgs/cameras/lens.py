@@ -166,7 +166,7 @@ class Lens:
         return replace(self, **{f.name: opaque(getattr(self, f.name)) for f in fields(self)})
 
     def for_camera(self, camera: CameraParameters) -> Lens:
-        """Return the lens that knows what the film of ``camera`` sees."""
+        """Return the lens with the limits of the film of ``camera``."""
         return self
 
     def shows(self, position: Array3f) -> Bool:
@@ -225,7 +225,7 @@ class Lens:
 
 
 class Perspective(Lens):
-    """A lens that sees what is in front of it, and whose depth is z."""
+    """A lens that sees points in front of it, and whose depth is z."""
 
     @override
     def visibility(

@@ -57,7 +57,7 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
     @classmethod
     @override
     def from_coefficients(cls, **coefficients: float) -> ThinPrismFisheye:
-        """Return the lens with COLMAP's coefficients; what is not given is zero."""
+        """Return the lens with COLMAP's coefficients; missing ones are zero."""
         given, (radial, *pairs) = usable_coefficients(coefficients), cls.groups.values()
         kept = trim_zeros(radial, given)
         tangential, prism = (check_pair(names, given) for names in pairs)

@@ -95,7 +95,7 @@ class CaptureFolder:
             if found.get(key) != value:
                 theirs, ours = (_value_text(key, each) for each in (found.get(key), value))
                 raise UserError(
-                    f"{path}: the folder holds another capture: {key} is {theirs}, asked for is "
+                    f"{path}: the folder holds another capture: {key} is {theirs}, requested is "
                     f"{ours}; {remedy}"
                 )
 

@@ -145,7 +145,7 @@ def load_scene(path: Path) -> mi.Scene:
 
 
 def _scene_dictionary(path: Path) -> dict[str, object]:
-    """Return what ``scene()`` of a Python file returns; files in its folder are found by name."""
+    """Return ``scene()`` of a Python file; files in its folder are found by name."""
     variant = mi.variant()
     assert variant is not None, "the command selects one"
     try:

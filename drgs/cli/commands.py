@@ -47,7 +47,7 @@ class CommandParser(argparse.ArgumentParser):
         self._more_help: Callable[[], str] = str
 
     def set_help_footer(self, text: Callable[[], str]) -> None:
-        """End the help with what ``text`` returns, called when the help is shown."""
+        """End the help with ``text()``, called when the help is shown."""
         self._more_help = text
 
     @override
@@ -56,7 +56,7 @@ class CommandParser(argparse.ArgumentParser):
         return super().format_help() + (f"\n{more}\n" if more else "")
 
     def show_examples(self, *lines: str) -> None:
-        """End the help with command lines; ``%(prog)s`` in them stands for the command."""
+        """End the help with command lines; ``%(prog)s`` in them is the command."""
         self.epilog = "\n  ".join(["example:" if len(lines) == 1 else "examples:", *lines])
 
     def add_commands(self, commands: dict[str, Subcommand], metavar: str) -> None:

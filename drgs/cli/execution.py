@@ -87,7 +87,7 @@ def _thread_count(count: int | None) -> Iterator[None]:
         try:
             dr.set_thread_count(count)
         except RuntimeError as error:
-            raise UserError(f"--threads {count}: the system says: {one_line(error)}") from None
+            raise UserError(f"--threads {count}: the system reports: {one_line(error)}") from None
         yield
     finally:
         dr.set_thread_count(previous)

@@ -198,7 +198,7 @@ class DensifyConfig(Section):
     prune: PruneConfig = subsection(PruneConfig)
 
     def stop_at_iteration(self, iteration: int) -> int:
-        """Return what ``stop`` was when this iteration was done."""
+        """Return the value of ``stop`` at this iteration."""
         aims = [aim.stop for aim in self.stop_aims if aim.after < iteration]
         return aims[-1] if aims else self.stop
 

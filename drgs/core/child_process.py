@@ -44,7 +44,7 @@ class DeferredInterrupts:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Restore the handlers, and send again what arrived."""
+        """Restore the handlers, and resend signals that arrived."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         if self._arrived is not None:
@@ -119,7 +119,7 @@ def run_in_child(
 
 
 def serve() -> None:
-    """Run in the child what :func:`run_in_child` sends."""
+    """Run the call of :func:`run_in_child` in the child."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries may print
     function, arguments = pickle.load(sys.stdin.buffer)

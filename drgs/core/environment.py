@@ -40,7 +40,7 @@ def require_module(module: str, extra: str, feature: str) -> ModuleType:
 
 
 def processor() -> str:
-    """Return the processor's name: on Linux its model, elsewhere what Python knows of it."""
+    """Return the processor's name: on Linux its model, elsewhere Python's name for it."""
     if os.path.exists("/proc/cpuinfo"):
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             names = [line.partition(":")[2].strip() for line in file if "model name" in line]

@@ -65,7 +65,7 @@ def format_bytes(count: float) -> str:
 
 
 def require_memory(path: str | Path, needed: int, what: str) -> None:
-    """Raise :class:`UserError` unless ``needed`` bytes are available for ``what`` is in a file."""
+    """Raise :class:`UserError` unless ``needed`` bytes are available for a file's content."""
     available = _check_available(needed, UNASKED_FILE_BYTES)
     if available is not None:
         raise UserError(

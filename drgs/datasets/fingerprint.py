@@ -86,7 +86,7 @@ class Fingerprint(BaseModel):
             raise ValueError("no fingerprint of data") from None
 
     def differences(self, now: Fingerprint) -> list[str]:
-        """Describe what is different ``now``; empty: the data is the same."""
+        """Describe the differences ``now``; empty: the data is the same."""
         pairs = ((self.train, now.train, "training"), (self.test, now.test, "test"))
         return [text for pair in pairs for text in _differences(*pair)]
 

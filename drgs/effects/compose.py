@@ -1,4 +1,4 @@
-"""Effects put into a pipeline, and composited features: normals, and those that the user names."""
+"""Effects of a pipeline, and composited features: normals, and the user's own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth of field: what is out of focus is blurred, as a thin lens blurs it.
+"""Depth of field of a thin lens: splats out of focus are blurred.
 
 A point is spread over a disc, whose variance is added to the splat's covariance on the film; the
 opacity falls such that its integral stays, and the alpha at which it ends with it: many small

@@ -1,4 +1,4 @@
-"""Surfaces between the splats: what they hide of each splat, at each pixel.
+"""Surfaces between the splats: the occluded part of each splat, at each pixel.
 
 Imported when a scene has surfaces. At a pixel, a surface k at depth z_k that stops the part p_k of
 the light behind it lies between splats like one more splat. With w_i = T_i a_i the weights of the

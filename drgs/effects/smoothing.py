@@ -1,4 +1,4 @@
-"""The 3D smoothing filter: Gaussians no smaller than what the training cameras can tell apart.
+"""The 3D smoothing filter: Gaussians no smaller than the training cameras can resolve.
 
 A scene that was photographed with a sampling rate nu (pixels per scene unit, focal length over
 depth) holds no detail below its Nyquist limit. Mip-Splatting (Yu et al. 2024, section 4.1)

@@ -1,4 +1,4 @@
-"""Gaussians rotated, scaled and moved as a whole: what is seen of them from each side is the same.
+"""Gaussians rotated, scaled and moved as a whole, without a change of their appearance.
 
 Host code.
 """

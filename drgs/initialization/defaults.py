@@ -112,7 +112,7 @@ def _is_cut_out(dataset: Dataset) -> bool:
 
 
 def _viewing_distance(dataset: Dataset) -> float:
-    """Return the cameras' distance to what they look at; without a focus, the scene's extent."""
+    """Return the cameras' distance to their focus; without a focus, the scene's extent."""
     if not dataset.train:
         return 1.0
     try:

@@ -19,7 +19,7 @@ Columns = Sequence[np.ndarray]  # coordinates x, y, z, each (N,)
 
 
 def is_projectable(view: Viewpoint) -> bool:
-    """Return whether a point has one place in the image: its camera stands still."""
+    """Return whether a point has one place in the image: the camera does not move."""
     return view.motion is None
 
 

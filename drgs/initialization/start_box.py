@@ -97,7 +97,7 @@ def box_looked_at(views: Sequence[Viewpoint]) -> Box:
 
 
 def _half_width(views: Sequence[Viewpoint]) -> float:
-    """Return the median of what is seen at distance 1."""
+    """Return the median half width of the views at distance 1."""
     return float(np.median([0.5 * view.width / view.fx for view in views]))
 
 

@@ -77,7 +77,7 @@ class Silhouette:
 
 
 def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
-    """Return silhouettes of views that have alpha and whose camera stands still.
+    """Return silhouettes of views that have alpha and a camera that does not move.
 
     A pixel that a mask leaves out is not known to be empty, and so is part of the silhouette.
     """
@@ -119,7 +119,7 @@ def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
 
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
-    """Return whether the alpha of nearly all ``views`` cuts out what is to be fitted."""
+    """Return whether the alpha of nearly all ``views`` cuts out the object."""
     wanted = LEAST_MASKED * len(thin_out(views))
     return num_transparent(silhouettes) >= max(LEAST_VIEWS, wanted)
 

@@ -19,7 +19,7 @@ from drgs.integrator.checks import surfaces_in
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState
 
-FILE_HEADER_REASON = "as the file says"  # for effects that the header of the Gaussians' file sets
+FILE_HEADER_REASON = "set by the file"  # for effects that the header of the Gaussians' file sets
 
 
 @dataclass(frozen=True)

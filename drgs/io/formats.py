@@ -50,7 +50,7 @@ Z_TO_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 class FileFormat:
-    """Base class of file formats: class attributes state what a file can hold.
+    """Base class of file formats: class attributes state the abilities of the format.
 
     ``rendered_with`` contains by name the approximations that Gaussians are to be rendered with
     (:class:`drgs.config.approximations.Approximations`), and their origin (:data:`ORIGIN`) if it is
@@ -168,7 +168,7 @@ def read_gaussians(
 
 
 def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return the content of a file in the format ``name``; what it cannot hold is left out.
+    """Return the content of a file in the format ``name``; data that it cannot hold is left out.
 
     gaussians, rendered_with: as for :meth:`FileFormat.encode`.
 
@@ -190,7 +190,7 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
 
 
 def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
-    """Return what a format has read as float32; raise ValueError where it is not :data:`Arrays`."""
+    """Return a format's arrays as float32; raise ValueError if they are not :data:`Arrays`."""
     if set(arrays) - {"smoothing"} != set(SHAPES) - {"smoothing"}:
         raise ValueError(f"arrays must be {', '.join(SHAPES)}, got {', '.join(arrays)}")
     num = len(arrays["means"])

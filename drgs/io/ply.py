@@ -340,7 +340,7 @@ def _refuse_end(path: str | Path, name: str, promised: int, got: int) -> None:
 
 
 def _check_end(path: str | Path, header: _Header, more: int) -> None:
-    """Refuse what follows the last row; more: bytes."""
+    """Refuse bytes after the last row; more: their number."""
     if more:
         raise UserError(
             f"{path}: the file must end after the rows that its header promises "
@@ -350,7 +350,7 @@ def _check_end(path: str | Path, header: _Header, more: int) -> None:
 
 
 def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
-    """Return logits with infinite ones at the ends of what sigmoids in float32 tell apart."""
+    """Return logits with infinite ones at the limits of float32's sigmoid."""
     if count := np.count_nonzero(np.isinf(logits)):
         note = (
             f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats of 8 "

@@ -36,7 +36,7 @@ def openexr_threads() -> Iterator[None]:
 
 
 def load_scene_file(path: Path, **definitions: str) -> mi.Object:
-    """Load what an XML file describes; definitions: values for its parameters ($name).
+    """Load the scene of an XML file; definitions: values for its parameters ($name).
 
     Raises RuntimeError as Mitsuba does, and :class:`UserError` for what Mitsuba would not survive.
     """
@@ -63,7 +63,7 @@ def load_scene_file(path: Path, **definitions: str) -> mi.Object:
 
 
 def load_scene_dictionary(description: dict[str, object], path: Path) -> mi.Object:
-    """Load what a dictionary describes, which the file ``path`` gave; raises as the above."""
+    """Load the scene dictionary of the file ``path``; raises as the above."""
     config = _parser_config()
     with openexr_threads():
         _check(mi.parser.parse_dict(config, description).nodes, path)

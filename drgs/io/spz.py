@@ -234,7 +234,7 @@ def _unpacked_rotations(rows: np.ndarray, version: int) -> np.ndarray:
 
 
 def _checked_header(path: Path, fields: tuple, versions: tuple[int, ...]) -> _Header:
-    """Check the header's numbers, and that there is memory for what it promises."""
+    """Check the header's numbers, and that there is memory for the Gaussians."""
     magic, version, num, degree, bits, flags = fields
     place = Place(path, "byte", 0)
     if magic != MAGIC:

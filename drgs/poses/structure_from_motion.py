@@ -244,7 +244,7 @@ def _find(
         raise
     except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
         raise UserError(
-            f"{photographs}: structure from motion failed: COLMAP says: {one_line(error, 500)}; "
+            f"{photographs}: structure from motion failed: COLMAP reports: {one_line(error, 500)}; "
             f"{REMEDY}"
         ) from None
 

@@ -87,7 +87,7 @@ class Lens:
         raise NotImplementedError
 
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return (M,), world units: what splats are sorted by and the near plane is compared with.
+        """Return (M,), world units: the order of splats, compared with the near plane.
 
         Here: z.
         """
@@ -101,7 +101,7 @@ class Lens:
         return self.depths(camera, points) >= camera.near
 
     def view_directions(self, camera: Camera, means: np.ndarray) -> np.ndarray:
-        """Return (N, 3), unit, world: along what the means (N, 3), world, are seen.
+        """Return (N, 3), unit, world: directions to the means (N, 3), world.
 
         Here: from the camera's centre to the mean.
         """

@@ -21,7 +21,7 @@ from drgs.reference.splatting import Gaussians
 
 
 @dataclass(frozen=True)
-class Passed:
+class SegmentRadiance:
     """The radiance and transmittance of segments."""
 
     colors: np.ndarray  # (R, 3) display space, sum of w_i c_i
@@ -30,7 +30,7 @@ class Passed:
     is_close: np.ndarray  # (R,) bool: a decision was taken by less than ``close``
 
 
-def pass_splats(
+def composite_segments(
     gaussians: Gaussians,
     origins: np.ndarray,
     directions: np.ndarray,
@@ -40,8 +40,8 @@ def pass_splats(
     stop: float = reference.TRANSMITTANCE_STOP,
     sh_degree: int | None = None,
     close: float = 0.0,
-) -> Passed:
-    """Composite what R segments pass.
+) -> SegmentRadiance:
+    """Composite the splats along R segments.
 
     origins: (R, 3) world; directions: (R, 3) unit; far: (R,) world units, inf: all; alpha_cut: a
     smaller alpha does not exist; stop: a segment ends before the splat that takes its transmittance
@@ -54,7 +54,7 @@ def pass_splats(
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)[:, : (degree + 1) ** 2]
     passed = [
-        _pass_one(
+        _composite_segment(
             np.einsum("nij,nj->ni", whitening, origins[r] - gaussians.means),
             whitening @ directions[r],
             far[r],
@@ -64,7 +64,7 @@ def pass_splats(
         )
         for r in range(len(origins))
     ]
-    return Passed(*(np.array(column) for column in zip(*passed, strict=True)))
+    return SegmentRadiance(*(np.array(column) for column in zip(*passed, strict=True)))
 
 
 def _colors(coefficients: np.ndarray, direction: np.ndarray, degree: int) -> np.ndarray:
@@ -72,7 +72,7 @@ def _colors(coefficients: np.ndarray, direction: np.ndarray, degree: int) -> np.
     return np.maximum(np.einsum("k,nkc->nc", basis, coefficients) + 0.5, 0.0)
 
 
-def _pass_one(
+def _composite_segment(
     start: np.ndarray,
     along: np.ndarray,
     far: float,

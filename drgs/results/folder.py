@@ -128,8 +128,8 @@ def require_no_run(folder: Path) -> None:
     if names := _visible_names(folder):
         raise UserError(
             f"{folder}: must be new or empty for a fit with --budget, got one that holds "
-            f"{format_names(names)}; choose another with --out, go on with --resume {folder}, or "
-            "replace it with --overwrite"
+            f"{format_names(names)}; choose another with --out, continue with --resume {folder}, "
+            "or replace it with --overwrite"
         )
 
 

@@ -92,7 +92,7 @@ class SamplePositions:
     samples: int = 1  # times that each pixel is evaluated
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> SamplePositions:
-        """Load what the lanes of one kernel need; the other methods are called of the result."""
+        """Load the inputs of one kernel's lanes; the other methods are called on the result."""
         del lanes, grid
         return self
 
@@ -237,7 +237,7 @@ class GaussianFalloff:
         return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
     def differentiable(self, splats: Splats2D) -> list[Float]:
-        """Return what :meth:`derivatives` are with respect to: as many columns as geometry."""
+        """Return the variables of :meth:`derivatives`: as many columns as geometry."""
         return [*splats.means2d, *splats.conic_factor, splats.opacities]
 
     def bounds(
@@ -393,7 +393,7 @@ class SplatFeatures:
         return self
 
     def check_differentiable_in_camera(self) -> None:
-        """Raise UnsupportedError if they depend on the camera but through what is stored."""
+        """Raise UnsupportedError if they depend on the camera other than through stored numbers."""
 
     def with_weight_derivatives(self) -> SplatFeatures:
         """Return features whose derivatives with respect to the first number are weights."""
@@ -463,7 +463,7 @@ class FootprintModel:
         self.features.check_differentiable_in_camera()
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> FootprintModel:
-        """This model for the lanes of one kernel: loads what a lane needs before its loop."""
+        """Return this model for the lanes of one kernel, with inputs loaded before the loop."""
         positions = self.positions.bind(lanes, grid)
         return FootprintModel(
             falloff=self.falloff,

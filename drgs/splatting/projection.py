@@ -137,7 +137,7 @@ class GaussianRows:
 
 
 def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
-    """Load every Gaussian's parameters, detached; of the SH only what ``sh_degree`` needs."""
+    """Load every Gaussian's parameters, detached; SH coefficients up to ``sh_degree``."""
     flat = dr.detach(gaussians.logit_opacities)
     t = types_of(type(flat))
     row, num_rows = dr.arange(t.UInt32, dr.width(flat)), dr.opaque(t.UInt32, dr.width(flat))

@@ -82,7 +82,7 @@ class CenterOrder:
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
     ) -> tuple[Projection, CenterOrder]:
-        """Return the function that projects, with what the order needs to know, and the order."""
+        """Return the projection, extended by the inputs of the order, and the order."""
         del approximations
         return projection.shape, cls()
 
@@ -209,7 +209,7 @@ class Pipeline:
 
 @dataclass(frozen=True)
 class Frame:
-    """A rendered frame: its planes, and what the adjoint and the tangent replay."""
+    """A rendered frame: its planes, and the inputs of its adjoint and tangent."""
 
     pipeline: Pipeline
     camera: Camera
@@ -228,7 +228,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class GaussianGradients:
-    """Derivatives of the loss, shaped like the parameters, and what densification needs."""
+    """Derivatives of the loss, shaped like the parameters, and statistics for densification."""
 
     parameters: Gaussians | None  # None: the splats came from elsewhere, where theirs are found
     means2d: Array2f  # (N,): loss per px
@@ -254,7 +254,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
 
 
 def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-    """Project ``gaussians`` and store what compositing needs; see :func:`render`."""
+    """Project ``gaussians`` and store the inputs of compositing; see :func:`render`."""
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
     columns = pipeline.feature_columns(splats, rows, camera)

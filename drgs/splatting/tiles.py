@@ -107,7 +107,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
     t = types_of(type(depths))
     if dr.width(depths) > 1 << _RANK_BITS:
         raise UserError(
-            f"at most {1 << _RANK_BITS:,} Gaussians can be told apart in a tile, got "
+            f"at most {1 << _RANK_BITS:,} Gaussians can be distinguished in a tile, got "
             f"{dr.width(depths):,}; render them in parts, or prune them"
         )
     # A stable sort: equal depths stay in the order of the Gaussians.

@@ -1,4 +1,4 @@
-"""The training loop, and what it is made of.
+"""The training loop and its parts.
 
 May import everything but the commands, the plugins and ``bench``.
 """

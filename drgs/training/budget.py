@@ -161,7 +161,7 @@ def load_curves() -> dict[str, Curve]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A strategy, and what a given time is enough for."""
+    """A strategy, and the iterations and the PSNR that a given time allows."""
 
     strategy: Strategy
     curve: Curve

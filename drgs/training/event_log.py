@@ -54,7 +54,7 @@ class EventLog(Observer):
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Write the last row, if the iteration has one; the history's clock stands still."""
+        """Write the last row, if the iteration has one; the history's clock is paused."""
         if done.row is not None:
             start = time.perf_counter()
             self._write(history.rows[-1], history)  # with what was measured since

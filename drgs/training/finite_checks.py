@@ -39,7 +39,7 @@ class WatchedIteration:
     numbers: Mapping[str, dr.ArrayBase]  # by name: of the view, optimised by effects
 
     def faults(self) -> Iterator[str]:
-        """Yield what is not finite; waits for the device."""
+        """Yield the values that are not finite; waits for the device."""
         # First: what is wrong with them is wrong with all that follows.
         for name, values in self.numbers.items():
             if (first := _first_nonfinite(np.array(values))) is not None:

@@ -111,7 +111,7 @@ class FitFolder:
             claim_output_folder(self.path, config, images)
 
     def write_plan(self, text: str) -> None:
-        """Write what was planned and why."""
+        """Write the plan and its reasons."""
         with atomic_path(self.path / BUDGET_PLAN) as temporary:
             temporary.write_text(text)
 

@@ -1,4 +1,4 @@
-"""The iterations of a fit, and what it writes down as it goes: the same for command and library."""
+"""The iterations of a fit and its history, for command and library."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class History(FitHistory):
 
     @staticmethod
     def from_arrays(rows: np.ndarray, density: np.ndarray, wall_s: float) -> History:
-        """Return the inverse of :meth:`arrays`; the clock goes on from ``wall_s``."""
+        """Return the inverse of :meth:`arrays`; the clock continues from ``wall_s``."""
         history = History()
         for i, loss, view_psnr, n, lr, at, test_psnr in rows:
             measured = None if math.isnan(test_psnr) else float(test_psnr)
@@ -83,7 +83,7 @@ class History(FitHistory):
         self.density.append(DensityRow(**asdict(report), iteration=iteration))
 
     def add_test_psnr(self, psnr: float) -> None:
-        """Note what the last row's Gaussians reach on test views, in dB."""
+        """Record the PSNR of the last row's Gaussians on test views, dB."""
         self.rows[-1] = replace(self.rows[-1], test_psnr=psnr)
 
     def leave_out(self, seconds: float) -> None:
@@ -207,7 +207,7 @@ class HeldOutQuality(Observer):
             self.measure(trainer, history)
 
     def measure(self, trainer: Trainer, history: History) -> None:
-        """Add the mean PSNR to the last row of the history; its clock stands still meanwhile."""
+        """Add the mean PSNR to the last row of the history; its clock is paused meanwhile."""
         start = time.perf_counter()
         trainer.sync_scene()
         pairs = zip(trainer.images(self._views), self._views, strict=True)

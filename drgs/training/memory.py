@@ -55,7 +55,7 @@ MIN_WIDTH_PX = 16  # no smaller images are advised
 
 @dataclass(frozen=True)
 class FitMemory:
-    """Bytes at the peak of a fit, by what takes them."""
+    """Bytes at the peak of a fit, by use."""
 
     process: int
     photographs: int  # as they are kept

@@ -105,7 +105,7 @@ class LeanAdam(Adam):
         self._moments.clear()
 
     def _update(self, key: str, rates: _LRCache) -> list[dr.ArrayBase]:
-        """Give a parameter its new state, not evaluated, and return what is to be evaluated."""
+        """Give a parameter its new state, not evaluated, and return the arrays to evaluate."""
         value, promoted, rate, (count, first, second, _) = self.state[key]
         is_large = dr.width(value) >= LARGE_WIDTH and dr.backend_v(value) == dr.JitBackend.LLVM
         former = first, second

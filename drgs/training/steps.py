@@ -58,7 +58,7 @@ class Stage:
             self.kept.add(view.index)
 
     def end(self) -> None:
-        """Free what is kept: the stage will not come again."""
+        """Free kept targets and uploads: the stage is over."""
         for index in self.kept:
             self.views[index].free()
         self.kept.clear()
@@ -80,7 +80,7 @@ def make_stages(
 
 
 def bytes_on_device(effects: Sequence[TrainingEffect]) -> int:
-    """Return the bytes of a pixel of a view: its target, and at most what effects upload."""
+    """Return the bytes of a pixel of a view: its target, and the most that effects upload."""
     return TARGET_BYTES + sum(effect.upload_bytes for effect in effects)
 
 
@@ -136,7 +136,7 @@ class Step:
 def plan_step(
     iteration: int, config: FitConfig, rates: LearningRates, stages: Sequence[Stage]
 ) -> Step:
-    """Return the step that an iteration is part of; iteration 0 stands for the start of a fit."""
+    """Return the step that an iteration is part of; iteration 0 is the start of a fit."""
     views_per_step = config.optimizer.views_per_step
     iterations = step_of(iteration, views_per_step, config.iterations)
     first, last = iterations[0], iterations[-1]

@@ -1,4 +1,4 @@
-"""The summary of a fit, printed at its start: what is simulated, which key is the reason."""
+"""The summary of a fit, printed at its start: simulated effects, and the keys that enable them."""
 
 from __future__ import annotations
 

@@ -249,7 +249,7 @@ class Trainer:
         return image, loss, error
 
     def _weight_planes(self, view: StepView, image: TensorXf) -> dict[str, Float]:
-        """Return the planes by which the strategy weighs what it sees of Gaussians; by name."""
+        """Evaluate the strategy's pixel weights of an image, by name."""
         weights = self._pixel_weights(view.iteration)
         return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
 
@@ -440,14 +440,14 @@ class Trainer:
         return Trainer(config, self.dataset, gaussians, self.comm, effects=effects, loss=loss)
 
     def warm_start(self, former: Trainer) -> None:
-        """Begin after the iterations of another trainer, with what its effects have found."""
+        """Begin after the iterations of another trainer, with the state of its effects."""
         before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
         self.iteration = -(-before // views_per_step) * views_per_step  # a step begins after it
         found = {effect.name: effect.state() for effect in former.effects}
         self._restore_effects({f"{name}/{k}": v for name in found for k, v in found[name].items()})
 
     def release(self) -> None:
-        """Free what only further iterations need; the scene still renders what was fitted last."""
+        """Free memory that only iterations need; the scene still renders the fit's Gaussians."""
         self.last_step.stage.end()
         self.optimizer.state.clear()
         release_unused_memory()

@@ -37,7 +37,7 @@ class TrainingView:
 
     @cached_property
     def counted_share(self) -> float:
-        """The share of the pixels that count: those that no mask leaves out."""
+        """The share of pixels that are not masked."""
         mask = self._view.mask
         return 1.0 if mask is None else max(float(np.asarray(mask).mean()), 1e-10)
 
@@ -52,7 +52,7 @@ class TrainingView:
         return self.photograph if self.replacement is None else self.replacement
 
     def free(self) -> None:
-        """Free what was made of the images; it is made again when it is needed."""
+        """Free target and uploads; they are computed again when needed."""
         self.__dict__.pop("photograph", None)
         self.uploads.clear()
 

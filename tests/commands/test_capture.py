@@ -433,7 +433,7 @@ def test_folders_of_others_are_left_alone(ball, captured, tmp_path, capsys):
     refusal(ball, tmp_path / "notes.txt")
     assert "--out must be a folder" in capsys.readouterr().err
     refusal(ball, captured, *SMALL, "--spp", 17)
-    assert "spp is 16, asked for is 17" in capsys.readouterr().err
+    assert "spp is 16, requested is 17" in capsys.readouterr().err
     other = write(tmp_path, "ball.xml", BALL.format(extra="<!-- changed -->"))
     refusal(other, captured, *SMALL)
     assert "the folder holds another capture: scene_sha256" in capsys.readouterr().err

@@ -131,7 +131,7 @@ def test_ranges_of_azimuth_and_elevation_keep_before_the_open_side(cornell, tmp_
     assert (noted["azimuth"], noted["elevation"]) == ([-25, 25], [-15, 20])
     again = run(cornell, tmp_path / "out", "--azimuth", -25, 30, "--elevation", -15, 20)
     assert again.returncode == 2
-    assert "azimuth is [-25.0, 25.0], asked for is [-25.0, 30.0]" in again.stderr
+    assert "azimuth is [-25.0, 25.0], requested is [-25.0, 30.0]" in again.stderr
 
 
 def test_the_scenes_own_sensors_are_used_where_asked_for(cornell, tmp_path):

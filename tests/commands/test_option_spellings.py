@@ -79,9 +79,9 @@ def test_another_capture_is_named_in_the_units_of_its_options(ball, tmp_path):
     assert run_in_process(capture.main, *words, "--size", 4, 4).returncode == 0
     refused = run_in_process(capture.main, *words, "--size", 4, 8)
     assert refused.returncode == 2
-    assert "size is [4, 4], asked for is [4, 8]" in refused.stderr
+    assert "size is [4, 4], requested is [4, 8]" in refused.stderr
     refused = run_in_process(capture.main, *words, "--size", 4, 4, "--fov", 50)
-    assert "fov is 39.5978, asked for is 50.0" in refused.stderr
+    assert "fov is 39.5978, requested is 50.0" in refused.stderr
 
 
 def test_gaussians_without_a_configuration_are_over_the_integrators_background(tmp_path):

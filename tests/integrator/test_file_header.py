@@ -67,9 +67,9 @@ def test_the_summary_lists_approximations_of_the_header(file):
     scene = scene_of({"filename": str(file)})
     lines = scene.integrator().summary(scene, *scene.sensors()).splitlines()
     assert (
-        "  antialiasing: opacities compensated for the low-pass filter (as the file says)" in lines
+        "  antialiasing: opacities compensated for the low-pass filter (set by the file)" in lines
     )
-    assert "  approximations: low_pass = 0.1 (as the file says)" in lines
+    assert "  approximations: low_pass = 0.1 (set by the file)" in lines
     scene = scene_of({"filename": str(file)}, **HEADER)
     lines = scene.integrator().summary(scene, *scene.sensors()).splitlines()
     assert "  antialiasing: opacities compensated for the low-pass filter (antialiased)" in lines

@@ -95,7 +95,9 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     rendered = along_rays(scene_of(splats, light_samples=0, **mirror), origins, directions)
     mirrored = gaussians(means * [1, 1, -1], 0.3, 0.7)
     mirrored = splatting.Gaussians(**{**vars(splats), "means": mirrored.means})
-    seen = reference.pass_splats(mirrored, origins, directions, np.full(len(origins), np.inf))
+    seen = reference.composite_segments(
+        mirrored, origins, directions, np.full(len(origins), np.inf)
+    )
     expected = radiance_of(seen, is_open=not has_sky)
     np.testing.assert_allclose(rendered, expected, atol=2e-4)
     assert expected.max() > 0.3
@@ -125,8 +127,10 @@ def test_a_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
     points = origins - directions * (origins[:, 2] / directions[:, 2])[:, None]
     to_lamp = lamp - points
     distance = np.linalg.norm(to_lamp, axis=1)
-    seen = reference.pass_splats(splats, points, to_lamp / distance[:, None], distance, stop=0)
-    before = reference.pass_splats(splats, origins, directions, np.full(len(origins), 30.0))
+    seen = reference.composite_segments(
+        splats, points, to_lamp / distance[:, None], distance, stop=0
+    )
+    before = reference.composite_segments(splats, origins, directions, np.full(len(origins), 30.0))
     ratio = (dark / bright).mean(2).ravel()
     clear = before.counts == 0
     assert clear.sum() > 30 and seen.transmittances[clear].min() < 0.3
@@ -296,7 +300,7 @@ def test_glass_that_does_not_refract_changes_nothing():
     }
     origins, directions = pixel_rays(mi.load_dict(slab["sensor"]))
     rendered = along_rays(scene_of(splats, light_samples=0, **slab), origins, directions)
-    seen = reference.pass_splats(splats, origins, directions, np.full(len(origins), np.inf))
+    seen = reference.composite_segments(splats, origins, directions, np.full(len(origins), np.inf))
     np.testing.assert_allclose(rendered, radiance_of(seen), atol=1e-3)
     assert rendered.max() > 0.3
 

@@ -127,7 +127,7 @@ def test_rays_meet_in_a_grid_what_they_meet_without(seeds):
         for seed in seeds:
             splats = cloud(seed)
             seen, rays = existing(splats), rays_at(splats, seed)
-            exact = reference.pass_splats(seen, *vars(rays).values(), close=1e-4)
+            exact = reference.composite_segments(seen, *vars(rays).values(), close=1e-4)
             sure = ~exact.is_close
             expected, double = exact.transmittances, let_through(splats, rays, FLOAT64)
             np.testing.assert_allclose(double[sure], expected[sure], atol=1e-9)

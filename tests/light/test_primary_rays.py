@@ -147,7 +147,7 @@ def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
     actual = {"kernels": pass_all(problem.gaussians, rays, precision, view)}
     if precision is FLOAT64:
         far = np.full(len(rays[0]), np.inf)
-        passed = reference_light.pass_splats(problem.gaussians, *rays, far)
+        passed = reference_light.composite_segments(problem.gaussians, *rays, far)
         planes = np.column_stack([passed.transmittances, passed.colors])
         actual["reference of rays"] = planes.reshape(expected.shape)
         # Many on a ray; and the image with a window puts all of them in order.

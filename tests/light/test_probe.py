@@ -96,7 +96,7 @@ def test_from_its_centre_a_probe_sees_what_rays_do(precision, number):
     probes = probes_of(gaussians, precision)
     origins = np.tile(CENTERS[number], (2000, 1))
     rays = Rays.towards(origins, CENTERS[number] + directions(2000, 5))
-    expected = reference.pass_splats(gaussians, rays.origins, rays.directions, rays.far)
+    expected = reference.composite_segments(gaussians, rays.origins, rays.directions, rays.far)
     color, coverage, is_known = look(probes, rays, precision, number)
     assert is_known.all() and (expected.transmittances < 0.5).sum() > 50
     np.testing.assert_allclose(coverage, 1 - expected.transmittances, atol=1.2e-3 + 1 / 255)
@@ -112,7 +112,7 @@ def test_a_place_off_the_centre_sees_the_same_surface():
     probes, gaussians = probes_of(shell(), FLOAT32), shell()
     starts = 0.5 * directions(600, 6) * np.random.default_rng(7).random((600, 1))
     rays = Rays.towards(starts, starts + directions(600, 8))
-    expected = reference.pass_splats(gaussians, rays.origins, rays.directions, rays.far)
+    expected = reference.composite_segments(gaussians, rays.origins, rays.directions, rays.far)
     color, coverage, is_known = look(probes, rays, FLOAT32)
     unmoved, _, _ = look(probes, Rays.towards(0 * starts, rays.directions), FLOAT32)
     errors = [np.abs(seen - expected.colors).mean() for seen in (color, unmoved)]

@@ -67,7 +67,9 @@ rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours up to 3, three ti
 def test_rays_pass_what_the_reference_says(precision, count, spread, size):
     gaussians, rays = random_gaussians(count, count, spread, size), random_rays(600)
     close = 0 if precision.dtype == np.float64 else 1e-4
-    exact = reference.pass_splats(gaussians, rays.origins, rays.directions, rays.far, close=close)
+    exact = reference.composite_segments(
+        gaussians, rays.origins, rays.directions, rays.far, close=close
+    )
     color, T, alone = passed(splats_of(gaussians, precision), rays, precision)
     sure = ~exact.is_close
     assert sure.mean() > (0.99 if close == 0 else 0.3) and exact.counts.max() > min(count, 2) - 1
@@ -75,7 +77,7 @@ def test_rays_pass_what_the_reference_says(precision, count, spread, size):
     np.testing.assert_allclose(color[sure], exact.colors[sure], atol=tolerance * 3)
     np.testing.assert_allclose(T[sure], exact.transmittances[sure], atol=tolerance)
     # Asked alone, it is that of all, down to where nothing shows.
-    ends = reference.pass_splats(gaussians, rays.origins, rays.directions, rays.far, stop=0)
+    ends = reference.composite_segments(gaussians, rays.origins, rays.directions, rays.far, stop=0)
     np.testing.assert_allclose(alone[sure], ends.transmittances[sure], atol=tolerance + 1e-4)
 
 

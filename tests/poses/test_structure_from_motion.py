@@ -157,7 +157,9 @@ def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
         raise RuntimeError("[reader.cc:1]\nno such image")
 
     monkeypatch.setattr(sfm._Reconstruction, "largest", refuse)
-    with pytest.raises(UserError, match=r"COLMAP says: \[reader.cc:1\] no such image; if memory"):
+    with pytest.raises(
+        UserError, match=r"COLMAP reports: \[reader.cc:1\] no such image; if memory"
+    ):
         sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
 
 

@@ -38,7 +38,7 @@ from drgs.training.density.strategy import (
 @STRATEGIES.register("adc")
 @dataclass
 class AdaptiveDensityControl(DensityStrategy):
-    """Clones and splits where gradients are large, prunes what is transparent or too large."""
+    """Clones and splits where gradients are large, prunes transparent and large Gaussians."""
 
     config: DensifyConfig
     white_background: bool = False

@@ -60,7 +60,7 @@ HALF_OPACITY, HALF_OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
 @STRATEGIES.register("budget")
 @dataclass
 class GrowthToNumber(DensityStrategy):
-    """Splits those that see most of the errors, as many as there is room for."""
+    """Splits the Gaussians with the largest errors, up to the number allowed."""
 
     config: DensifyConfig
     coarse: Sequence[CoarseStage] = ()
@@ -108,7 +108,7 @@ class GrowthToNumber(DensityStrategy):
 
     @override
     def refine(self, population: Population, iteration: int) -> DensityReport:
-        """Remove what is transparent, and split where errors are."""
+        """Remove transparent Gaussians, and split those with the largest errors."""
         before, least = population.num_rows, self.config.budget.prune_opacity
         keep = expit(population.host("logit_opacities")) >= least  # NaN counts as transparent
         if not keep.any():

@@ -48,7 +48,7 @@ _UNIT_OF_WORD = 2.0**-24
 @STRATEGIES.register("mcmc")
 @dataclass
 class MarkovChain(DensityStrategy):
-    """Relocates what is transparent, and adds noise to where it is."""
+    """Relocates transparent Gaussians, and adds noise to means."""
 
     config: DensifyConfig
     extent: float = math.nan  # of the scene, world units; known when it begins

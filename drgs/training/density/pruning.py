@@ -90,7 +90,7 @@ class Pruning(DensityStrategy):
 
 @STRATEGIES.register("importance")
 class Importance(Pruning):
-    """Removes Gaussians by what they contribute to images.
+    """Removes Gaussians by their contribution to images.
 
     A Gaussian's score is the sum of its weights T a (3DGS, equation 3) over the pixels of the
     images of the phase so far (as in Mini-Splatting, Fang and Wang 2024, section 4.2). Those of the
@@ -145,7 +145,7 @@ class Importance(Pruning):
 
 @STRATEGIES.register("selection")
 class NaturalSelection(Pruning):
-    """Lowers opacities alike, and removes what becomes transparent.
+    """Lowers all opacities, and removes Gaussians that become transparent.
 
     The derivatives of the loss raise again what is seen, all the faster as the opacities' rate is
     higher meanwhile; what hardly matters falls below a threshold (GNS, Gaussian natural selection).

@@ -62,7 +62,7 @@ def absolute_errors(image: TensorXf, photograph: TensorXf) -> Float:
 
 @dataclass(frozen=True)
 class Population:
-    """The rows of a fit: what a strategy may read and change.
+    """The rows of a fit, which a strategy may read and change.
 
     A row is a Gaussian: its parameters, named as in ``gaussians.PARAMETER_NAMES``, and the moments
     that Adam keeps of them. Everything is detached. Where several processes fit, each has some rows
@@ -178,7 +178,7 @@ def displace_means(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> Ten
 
 
 class DensityStrategy(Protocol):
-    """A strategy that leaves the population as it is; others override what they need.
+    """Base class of strategies, which leaves the population as it is.
 
     Equal inputs give equal bytes: random numbers are functions of seed, iteration and row. Where
     several processes fit, each has a strategy with statistics of its own rows; decisions are made

@@ -30,7 +30,7 @@ def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:
 
 @EFFECTS.register("background")
 class RandomBackground(TrainingEffect):
-    """A new colour behind each image: nothing but an opaque splat can look like what is there.
+    """A new background colour for each image: only opaque splats can match the photograph.
 
     The colours are functions of seed and iteration.
     """

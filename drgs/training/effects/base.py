@@ -46,7 +46,7 @@ class FitState:
 
 
 class TrainingEffect(Protocol):
-    """An effect that does nothing; others override what they need.
+    """Base class of effects, which does nothing.
 
     Images are tensors (H, W, C) in display space.
     """
@@ -76,7 +76,7 @@ class TrainingEffect(Protocol):
     by_row: frozenset[str] = frozenset()  # names in its state that have a row for each Gaussian
 
     def upload(self, view: View) -> object:
-        """Return what the effect needs of a view, on the device: see ``TrainingView.uploads``."""
+        """Return the effect's data of a view, on the device: see ``TrainingView.uploads``."""
 
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:
         """Return the photograph (H, W, 3) that a rendering is compared with."""
@@ -122,11 +122,11 @@ class TrainingEffect(Protocol):
         """Called before the Gaussians are taken out."""
 
     def correct_views(self, views: tuple[View, ...]) -> tuple[View, ...]:
-        """Return views that were not trained on, with what the fit knows of their cameras."""
+        """Return views that were not trained on, with the cameras' corrections by the fit."""
         return views
 
     def write(self, folder: Path, dataset: Dataset) -> None:
-        """Write what was found for the training views into the output folder."""
+        """Write the effect's results for the training views into the output folder."""
 
     def numbers_of(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         """Return the optimised numbers of a view: Float by name, without derivatives."""
@@ -137,7 +137,7 @@ class TrainingEffect(Protocol):
         return {}
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return what the coming iterations depend on."""
+        """Return the state that the coming iterations depend on."""
         return {}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

@@ -50,7 +50,7 @@ class _Start:
 
 @EFFECTS.register("cameras")
 class CameraRefinement(OptimisedEffect):
-    """Poses of all training views, and what their lenses share."""
+    """Poses of all training views, and their lens."""
 
     name = "cameras"
     moves_sensors = True

@@ -35,6 +35,6 @@ class Masks(TrainingEffect):
 
     @override
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
-        """Return the rendering without what the mask leaves out."""
+        """Return the rendering without masked pixels."""
         mask = view.uploads[self.name]
         return image if mask is None else image * mask

@@ -167,7 +167,7 @@ class Communicator:
         return np.split(received, np.cumsum(counts)[:-1])
 
     def collective(self, call: Callable[[], T]) -> T:
-        """Return what ``call``, which communicates nothing, returns; a UserError is raised by all.
+        """Return ``call()``, which must not communicate; a UserError is raised by all ranks.
 
         If several ranks raise one, it is that of the earliest iteration, on the lowest rank.
         """
@@ -198,7 +198,7 @@ class Communicator:
 
 
 def wait(*requests: Request | None) -> None:
-    """Wait until all requests are done; None stands for one that is."""
+    """Wait until all requests are done; None: a finished one."""
     pending, polls = [request for request in requests if request is not None], 0
     while not all([request.Test() for request in pending]):
         polls += 1

@@ -68,7 +68,7 @@ BOX_NUMBERS = 4  # numbers of a splat's box of tiles: see :class:`drgs.splatting
 
 @dataclass(frozen=True, eq=False)
 class LocalProjection:
-    """This rank's rows as one camera sees them at one time, without what is stored of them."""
+    """This rank's rows as one camera sees them at one time, without stored numbers."""
 
     camera: Camera
     pipeline: Pipeline  # composed for the camera
@@ -79,7 +79,7 @@ class LocalProjection:
 
     @staticmethod
     def from_footprints(camera: Camera, pipeline: Pipeline, found: Footprints) -> LocalProjection:
-        """Keep what derivatives need of projected splats."""
+        """Keep the inputs of the derivatives of projected splats."""
         counts = found.rows.width, found.num_features, found.num_keys
         return LocalProjection(camera, pipeline, found.boxes, *counts)
 
@@ -101,7 +101,7 @@ class LocalProjection:
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Columns of the blocks of a splat: its box, what is stored, its depth."""
+        """Columns of the blocks of a splat: its box, its stored numbers, its depth."""
         return (BOX_NUMBERS, *block_widths(self.num_stored), 1)
 
     def footprints(self, blocks: Blocks) -> Footprints:
@@ -127,7 +127,7 @@ class PackedProjection:
 
     @staticmethod
     def from_footprints(local: LocalProjection, found: Footprints) -> PackedProjection:
-        """Pack what is on the film. The host reads the number of splats."""
+        """Pack the splats on the film. The host reads their number."""
         rows = cast(UInt32, dr.compress(local.visible))
         count, float_type = dr.width(rows), found.rows.Float
         blocks = _empty_blocks(0, local.widths, float_type)
@@ -202,7 +202,7 @@ class ViewMessages:
 
 @dataclass(eq=False)
 class _View:
-    """A view of the step: what this rank knows of it."""
+    """A view of the step, with this rank's results."""
 
     view: StepView
     renderer: int  # the rank that renders it
@@ -299,7 +299,7 @@ class ViewExchange:
         self._add_ready_views(is_end=False)
 
     def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
-        """Return what is known of all views, whose derivatives are in the parameters now.
+        """Return the gradients of all views; their sum is in the parameters now.
 
         names: of each view's planes for weighted sums.
         """
@@ -373,7 +373,7 @@ class ViewExchange:
         return GaussianGradients(None, dr.zeros(t.Array2f), t.Bool(False), t.UInt32(NO_FAULT))
 
     def _cameras(self, view: StepView) -> list[Camera]:
-        """Return what is simulated of the view's camera, by time, detached."""
+        """Return the view's cameras by time, detached."""
         state = read_sensor(view.view.sensor, self.integrator.near)
         camera = without_effects(camera_from_sensor(state.detach()), self.integrator.ignore)
         return cameras_in_time(camera)
@@ -409,7 +409,7 @@ class ViewExchange:
         return rows.load(dr.arange(index_type, each.local[time].num_rows) + first)
 
     def _receive(self, each: _View, weights: Sequence[str]) -> None:
-        """Receive what another rank has found out about the rows of this one."""
+        """Receive derivatives and weighted sums of this rank's rows from the view's renderer."""
         place, source = each.view.place, each.renderer
         for time, packed in enumerate(each.packed):
             width = packed.local.num_gradients

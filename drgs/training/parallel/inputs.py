@@ -1,4 +1,4 @@
-"""Inputs of processes that work together: what rank 0 sends, and what the others read themselves.
+"""Inputs of the processes of a fit: sent by rank 0, or read by each rank.
 
 Rank 0 reads the whole dataset of a fit. Each other rank reads the photographs of the views that it
 renders by itself, and of other views the cameras and sizes, from files' headers. What a rank reads

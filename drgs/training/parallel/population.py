@@ -178,7 +178,7 @@ class ShardedPopulation(Population):
         self.shard.total = after.total
 
     def _row_moves(self, after: Shard, kept: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Return what turns rows of this process into the kept ones of its next interval."""
+        """Return the function from this process's rows to the kept rows of its next interval."""
         before = self.shard
         sources, goals = before.owners(kept), after.owners(np.arange(len(kept)))
         from_here = sources == before.rank

@@ -10,8 +10,8 @@ from support.small_capture import blobs, make_dataset, write_dataset
 SAID = {"antialiased": True, "low_pass": 0.02}
 CAMERA = ["--origin", 0, -4, 1, "--size", 24, 16]
 LINES = [
-    "  antialiasing: opacities compensated for the low-pass filter (as the file says)",
-    "  approximations: low_pass = 0.02 (as the file says)",
+    "  antialiasing: opacities compensated for the low-pass filter (set by the file)",
+    "  approximations: low_pass = 0.02 (set by the file)",
 ]
 
 
@@ -40,7 +40,7 @@ def test_a_file_alone_is_shown_as_it_says(files, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert set(LINES) <= set(lines)
     assert said != shown(files, "b", files / "plain.ply", *CAMERA)
-    assert "as the file says" not in capsys.readouterr().out
+    assert "set by the file" not in capsys.readouterr().out
 
 
 def test_the_file_has_the_word_before_a_configuration_and_set_before_the_file(files, capsys):
@@ -56,7 +56,7 @@ def test_the_file_has_the_word_before_a_configuration_and_set_before_the_file(fi
     plain = shown(files, "e", files / "plain.ply", "--scene", config)
     capsys.readouterr()
     assert shown(files, "f", ply, "--scene", config, *usual) == plain
-    assert "as the file says" not in capsys.readouterr().out
+    assert "set by the file" not in capsys.readouterr().out
 
 
 def test_a_file_for_viewers_is_shown_as_they_show_it(files):
