@@ -21,7 +21,7 @@ from drgs.splatting import rendering
 _REASONS = {
     (
         "exact.RayFalloff.footprint",
-        "squared < LARGEST_EXPONENT * denominator",
+        "squared < MAX_EXPONENT * denominator",
         (AT_EQUALITY, ALWAYS),
     ): "beyond it alpha is 2^-10000 = 0: it keeps the factors of that 0 from overflowing",
     (
@@ -76,7 +76,7 @@ class Copies:
             board,
             ray_colors,
             derivatives=["RayColors.add_derivatives", "RayColors.tangents"],
-            forward=["RayColors.at", "RayColors.bind"],
+            forward=["RayColors.pixel_values", "RayColors.bind"],
         )
         return Copies(
             falloff=falloff["RayFalloff"],

@@ -121,7 +121,7 @@ def test_the_stress_scene_is_what_it_says():
 def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monkeypatch):
     mi.set_variant("llvm_ad_rgb")
     bench_gaussians(50).save(tmp_path / "few.ply")
-    monkeypatch.setattr(accuracy, "SIZE", 32)
+    monkeypatch.setattr(accuracy, "FILM_SIZE_PX", 32)
     monkeypatch.setattr(accuracy, "RUNGS", accuracy.RUNGS[:3])
     bench.main(["accuracy", str(tmp_path / "few.ply"), "--quick", "--out", str(tmp_path)])
     printed = capsys.readouterr().out

@@ -191,12 +191,14 @@ def _detectors(at_thresholds):
 @pytest.fixture(scope="module")
 def outcome():
     board = Switchboard()
-    sums = Instrumented(board, reduction, derivatives=["CompositedPairs.of", *SUMS[1:]], forward=[])
+    sums = Instrumented(
+        board, reduction, derivatives=["CompositedPairs.find", *SUMS[1:]], forward=[]
+    )
     kernels = Instrumented(
         board,
         rasterize,
         derivatives=["composite_adjoint", "composite_tangent"],
-        forward=["composite", "Records.of", "Layers.planes"],
+        forward=["composite", "Records.from_ranks", "Layers.planes"],
         **{name: sums[name] for name in SUMS},
     )
     chain = Instrumented(
