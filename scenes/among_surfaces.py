@@ -17,7 +17,7 @@ from drgs.cli.commands import bounded_int
 from drgs.reference.splatting import C_00, Gaussians
 
 PATHS = 64
-"""Of a pixel, in each of :data:`ROUNDS` images."""
+"""Paths of a pixel, in each of :data:`ROUNDS` images."""
 
 ROUNDS = 8
 
@@ -139,7 +139,7 @@ def lamp(name: str) -> dict:
 
 
 def floor_image(size: int, name: str, ball: dict, splats: Gaussians) -> np.ndarray:
-    """What a camera that does not see the ball sees of the floor below it."""
+    """Render the floor below the ball from a camera that does not see the ball."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)}
     objects = {"floor": floor, "lamp": lamp(name)} | ball
     settings = {"light": "rays", "nested_spp": 4 * PATHS}

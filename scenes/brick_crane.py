@@ -177,7 +177,7 @@ def crane(b: Builder) -> None:
 
 
 def cargo(b: Builder) -> None:
-    """What lies on the deck: a spare wheel, a crate, a coil of rope, barrels."""
+    """Put a load on the deck: a spare wheel, a crate, a coil of rope, barrels."""
     with b.at(3.0, 2.0, 5.6):
         b.wheel(1.6, 1.3)
     for z in (10, 11, 12):

@@ -37,7 +37,7 @@ FIELD_OF_VIEW = 40.0
 
 @dataclass(frozen=True)
 class Result:
-    """What one integrator makes of the scene."""
+    """The results of one integrator."""
 
     image: np.ndarray  # (H, W, 3) display space
     seconds: float  # the median

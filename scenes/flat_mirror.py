@@ -30,7 +30,7 @@ SIDE = 4
 """Rays of the reference through each pixel, along either axis."""
 
 PATHS = 64
-"""Of a pixel."""
+"""Paths of a pixel."""
 
 
 def main() -> None:

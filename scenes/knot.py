@@ -84,7 +84,7 @@ def shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Of length one, in the last axis."""
+    """Normalize vectors along the last axis."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 

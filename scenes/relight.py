@@ -73,7 +73,7 @@ from drgs.reference import splatting as reference
 
 
 class Unknowns:
-    """What is to be found, as a table shows it."""
+    """The unknowns of a case, as a table shows them."""
 
     TITLES: ClassVar[dict[str, str]]
     LIMITS: ClassVar[dict[str, tuple[float, float]]]
@@ -101,7 +101,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class OfObjects(Unknowns):
-    """Those of the case ``objects``."""
+    """Unknowns of the case ``objects``."""
 
     shift: list[float]  # of the model, in its radii
     turn: list[float]  # of the model
@@ -122,7 +122,7 @@ class OfObjects(Unknowns):
 
 @dataclass(frozen=True)
 class OfMirror(Unknowns):
-    """Those of the case ``mirror``."""
+    """Unknowns of the case ``mirror``."""
 
     normal: list[float]  # of the sheet; of any length
     roughness: list[float]  # alpha
@@ -208,9 +208,9 @@ def relight(case: Case, model: Gaussians, size: int, iterations: int, out: Path)
 
 
 def distance(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Of two images (H, W, 3): the mean square of their difference at each of :data:`SCALES`.
+    """Return the mean square difference of two images (H, W, 3) at each of :data:`SCALES`.
 
-    The sum weights them by s, for what is left of noise and detail in a block shrinks with it.
+    The sum weights them by s, since noise and detail that remain in a block shrink with it.
     """
     difference = image - target
     height, width, _ = difference.shape
@@ -235,7 +235,7 @@ class Stage(ABC):
     model: Gaussians  # Dr.Jit, as it was fitted
 
     NESTED: ClassVar[dict[str, Any]]
-    """Of the integrator ``splats``: how surfaces are rendered."""
+    """Properties of ``splats`` that render surfaces."""
 
     @classmethod
     def of(cls, model: Gaussians, size: int) -> Stage:
@@ -353,7 +353,7 @@ class Mirror(Stage):
 
 @dataclass(frozen=True)
 class Case:
-    """What is unknown of which scene."""
+    """A scene and its unknowns."""
 
     stage: type[Stage]
     true: Unknowns

@@ -194,7 +194,7 @@ FRAME_CONTENTS: dict[str, Callable[[LiveScene, FrameRequest], ViewerFrame]] = {
     "opacity": _opacity,
     "error": _error,
 }
-"""By name; ``error`` is 0.5 + 5 x the difference from the most accurate image, display space."""
+"""Contents by name; ``error``: 0.5 + 5 x the difference from the most accurate image."""
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:

@@ -51,7 +51,7 @@ OPTIONS = {
 """By command and name, words that are right by themselves."""
 
 SUBJECTS = ("run", "gaussians.ply", "splats.xml", "stopped", "photos")
-"""What ``render`` is told to render."""
+"""Inputs of ``render``."""
 
 
 def combination_attacks() -> Iterator[Attack]:
@@ -195,7 +195,7 @@ NAMES = {
     "backslash": "a\\b",
     "dots": "...",
 }
-"""What folders, images and configurations may be called."""
+"""Names of folders, images and configurations."""
 
 
 def _moved(old: str, new: str, folder: Path) -> None:

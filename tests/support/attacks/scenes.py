@@ -197,7 +197,7 @@ OBJECTS = {
         '<lookat origin="4', '<scale x="5"/><lookat origin="4'
     ),
 }
-"""By name, a scene made of the attack folder's."""
+"""Scenes made of the attack folder's, by name."""
 
 
 def _sensor(scene: str) -> str:
