@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
-    parser.description = "Write Gaussians in a format of other programs."
+    parser.description = "Export Gaussians to other programs."
     parser.show_examples(
         "%(prog)s out/lego --format spz",
         "%(prog)s out/lego --out lego.glb --min-opacity 0.02",
@@ -137,43 +137,43 @@ def add_arguments(parser: CommandParser) -> None:
         "--out",
         type=file_or_folder,
         metavar="FILE",
-        help="the file to write (default: the name of what is exported, with another suffix)",
+        help="output file (default: the name of the input, with the suffix of the format)",
     )
     _add_cleaning(parser)
     parser.set_defaults(run=run)
 
 
 def _add_cleaning(parser: CommandParser) -> None:
-    add = parser.add_argument_group("what is kept, and how it lies").add_argument
+    add = parser.add_argument_group("selection and orientation").add_argument
     corners = tuple(f"{axis}{end}" for end in "01" for axis in "XYZ")
     add(
         "--crop",
         type=finite_number,
         nargs=6,
         metavar=corners,
-        help="keep what is between two corners",
+        help="keep the Gaussians inside a box",
     )
-    add("--min-opacity", type=_opacity, metavar="P", help="leave out what is less opaque, 0 to 1")
+    add("--min-opacity", type=_opacity, metavar="P", help="remove less opaque Gaussians, 0 to 1")
     add(
         "--max-size",
         type=_size,
         metavar="S",
-        help="leave out what has a larger standard deviation, scene units",
+        help="remove Gaussians with a larger standard deviation, scene units",
     )
     add(
         "--up",
         nargs="+",
         metavar="UP",
-        help="turn the model so that programs show this direction, X Y Z, upright; cameras: as the "
-        "training cameras were held (default: for formats that say what is up, cameras, or 0 0 1 "
-        "where there are none; others are not turned)",
+        help="rotate the model so that this direction, X Y Z, is up; cameras: the mean up "
+        "direction of the training cameras (default: for formats with an up direction, cameras, or "
+        "0 0 1 without any; other formats are not rotated)",
     )
     add(
         "--order",
         choices=("file", "morton"),
         default="file",
-        help="morton: neighbours in space are neighbours in the file (default: as they are; "
-        "formats that need an order of their own bring it)",
+        help="morton: sort along a space-filling curve (default: order of the input, or of the "
+        "format)",
     )
 
 

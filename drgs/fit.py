@@ -58,17 +58,17 @@ def add_arguments(parser: CommandParser) -> None:
         nargs="?",
         type=file_or_folder,
         metavar="CONFIG.yml|FOLDER",
-        help="what to fit, and how; or the folder of a dataset, to have that chosen",
+        help="configuration file, or dataset folder, whose settings are then chosen automatically",
     )
     what.add_argument(
         "--resume", type=file_or_folder, metavar="OUT_DIR", help="continue a fit that was stopped"
     )
     parser.add_argument(
-        "--data", metavar="DIR", help="dataset folder (data.path), also one that was moved"
+        "--data", metavar="DIR", help="dataset folder (data.path), also if it was moved"
     )
     parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")
     parser.add_argument(
-        "--overwrite", action="store_true", help="replace the run that the output folder holds"
+        "--overwrite", action="store_true", help="replace an earlier run in the output folder"
     )
     parser.add_argument(
         "--set",
@@ -82,7 +82,7 @@ def add_arguments(parser: CommandParser) -> None:
         "--budget",
         type=parse_duration,
         metavar="TIME",
-        help="90s, 5m, 1h30m: plan a fit that is done, results written, after this time",
+        help="90s, 5m, 1h30m: plan a fit that ends within this time, results included",
     )
     _add_viewing(parser)
     add_execution_arguments(parser)
@@ -90,27 +90,27 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def _add_viewing(parser: CommandParser) -> None:
-    group = parser.add_argument_group("viewing", "The result has the same bytes without these.")
+    group = parser.add_argument_group("viewing", "These do not change the result.")
     group.add_argument(
         "--view",
         action="store_true",
-        help="show the fit on a page while it runs, with a pause and an early end (extra: viewer)",
+        help="show the running fit on a web page, with buttons to pause and end it (extra: viewer)",
     )
     group.add_argument(
         "--view-address",
         metavar="ADDRESS",
-        help="where the page is (default: 127.0.0.1, for this machine alone)",
+        help="address of the page (default: 127.0.0.1, reachable from this machine only)",
     )
     group.add_argument(
         "--view-port",
         type=bounded_int(1, MAX_PORT),
         metavar="N",
-        help="(default: the first free one)",
+        help="port of the page (default: first free port from 8080)",
     )
     group.add_argument(
         "--tensorboard",
         action="store_true",
-        help="write the history for TensorBoard, too (extra: tensorboard)",
+        help="also write the history for TensorBoard (extra: tensorboard)",
     )
 
 

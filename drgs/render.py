@@ -96,7 +96,10 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s scene.xml -D model=model.ply --out DIR",
     )
     parser.add_argument(
-        "what", type=file_or_folder, metavar="MODEL|SCENE.xml|OUT_DIR", help="what to render"
+        "what",
+        type=file_or_folder,
+        metavar="MODEL|SCENE.xml|OUT_DIR",
+        help="file of Gaussians, Mitsuba scene, or output folder of a fit",
     )
     parser.add_argument(
         "--out", type=file_or_folder, required=True, metavar="DIR", help="output folder"
@@ -109,65 +112,69 @@ def add_arguments(parser: CommandParser) -> None:
         type=_definition,
         action="append",
         metavar="NAME=VALUE",
-        help="a parameter of the scene file, as in model=point_cloud.ply; repeatable",
+        help="parameter of the scene file, as in model=point_cloud.ply; repeatable",
     )
     add_execution_arguments(parser, variants=None)
     parser.set_defaults(run=run, is_shared=True)
 
 
 def _add_cameras(parser: CommandParser) -> None:
-    group = parser.add_argument_group("cameras, of Gaussians")
+    group = parser.add_argument_group("cameras")
     vector = {"type": finite_number, "nargs": 3, "metavar": ("X", "Y", "Z")}
     one_of = group.add_mutually_exclusive_group().add_argument
     one_of(
-        "--split", choices=("test", "train"), help="the photographs' cameras, with PSNR and SSIM"
+        "--split", choices=("test", "train"), help="cameras of the photographs, with PSNR and SSIM"
     )
     one_of(
         "--orbit",
         type=bounded_int(1, MAX_FRAMES),
         metavar="N",
-        help="N frames around the scene, and an animation",
+        help="N frames of an orbit, and an animation",
     )
     one_of(
         "--camera",
         type=file_or_folder,
         metavar="FILE.json",
-        help="cameras in the layout of transforms.json",
+        help="cameras of a file in the layout of transforms.json",
     )
-    one_of("--origin", **vector, help="one camera, here")
+    one_of("--origin", **vector, help="position of one camera")
     add = group.add_argument
-    add("--target", **vector, help="what it looks at (default: the model's origin, 0 0 0)")
-    add("--up", **vector, help="up in the image, of --origin or --orbit (default: 0 0 1)")
+    add(
+        "--target",
+        **vector,
+        help="point that it looks at (default: 0 0 0, relative to the model's origin)",
+    )
+    add("--up", **vector, help="up direction of --origin or --orbit (default: 0 0 1)")
     add(
         "--fov",
         type=degrees,
         metavar="DEGREES",
-        help="horizontal field of view (default: 40; of --orbit, the photographs')",
+        help="horizontal field of view (default: 40; for --orbit, that of the photographs)",
     )
     add(
         "--size",
         type=bounded_int(1),
         nargs=2,
         metavar=("W", "H"),
-        help="px (default: 400 400; of --orbit, the photographs', within that)",
+        help="px (default: 400 400; for --orbit, at most that, in the photographs' proportions)",
     )
 
 
 def _add_settings(parser: CommandParser) -> None:
-    group = parser.add_argument_group("how Gaussians are rendered")
+    group = parser.add_argument_group("rendering")
     add_background(group)
     group.add_argument(
         "--ignore",
         nargs="+",
         choices=IGNORABLE,
         metavar="EFFECT",
-        help=f"what is not to be simulated: {', '.join(IGNORABLE)}",
+        help=f"effects to leave out: {', '.join(IGNORABLE)}",
     )
     group.add_argument(
         "--scene",
         type=file_or_folder,
         metavar="CONFIG.yml",
-        help="configuration that names the photographs",
+        help="configuration with the photographs and settings of the fit",
     )
     group.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
     group.add_argument(
@@ -184,8 +191,8 @@ def add_background(parser: argparse._ActionsContainer) -> None:
         "--background",
         nargs="+",
         metavar="COLOR",
-        help="white, black, R G B in 0..1, or an image's file (default: the configuration's; "
-        "without one, black)",
+        help="white, black, R G B in 0..1, or an image file (default: that of the configuration, "
+        "or black without one)",
     )
 
 

@@ -43,23 +43,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
-    parser.description = "Look at Gaussians in a browser, rendered live on this machine."
+    parser.description = "View Gaussians in a browser, rendered live on this machine."
     parser.show_examples("%(prog)s out/lego", "%(prog)s model.ply --background white")
-    parser.add_argument("what", type=file_or_folder, metavar="MODEL|OUT_DIR", help="to look at")
+    parser.add_argument(
+        "what",
+        type=file_or_folder,
+        metavar="MODEL|OUT_DIR",
+        help="file of Gaussians, or output folder of a fit",
+    )
     add_background(parser)
     parser.add_argument(
         "--up",
         type=finite_number,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="what the camera turns about (default: as the training cameras were held; of a file "
-        "alone, 0 0 1)",
+        help="axis that the camera orbits about (default: mean up direction of the training "
+        "cameras; 0 0 1 for a file)",
     )
     parser.add_argument(
-        "--address", metavar="ADDRESS", help="of the page (default: 127.0.0.1, this machine alone)"
+        "--address",
+        metavar="ADDRESS",
+        help="address of the page (default: 127.0.0.1, reachable from this machine only)",
     )
     parser.add_argument(
-        "--port", type=bounded_int(1, MAX_PORT), metavar="N", help="(default: the first free one)"
+        "--port",
+        type=bounded_int(1, MAX_PORT),
+        metavar="N",
+        help="port of the page (default: first free port from 8080)",
     )
     add_execution_arguments(parser)
     parser.set_defaults(run=run)

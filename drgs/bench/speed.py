@@ -82,14 +82,14 @@ def add_arguments(parser: CommandParser) -> None:
     parser.add_argument(
         "--without-avx512",
         action="store_true",
-        help="compile for this processor as if it ended at AVX2; only where Dr.Jit uses AVX-512",
+        help="compile for AVX2; only where Dr.Jit uses AVX-512",
     )
     parser.add_argument(
         "--trained",
         type=Path,
         default=Path("out/lego") / GAUSSIANS,
         metavar="PLY",
-        help="a fitted scene to measure as well (default: out/lego/point_cloud.ply, if it exists)",
+        help="also measure this fitted scene (default: out/lego/point_cloud.ply, if it exists)",
     )
 
 

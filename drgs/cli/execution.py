@@ -29,12 +29,12 @@ def add_execution_arguments(
         "--threads",
         type=bounded_int(1, MAX_THREADS, "no machine has more cores"),
         metavar="N",
-        help="CPU threads to use (default: one a core)",
+        help="number of CPU threads (default: one per core)",
     )
     parser.add_argument(
         "--debug",
         action="store_true",
-        help="check the range of every access to memory and stop where one is violated; slow",
+        help="check the bounds of every memory access, and stop at the first violation; slow",
     )
 
 

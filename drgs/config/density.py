@@ -39,53 +39,53 @@ def schedule_of(strategy: str) -> Schedule:
 
 
 class AdcConfig(Section):
-    """The strategy adc, adaptive density control: clone, split, prune, opacity reset."""
+    """The strategy ``adc``, adaptive density control: clone, split, prune, opacity reset."""
 
     grad_threshold: float = Field(
         2e-4,
         gt=0,
-        description="A Gaussian is cloned or split if the mean norm of its 2D position gradient, "
-        "in NDC units, over the views that saw it reaches this.",
+        description="Clone or split a Gaussian whose 2D position gradient has at least this mean "
+        "norm, in NDC units, over the views that it is visible in.",
     )
     clone_scale: float = Field(
         0.01,
         gt=0,
-        description="Cloned if its largest scale is at most this, split if larger; x extent.",
+        description="Clone up to this largest scale, split above it; in scene extents.",
     )
     split_count: int = Field(
-        2, ge=2, le=1_000_000, description="Samples that replace a Gaussian that is split."
+        2, ge=2, le=1_000_000, description="Number of samples that replace a split Gaussian."
     )
-    split_shrink: float = Field(1.6, gt=1, description="Their scales are the parent's / this.")
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
+    split_shrink: float = Field(1.6, gt=1, description="Divisor of the samples' scales.")
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Remove less opaque Gaussians.")
     prune_scale: float = Field(
         0.1,
         gt=0,
-        description="Removed after the first reset if its largest scale is larger; x extent.",
+        description="Remove Gaussians of a larger scale after the first reset; in scene extents.",
     )
     reset_every: Count = Field(
-        3000, ge=1, description="Iterations between opacity resets, which end with densify.stop."
+        3000, ge=1, description="Iterations between opacity resets, up to densify.stop."
     )
-    reset_opacity: float = Field(0.01, gt=0, lt=1, description="A reset lowers opacities to this.")
+    reset_opacity: float = Field(0.01, gt=0, lt=1, description="Maximum opacity after a reset.")
     white_background_reset: Count | None = Field(
         500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
     )
 
 
 class BudgetConfig(Section):
-    """The strategy budget: growth to a number of Gaussians, where errors are."""
+    """The strategy ``budget``: growth to a given number of Gaussians, where errors are largest."""
 
     gaussians: Resolved[Count] = Field(
         UNRESOLVED,
         ge=4,
-        description="Number at densify.stop. null: 250 times the square root of an image's number "
-        "of pixels, 100,000 for 400 x 400 px.",
+        description="Number of Gaussians at densify.stop. null: 250 times the square root of an "
+        "image's number of pixels, 100,000 for 400 x 400 px.",
     )
     error_every: Count = Field(
         10,
         ge=1,
-        description="Iterations between measured errors, which take half an iteration.",
+        description="Iterations between measurements of errors; each takes half an iteration.",
     )
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Removed if less opaque.")
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Remove less opaque Gaussians.")
 
 
 class McmcConfig(Section):
@@ -94,49 +94,50 @@ class McmcConfig(Section):
     gaussians: Resolved[Count] = Field(
         UNRESOLVED,
         ge=4,
-        description="The population grows to this, and no further. null: as with budget.",
+        description="Final number of Gaussians. null: as with budget.",
     )
-    growth: float = Field(0.05, ge=0, le=10, description="Of the population, at each change.")
+    growth: float = Field(
+        0.05, ge=0, le=10, description="Relative growth of the population at each change."
+    )
     spread: float = Field(
         1.0,
         ge=0,
         le=10,
-        description="Distance of copies from their originals, in standard deviations; 0 in the "
-        "paper.",
+        description="Displacement of copies, in standard deviations; 0 in the paper.",
     )
     min_opacity: float = Field(
-        0.005, gt=0, lt=1, description="Gaussians that are not more opaque are moved elsewhere."
+        0.005, gt=0, lt=1, description="Relocate Gaussians up to this opacity."
     )
     noise_lr: float = Field(
         1e5,
         ge=0,
         le=1e12,
-        description="Of the noise on means, times their rate and the covariance in squared scene "
-        "extents. The paper's, about 1e7, costs 2 dB in small images.",
+        description="Factor of the noise on means, times their rate and the covariance in squared "
+        "scene extents. The paper's value, about 1e7, costs 2 dB in small images.",
     )
     opacity_weight: float = Field(
-        0.01, ge=0, le=1e6, description="Of the mean opacity, in the loss."
+        0.01, ge=0, le=1e6, description="Weight of the mean opacity in the loss."
     )
     scale_weight: float = Field(
-        0.05, ge=0, le=1e6, description="Of the mean scale, in scene extents, in the loss."
+        0.05, ge=0, le=1e6, description="Weight of the mean scale, in scene extents, in the loss."
     )
 
 
 class PruneConfig(Section):
-    """The population's last phase: down to a number of Gaussians, after any strategy."""
+    """Pruning to a given number of Gaussians, after any strategy."""
 
     to: Count | None = Field(
-        None, ge=1, description="Gaussians that are left in the end, at most; null: no such phase."
+        None, ge=1, description="Maximum number of Gaussians at the end; null: no pruning."
     )
     method: Literal["selection", "importance"] = Field(
         "selection",
         description="selection: opacities are lowered against the loss until enough Gaussians are "
-        "transparent. importance: those that contribute least to images are removed.",
+        "transparent. importance: Gaussians that contribute least to images are removed.",
     )
     start: Count | None = Field(
         None,
         ge=1,
-        description="Begin after this iteration and densify.stop. null: after densify.stop.",
+        description="Iteration after which it begins, at least densify.stop. null: densify.stop.",
     )
     stop: Count | None = Field(
         None,
@@ -145,18 +146,21 @@ class PruneConfig(Section):
     )
     every: Count = Field(50, ge=1, description="Iterations between two changes.")
     opacity: float = Field(
-        0.005, gt=0, lt=1, description="selection: Gaussians that become less opaque are removed."
+        0.005, gt=0, lt=1, description="selection: remove less opaque Gaussians."
     )
     opacity_rate: float = Field(
-        4.0, gt=0, le=100, description="selection: factor of optimizer.opacities_lr meanwhile."
+        4.0,
+        gt=0,
+        le=100,
+        description="selection: factor of optimizer.opacities_lr during this phase.",
     )
 
 
 class StopAim(Section):
     """Target of growth after an iteration."""
 
-    after: Count = Field(ge=0, description="The last iteration that is not affected.")
-    stop: Count = Field(ge=1, description="What densify.stop was then.")
+    after: Count = Field(ge=0, description="Last iteration before this value applies.")
+    stop: Count = Field(ge=1, description="Value of densify.stop from then on.")
 
 
 class DensifyConfig(Section):
@@ -164,24 +168,23 @@ class DensifyConfig(Section):
 
     strategy: StrategyName = Field(
         "budget",
-        description="What changes the population. adc: adaptive density control, as in the paper "
-        "(Kerbl et al. 2023); budget: growth to a number of Gaussians, where errors are; mcmc: "
-        "relocation and noise, up to a number of Gaussians (Kheradmand et al. 2024). Or the name "
-        "of an extension.",
+        description="How the population changes. adc: adaptive density control, as in the paper "
+        "(Kerbl et al. 2023); budget: growth to a given number of Gaussians, where errors are "
+        "largest; mcmc: relocation and noise (Kheradmand et al. 2024). Or the name of an "
+        "extension.",
     )
     start: Resolved[Count] = Field(
         REFERENCE_START,
         ge=0,
-        description="The population changes only after this iteration. Not given, or null: 500; "
-        "less where that is more than half of stop, or, with budget and mcmc, than a twentieth of "
-        "all iterations.",
+        description="Last iteration before the first change. Not given, or null: 500, but at most "
+        "half of stop and, with budget and mcmc, a twentieth of all iterations.",
     )
     stop: Resolved[Count] = Field(
         REFERENCE_STOP,
         ge=1,
-        description="It changes, and is reset, only before this iteration; with budget, at it for "
-        "the last time. Not given, or null: 15,000; less in shorter fits: with budget a half of "
-        "the iterations, else 5/7.",
+        description="Changes and resets end before this iteration; with budget, the last change is "
+        "at this iteration. Not given, or null: 15,000, but at most half of the iterations with "
+        "budget, and 5/7 of them otherwise.",
     )
     stop_aims: list[StopAim] = Field(
         default_factory=list,
@@ -190,7 +193,7 @@ class DensifyConfig(Section):
     )
     every: Count = Field(100, ge=1, description="Iterations between two changes.")
     max_gaussians: int = Field(
-        1_000_000, ge=4, le=100_000_000, description="Cap that is never exceeded."
+        1_000_000, ge=4, le=100_000_000, description="Limit that the population never exceeds."
     )
     adc: AdcConfig = subsection(AdcConfig)
     budget: BudgetConfig = subsection(BudgetConfig)
@@ -219,6 +222,6 @@ class DensifyConfig(Section):
         return start, self.prune.stop or (start + iterations + 1) // 2
 
     def first_fixed_iteration(self, iterations: int) -> int:
-        """Return the iteration from which on no row is added or removed; iterations: of the fit."""
+        """Return the first iteration after the last change of rows; iterations: of the fit."""
         last = self.stop if self.prune.to is None else self.prune_window(iterations)[1]
         return max(self.stop, last) + 1

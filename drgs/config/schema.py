@@ -63,11 +63,11 @@ Decay = Annotated[float, Field(ge=0, le=0.999999)]  # float32 has few numbers be
 
 
 class DataConfig(Section):
-    """The photographs and their cameras, and how they are read."""
+    """Photographs, cameras, and how to read them."""
 
     path: PathField = Field(description="Dataset folder; relative to the configuration file.")
     source: str = Field(
-        "", description="Where to get the data: printed in the error if the folder is missing."
+        "", description="Source of the data, for the error message if the folder is missing."
     )
     type: ReaderName = Field(
         "auto",
@@ -78,46 +78,44 @@ class DataConfig(Section):
         None,
         ge=1,
         description="px. Wider images are scaled down to this width by area averaging; null: "
-        "photographs to 1600, as in the reference; images of the NeRF-synthetic layout are not.",
+        "1600 for photographs, as in the reference; NeRF-synthetic images keep their size.",
     )
     downscale: Literal[1, 2, 4, 8] | None = Field(
         None,
         description="COLMAP's layout: read images, images_2, images_4 or images_8; null: the "
-        "smallest that are not smaller than image_size.",
+        "smallest of at least image_size.",
     )
     test_split: Literal["train", "val", "test"] | None = Field(
         None,
-        description="Split to measure on, of NeRF-synthetic's and of those that the data lists; "
-        "null: test if it is there, else val.",
+        description="Split to evaluate on, of the NeRF-synthetic layout and of splits that the "
+        "data lists; null: test if it exists, else val.",
     )
     test_every: Count = Field(
         8,
         ge=2,
         description="nerfstudio, colmap: images 0, n, 2n, ... by file name are the test split, "
-        "unless the data lists its splits.",
+        "unless the data lists splits.",
     )
     background: ColorField = Field(
         None,
-        description="white, black or [r, g, b] in display space: behind transparent images, and "
-        "behind the splats at training, evaluation and rendering. null: white if any image is "
+        description="white, black or [r, g, b] in display space: background of transparent images, "
+        "and of the splats in training, evaluation and rendering. null: white if any image is "
         "transparent, else black.",
     )
     random_background: bool = Field(
         False,
-        description="A random colour behind transparent images and splats in each iteration.",
+        description="Use a random background in each iteration.",
     )
-    ignore_distortion: bool = Field(
-        False, description="Treat images with lens distortion as those of a pinhole camera."
-    )
+    ignore_distortion: bool = Field(False, description="Ignore lens distortion.")
     ignore_motion: bool = Field(False, description="Ignore motion of the camera during exposure.")
     shutter_samples: int = Field(
         SHUTTER_SAMPLES,
         ge=1,
         le=MAX_SHUTTER_SAMPLES,
-        description="Images averaged for a moving camera with a global shutter; each takes the "
-        "memory and time of one.",
+        description="Number of images averaged for a moving camera with a global shutter; memory "
+        "and time are proportional.",
     )
-    ignore_masks: bool = Field(False, description="Use the pixels that masks leave out as well.")
+    ignore_masks: bool = Field(False, description="Do not read masks.")
     ignore_depth: bool = Field(
         False, description="Do not read depth, as with a loss.depth_weight of 0."
     )
@@ -135,52 +133,51 @@ class InitConfig(Section):
 
     start: Literal["auto", "masks", "points", "random"] = Field(
         "auto",
-        description="What the points are. masks: the surface of what no image's alpha shows "
-        "empty, coloured from the images, which have to be transparent where there is nothing. "
-        "points: a point cloud. random: in the start box, or where the cameras look. auto: the "
-        "point_cloud or the half_extent that is given; else masks if nearly all training images "
-        "are partly transparent; else the dataset's point cloud if it names one; else random.",
+        description="Start of the Gaussians. masks: the surface of the visual hull of the images' "
+        "alpha channels, coloured from the images. points: a point cloud. random: in the start "
+        "box, or where the cameras look. auto: point_cloud or half_extent if given; else masks if "
+        "nearly all training images are partly transparent; else the dataset's point cloud if it "
+        "has one; else random.",
     )
     num_points: Count | None = Field(
         None,
         ge=4,
         le=100_000_000,
-        description="Points, random or, at most, on the surface of the masks' hull. null: 100,000 "
-        "with the strategy adc, else two fifths of the number that it grows to.",
+        description="Number of random points, or maximum number on the hull. null: 100,000 with "
+        "the strategy adc, else two fifths of the final number.",
     )
     half_extent: float | None = Field(
         None,
         gt=0,
         le=1e9,
-        description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 where "
-        "the cameras are those of NeRF-synthetic scenes, otherwise a box derived from them.",
+        description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 for "
+        "cameras of NeRF-synthetic scenes, else a box derived from the cameras.",
     )
-    opacity: float = Field(
-        0.1, ge=1e-6, le=0.999999, description="Opacity of every starting Gaussian."
-    )
+    opacity: float = Field(0.1, ge=1e-6, le=0.999999, description="Initial opacity.")
     scale: float = Field(
         1.0,
         ge=1e-3,
         le=1e3,
-        description="Its standard deviation, per RMS distance to the three nearest others.",
+        description="Initial standard deviation, relative to the RMS distance to the three nearest "
+        "neighbours.",
     )
     point_cloud: PathField | None = Field(
         None,
-        description="PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP, to use "
-        "instead of other points. null: the one that the dataset has (ply_file_path, points3D), if "
-        "it does, no half_extent is given and there are no masks.",
+        description="PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP. null: "
+        "the dataset's own (ply_file_path, points3D), unless half_extent is given or masks are "
+        "used.",
     )
     max_point_error: float | None = Field(
         None,
         ge=0,
         le=1e9,
-        description="px: leave out COLMAP's points with a larger mean reprojection error, but not "
-        "those of unknown error (-1); null: none.",
+        description="px: drop COLMAP's points with a larger mean reprojection error, but keep "
+        "points of unknown error (-1); null: keep all.",
     )
     min_track_length: Count | None = Field(
         None,
         ge=0,
-        description="Leave out COLMAP's points that fewer images observe; null: none.",
+        description="Drop COLMAP's points that fewer images observe; null: keep all.",
     )
 
 
@@ -191,16 +188,16 @@ class _Model(Section):
     sh_increase_every: Resolved[Count] = Field(
         LATEST_DEGREE,
         ge=1,
-        description="Iterations between +1 of the degree in use, which starts at 0. Not given, or "
-        "null: a fortieth of all, at most 1000.",
+        description="Iterations between increments of the degree in use, which starts at 0. Not "
+        "given, or null: a fortieth of all iterations, at most 1000.",
     )
     near: Resolved[float] = Field(
         UNRESOLVED,
         ge=NEAR_LIMITS[0],
         le=NEAR_LIMITS[1],
-        description="Near plane, scene units: closer means are culled. null: about a twenty-fifth "
-        "of the cameras' distance to what they look at, the reference's 0.2 for NeRF-synthetic "
-        "scenes.",
+        description="Near plane, scene units: closer means are culled. null: the reference's 0.2 "
+        "for NeRF-synthetic scenes, else about a twenty-fifth of the cameras' distance to the "
+        "point that they look at.",
     )
 
 
@@ -216,7 +213,7 @@ def _as_field(name: str, declared: Declared) -> tuple[object, FieldInfo]:
         default = declared.unrounded
     elif default == math.inf:
         kind, default = float | None, None
-        description = f"{description} null: where alpha_cut ends them."
+        description = f"{description} null: the radius at which alpha falls to alpha_cut."
     limits: dict[str, Any] = declared.limits.finite if declared.limits else {}
     return kind, Field(default, description=description, **limits)
 
@@ -232,8 +229,8 @@ class ModelConfig(_ModelWithApproximations):
 
     smoothing: bool = Field(
         False,
-        description="Widen Gaussians to what the training cameras can tell apart, for renderings "
-        "at other sizes (the 3D filter of Mip-Splatting, Yu et al. 2024).",
+        description="Widen Gaussians to the resolution of the training cameras, for renderings at "
+        "other sizes (the 3D filter of Mip-Splatting, Yu et al. 2024).",
     )
 
     @field_validator(*(name for name, d in DECLARED.items() if d.limits or d.registry))
@@ -265,63 +262,61 @@ class ModelConfig(_ModelWithApproximations):
 class RateAim(Section):
     """Target of a falling rate after an iteration."""
 
-    after: Count = Field(ge=0, description="The last iteration that is not affected.")
-    end: Count = Field(ge=1, description="Where the rate would be the last one.")
+    after: Count = Field(ge=0, description="Last iteration before this value applies.")
+    end: Count = Field(ge=1, description="Iteration at which the rate would reach its final value.")
 
 
 class OptimizerConfig(Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
-    means_lr: Rate = Field(
-        3.2e-4, gt=0, description="First rate of the means, in units of the scene extent."
-    )
+    means_lr: Rate = Field(3.2e-4, gt=0, description="Initial rate of the means, in scene extents.")
     means_lr_final: Rate = Field(
-        3.2e-6, gt=0, description="Last rate of the means, which decays exponentially."
+        3.2e-6, gt=0, description="Final rate of the means; the decay is exponential."
     )
     means_lr_aims: list[RateAim] = Field(
         default_factory=list,
-        description="When the means' rate ends, after revisions of --budget: a list of "
+        description="Ends of the decay after revisions of --budget: a list of "
         "{after: iteration, end: iteration}; empty: at the last iteration.",
     )
-    sh0_lr: Rate = Field(5e-3, ge=0, description="Degree-0 colour coefficients.")
-    shN_lr: Rate = Field(1e-3, ge=0, description="Colour coefficients of higher degrees.")  # noqa: N815
+    sh0_lr: Rate = Field(5e-3, ge=0, description="Rate of the degree-0 colour coefficients.")
+    shN_lr: Rate = Field(1e-3, ge=0, description="Rate of the higher degrees.")  # noqa: N815
     opacities_lr: Rate = Field(
-        0.05, ge=0, description="Logit opacities (0.025 in newer releases of the reference)."
+        0.05, ge=0, description="Rate of the logit opacities (0.025 in newer references)."
     )
-    scales_lr: Rate = Field(1e-2, ge=0, description="Logarithms of the scales.")
-    quats_lr: Rate = Field(2e-3, ge=0, description="Quaternions.")
+    scales_lr: Rate = Field(1e-2, ge=0, description="Rate of the log scales.")
+    quats_lr: Rate = Field(2e-3, ge=0, description="Rate of the quaternions.")
     decay: Resolved[float] = Field(
         UNRESOLVED,
         ge=1e-6,
         le=1,
-        description="Last rates, other than of means, in parts of the first ones. null: 0.1; with "
-        "the strategy adc 1, as in the paper.",
+        description="Ratio of final to initial rates, except for the means. null: 0.1; 1 with the "
+        "strategy adc, as in the paper.",
     )
     decay_from: float = Field(
         0.5,
         ge=0,
         lt=1,
-        description="When they begin to fall, in parts of the iterations after coarse stages.",
+        description="Start of their decay, as a fraction of the iterations after coarse stages.",
     )
     views_per_step: int = Field(
         1,
         ge=1,
         le=1000,
-        description="Views B whose mean gradient is a step, an iteration each, shared by several "
-        "processes. Rates are multiplied by the root of B, beta_1 and beta_2 become powers of B.",
+        description="Batch size B: number of views, one iteration each, whose mean gradient makes "
+        "a step. Rates are multiplied by sqrt(B), and beta_1 and beta_2 raised to the power of B.",
     )
     views: int = Field(
         1,
         ge=1,
         le=1000,
-        description="Views of a step late in the fit, with unchanged rates; at most "
-        "views_per_step, or a multiple of it.",
+        description="Batch size late in the fit, with unchanged rates; at most views_per_step, or "
+        "a multiple of it.",
     )
     views_from: float = Field(
         0.75,
         ge=0,
         lt=1,
-        description="When that begins, in the same unit; not before the population is final.",
+        description="Start of that, as decay_from, but not before the population is final.",
     )
     beta_1: Decay = Field(0.9, description="Decay of the first moment.")
     beta_2: Decay = Field(0.999, description="Decay of the second moment.")
@@ -329,7 +324,7 @@ class OptimizerConfig(Section):
         1e-15,
         ge=1e-30,
         le=1,
-        description="Added to the root of the second moment; gradients are tiny.",
+        description="Added to the root of the second moment.",
     )
 
 
@@ -337,12 +332,15 @@ class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
     type: LossName = Field("photometric", description="photometric, or the name of an extension.")
-    dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 leaves D-SSIM out.")
+    dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 disables D-SSIM.")
     window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
-    sigma: float = Field(1.5, ge=0.1, le=1000, description="px: its standard deviation.")
+    sigma: float = Field(
+        1.5, ge=0.1, le=1000, description="px: standard deviation of SSIM's window."
+    )
     depth_weight: Weight = Field(
         0.2,
-        description="Of the mean difference in depth, in scene extents, if the data has depth.",
+        description="Weight of the mean absolute error of depth, in scene extents, if the data has "
+        "depth.",
     )
 
 
@@ -352,43 +350,47 @@ class ColorConfig(Section):
     lr: Rate | None = Field(
         None,
         gt=0,
-        description="First rate of the 3 x 4 numbers of each transform, such as 0.02; falls as "
-        "that of the means. null: there are no transforms.",
+        description="Initial rate of the 3 x 4 numbers of each transform, such as 0.02; decays as "
+        "the rate of the means. null: no transforms.",
     )
     identity_weight: Weight = Field(
-        1.0, description="Of the mean square by which a transform differs from the identity."
+        1.0, description="Weight of the mean squared difference from the identity."
     )
 
 
 class CamerasConfig(Section):
-    """Refinement of the training cameras; first rates, for 30,000 iterations, fall as the means'.
+    """Refinement of the training cameras; rates, for 30,000 iterations, decay as the means'.
 
     A pose has one step per use of its image: 70 in 7,000 iterations of 100 images.
     """
 
     optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
-    start: Count = Field(0, ge=0, description="Iterations before it begins.")
-    rotation_lr: CameraRate = Field(3e-4, ge=0, description="Radians.")
-    translation_lr: CameraRate = Field(3e-4, ge=0, description="In units of the scene extent.")
+    start: Count = Field(0, ge=0, description="Last iteration before it begins.")
+    rotation_lr: CameraRate = Field(3e-4, ge=0, description="Initial rate of rotations, radians.")
+    translation_lr: CameraRate = Field(
+        3e-4, ge=0, description="Initial rate of translations, scene extents."
+    )
     focal_lr: CameraRate = Field(
-        0.0, ge=0, description="Relative to the focal lengths, which all views share."
+        0.0, ge=0, description="Initial relative rate of the focal lengths, shared by all views."
     )
     principal_lr: CameraRate = Field(
-        0.0, ge=0, description="In parts of the image's size; all views share it."
+        0.0,
+        ge=0,
+        description="Initial rate of the principal point, image sizes, shared by all views.",
     )
 
 
 class OutputConfig(Section):
-    """Files that a fit leaves behind."""
+    """Output files of a fit."""
 
     dir: PathField | None = Field(
         None,
-        description="Folder, relative to the configuration file; null: out/NAME under the current "
-        "folder, NAME being that of the configuration file.",
+        description="Output folder, relative to the configuration file; null: out/NAME in the "
+        "current folder, with the NAME of the configuration file.",
     )
     bake_smoothing: bool = Field(
         False,
-        description="Apply model.smoothing to scales and opacities of point_cloud.ply.",
+        description="Bake model.smoothing into point_cloud.ply.",
     )
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
     report: bool = Field(
@@ -402,9 +404,9 @@ class OutputConfig(Section):
 
 
 class CoarseStage(Section):
-    """Iterations that see smaller images."""
+    """Iterations with smaller images."""
 
-    until: Count = Field(ge=1, description="The stage's last iteration.")
+    until: Count = Field(ge=1, description="Last iteration of the stage.")
     factor: int = Field(ge=2, le=64, description="Width and height are divided by this.")
 
 
@@ -422,7 +424,7 @@ def _format_section(section: BaseModel) -> str:
 
 
 class FitConfig(Section):
-    """Everything that decides a fit."""
+    """The configuration of a fit."""
 
     data: DataConfig
     init: InitConfig = subsection(InitConfig)
@@ -436,20 +438,21 @@ class FitConfig(Section):
     iterations: Count = Field(
         30_000,
         ge=1,
-        description="Rendered views; each is a step, but for optimizer.views_per_step and .views.",
+        description="Number of rendered views; each is a step unless optimizer.views_per_step is "
+        "set.",
     )
     coarse: Resolved[list[CoarseStage]] = Field(
         UNRESOLVED,
         description="Stages of smaller training images, before those of full size: a list of "
         "{until: iteration, factor: 4}. null: half the size for the first 35 % of a fit to "
-        "photographs of at least 100 px that are not cut out, else none; with the strategy adc "
-        "none, as in the paper.",
+        "opaque photographs of at least 100 px, else none; none with the strategy adc, as in the "
+        "paper.",
     )
-    seed: Count = Field(0, ge=0, description="Seed of everything random.")
+    seed: Count = Field(0, ge=0, description="Seed of all random numbers.")
     extensions: Sections = Field(
         default_factory=dict,
-        description="Sections of extensions, by name; one, be it empty, activates an effect or a "
-        "term of the loss.",
+        description="Sections of extensions, by name; a section, even an empty one, activates an "
+        "effect or a loss term.",
     )
 
     @property

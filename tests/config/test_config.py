@@ -212,7 +212,7 @@ def test_a_wrong_value_is_refused_with_file_key_expected_and_got(load, text, mes
         ("data: {}", "data.path is missing: Dataset folder; relative to the configuration file."),
         (
             "seed: 1",
-            "data is missing: The photographs and their cameras, and how they are read.",
+            "data is missing: Photographs, cameras, and how to read them.",
         ),
         ("", "must hold sections such as 'data:', got null"),
         ("- 1", "must hold sections such as 'data:', got [1]"),
