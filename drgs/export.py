@@ -195,7 +195,7 @@ def run(args: argparse.Namespace) -> None:
     target = targets()[name]
     source = load_source(args.what, target.honoured)
     if out.resolve() == source.path.resolve():
-        raise UserError(f"--out {out}: is what is exported; choose another name")
+        raise UserError(f"--out {out}: is the input; choose another name")
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
     up = _up_direction(args, source, target)
     gaussians = _select(source, args)

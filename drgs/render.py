@@ -396,7 +396,7 @@ def _check_cameras(args: argparse.Namespace) -> None:
     has_photographs = args.scene is not None or args.what.is_dir()
     if way is None and not has_photographs:
         raise UserError(
-            f"{args.what}: say what to render: --orbit N, --camera FILE.json, --origin X Y Z, or "
+            f"{args.what}: choose the cameras: --orbit N, --camera FILE.json, --origin X Y Z, or "
             "--split with --scene CONFIG.yml"
         )
     way = way or "split"

@@ -35,7 +35,7 @@ BENCH_FIELD_OF_VIEW = 0.691111  # rad, horizontal
 def bench_gaussians(count: int, seed: int = 0) -> Gaussians:
     """Return ``count`` Gaussians in and on the box [-1, 1]^3, as numpy arrays.
 
-    80 % are on a random face, moved inwards by |N(0, 0.05)|, the others uniform inside. Scales
+    80 % are on a random face, moved inwards by |N(0, 0.05)|, the rest uniform inside. Scales
     are log-normal around 0.01, rotations uniform, opacities uniform in [0.1, 0.95]; SH of degree
     3, with base colours uniform in [0, 1].
     """

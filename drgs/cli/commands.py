@@ -33,7 +33,7 @@ MAX_PORT = 65535  # of TCP
 class Subcommand(NamedTuple):
     """A command among several."""
 
-    text: str  # what it does, one phrase in small letters
+    text: str  # description, one phrase in lower case
     module: str  # has a function add_arguments(parser), which sets run(args) as a default
 
 

@@ -1,4 +1,4 @@
-"""Array types, constants, errors, files and LLVM: what everything else stands on.
+"""Array types, constants, errors, files and LLVM: the lowest layer.
 
 Imports nothing of drgs.
 """

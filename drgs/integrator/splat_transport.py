@@ -310,9 +310,8 @@ def _warn_of_close(
     }
     for name in sorted(close - splats.cache.too_close):
         message = (
-            f"splats: splats are so close to '{name}' for its size that its surface sees others "
-            "than its middle does, where its probe is: its image may be far from that of light "
-            "'rays'"
+            f"splats: '{name}' has splats so close to its surface that the probe at its centre is "
+            "inaccurate; compare with light 'rays'"
         )
         mi.Log(mi.LogLevel.Warn, message)  # pyright: ignore[reportCallIssue]  no type in the stub
     splats.cache.too_close |= close

@@ -119,7 +119,7 @@ def write_run_config(folder: Path, config: FitConfig) -> None:
     except UserError:
         is_same = False
     if not is_same:
-        note = f"{path}: was changed since the fit wrote it, and stays as it is"
+        note = f"{path}: was changed after the fit wrote it, and is kept"
         warnings.warn(UserNote(note), stacklevel=2)
 
 

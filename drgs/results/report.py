@@ -286,8 +286,8 @@ def _viewers(metrics: FitMetrics) -> str:
         return "splat viewers read it"
     link = f'<a href="{GAUSSIANS_FOR_VIEWERS}" download>{GAUSSIANS_FOR_VIEWERS}</a>'
     return (
-        f"for drgs; what most other viewers show right is {link}: they show the "
-        f"{metrics['viewers']['split']} views with {metrics['viewers']['psnr']:.2f} dB"
+        f"for drgs; for most other viewers, use {link}: they show the "
+        f"{metrics['viewers']['split']} views at {metrics['viewers']['psnr']:.2f} dB"
     )
 
 

@@ -190,9 +190,9 @@ class TrainingPage(Page):
         assert event.client is not None, "a client has clicked"
         gui = event.client.gui
         with gui.add_modal("End the fit here?") as modal:
-            gui.add_markdown("The results are those of a fit of as many iterations as are done.")
-            end = gui.add_button("End it", color="red")
-            stay = gui.add_button("Go on", color="gray")
+            gui.add_markdown("The results are those of a fit with the iterations so far.")
+            end = gui.add_button("End", color="red")
+            stay = gui.add_button("Continue", color="gray")
         for button in (end, stay):
             button.on_click(event_handler(modal.close))
         end.on_click(event_handler(self._end_fit))

@@ -110,7 +110,7 @@ def test_for_playcanvas_the_file_whose_low_pass_is_nearer_is_taken(fit, low_pass
 def test_what_was_exported_is_not_replaced_by_a_part_of_itself(model):
     run(model, "--format", "spz")
     source = model.with_name("model.spz")
-    message = f"--out {source}: is what is exported; choose another name"
+    message = f"--out {source}: is the input; choose another name"
     words = [source, "--format", "spz", "--min-opacity", "0.9"]
     assert_refused(export.main, *words, folder=model.parent, message=message)
 
@@ -280,7 +280,7 @@ def pose_turned(view, rotation):
         (["model.ply", "--out", "a.obj"], "--format: must be one of"),
         (["model.ply", "--format", "spz", "--out", "a.glb"], "name of a spz file must end in .spz"),
         (["model.ply", "--format", "ply", "--out", "a.compressed.ply"], "that of a compressed-ply"),
-        (["model.ply", "--format", "ply"], "is what is exported; choose another name"),
+        (["model.ply", "--format", "ply"], "is the input; choose another name"),
         (["none.ply", "--format", "spz"], "none.ply: there is no such file or folder"),
         ([".", "--format", "spz"], "must be the output folder of a fit that has ended"),
         (["model.ply", "--format", "spz", "--up", "cameras"], "--up cameras: needs the output"),

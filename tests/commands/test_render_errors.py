@@ -33,7 +33,7 @@ def fails(capsys, *arguments):
         ("nowhere.ply", [], "there is no such file or folder"),
         ("../data", [], "there is no config.yml in it"),
         ("config.yml", [], "must be a file of Gaussians (.ply, .compressed.ply, .spz,"),
-        ("point_cloud.ply", [], "say what to render: --orbit N"),
+        ("point_cloud.ply", [], "choose the cameras: --orbit N"),
         ("point_cloud.ply", ["--split", "test"], "needs photographs"),
         (
             "point_cloud.ply",

@@ -145,7 +145,7 @@ def test_objects_too_close_to_splats_are_warned_of_once():
                 params["integrator.sh0"] = params["integrator.sh0"] + 0.1
                 params.update()
                 mi.render(found, spp=1, seed=seed)
-            assert sum("so close to 'ball'" in line for line in lines) == count
+            assert sum("'ball' has splats so close" in line for line in lines) == count
     finally:
         logger.remove_appender(appender)
 

@@ -151,7 +151,7 @@ def test_a_fit_is_seen_paused_and_ended(tmp_path):
         first = iteration()
         browsers.wait_until(lambda: iteration() > first, "progress")
         page.click("Pause")
-        page.wait_for("[...document.querySelectorAll('button')].some(b => b.innerText == 'Go on')")
+        page.wait_for("[...document.querySelectorAll('button')].some(b => b.innerText == 'Continue')")
         time.sleep(FADE_SECONDS)
         held, still = iteration(), seen(page)
         page.drag((400, 500), (340, 530))
@@ -159,11 +159,11 @@ def test_a_fit_is_seen_paused_and_ended(tmp_path):
             lambda: np.abs(seen(page) - still).mean() > 3, lambda: "an image in the pause"
         )
         assert iteration() == held
-        page.click("Go on")
+        page.click("Continue")
         browsers.wait_until(lambda: iteration() > held, "progress after the pause")
         assert_clean(page, address)  # once the fit has ended, nobody answers the page
         page.click("End and write results")
-        page.click("End it")
+        page.click("End")
         assert process.wait(120) == 0, log.read_text()
         done = json.loads((out / "metrics.json").read_text())["iterations"]
         assert held < done < ENDLESS and f"{done} iterations in" in log.read_text()
