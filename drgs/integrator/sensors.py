@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 from typing_extensions import override
 
-from drgs.cameras.camera import Camera
+from drgs.cameras.camera import Aperture, Camera
 from drgs.core.arrays import types_of
 from drgs.core.errors import PluginError, PluginTypeError
 from drgs.core.types import Array3f, Float, Matrix3f, Matrix4f
@@ -142,13 +142,9 @@ def _perspective(state: SensorState) -> Camera:
 
 
 def _thin_lens(state: SensorState) -> Camera:
-    from drgs.cameras.thin_lens import RoundAperture
-
     device = state.device
     scales = axis_lengths(device["to_world"])
-    aperture = RoundAperture(
-        device["aperture_radius"] * scales[0], device["focus_distance"] * scales[2]
-    )
+    aperture = Aperture(device["aperture_radius"] * scales[0], device["focus_distance"] * scales[2])
     return replace(_perspective(state), aperture=aperture)
 
 

@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from support.helpers import FLOAT32, Case, device_camera, device_gaussians
 
 from drgs.accuracy.exact import RayFalloff, exact_shape
-from drgs.cameras.thin_lens import RoundAperture
+from drgs.cameras.camera import Aperture
 from drgs.effects.compose import with_effects, without_effects
 from drgs.effects.defocus import Defocused, DimmedFalloff
 from drgs.effects.smoothing import apply_smoothing
@@ -17,7 +17,7 @@ from drgs.splatting import rendering
 from drgs.splatting.footprint import FootprintModel
 
 CASE = Case("compose", 16, 12, 0, count=12)
-APERTURE = RoundAperture(llvm.Float(0.1), llvm.Float(2.0))
+APERTURE = Aperture(llvm.Float(0.1), llvm.Float(2.0))
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ from support.reference_lenses import camera_at_origin, gaussians_at
 from support.reference_scenes import numeric_gradients
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.cameras import thin_lens
+from drgs.cameras.camera import Aperture
 from drgs.config.approximations import Approximations
 from drgs.effects.defocus import Defocused
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -97,7 +97,7 @@ def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pas
     shape = ewa
     if defocus is not None:
         numbers = (dr.opaque(precision.Float, n) for n in vars(defocus).values())
-        device = replace(device, aperture=thin_lens.RoundAperture(*numbers))
+        device = replace(device, aperture=Aperture(*numbers))
         shape = Defocused(ewa)
     parameter_rows = load_rows(device_gaussians(gaussians, precision), 0)
     return project(parameter_rows, device, 0, rule, shape, low_pass=low_pass)
@@ -164,7 +164,7 @@ def aperture_camera(camera, precision, defocus):
     if defocus is None:
         return device
     numbers = (dr.opaque(precision.Float, n) for n in vars(defocus).values())
-    return replace(device, aperture=thin_lens.RoundAperture(*numbers))
+    return replace(device, aperture=Aperture(*numbers))
 
 
 # ----------------------------------------------------------------------------------------------

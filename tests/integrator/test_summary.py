@@ -33,7 +33,7 @@ from drgs.training.summary import summary_of_fit
 
 MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
-    "cameras.radial_tangential", "cameras.thin_lens",
+    "cameras.radial_tangential",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
     "effects.smoothing", "integrator.splat_transport", "integrator.shadows",
     "integrator.surfaces",
@@ -511,7 +511,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
             "drgs.cameras.distortion",
             "drgs.cameras.radial_tangential",
         ],
-        "thin lens": ["drgs.cameras.thin_lens", "drgs.effects.defocus"],
+        "thin lens": ["drgs.effects.defocus"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
         "light": ["drgs.integrator.splat_transport", "drgs.light.grid", "drgs.light.walk"],
     }

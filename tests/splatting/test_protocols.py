@@ -13,7 +13,6 @@ from drgs.cameras import (
     motion,
     orthographic,
     radial_tangential,
-    thin_lens,
     thin_prism_fisheye,
 )
 from drgs.effects import defocus, occlusion
@@ -32,7 +31,6 @@ CLASSES = {
         pixel_lists.ParallelDepths,
         pixel_lists.RayDepths,
     ),
-    camera.Aperture: (thin_lens.RoundAperture,),
     lens.Lens: (
         lens.Pinhole,
         radial_tangential.RadialTangential,
@@ -87,7 +85,7 @@ def test_a_class_has_what_its_protocol_says(protocol, implementation):
 
 
 def test_what_is_missing_is_found():
-    assert "view_direction" in missing(lens.Lens, thin_lens.RoundAperture)
+    assert "view_direction" in missing(lens.Lens, camera.Aperture)
     assert missing(lens.Lens, lens.Perspective) == ["project_point", "projection_jacobian"]
 
     class Protocol:

@@ -8,8 +8,8 @@ from functools import cache
 import drjit as dr
 import numpy as np
 
-from drgs.cameras import fisheye, orthographic, thin_lens, thin_prism_fisheye
-from drgs.cameras.camera import Camera
+from drgs.cameras import fisheye, orthographic, thin_prism_fisheye
+from drgs.cameras.camera import Aperture, Camera
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects
@@ -147,7 +147,7 @@ class LensCase(Case):
             return camera
         assert self.camera.fx == self.camera.fy, "an aperture's disc is round"
         numbers = (self.defocus.aperture_radius, self.defocus.focus_distance)
-        aperture = thin_lens.RoundAperture(*(dr.opaque(precision.Float, n) for n in numbers))
+        aperture = Aperture(*(dr.opaque(precision.Float, n) for n in numbers))
         return replace(camera, aperture=aperture)
 
     def render(self, precision: Precision, pipeline=None) -> tuple[Gaussians, rendering.Frame]:

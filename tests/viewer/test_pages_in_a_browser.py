@@ -151,7 +151,9 @@ def test_a_fit_is_seen_paused_and_ended(tmp_path):
         first = iteration()
         browsers.wait_until(lambda: iteration() > first, "progress")
         page.click("Pause")
-        page.wait_for("[...document.querySelectorAll('button')].some(b => b.innerText == 'Continue')")
+        page.wait_for(
+            "[...document.querySelectorAll('button')].some(b => b.innerText == 'Continue')"
+        )
         time.sleep(FADE_SECONDS)
         held, still = iteration(), seen(page)
         page.drag((400, 500), (340, 530))
