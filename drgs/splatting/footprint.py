@@ -1,13 +1,13 @@
 """The footprint of a splat at the 16 pixels of a micro-tile: the image model of the kernels.
 
-A :class:`FootprintModel` holds what tiles and compositing have to agree on, each an object that the
-kernels' Python code calls while Dr.Jit traces it. The classes here are the bases, and the defaults,
-those of the 3DGS paper; others are in modules of their own, imported when they are chosen:
+A :class:`FootprintModel` holds four choices that tiles and compositing share, each an object that
+the kernels call while Dr.Jit traces them. The classes here are the base classes and the defaults of
+the 3DGS paper; others are in separate modules, imported when they are chosen:
 
-- *falloff*: how alpha falls off around a splat (:class:`GaussianFalloff`)
-- *positions*: where in a pixel it is evaluated (:class:`Positions`: :class:`PixelCenters`)
-- *features*: what is composited of a splat (:class:`SplatFeatures`)
-- *cutoffs*: where splats and pixels end (:class:`drgs.splatting.cutoffs.Cutoffs`)
+- *falloff*: alpha around a splat (:class:`GaussianFalloff`)
+- *positions*: sample positions in a pixel (:class:`SamplePositions`: :class:`PixelCenters`)
+- *features*: composited values of a splat (:class:`SplatFeatures`)
+- *cutoffs*: extent of splats and end of pixels (:class:`drgs.splatting.cutoffs.Cutoffs`)
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Alpha:
 
 
 # ----------------------------------------------------------------------------------------------
-# Where in a pixel
+# Sample positions
 # ----------------------------------------------------------------------------------------------
 
 
@@ -174,7 +174,7 @@ def total(values: list[Float]) -> Float:
 
 
 def flat_columns(rows: list) -> list[Float]:
-    """The 16 values of 4 rows of 4."""
+    """Flatten 4 rows of 4 values."""
     return [value for row in rows for value in row]
 
 
@@ -186,7 +186,7 @@ def _dot(a: list[Float], b: list[Float]) -> Float:
 
 
 # ----------------------------------------------------------------------------------------------
-# How alpha falls off
+# Falloff
 # ----------------------------------------------------------------------------------------------
 
 
@@ -208,12 +208,12 @@ Offsets = Callable[[Float, Float], tuple[list, list]]
 @FALLOFFS.register("gaussian")
 @dataclass(frozen=True)
 class GaussianFalloff:
-    """The projected Gaussian is a Gaussian on the film: alpha = o exp(-|U d|^2 / 2).
+    """The projected Gaussian is a Gaussian in the image: alpha = o exp(-|U d|^2 / 2).
 
-    The base of all falloffs. *Geometry* are the numbers of a splat that decide its alpha: mean
+    The base of all falloffs. The *geometry* of a splat are the numbers that alpha depends on: mean
     x, y (px); then p, r, s of U and log2_opacity, scaled such that log2_alpha = log2_opacity -
-    |U d|^2; a falloff may have others besides. *Moments* are sums over pixels, weighted by
-    d loss / d ln(alpha), that give the derivatives of what :meth:`differentiable` lists.
+    |U d|^2; subclasses may add more. *Moments* are sums over pixels, weighted by
+    d loss / d ln(alpha), from which :meth:`derivatives` follow.
     """
 
     @property
@@ -227,44 +227,44 @@ class GaussianFalloff:
         return 6
 
     def for_camera(self, camera: Camera) -> GaussianFalloff:
-        """Return this falloff for one camera; here, nothing depends on it."""
+        """Return this falloff for one camera; here, it is independent of the camera."""
         del camera
         return self
 
     def geometry(self, splats: Splats2D) -> list[Float]:
-        """Columns, one value per Gaussian."""
+        """Return the geometry, Float (N,) each."""
         p, r, s = splats.conic_factor * WHITENING_SCALE
         return [*splats.means2d, p, r, s, dr.log2(splats.opacities)]
 
     def differentiable(self, splats: Splats2D) -> list[Float]:
-        """Return the variables of :meth:`derivatives`: as many columns as geometry."""
+        """Return the variables of :meth:`derivatives`, as many as the geometry has."""
         return [*splats.means2d, *splats.conic_factor, splats.opacities]
 
     def bounds(
         self, splats: Splats2D, geometry: list[Float], reach: Float
     ) -> tuple[Array2f, Array2f]:
-        """Return centre and half sizes (Array2f, px) of a box around all that shows.
+        """Return centre and half sizes (Array2f, px) of the visible part's bounding box.
 
-        reach: by how much log2_alpha may be below log2_opacity; here, of |U d|^2.
+        reach: the largest log2_opacity - log2_alpha; here, the largest |U d|^2.
         """
         del geometry
         return splats.means2d, dr.sqrt(2 * math.log(2) * reach * splats.variances)
 
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
-        """Mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
+        """Return mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that contains the splat."""
         del reach
         return geometry[:5]
 
     def log2_opacity(self, geometry: list[Float]) -> Float:
-        """The base-2 logarithm of the opacity."""
+        """Return the base-2 logarithm of the opacity."""
         return geometry[5]
 
     def log2_floor(self, geometry: list[Float], cutoffs: Cutoffs) -> Float | float:
-        """The base-2 logarithm of the smallest alpha of a splat."""
+        """Return the base-2 logarithm of the smallest alpha of a splat."""
         return cutoffs.log2_floor(self.log2_opacity(geometry))
 
     def coordinates(self, geometry: list[Float], x: Float, y: Float) -> tuple[Float, Float]:
-        """U d at a point of the film, px."""
+        """Return U d at a point of the film, px."""
         mean_x, mean_y, p, r, s = geometry[:5]
         dx, dy = x - mean_x, y - mean_y
         return dr.fma(p, dx, r * dy), s * dy
@@ -282,8 +282,7 @@ class GaussianFalloff:
         v = [[s * y for y in row] for row in dy]
         log2_alpha = [
             dr.fma(-a, a, dr.fma(-b, b, log2_opacity))
-            for rows in zip(u, v, strict=True)
-            for a, b in zip(*rows, strict=True)
+            for a, b in zip(flat_columns(u), flat_columns(v), strict=True)
         ]
         return Footprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
 
@@ -292,8 +291,7 @@ class GaussianFalloff:
     ) -> list[Float]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
         dx, dy = footprint.dx, footprint.dy
-        u = [value for row in footprint.u for value in row]
-        z = [a * b for a, b in zip(weights, u, strict=True)]
+        z = [a * b for a, b in zip(weights, flat_columns(footprint.u), strict=True)]
         return [
             positions.sum(weights),
             positions.sum(z),
@@ -323,56 +321,54 @@ class GaussianFalloff:
         ]
 
     def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
-        """Tangents of the geometry, that of the opacity as d ln(opacity)."""
+        """Return tangents of the geometry, with d ln(opacity) for the opacity."""
         *others, d_opacity = tangents
         return [*others, d_opacity * dr.exp2(-self.log2_opacity(geometry))]
 
     def tangent(
         self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
     ) -> list[Float]:
-        """Tangent of ln(alpha) at the 16 pixels."""
+        """Return the tangent of ln(alpha) at the 16 pixels."""
         _, _, p, r, s, _ = geometry
         d_x, d_y, d_p, d_r, d_s, d_log_opacity = d_geometry
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
         scale = 2 * math.log(2)
         result = []
-        for dx_row, dy_row, u_row, v_row in zip(
-            footprint.dx, footprint.dy, footprint.u, footprint.v, strict=True
-        ):
-            for dx, dy, u, v in zip(dx_row, dy_row, u_row, v_row, strict=True):
-                dv = dr.fma(d_s, dy, -s * d_y)
-                d_row = dr.fma(-scale * v, dv, d_log_opacity)
-                du_row = dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y))
-                result.append(dr.fma(-scale * u, dr.fma(d_p, dx, du_row), d_row))
+        grids = map(flat_columns, (footprint.dx, footprint.dy, footprint.u, footprint.v))
+        for dx, dy, u, v in zip(*grids, strict=True):
+            dv = dr.fma(d_s, dy, -s * d_y)
+            d_row = dr.fma(-scale * v, dv, d_log_opacity)
+            du_row = dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y))
+            result.append(dr.fma(-scale * u, dr.fma(d_p, dx, du_row), d_row))
         return result
 
 
 # ----------------------------------------------------------------------------------------------
-# What is composited
+# Features
 # ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class FeatureGroup:
-    """Features that one kernel composites, of many."""
+    """A subset of the features, composited by one kernel."""
 
-    stored: list[int]  # places of the numbers that they need among all that are stored
-    planes: list[int]  # places of their planes among all; one may be of several groups
+    stored: list[int]  # indices of the stored numbers that they need
+    planes: list[int]  # indices of their planes; a plane may belong to several groups
     features: SplatFeatures
 
 
 @dataclass(frozen=True)
 class SplatFeatures:
-    """The composited features of a splat, from the numbers that are stored of it.
+    """The composited features of a splat, computed from its stored numbers.
 
-    Here its features are the same at every pixel: what is stored is what is composited.
+    Here they are the stored numbers, the same at every pixel.
     """
 
     def groups(self, num_stored: int, size: int) -> list[FeatureGroup]:
         """Divide the features into groups of at most ``size`` planes.
 
-        Numbers that are stored for more than their own plane are of the first group, the others
-        are composited as they are.
+        Numbers that several planes need are in the first group, with these planes. All others are
+        composited unchanged.
         """
         more, plain = num_stored - self.num_planes(num_stored), SplatFeatures()
         groups = []
@@ -384,11 +380,11 @@ class SplatFeatures:
         return groups
 
     def num_planes(self, num_stored: int) -> int:
-        """Planes that come of ``num_stored`` numbers per splat."""
+        """Return the number of planes for ``num_stored`` numbers per splat."""
         return num_stored
 
     def for_camera(self, camera: Camera) -> SplatFeatures:
-        """Return the features for one camera; here, nothing depends on it."""
+        """Return the features for one camera; here, they are independent of the camera."""
         del camera
         return self
 
@@ -396,28 +392,28 @@ class SplatFeatures:
         """Raise UnsupportedError if they depend on the camera other than through stored numbers."""
 
     def with_weight_derivatives(self) -> SplatFeatures:
-        """Return features whose derivatives with respect to the first number are weights."""
+        """Return features whose derivative with respect to the first number is the weight."""
         return self
 
     def bind(self, lanes: Lanes, positions: SamplePositions) -> SplatFeatures:
-        """Return the features for the lanes of one kernel; here, nothing depends on the pixels."""
+        """Return the features for one kernel's lanes; here, they do not depend on the pixel."""
         del lanes, positions
         return self
 
     def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
-        """The splat's features at a pixel."""
+        """Return the splat's features at a pixel."""
         del pixel
         return stored
 
     def add(
         self, planes: list[Float], stored: list[Float], pixel: int, weight: Float
     ) -> list[Float]:
-        """A pixel's ``planes`` with this splat's share; weight: T alpha."""
+        """Return a pixel's ``planes`` plus this splat's contribution; weight: T alpha."""
         features = self.pixel_values(stored, pixel)
         return [dr.fma(weight, c, plane) for c, plane in zip(features, planes, strict=True)]
 
     def feature_gradient(self, stored: list[Float], pixel: int, g: list[Float]) -> Float | int:
-        """c . g, with the features c at a pixel and the loss's derivatives g there."""
+        """Return c . g, with the features c and the derivatives g of the loss at a pixel."""
         result: Float | int = 0  # there may be no features, but alpha alone
         for c, derivative in zip(self.pixel_values(stored, pixel), g, strict=True):
             result = dr.fma(c, derivative, result)
@@ -426,7 +422,7 @@ class SplatFeatures:
     def add_derivatives(
         self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
     ) -> list[Float]:
-        """Return ``totals`` with one pixel's share of the derivatives with respect to ``stored``.
+        """Return ``totals`` plus one pixel's derivatives with respect to ``stored``.
 
         weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
         """
@@ -436,14 +432,14 @@ class SplatFeatures:
         ]
 
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
-        """Tangents of the features at a pixel."""
+        """Return tangents of the features at a pixel."""
         del stored, pixel
         return d_stored
 
 
 @dataclass(frozen=True)
 class FootprintModel:
-    """The footprint of splats, as tiles and compositing see it; see the module's description."""
+    """The image model of splats; see the module's description."""
 
     falloff: GaussianFalloff = field(default_factory=GaussianFalloff)
     positions: SamplePositions = field(default_factory=PixelCenters)
@@ -451,7 +447,7 @@ class FootprintModel:
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
 
     def for_camera(self, camera: Camera) -> FootprintModel:
-        """This model for one camera."""
+        """Return this model for one camera."""
         return replace(
             self,
             falloff=self.falloff.for_camera(camera),
@@ -473,11 +469,11 @@ class FootprintModel:
         )
 
     def footprint(self, geometry: list[Float], lanes: Lanes, active: Bool | bool) -> Footprint:
-        """A splat at the pixels of each lane."""
+        """Evaluate a splat at the pixels of each lane."""
         return self.falloff.footprint(geometry, partial(self.positions.offsets, lanes), active)
 
     def alphas(self, geometry: list[Float], footprint: Footprint) -> list[Alpha]:
-        """Alpha at the 16 pixels."""
+        """Return alpha at the 16 pixels."""
         floor = self.falloff.log2_floor(geometry, self.cutoffs)
         return [Alpha.from_log2(x, floor, self.cutoffs.alpha_max) for x in footprint.log2_alpha]
 
