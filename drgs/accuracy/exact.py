@@ -1,13 +1,13 @@
 r"""Splats evaluated along each pixel's ray: the projection ``exact``, and depths at a pixel.
 
-Imported when it is chosen. The affine approximation (EWA) replaces a Gaussian by one on the film.
-What a ray really meets is the Gaussian's peak along it, and that is hardly more work.
+Imported when it is selected. The affine approximation (EWA) replaces a Gaussian by one in image
+space. The exact maximum along a ray is the Gaussian's peak, at little more cost.
 
 In camera axes let d be a pixel's offset from the mean on the film, in the coordinates e = U d in
 which the affine approximation at the mean is the unit Gaussian. Write k for the covariance of the
 position on the film with z / z_mean, w for the variance of z / z_mean, kappa = U k, and h = w -
-|kappa|^2: the variance of z / z_mean where the position on the film is known. Along the ray through
-the pixel, the smallest Mahalanobis distance from the mean, rho^2, and where it lies, z, are
+|kappa|^2: the variance of z / z_mean given the position on the film. Along the ray through the
+pixel, the smallest squared Mahalanobis distance from the mean, rho^2, and its depth z are
 
     rho^2 = |e|^2 / D,  z = z_mean a / D,  a = 1 - kappa . e,  D = a^2 + h |e|^2
 
@@ -21,25 +21,25 @@ falloff.
 The low-pass widens the Gaussian parallel to the film, which changes C and neither k nor w.
 
 **Anchor.** Where a mean is far outside the film, but its splat reaches it, a is a small difference
-of large numbers. It is linear in the pixel, and so is known from a point c of the film, the closest
-to the mean: a = a_c + g . (x - c). The same formulas, seen from the ray through c and with primes
-(m = U' (c - mean), a' = 1 + kappa' . m, D' = a'^2 + h' |m|^2), give sums of what is small:
+of large numbers. It is linear in the pixel, so it follows from its value at the point c of the film
+that is closest to the mean: a = a_c + g . (x - c). The same formulas for the ray through c, with
+primes (m = U' (c - mean), a' = 1 + kappa' . m, D' = a'^2 + h' |m|^2), give sums of small terms:
 
     a_c = a' / D',  g = -U'^T (a' kappa' + h' m) / D',  h = h' / D'
 
 *Proof.* By the same two inversions, from C' = C - d k^T - k d^T + w d d^T back to C. Where the mean
 is on the film, c is the mean, a_c = 1, g = -U^T kappa.
 
-As rho^2 is a ratio, U, g and z_mean are divided by |a_c| once and for all: then a = +-1 +
-g . (x - c). The sign, that of a_c, is kept as that of U, which does not matter otherwise.
+As rho^2 is a ratio, U, g and z_mean are divided by |a_c| once: then a = +-1 + g . (x - c). The sign
+of a_c is stored as the sign of U, which is arbitrary otherwise.
 
-**Parallel rays** see no perspective. Where the position on the film is known, the depth is expected
-at z = z_mean (1 + kappa . e) (linear regression), and there is the peak.
+**Parallel rays** have no perspective. Given the position on the film, the expected depth, which is
+the peak's, is z = z_mean (1 + kappa . e) (linear regression).
 
-**Extent.** With t = |U d|^2 the smallest exponent that shows, |e|^2 <= t D is |e| <= sqrt(q) a with
+**Extent.** With t = |U d|^2 the largest visible exponent, |e|^2 <= t D is |e| <= sqrt(q) a with
 q = t / (1 - t h): a conic section with a focus in the mean and the eccentricity sqrt(q) |kappa|. If
-that is below 1 it is an ellipse, which :meth:`RayFalloff.outline` finds; otherwise the splat
-reaches around the camera and is taken to be everywhere.
+that is below 1 it is an ellipse, which :meth:`RayFalloff.outline` computes; otherwise the splat
+extends around the camera, and its outline is unbounded.
 """
 
 from __future__ import annotations
@@ -76,9 +76,8 @@ from drgs.splatting.projection import (
 )
 
 MAX_ECCENTRICITY = 0.99
-"""Outlines whose squared eccentricity is larger are taken to be everywhere: an ellipse ten times as
-long as wide, whose size is known to 1e-5 in single precision. The same for t h, the share of the
-way to the camera."""
+"""Outlines of a larger squared eccentricity are treated as unbounded. At the limit, an ellipse is
+ten times as long as wide, and its size accurate to 1e-5 in single precision. It also limits t h."""
 
 _UNBOUNDED_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
 
@@ -91,7 +90,7 @@ def exact_shape(
     """Project to the shape that :class:`RayFalloff` evaluates; its slopes are not clamped.
 
     Its conic factor is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
-    where the anchor is, which makes no difference.
+    the position of the anchor, which does not change the result.
     """
     m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
     film = factor_conic(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)

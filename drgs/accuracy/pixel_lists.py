@@ -1,9 +1,9 @@
 """Depths of splats' peaks along the ray of each pixel, and lists that are sorted by them.
 
-What the order of each pixel (``drgs.accuracy.pixel_order``) compares: :class:`RayDepths` where the
-falloff finds the peak anyway (``drgs.accuracy.exact``, whose formulas these are),
-:class:`AffineDepths` where it does not, :class:`ParallelDepths` of parallel rays. It starts from
-:class:`PixelLists`: what each micro-tile composites, sorted by the depths of peaks at its middle.
+The sort keys of ``drgs.accuracy.pixel_order`` are :class:`RayDepths` if the falloff computes the
+peak (``drgs.accuracy.exact``, which has the formulas), :class:`AffineDepths` otherwise, and
+:class:`ParallelDepths` for parallel rays. :class:`PixelLists` has the entries of each micro-tile,
+sorted by the depths of the peaks at its centre.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 
 @dataclass(frozen=True)
 class AffineDepths:
-    """Base of depths at a pixel, for a falloff that does not know them: stores kappa and h."""
+    """Depths at a pixel from kappa and h, for falloffs that compute none; the base class."""
 
     bounds: tuple[Float, Float] | None = None  # nearest and farthest, (H * W,), scene units
     bound: list[tuple[Float, Float]] = field(default_factory=list)  # the same, at the 16 of a lane
 
     def for_camera(self, camera: Camera) -> AffineDepths:
-        """Bind to a camera, whose rays may be parallel."""
+        """Return the depths for one camera, which may have parallel rays."""
         return ParallelDepths(self.bounds) if camera.lens.parallel else self
 
     def keys(self, splats: Splats2D) -> list[Float]:
@@ -109,7 +109,7 @@ class WithAffineDepth:
 
 @dataclass(frozen=True)
 class ParallelDepths(AffineDepths):
-    """The same for rays that are parallel."""
+    """Depths at a pixel for parallel rays."""
 
     @staticmethod
     @override
@@ -120,9 +120,9 @@ class ParallelDepths(AffineDepths):
 
 @dataclass(frozen=True)
 class RayDepths(AffineDepths):
-    """Depths at a pixel for ``RayFalloff``, which computes them."""
+    """Depths at a pixel by ``RayFalloff``."""
 
-    camera: Camera | None = None  # whose film has the anchors
+    camera: Camera | None = None
 
     @override
     def for_camera(self, camera: Camera) -> RayDepths:
@@ -153,7 +153,7 @@ class RayDepths(AffineDepths):
 
 
 MAX_DEPTH_RATIO = 4.0
-"""Between this and its inverse is the depth by which a list is sorted, relative to the mean's."""
+"""Sort keys of lists, relative to the mean's depth, are clamped to this and its inverse."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class PixelLists:
     def build(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
         """Make the lists. The host reads one value, the number of items."""
         t = types_of(bins.rows.Float)
-        # Entries as they are made, and one behind the last.
+        # Unsorted entries, and one behind the last.
         position = dr.arange(t.UInt32, bins.num_entries)
         entry = dr.zeros(t.UInt32, bins.num_entries + 1)
         dr.scatter(entry, position, dr.gather(t.UInt32, bins.source, position))
@@ -210,13 +210,13 @@ class PixelLists:
 
 
 _LEVELS = 1 << 14
-"""Depths that the lists distinguish: as many as one pass of a sort can. Where they do not, splats
-are in the order of their means, and the window sorts what is left."""
+"""Number of distinct depths in lists, limited by one pass of a sort. Splats of equal level are in
+the order of their means, and the window sorts them."""
 
 
 def _levels(depths: Float) -> UInt32:
     """Quantize positive depths to ``_LEVELS`` parts of their range; nearly logarithmic."""
-    # The bits of positive single-precision numbers are ordered as they are.
+    # Bits of positive single-precision numbers have the order of the numbers.
     Single = cast(type[Float], dr.float32_array_t(type(depths)))
     bits = reinterpret(types_of(Single).UInt32, Single(depths))
     first = dr.min(bits)
@@ -234,7 +234,7 @@ def _items(
     item: UInt32,
     count: int,
 ) -> tuple[Float, UInt32, UInt32]:
-    """Make items: the depths of peaks at the middle of micro-tiles, micro-tiles, and entries.
+    """Return items: the depths of peaks at the centre of micro-tiles, micro-tiles, and entries.
 
     entry: sorted entries; masks: their micro-tiles; item: the first of each one's items.
     """
@@ -256,7 +256,7 @@ def _items(
         micro = dr.tzcnt(masks)
         middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
         a, denominator = depths.depth_ratio(bins.model.falloff, geometry, keys, *middle)
-        # Where there is no peak, there may be one at a neighbour.
+        # Without a peak here, a neighbouring pixel may have one.
         along = dr.select(a > 0, a / denominator, 1)
         along = dr.select(along < 1 / MAX_DEPTH_RATIO, 1 / MAX_DEPTH_RATIO, along)
         along = dr.select(along > MAX_DEPTH_RATIO, MAX_DEPTH_RATIO, along)

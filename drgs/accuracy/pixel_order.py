@@ -1,24 +1,23 @@
-"""Splats in the order of each pixel: ``order: pixel``.
+"""An order of compositing for each pixel: ``order: pixel``, imported when it is selected.
 
-Imported when it is chosen. By default all pixels composite in one order, that of the depths of the
-means; splats that interpenetrate then swap as a whole when the camera moves (*popping*). Here each
-pixel orders splats by the depth of their peak along its own ray.
+By default, all pixels composite in the order of the depths of the means; interpenetrating splats
+then swap as a whole when the camera moves (*popping*). Here each pixel sorts splats by the depth of
+their peak along its own ray.
 
-A pixel keeps a *window* of the K nearest splats that it has met and not yet composited (Radl et al.
-2024, "StopThePop", section 4, with a window of one level). A splat that is met is inserted, and the
-nearest of the K + 1 is composited. Each micro-tile has a list of its own, sorted by the depths of
-the peaks along the ray through its middle. The order is exact wherever a splat's place among those
-of its pixel differs by at most K from its place in that list; the error vanishes as K grows, but
-for what :data:`UNORDERED_ALPHA` leaves out.
+A pixel keeps a *window* of the K nearest pending splats (Radl et al. 2024, "StopThePop", section 4,
+with a window of one level). The next splat is inserted, and the nearest of the K + 1 is composited.
+Each micro-tile has its own list, sorted by the depths of the peaks along the ray through its
+centre. The order is exact where the rank of a splat at a pixel differs by at most K from its rank
+in the list; the error vanishes as K grows, except for alphas below :data:`UNORDERED_ALPHA`.
 
-Nothing jumps: inserting into a sorted window is K comparisons with selections, at every pixel.
+Insertion into a sorted window takes K comparisons with selections at every pixel, without branches.
 
-**Adjoint.** Pixels of a micro-tile composite different splats at the same time, while a splat's
-partial derivatives are sums over pixels. So two walks compute what a pixel contributes, and store w
-= T alpha and d loss / d ln(alpha) where the splat's pixels are together; a third walk sums. What
-lies behind a splat, b (see ``drgs.splatting.rasterize``), follows from the sum over all
-splats less that of the splats in front. That difference would cancel: both sums are kept as two
-numbers each, whose sum is exact to twice the precision.
+**Adjoint.** The pixels of a micro-tile composite different splats at the same time, while a splat's
+partial derivatives are sums over pixels. Two passes therefore compute each pixel's contribution,
+and store w = T alpha and d loss / d ln(alpha) by splat; a third pass sums over the pixels. b, the
+derivative behind a splat (see ``drgs.splatting.rasterize``), is the sum over all splats minus that
+over the splats in front. To avoid cancellation, each sum is stored as two numbers, which are exact
+to twice the precision.
 """
 
 from __future__ import annotations
@@ -57,11 +56,11 @@ from drgs.splatting.tiles import TileBins
 S = TypeVar("S")
 
 UNORDERED_ALPHA = 1e-4
-"""A smaller alpha, which only a smaller alpha cut lets in, is composited when it is met, before all
-that waits. Two splats in the wrong order change a pixel by the product of their alphas: a splat
-loses at most the sum of the faint alphas behind it, and no window makes up for that. But in order,
-the faint rims of large splats, whose peaks are far from everything else, would fill the windows:
-uncut, a fitted scene is 52.4 dB from the true order with 16 places, and 51.3 dB with 1e-6 here."""
+"""Smaller alphas, which occur with a smaller alpha cut, are composited at once, before the window.
+Two splats in the wrong order change a pixel by the product of their alphas, so a splat loses at
+most the sum of the faint alphas behind it. In order, the faint rims of large splats, whose peaks
+are far away, would fill the windows: uncut, a fitted scene is 52.4 dB from the true order with 16
+places, and 51.3 dB with 1e-6 here."""
 
 
 @ORDERS.register("pixel")
@@ -126,7 +125,7 @@ class PixelOrder(CenterOrder):
 
 @dataclass(frozen=True)
 class _Crossing:
-    """A splat that the lanes meet."""
+    """The next splat of each lane."""
 
     place: UInt32  # in the lists
     entry: UInt32  # sorted
@@ -189,7 +188,7 @@ class _WalkInputs:
         return self.model.cutoffs.transmittance_stop
 
     def transmittance(self) -> list[Float]:
-        """Return that of the 16 pixels before the first splat; those off the film are finished."""
+        """Return the initial transmittance of the 16 pixels; pixels off the film are finished."""
         Float = self.bins.rows.Float
         inside = [inside for _, inside in pixels_of(self.lanes, self.bins.grid)]
         return [dr.select(of_pixel, Float(1), -1) for of_pixel in inside]
@@ -210,9 +209,9 @@ def _walk(
 ) -> S:
     """Visit each pixel's splats in their order; returns the last state.
 
-    carry: the numbers that a splat brings along at a pixel; visit: from a state and, for each
-    pixel, alpha and what was carried, to the next state and whether any pixel is unfinished;
-    nothing: what is carried where there is no splat, with an alpha of 0.
+    carry: returns the numbers of a splat at a pixel; visit: maps a state and, for each pixel, alpha
+    and these numbers to the next state and whether any pixel is unfinished; nothing: the numbers
+    where there is no splat, with an alpha of 0.
     """
     lists, records, lanes = inputs.lists, inputs.records, inputs.lanes
     model, order = inputs.model, inputs.order
@@ -227,8 +226,8 @@ def _walk(
         footprint = model.footprint(geometry, lanes, active)
         alphas = model.alphas(geometry, footprint)
         met = _Crossing(place, entry, active, geometry, features, footprint, alphas)
-        # The place of a pixel where there is no splat: before all others, and so it is visited at
-        # once, and changes nothing. When all splats were met, behind them: it takes their places.
+        # Depth of a missing splat: before all others, so that it is visited at once and changes
+        # nothing; after the last splat, behind them, so that it replaces them in the window.
         absent = dr.select(active, t.Float(-dr.inf), dr.inf)
         next_queue, visited = [], []
         for pixel, along in enumerate(order.depths.pixel_depths(footprint, keys)):
@@ -249,7 +248,7 @@ def _walk(
             state,
             dr.full(t.Bool, True, size),
         ),
-        # The last splats are still waiting when all were met.
+        # After the last splat, the window still has to be emptied.
         cond=lambda place, queue, state, go_on: (place < end + order.window) & go_on,
         body=body,
     )

@@ -1,12 +1,12 @@
-"""Many features, composited a few at a time: kernels that compile soon, whatever their number.
+"""Compositing of many features in groups, which bounds the compilation time of kernels.
 
-LLVM takes more than linear time for a kernel, and a feature adds a number for each of a lane's 16
-pixels to it: 64 features of float64 in one kernel took four minutes with AVX2, and take 6 s in
-groups, whose kernels are compiled once. Each group walks the splats again, so that its
-transmittance, its decisions and its weights are those of all others.
+LLVM compiles large kernels in more than linear time, and each feature adds 16 numbers to a lane's
+state: with AVX2, 64 features of float64 take four minutes to compile in one kernel, and 6 s in
+groups, which share a kernel. Each group composites all splats again, with the same transmittance,
+decisions and weights.
 
 The adjoint is linear in the derivatives of the planes: the groups' derivatives of the geometry are
-added up, with those of planes that several groups have, as the transmittance, in the first alone.
+added. Planes that several groups share, such as transmittance, are differentiated in the first.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from drgs.splatting.rasterize import ONE_SAMPLE, Layers, Records, SplatGradients
 from drgs.splatting.tiles import TileBins
 
 FEATURES_AT_ONCE = {4: 32, 8: 8}
-"""Most features of a group, by the bytes of a number. With AVX2, kernels of so many compile in
-7 s and 3 s, forward and backward; those of twice as many in 25 s and 12 s."""
+"""Maximum number of features of a group, by bytes per number. With AVX2, such kernels compile in
+7 s and 3 s, forward and backward; kernels of twice the size in 25 s and 12 s."""
 
 
 def group_features(order: Any, bins: TileBins) -> Any:
@@ -110,9 +110,9 @@ class InGroups:
         d_transmittance: Float,
         samples: range,
     ) -> SplatGradients:
-        """Add up the groups' derivatives, of one sample."""
+        """Add the groups' derivatives of one sample."""
         cotangents = [d_transmittance, *d_features]
-        dr.eval(cotangents)  # or each group would have kernels of its own
+        dr.eval(cotangents)  # so that all groups share kernels
         zeros = dr.opaque(type(d_transmittance), 0, dr.width(d_transmittance))
         zero, falloff = bins.rows.Float(0), bins.model.falloff
         geometry, features = [zero] * falloff.num_geometry, [zero] * bins.num_features

@@ -1,7 +1,7 @@
-"""Lanes of the compositing kernels: which micro-tile, which pixels, which splat next.
+"""Lanes of the compositing kernels: their micro-tiles, their pixels, and iteration over splats.
 
-One SIMD lane is one micro-tile of 4x4 pixels. It walks the entries of its tile, front to back or
-back to front, and visits those whose bit in its words is set.
+One SIMD lane is one micro-tile of 4x4 pixels. It iterates over the entries of its tile, front to
+back or back to front, and visits those whose bit in its words is set.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ T = TypeVar("T", Float, UInt32)
 def make_lanes(
     Float: type, grid: TileGrid, order: UInt32 | None = None, tiles: range | None = None
 ) -> Lanes:
-    """Make lanes such that neighbours in time are far apart on the film.
+    """Return lanes in an order that spreads neighbouring tiles over the launch.
 
-    Dr.Jit cuts a small launch into few blocks of consecutive lanes. Tiles are visited with a
-    stride near the golden section, so that each block gets its share of the busy centre.
+    Dr.Jit splits a small launch into few blocks of consecutive lanes. Tiles are visited with a
+    stride near the golden section, so that each block gets a share of the image's busy centre.
 
-    order: UInt32, a permutation of the lanes; None: as they are. tiles: those of some tiles only,
-    among those of all samples.
+    order: UInt32, a permutation of the lanes; None: unchanged. tiles: range of the tiles of all
+    samples; None: all.
     """
     t = types_of(Float)
     tiles = grid.tiles_of(range(grid.samples)) if tiles is None else tiles
@@ -56,7 +56,7 @@ def make_lanes(
 
 
 def group_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
-    """Make lanes that are ordered, within each block, by roughly their number of splats.
+    """Return lanes sorted, within each block, by their approximate number of splats.
 
     work: UInt32, the number of splats of each lane of :func:`make_lanes`.
     """
@@ -68,8 +68,8 @@ def group_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None
 def _sort_in_blocks(level: UInt32) -> UInt32:
     """Return the lanes ordered by level in each block; the order of equal lanes is arbitrary.
 
-    Nothing depends on it but which lanes share a vector. (The host would wait for the order of
-    Dr.Jit's sorting functions, and the device for the host, which has not traced what comes next.)
+    It only decides which lanes share a vector. (Dr.Jit's sorting functions would synchronise host
+    and device.)
     """
     UInt32 = type(level)
     lane = dr.arange(UInt32, dr.width(level))
@@ -85,8 +85,8 @@ def _sort_in_blocks(level: UInt32) -> UInt32:
 
 
 _BLOCK = 32 * MICROS
-"""Lanes that are ordered together. In larger blocks the lanes of a tile, which read the same
-records, are too far apart; in smaller ones they are less alike."""
+"""Number of lanes that are sorted together. In larger blocks, the lanes of a tile, which read the
+same records, are too far apart; in smaller ones, lengths differ more."""
 
 _LEVELS = 256
 

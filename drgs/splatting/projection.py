@@ -1,12 +1,11 @@
 """Projection of 3D Gaussians to 2D splats: culling, EWA projection, opacity and colour.
 
-The first stage: ``Gaussians`` + ``Camera`` -> ``Splats2D``. One lane is one Gaussian; every line is
-plain arithmetic, so Dr.Jit differentiates it. The equations are those of Zwicker et al. 2002 ("EWA
-splatting") as used in section 4 of the 3DGS paper, written so that they do not cancel in single
-precision.
+The first stage: ``Gaussians`` + ``Camera`` -> ``Splats2D``. One lane is one Gaussian; Dr.Jit
+differentiates the arithmetic. The equations are from Zwicker et al. 2002 ("EWA splatting") as used
+in section 4 of the 3DGS paper, in a form without cancellation in single precision.
 
-A :data:`Projection` is what brings a Gaussian's shape to the film: :func:`ewa` or one of another
-module (``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
+A :data:`Projection` projects mean and covariance: :func:`ewa`, or one of another module
+(``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ from drgs.splatting.cutoffs import Cutoffs
 class RayTerms:
     """Parameters of the peak along a pixel's ray: see ``drgs.accuracy.exact``."""
 
-    tilt_x: Float  # how the peak's depth changes across the film, kappa or g / |a_c|
+    tilt_x: Float  # change of the peak's depth across the film: kappa or g / |a_c|
     tilt_y: Float
-    spread: Float  # h, of the depth where the place on the film is known
-    scale: Float | None = None  # 1 / |a_c|, what the conic factor is multiplied by; None: 1
+    spread: Float  # h, variance of the depth given the film position
+    scale: Float | None = None  # 1 / |a_c|, factor of the conic factor; None: 1
 
     def numbers(self) -> list[Float]:
         """Return the numbers that are set."""
@@ -58,12 +57,10 @@ class Splats2D:
     conic_factor: Array3f  # (p, r, s), 1 / px
     depths: Float  # z in the camera, scene units
     opacities: Float  # in (0, 1)
-    colors: (
-        Array3f | Sequence[Float]
-    )  # display space; or whatever else :func:`project`'s ``color`` gave
+    colors: Array3f | Sequence[Float]  # display space; or results of another :data:`SplatColor`
     variances: Array2f  # px^2: diagonal of the projected covariance, low-pass included
     visible: Bool  # in front of the near plane, above the alpha cut, finite
-    ray: RayTerms | None = None  # only where something needs them
+    ray: RayTerms | None = None  # only if a falloff or an order needs them
     opacity_compensation: Float | None = None  # factor of the opacity, out of focus
 
     @property
@@ -80,13 +77,13 @@ class FilmShape:
     means2d: Array2f  # px
     conic_factor: Array3f  # (p, r, s), 1 / px
     variances: Array2f  # px^2, low-pass included
-    determinant: Float  # px^2: of the covariance without low-pass, over the variance in y
-    added_determinant: Float  # px^2: what the low-pass adds to it
+    determinant: Float  # px^2: of the covariance without low-pass, divided by the variance in y
+    added_determinant: Float  # px^2: increase of it by the low-pass
     ray: RayTerms | None = None
     opacity_compensation: Float | None = None  # factor of the opacity; None: 1
 
     def root_determinant(self) -> Float:
-        """The square root of det(conic) at the mean, 1 / px^2."""
+        """Return the square root of det(conic) at the mean, 1 / px^2."""
         p, _, s = self.conic_factor
         if self.ray is not None and self.ray.scale is not None:
             p, s = p / self.ray.scale, s / self.ray.scale
@@ -94,17 +91,17 @@ class FilmShape:
 
 
 Projection = Callable[["GaussianRows", Camera, Array3f, Float | float], FilmShape]
-"""From rows, camera, means (Array3f, camera axes) and low-pass (px^2) to shapes on the film."""
+"""Maps rows, camera, means (Array3f, camera axes) and low-pass (px^2) to projected shapes."""
 
 
 class ProjectionModel:
-    """A projection that ``model.projection`` of a configuration can name.
+    """A named projection, for ``model.projection`` of a configuration.
 
-    A subclass has a :data:`Projection` as its static method ``shape``, and enters ``PROJECTIONS``.
+    A subclass defines ``shape`` and is registered in ``PROJECTIONS``.
     """
 
-    falloff: ClassVar[type | None] = None  # its own falloff; None: as is configured
-    shape_with_depth: ClassVar[Projection | None] = None  # whose shapes have RayTerms
+    falloff: ClassVar[type | None] = None  # its own falloff; None: the configured one
+    shape_with_depth: ClassVar[Projection | None] = None  # returns shapes with RayTerms
 
     @staticmethod
     def shape(
@@ -115,11 +112,11 @@ class ProjectionModel:
 
 
 OpacityRule = Callable[[Float, Float, Float], Float]
-"""From an opacity and the two determinants of :class:`FilmShape` to an opacity, Float each."""
+"""Maps an opacity and the two determinants of :class:`FilmShape` to an opacity, Float each."""
 
 SplatColor = Callable[["GaussianRows", Array3f, int], Array3f | Sequence[Float]]
-"""From rows, directions in which means are seen (Array3f, world, of any length) and SH degree to
-what is stored of a splat's colour, Float each."""
+"""Maps rows, directions from the camera to the means (Array3f, world, of any length) and SH degree
+to the stored numbers of a splat's colour, Float each."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +126,11 @@ class GaussianRows:
     means: Array3f
     quats: Array4f  # wxyz
     log_scales: Array3f
-    logit_opacities: Float  #
+    logit_opacities: Float
     sh: list[Array3f]  # (degree + 1)^2
-    smoothing: Float | None = None  # see drgs.effects.smoothing; None: there is none
+    smoothing: Float | None = None  # see drgs.effects.smoothing
     opacity_compensation: Float | None = None  # factor of the opacity; None: 1
-    features: Mapping[str, list[Float]] | None = None  # by name; None: there are none
+    features: Mapping[str, list[Float]] | None = None  # by name
 
 
 def load_rows(gaussians: Gaussians, sh_degree: int) -> GaussianRows:
@@ -172,11 +169,11 @@ def project(
 ) -> Splats2D:
     """Project Gaussians onto the image plane of ``camera``.
 
-    opacity_rule: how low-pass filtering affects opacity: :func:`plain_opacity` or
-    :func:`compensated_opacity`; shape: how mean and covariance are projected, by default
-    :func:`ewa`; color: what is known of a splat's colour, by default :func:`color_at_mean`;
-    low_pass: px^2 added to the covariance; least_alpha: Gaussians whose opacity, before the shape's
-    opacity compensation, does not reach it are not visible.
+    opacity_rule: effect of the low-pass on opacity: :func:`plain_opacity` or
+    :func:`compensated_opacity`; shape: projection of mean and covariance, by default :func:`ewa`;
+    color: stored numbers of a splat's colour, by default :func:`color_at_mean`; low_pass: px^2
+    added to the covariance; least_alpha: Gaussians of a smaller opacity, before the shape's opacity
+    compensation, are not visible.
 
     Differentiable in ``rows`` and in the camera's numbers. Not differentiated: visibility.
     """
@@ -214,10 +211,10 @@ def project(
 def ewa(
     rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
-    """The affine approximation of the projection at the mean (Zwicker et al. 2002, section 4).
+    """Project by the affine approximation at the mean (Zwicker et al. 2002, section 4).
 
     position: Array3f, camera axes, the mean. With M = J R_camera R(q) diag(s), 2 x 3, the
-    covariance on the film is M M^T + low_pass I.
+    projected covariance is M M^T + low_pass I.
     """
     lens = camera.lens
     m0, m1, _ = film_axes(rows, camera, position, lens.clamped_slopes(camera, position))
@@ -234,9 +231,9 @@ class Ewa(ProjectionModel):
 def factor_conic(
     means2d: Array2f, m0: Sequence[Float], m1: Sequence[Float], low_pass: Float | float
 ) -> FilmShape:
-    """The shape of a Gaussian whose covariance on the film is M M^T + low_pass I.
+    """Return the shape of a Gaussian of the projected covariance M M^T + low_pass I.
 
-    m0, m1: the rows of M, equally many numbers, px.
+    m0, m1: the rows of M, of the same length, px.
     """
     xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + low_pass
     # U needs det / yy, the variance of x where y is given. det(M M^T) is the sum of the squared
@@ -258,7 +255,7 @@ def factor_conic(
 
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
-    """The inner product of two vectors of the same length."""
+    """Return the inner product of two vectors of the same length."""
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
         total = dr.fma(x, y, total)
@@ -266,21 +263,21 @@ def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
 
 
 def color_at_mean(rows: GaussianRows, direction: Array3f, sh_degree: int) -> Array3f:
-    """The colour (Array3f) in the ``direction`` in which the mean is seen, of any length."""
+    """Return the colour in the ``direction`` (of any length) from the camera to the mean."""
     return sh.sh_color(rows.sh, normalize(direction), sh_degree)
 
 
 def plain_opacity(opacity: Float, determinant: Float, added_determinant: Float) -> Float:
-    """The opacity as it is: low-pass filtering makes small splats larger and thus brighter."""
+    """Return the opacity unchanged: the low-pass makes small splats larger and thus brighter."""
     del determinant, added_determinant
     return opacity
 
 
 def compensated_opacity(opacity: Float, determinant: Float, added_determinant: Float) -> Float:
-    """Opacity scaled by sqrt(det without / det with low-pass): the splat's integral is kept.
+    """Scale the opacity by sqrt(det without / det with low-pass), which keeps the splat's integral.
 
-    determinant, added_determinant: Float, of the covariance on the film without low-pass, and what
-    the low-pass adds to it; only their ratio counts.
+    determinant, added_determinant: Float, of the projected covariance without low-pass, and its
+    increase by the low-pass; only their ratio matters.
 
     Mip-Splatting (Yu et al. 2024), section 5; gsplat's "antialiased" mode. The derivative of
     the square root at 0 (a splat of no area) is taken as 0.
@@ -295,10 +292,10 @@ def compensated_opacity(opacity: Float, determinant: Float, added_determinant: F
 def film_axes(
     rows: GaussianRows, camera: Camera, position: Array3f, slopes: list[Float] | None
 ) -> tuple[Array3f, Array3f, Array3f]:
-    """The half axes of a Gaussian as rows of two matrices: on the film, and in depth.
+    """Return the projected semi-axes of a Gaussian, as three rows: film x and y, and depth.
 
-    The first two are those of M = J R_camera R(q) diag(s), px; the third the same for the depth
-    divided by that of the mean. slopes: see :meth:`drgs.cameras.lens.Lens.projection_jacobian`.
+    The first two are M = J R_camera R(q) diag(s), px; the third is the same for the depth divided
+    by the mean's. slopes: see :meth:`drgs.cameras.lens.Lens.projection_jacobian`.
     """
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
 
@@ -310,7 +307,7 @@ def film_axes(
 
 
 def world_axes(rows: GaussianRows) -> list[Array3f]:
-    """The three half axes of a Gaussian, Array3f, world."""
+    """Return the three semi-axes of a Gaussian, Array3f, world."""
     world_from_splat, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
     Array3f = types_of(type(rows.logit_opacities)).Array3f
     return [
@@ -320,7 +317,7 @@ def world_axes(rows: GaussianRows) -> list[Array3f]:
 
 
 def _sigmoid(x: Float) -> Float:
-    """1 / (1 + e^-x) without overflow for large |x|."""
+    """Return 1 / (1 + e^-x) without overflow for large |x|."""
     # Not dr.abs: its derivative at 0 is 0, and a logit of exactly 0 would never move.
     decayed = dr.exp(dr.select(x >= 0, -x, x))
     return dr.select(x >= 0, 1, decayed) / (1 + decayed)

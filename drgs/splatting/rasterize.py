@@ -8,35 +8,35 @@ The last stage: ``TileBins`` + features -> planes of pixels. The image model is 
     C = sum_i w_i c_i,  T = T_last
 
 where splats with a_i < 1/255 are skipped and a pixel stops before the splat that would take T
-below 1e-4. c_i is a vector of any length, the splat's *features*: colour, depth, or whatever
-else is to be composited. The background is added by the caller, from T.
+below 1e-4. c_i is a vector of any length, the splat's *features*, such as colour and depth. The
+caller adds the background with the weight T.
 
-**Adjoint.** Let g = dL/dC and G = dL/dT. Whatever lies behind splat i contributes to the loss
-through the factor T_{i+1} = T_i (1 - a_i) only. Let b_i ("behind") be the derivative of the loss
-with respect to that factor: b_last = G, since behind the last splat is the background, and
+**Adjoint.** Let g = dL/dC and G = dL/dT. Everything behind splat i affects the loss only through
+the factor T_{i+1} = T_i (1 - a_i). Let b_i ("behind") be the derivative of the loss with respect to
+that factor: b_last = G, since the background is behind the last splat, and
 
     b_{i-1} = a_i (c_i . g) + (1 - a_i) b_i.
 
     dL/dc_i = w_i g,   dL/da_i = T_i (c_i . g - b_i).
 
-The adjoint walks the splats back to front, from the last one that the pixel composited, and
-recovers T_i = T_{i+1} / (1 - a_i) (3DGS, section 6), which alpha <= 0.99 keeps accurate. b is a
-convex combination of the values behind it: its rounding errors do not grow, and a splat that is
-seen through little transmittance has a gradient as accurate, relative to its own size, as the
-first. (The equivalent sums from front to back, S_i = S_{i-1} - w_i (c_i . g) and dL/da_i =
-T_i (c_i . g) - S_i / (1 - a_i), cancel: they carry the error of the whole sum to the last splat.)
-Nothing is stored per pixel pair, and all decisions of the forward pass are taken again exactly.
+The adjoint iterates back to front, from the last splat that the pixel composited, and recovers
+T_i = T_{i+1} / (1 - a_i) (3DGS, section 6), which is accurate because alpha <= 0.99. b is a convex
+combination of the values behind it, so its rounding errors do not grow: the gradient of a splat
+behind many others has the same relative accuracy as that of the first. (The equivalent sums from
+front to back, S_i = S_{i-1} - w_i (c_i . g) and dL/da_i = T_i (c_i . g) - S_i / (1 - a_i), suffer
+from cancellation: the last splat gets the rounding error of the whole sum.) Nothing is stored per
+pixel and splat, and the tests of the forward pass are repeated exactly.
 
-**Mapping to the machine.** One SIMD lane is one micro-tile of 4x4 pixels, its pixels unrolled:
-the load of a splat's record is paid once for 16 pixels. Lanes that share a vector wait for the
-last of them, so that lanes with similarly many splats are put together.
+**Mapping to the machine.** One SIMD lane is one micro-tile of 4x4 pixels, unrolled: a splat's
+record is loaded once for 16 pixels. The lanes of a vector wait for the slowest, so lanes with
+similar numbers of splats are grouped.
 
-**Memory.** A read or a write that no cache foresees takes as long as a lane's arithmetic. Lanes
-therefore walk through memory in order: splats are copied into the order of the entries, and what
-a lane of the adjoint writes is contiguous.
+**Memory.** A cache miss takes as long as a lane's arithmetic. Lanes therefore access memory in
+order: splats are copied into the order of the entries, and a lane of the adjoint writes contiguous
+memory.
 
 **No atomics.** In the adjoint, a lane sums each splat's partial derivatives over its 16 pixels
-and writes them into a slot that belongs to this (splat, micro-tile) alone: see
+and writes them into the slot of this (splat, micro-tile) pair: see
 :mod:`drgs.splatting.reduction`.
 """
 
@@ -85,10 +85,10 @@ class Layers:
     grid: TileGrid
 
     def planes(self) -> list[Float]:
-        """1 + C planes in row-major pixel order, Float (samples * H * W,), not evaluated.
+        """Return 1 + C planes in row-major pixel order, Float (samples * H * W,), not evaluated.
 
-        The first is T, the transmittance left for the background; then sum_i w_i c_i for each
-        component of c.
+        The first is T, the transmittance of the background; then sum_i w_i c_i for each component
+        of c.
         """
         t = types_of(type(self.values))
         pixel, grid = dr.arange(t.UInt32, self.grid.num_pixels), self.grid
@@ -131,21 +131,21 @@ class Records:
 
     @staticmethod
     def from_ranks(bins: TileBins, numbers: Callable[[UInt32, Bool], list[Float]]) -> Records:
-        """Copy each rank's ``numbers``, such as those of ``bins.rows.load``, and evaluate them.
+        """Copy each rank's ``numbers``, such as ``bins.rows.load``, and evaluate them.
 
-        numbers: given ranks, and which lanes are active. Entries that touch nothing have zeros.
+        numbers: a function of ranks and active lanes. Entries that touch nothing have zeros.
         """
         rows = Rows.from_columns(numbers(bins.ranks, bins.masks != 0))
         dr.eval(rows)
         return Records(rows, bins.model.falloff.num_geometry, bins.num_features)
 
     def load(self, entry: UInt32, active: Bool | bool) -> tuple[list[Float], list[Float]]:
-        """Geometry and features of a sorted entry."""
+        """Return geometry and features of a sorted entry."""
         numbers = self.rows.load(entry, active)
         return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
 
     def load_keys(self, entry: UInt32, active: Bool | bool) -> list[Float]:
-        """Keys of a sorted entry."""
+        """Return keys of a sorted entry."""
         return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
 
 
@@ -183,8 +183,8 @@ def composite(bins: TileBins, records: Records) -> Layers:
     stop = model.cutoffs.transmittance_stop
     size = dr.width(lanes.tile)
     nothing = [*[dr.zeros(t.Float, size)] * count, dr.zeros(t.UInt32, size)]
-    # One pixel after the other: instructions are in the order of the state that they compute, and
-    # what a pixel needs is in registers only for as long as it is at work.
+    # Pixel by pixel: Dr.Jit orders instructions by the state that they compute, and the values of
+    # one pixel then stay in registers.
     _, pixels, _ = dr.while_loop(
         state=(
             entries.begin(),
@@ -222,7 +222,7 @@ def any_unfinished(transmittances: list[Float]) -> Bool:
 
 
 def largest(values: list[UInt32]) -> UInt32:
-    """The largest of several numbers, lane by lane."""
+    """Return the largest of several numbers, lane by lane."""
     result = values[0]
     for v in values[1:]:
         result = dr.select(v > result, v, result)
@@ -272,10 +272,10 @@ def composite_adjoint(
 ) -> SplatGradients:
     """Return derivatives with respect to the splats, given those with respect to the planes.
 
-    layers: what :func:`composite` returned for the same bins and records; d_features: C planes
-    (samples * H * W,); d_transmittance: plane (samples * H * W,); samples: those of the layers that
-    are added, one after the other, to the derivatives ``before``. Not differentiated: the order,
-    the decisions (cut, clamp, stop).
+    layers: the result of :func:`composite` for the same bins and records; d_features: C planes
+    (samples * H * W,); d_transmittance: plane (samples * H * W,); samples: samples of the layers,
+    added one after the other to the derivatives ``before``. Not differentiated: the order, the
+    decisions (cut, clamp, stop).
     """
     pairs = CompositedPairs.find(bins, layers.stop, samples)
     bands = split_bands(bins, pairs)
@@ -314,8 +314,8 @@ def _partials(
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
     partials = Rows.empty(t.Float, bins.num_sums, max(slots.band.num_slots, 1))
 
-    # A packet is stored with a branch for each lane, and across branches numbers wait in memory
-    # instead of registers. A turn therefore begins with storing what the one before has summed.
+    # A packet is stored with a branch for each lane, across which registers are spilled. An
+    # iteration therefore starts by storing the sums of the last one.
     def body(cursor: Cursor, slot: UInt32, pixels: list, sums: list, is_summed: Bool) -> tuple:
         partials.store(sums, slot, is_summed)
         entry, active = entries.current(cursor)
@@ -358,9 +358,9 @@ def _adjoint_step(
 ) -> tuple[list, list, list]:
     """Return T and b before a splat at 16 pixels, d loss / d ln(alpha), and d loss / d stored.
 
-    composited: whether each pixel was still unfinished; stored: what is stored of the splat, and
-    features: what they are at a pixel; pixels: T and b of each, past the splat; g: [plane][pixel]
-    derivative of the loss with respect to C.
+    composited: whether each pixel was unfinished; stored: the splat's stored numbers; features:
+    their values at a pixel; pixels: T and b of each, behind the splat; g: [plane][pixel] derivative
+    of the loss with respect to C.
     """
     zero = type(pixels[0][0])(0)
     before, d_log_alpha, d_stored = [], [], [zero for _ in stored]
@@ -385,8 +385,8 @@ def splat_gradients(
 ) -> SplatGradients:
     """Return the derivatives of each splat, by Gaussian, from its sums, by rank.
 
-    totals: from ranks and a sample to moments, and derivatives of the features; before: what the
-    samples' derivatives are added to, in their order.
+    totals: maps ranks and a sample to moments and derivatives of the features; before: derivatives
+    to which the samples' are added, in their order.
     """
     t, falloff = types_of(bins.rows.Float), bins.model.falloff
     size = dr.width(bins.order)
@@ -404,7 +404,7 @@ def splat_gradients(
     if before is None:
         first, columns = 1, terms(t.UInt32(0))
     else:
-        stored = Rows.from_columns(before.geometry + before.features)  # a packet is read at once
+        stored = Rows.from_columns(before.geometry + before.features)  # as packets
         dr.eval(stored)
         first, columns = 0, stored.load(bins.order)
     if first + 1 == num_samples:  # inside of a loop, the sums would take longer
@@ -433,8 +433,8 @@ def composite_tangent(
 ) -> Layers:
     """Return directional derivatives of the planes along ``tangents`` of the 2D splats.
 
-    tangents: the same fields as the gradients, holding the direction. Returns the tangents of
-    the planes that :func:`composite` made. Not differentiated: the order, the decisions.
+    tangents: the direction, in the fields of the gradients. Returns the tangents of the planes of
+    :func:`composite`. Not differentiated: the order, the decisions.
     """
     t = types_of(bins.rows.Float)
     count = layers.count
@@ -498,7 +498,7 @@ def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     geometry = bins.rows.load(rank)[: bins.model.falloff.num_geometry]
     numbers = bins.model.falloff.pack_tangents(geometry, by_rank(tangents.geometry))
     numbers += by_rank(tangents.features)
-    numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # they have no derivatives
+    numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # not differentiated
     rows = Rows.from_columns(numbers)
     dr.eval(rows)
     return Records.from_ranks(bins, rows.load)

@@ -1,12 +1,12 @@
-"""Slots: where partial derivatives wait until they are added up, in an order of their own.
+"""Reduction of partial derivatives in a fixed order, without atomic additions.
 
 In the adjoint of compositing, a lane sums the partial derivatives of a splat over 16 pixels. Each
-composited (entry, micro-tile) pair has a *slot*, which that lane alone writes; then one lane per
-entry adds up the entry's slots, and one lane per splat its entries. Nothing is added atomically:
-the result is the same to the last bit in every run.
+composited (entry, micro-tile) pair has a *slot*, which only this lane writes. Then one lane per
+entry adds the entry's slots, and one lane per splat its entries. The result is the same to the last
+bit in every run.
 
-Slots are written and read once. To save memory, the film is cut into *bands* of tiles whose slots
-exist at a time.
+To save memory, the image is divided into *bands* of tiles, and only the slots of one band exist at
+a time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drgs.splatting.tiles import WORD, TileBins, transpose_masks
 
 BAND_SLOTS = 1 << 20
 """Slots of a band, as far as whole tiles allow: 38 MB, three colours in single precision.
-With fewer, Dr.Jit traces and launches more often than it saves."""
+Smaller bands cost more in tracing and launches than they save."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class CompositedPairs:
     """Pairs of an entry and a micro-tile that were composited, in each of S samples.
 
     An entry with such a pair is *seen* and has a row of sums; those of a splat follow each other.
-    Entries, sorted and unsorted, and ranks are counted on from sample to sample.
+    Numbers of entries, sorted and unsorted, and ranks continue from sample to sample.
     """
 
     masks: UInt32  # (S * M padded,): sorted -> bit per micro-tile
@@ -118,12 +118,12 @@ def _merge_inner_ends(column: UInt32, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Slots:
-    """Places for the partial derivatives of each composited (entry, micro-tile) pair of a band.
+    """Indices of slots of the composited (entry, micro-tile) pairs of a band.
 
-    First come the pairs of all tiles' first micro-tiles, in the order of the sorted entries, then
-    those of the second ones, and so on: what a lane writes is contiguous. (In the order in which
-    the slots are added up, each write would wait for memory of its own.) Pairs behind a
-    micro-tile's stop have no slot, so that every slot is written exactly once.
+    The pairs of all tiles' first micro-tiles come first, in the order of the sorted entries, then
+    those of the second ones, and so on: a lane writes contiguous memory. (In the order of the sums,
+    each write would miss the cache.) Pairs behind a micro-tile's stop have no slot, so every slot
+    is written exactly once.
     """
 
     pairs: UInt32  # (groups * 16 * 2,): (group, micro-tile) -> first slot, bits

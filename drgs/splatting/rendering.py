@@ -1,15 +1,15 @@
-"""The stages composed: from Gaussians and a camera to planes of pixels, and back.
+"""The rendering pipeline: from Gaussians and a camera to planes of pixels, and its adjoint.
 
-A :class:`Pipeline` holds the SH degree, the opacity rule, the features that are composited and the
-approximations, as functions and objects. Dr.Jit traces only what is called, so that a stage that is
-not composed in leaves no instruction in any kernel.
-``drgs.config.approximations`` makes a pipeline from names.
+A :class:`Pipeline` holds the SH degree, the opacity rule, the composited features and the
+approximations, as functions and objects. Dr.Jit traces only the functions of the pipeline, so an
+effect that is not part of it adds no instruction to any kernel. ``drgs.accuracy.pipeline`` makes a
+pipeline from names.
 
 The chain is  Gaussians -> ``project`` -> Splats2D -> ``footprints_of`` -> Footprints
--> ``bin_footprints`` -> TileBins -> ``composite`` -> Layers.  The adjoint runs it backwards: the
+-> ``bin_footprints`` -> TileBins -> ``composite`` -> Layers.  The adjoint runs backwards: the
 hand-written adjoint of compositing gives the derivatives of the 2D splats, and Dr.Jit
-differentiates projection and SH, which are traced again, one Gaussian per lane, so that no gradient
-is ever scattered.
+differentiates projection and SH, which are traced again, one Gaussian per lane, so no gradient is
+scattered.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from functools import reduce
 from typing import Any, Protocol
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
@@ -55,17 +56,17 @@ from drgs.splatting.rasterize import (
 from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
 
 Feature = Callable[[Splats2D, GaussianRows, Camera], list[Float]]
-"""Something that is composited of each splat: columns, Float (N,) each, one for each plane."""
+"""Composited values of each splat: columns, Float (N,) each, one for each plane."""
 
 
 def color_features(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
-    """Red, green and blue in display space: three planes."""
+    """Return red, green and blue in display space: three planes."""
     del rows, camera
     return list(splats.colors)
 
 
 def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
-    """z in the camera, scene units: one plane, the alpha-weighted sum of the depths."""
+    """Return camera z, scene units: one plane, the alpha-weighted sum of the depths."""
     del rows, camera
     return [splats.depths]
 
@@ -73,10 +74,7 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
 @ORDERS.register("center")
 @dataclass(frozen=True)
 class CenterOrder:
-    """The order in which a pixel composites its splats: by the depth of their means.
-
-    The base of all orders.
-    """
+    """The order of compositing, by the depth of the means; the base of all orders."""
 
     @classmethod
     def create(
@@ -87,21 +85,21 @@ class CenterOrder:
         return projection.shape, cls()
 
     def for_camera(self, camera: Camera) -> CenterOrder:
-        """Return this order for one camera; here, nothing depends on it."""
+        """Return this order for one camera; here, it is independent of the camera."""
         del camera
         return self
 
     def keys(self, splats: Splats2D) -> list[Float]:
-        """Return columns that compositing needs besides the order of the entries."""
+        """Return further columns for compositing, if the order needs any."""
         del splats
         return []
 
     def sort_depths(self, splats: Splats2D) -> Float:
-        """Return the depths by which the entries are sorted, Float (N,), the smallest first."""
+        """Return the sort keys of the splats, Float (N,), in ascending order."""
         return splats.depths
 
     def records(self, bins: TileBins) -> Records:
-        """Return copies of the numbers that compositing loads of each sorted entry, evaluated."""
+        """Return the rows that compositing loads, one per sorted entry, evaluated."""
         return Records.from_ranks(bins, bins.rows.load)
 
     def composite(self, bins: TileBins, records: Records) -> Layers:
@@ -144,17 +142,17 @@ class ProjectionStage(Protocol):
 
 
 @dataclass(frozen=True)
-class Projected:
-    """Project the Gaussians that are rendered, and go back through the projection."""
+class Projected(ProjectionStage):
+    """Project the rendered Gaussians, and differentiate the projection."""
 
+    @override
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-        """Project them."""
         return project_footprints(gaussians, camera, pipeline)
 
+    @override
     def gradients(
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
     ) -> GaussianGradients:
-        """Go back through the projection."""
         found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, of_camera)
         return replace(found, visible=on_film(frame.bins))
 
@@ -171,21 +169,21 @@ class Pipeline:
     sh_degree: int = 3
     opacity_rule: OpacityRule = plain_opacity
     features: tuple[Feature, ...] = (color_features,)
-    rows: Callable[[GaussianRows], GaussianRows] = load_unchanged  # applied to Gaussians first
-    shape: Projection = ewa  # how a Gaussian's mean and covariance come to the film
-    color: SplatColor = color_at_mean  # what is stored of a splat's colour
+    rows: Callable[[GaussianRows], GaussianRows] = load_unchanged  # applied before projection
+    shape: Projection = ewa  # projection of mean and covariance
+    color: SplatColor = color_at_mean  # stored numbers of a splat's colour
     low_pass: float = LOW_PASS  # px^2
     model: FootprintModel = DEFAULT
     order: CenterOrder = CenterOrder()
     source: ProjectionStage = Projected()
-    of_smoothing: bool = False  # whether derivatives include those of a smoothing filter
+    of_smoothing: bool = False  # whether the smoothing filter is differentiated
 
     def select_differentiable(self, rows: GaussianRows) -> GaussianRows:
-        """The numbers with respect to which derivatives are computed."""
+        """Return the differentiated numbers."""
         return rows if self.of_smoothing else replace(rows, smoothing=None)
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
-        """The first stage with this pipeline's approximations."""
+        """Project with this pipeline's approximations."""
         splats = project(
             self.rows(rows),
             camera.for_means(rows.means),
@@ -203,7 +201,7 @@ class Pipeline:
         return splats
 
     def feature_columns(self, splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[Float]:
-        """The columns of all features, in order."""
+        """Return the columns of all features, in order."""
         return [column for feature in self.features for column in feature(splats, rows, camera)]
 
 
@@ -219,9 +217,9 @@ class Frame:
     layers: Layers  # of that order
 
     def planes(self) -> list[Float]:
-        """Transmittance, then the pipeline's features, unevaluated.
+        """Return transmittance, then the pipeline's features, unevaluated.
 
-        Each Float (samples * H * W,): the pixels of the first sample, then those of the second.
+        Each is Float (samples * H * W,), sample by sample.
         """
         return self.layers.planes()
 
@@ -230,17 +228,17 @@ class Frame:
 class GaussianGradients:
     """Derivatives of the loss, shaped like the parameters, and statistics for densification."""
 
-    parameters: Gaussians | None  # None: the splats came from elsewhere, where theirs are found
+    parameters: Gaussians | None  # None: on the processes that have sent the splats
     means2d: Array2f  # (N,): loss per px
     visible: Bool  # (N,): the Gaussian's extent touches the film
     first_nonfinite: UInt32  # (1,): of ``parameters``, see :func:`decode_nonfinite`
-    camera: list[Float] | None = None  # (1,) each: of ``camera.numbers()``, where found here
+    camera: list[Float] | None = None  # (1,) each: of ``camera.numbers()``, if requested
 
 
 def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
-    """Render ``gaussians`` as seen by ``camera``. Parameters may be attached; they are detached.
+    """Render ``gaussians`` through ``camera``. Attached parameters are detached.
 
-    An aperture and a smoothing filter must have been composed into the pipeline: see
+    An aperture and a smoothing filter must be part of the pipeline: see
     :func:`drgs.effects.compose.with_effects`. The host reads one value, the number of (splat, tile)
     entries.
     """
@@ -267,8 +265,8 @@ def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline)
 def render_again(frame: Frame, model: FootprintModel) -> Frame:
     """Composite the same splats, in the same tiles, with another footprint model.
 
-    model: that of the frame's pipeline, but for points of the pixels within the same margin, or
-    for features that are composited of the same stored numbers.
+    model: that of the frame's pipeline, except for sample positions within the same margin, or
+    features of the same stored numbers.
     """
     grid = replace(frame.bins.grid, samples=model.positions.samples)
     bins = replace(frame.bins, grid=grid, model=model.for_camera(frame.camera))
@@ -285,11 +283,11 @@ def frames_adjoint(
 
     The loss depends on several frames of the same splats and one camera.
 
-    gaussians: those that ``frames`` were rendered from; d_planes: of each frame, derivatives of the
-    loss with respect to its planes (see :meth:`Frame.planes`); of_camera: whether those with
-    respect to the camera are requested. All samples are added in their order.
+    gaussians: the input of ``frames``; d_planes: for each frame, derivatives of the loss with
+    respect to its planes (see :meth:`Frame.planes`); of_camera: also differentiate with respect to
+    the camera. Samples are added in their order.
 
-    Raises NotImplementedError if they are, and the pipeline has none.
+    Raises NotImplementedError if the pipeline has no derivatives with respect to the camera.
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
@@ -305,8 +303,8 @@ def frames_adjoint(
 
 
 ENTRIES_AT_ONCE = 1 << 19
-"""Entries, and splats, of the samples that the adjoint adds at once. Of each entry it stores
-about 40 bytes besides its slots, whose memory is bounded by itself."""
+"""Maximum number of entries, and of splats, that the adjoint adds at once. It stores about 40 bytes
+per entry, besides the slots, whose memory is bounded separately."""
 
 
 def gradients_of(
@@ -316,12 +314,12 @@ def gradients_of(
     of_splats: SplatGradients,
     of_camera: bool = False,
 ) -> GaussianGradients:
-    """Return derivatives of the parameters, from those of the 2D splats, by Dr.Jit.
+    """Return derivatives of the parameters, given those of the 2D splats, by Dr.Jit.
 
-    See :func:`frames_adjoint`; ``visible`` is that of projection, without regard to the film.
+    See :func:`frames_adjoint`; ``visible`` does not include the bounds of the film.
     """
     found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, of_camera)
-    # In an order that is the same in every run.
+    # dr.sum adds in the same order in every run.
     return replace(found, camera=[dr.sum(each) for each in of_rows]) if of_camera else found
 
 
@@ -332,9 +330,9 @@ def gradients_by_row(
     of_splats: SplatGradients,
     of_camera: bool,
 ) -> tuple[GaussianGradients, list[Float]]:
-    """Return :func:`gradients_of`, and each Gaussian's share of the camera's derivatives.
+    """Return :func:`gradients_of`, and each Gaussian's contribution to the camera's derivatives.
 
-    The shares are evaluated: (N,) of each of ``camera.numbers()``, none if not ``of_camera``.
+    Contributions are evaluated: (N,) for each of ``camera.numbers()``, none without ``of_camera``.
     """
     rows = load_rows(gaussians, pipeline.sh_degree)
     d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
@@ -354,7 +352,7 @@ def gradients_by_row(
 
 @dataclass(frozen=True)
 class CameraGradients:
-    """The derivatives of the splats that one camera sees."""
+    """The derivatives of the 2D splats of one camera."""
 
     camera: Camera
     pipeline: Pipeline
@@ -366,17 +364,17 @@ def sum_of_views(
 ) -> tuple[Gaussians, list[UInt32]]:
     """Sum :func:`gradients_of` over several views, in one kernel.
 
-    views: the derivatives at each time of each view, which are added in this order. What the views
-    share is computed once, and the sum stays in registers.
+    views: the derivatives at each time of each view, added in this order. Shared values are
+    computed once, and the sum stays in registers.
 
-    Returns the derivatives, and the first fault of each view.
+    Returns the derivatives, and each view's first non-finite number.
     """
     rows, faults = load_rows(gaussians, views[0][0].pipeline.sh_degree), []
     total: dict[str, list[Float]] = {}
     for view in views:
         of_times = []
         for seen in view:
-            own = dr.copy(rows)  # whose derivatives are of this camera alone
+            own = dr.copy(rows)  # separates the derivatives of the cameras
             d_rows, visible, _ = _back_to_rows(own, seen.camera, seen.pipeline, seen.gradients)
             columns = _columns_of(d_rows, gaussians, visible)
             total = _sum_of_columns(total, columns) if total else columns
@@ -420,9 +418,9 @@ def weighted_sums(frame: Frame, plane: Float) -> Float:
     """Return, for each Gaussian, the sum over pixels of its weight times ``plane``: (N,).
 
     plane: x, Float (H * W,), the same for all samples. A plane of the frame is C = sum_i w_i c_i,
-    so that the adjoint's derivative with respect to c_i is sum w_i g over pixels: here g is x for
-    the first feature and 0 for the others. No other kernel is compiled than that of the adjoint,
-    unless colours are seen along each pixel's ray.
+    so the adjoint's derivative with respect to c_i is sum w_i g over pixels: here g is x for the
+    first feature and 0 for the rest. This reuses the adjoint's kernel, unless colours are evaluated
+    along each pixel's ray.
     """
     model, samples = frame.bins.model, frame.bins.grid.samples
     bins = replace(
@@ -445,7 +443,7 @@ def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGrad
         first_nonfinite=dr.select(
             a.first_nonfinite < b.first_nonfinite, a.first_nonfinite, b.first_nonfinite
         ),
-        # Their cameras are not the same: each has derivatives of its own.
+        # Derivatives of the cameras are separate.
     )
     dr.eval(total)
     return total
@@ -481,10 +479,10 @@ def frames_tangent(
     tangents: Gaussians,
     camera_tangents: list[Float] | None = None,
 ) -> list[list[Float]]:
-    """Directional derivatives of each frame's planes along ``tangents`` of the parameters.
+    """Return directional derivatives of each frame's planes along ``tangents`` of the parameters.
 
-    gaussians: those that ``frames`` were rendered from, all by one camera; camera_tangents: of
-    ``camera.numbers()``; None: the camera stays.
+    gaussians: the input of ``frames``, which have one camera; camera_tangents: of
+    ``camera.numbers()``; None: zero.
 
     Raises NotImplementedError for the camera's tangents if the pipeline has none.
 
@@ -500,7 +498,7 @@ def _splat_tangents(
     tangents: Gaussians,
     camera_tangents: list[Float] | None = None,
 ) -> SplatGradients:
-    """Return the direction of the 2D splats, from that of the parameters, by Dr.Jit."""
+    """Return tangents of the 2D splats, given those of the parameters, by Dr.Jit."""
     rows = load_rows(gaussians, frame.pipeline.sh_degree)
     camera, numbers = frame.camera, []
     if camera_tangents is not None:
@@ -530,10 +528,10 @@ def _splat_tangents(
 def _columns_of(
     d_rows: GaussianRows, gaussians: Gaussians, visible: Bool
 ) -> dict[str, list[Float]]:
-    """Return per-lane derivatives by parameter, as many columns as it has.
+    """Return per-lane derivatives by parameter, column by column.
 
-    Rows that are not visible have zero gradient, also where their values are not finite; so have
-    SH coefficients above the pipeline's degree.
+    The gradient of invisible rows is zero, also if their values are not finite; so is that of SH
+    coefficients above the pipeline's degree.
     """
     t = types_of(type(d_rows.logit_opacities))
     columns = _parameter_columns(d_rows)
@@ -549,7 +547,7 @@ def _columns_of(
 
 
 def _parameter_columns(rows: GaussianRows) -> dict[str, list[Float]]:
-    """The columns of ``PARAMETER_NAMES``, as far as they were loaded."""
+    """Return the loaded columns of ``PARAMETER_NAMES``."""
     return {
         "means": [*rows.means],
         "quats": [*rows.quats],
@@ -563,7 +561,7 @@ def _parameter_columns(rows: GaussianRows) -> dict[str, list[Float]]:
 def _as_tensors(
     columns: dict[str, list[Float]], gaussians: Gaussians, others: list[UInt32]
 ) -> Gaussians:
-    """Columns as tensors shaped like the parameters; evaluated together with ``others``."""
+    """Return columns as tensors shaped like the parameters, evaluated together with ``others``."""
     t = types_of(type(gaussians.logit_opacities))
     stored = {name: store_columns(own) for name, own in columns.items()}
     dr.eval(stored, others)
@@ -590,7 +588,7 @@ def _as_tensors(
 
 
 def _nonfinite_flags(d_rows: GaussianRows, visible: Bool) -> UInt32:
-    """UInt32 (N,): row * 6 + number of the first parameter at fault there, or ``NO_FAULT``."""
+    """Return UInt32 (N,): row * 6 + number of its first non-finite parameter, or ``NO_FAULT``."""
     UInt32 = types_of(type(d_rows.logit_opacities)).UInt32
     row = dr.arange(UInt32, dr.width(d_rows.logit_opacities))
     columns = _parameter_columns(d_rows)

@@ -1,15 +1,15 @@
-"""Integer binning: which splats touch which tile, front to back.
+"""Binning: lists of the splats that touch each tile, front to back.
 
-The second stage: ``Splats2D`` -> ``Footprints`` -> ``TileBins``. The film is cut into tiles of
+The second stage: ``Splats2D`` -> ``Footprints`` -> ``TileBins``. The image is divided into tiles of
 16x16 pixels, each a 4x4 grid of micro-tiles of 4x4 pixels. Every (splat, tile) pair of a splat's
-bounding box is one *entry*; an entry carries 16 bits that say which micro-tiles its ellipse
-touches. All steps are flat: no lane loops over a splat's tiles, so a giant splat does not hold up
-its neighbours, and the only value that the host reads is the number of entries.
+bounding box is one *entry*, with a mask of 16 bits for the micro-tiles that its ellipse touches. No
+lane loops over a splat's tiles, so a giant splat does not delay its neighbours, and the host reads
+one value, the number of entries.
 
 1. Store each splat's numbers as a row and count the tiles of its bounding box.
-2. Sort the splats by depth; a prefix sum gives each one its run of entries.
-3. For each entry: its tile, and the exact ellipse-against-rectangle test of its micro-tiles.
-4. Stable sort of the entries by tile; within a tile they stay front to back.
+2. Sort the splats by depth; a prefix sum gives each one its range of entries.
+3. For each entry: its tile, and the exact ellipse-rectangle test of its micro-tiles.
+4. Stable sort of the entries by tile; within a tile they remain front to back.
 5. Transpose the bits: for each group of 32 entries and each micro-tile one 32-bit word, so that
    compositing finds a micro-tile's next splat by counting trailing zeros.
 """
@@ -36,9 +36,9 @@ WORD = 32  # entries in a word of the transposed masks
 class TileBins:
     """Entries sorted by tile, then by depth.
 
-    N splats in depth order are *ranks*; M entries in the order in which they are made, run by
-    run, are *unsorted*; in the order of the tiles they are *sorted*. Sorted arrays are padded
-    to a multiple of 32 with entries that touch nothing.
+    N splats in depth order are *ranks*; M entries in the order of the ranks are *unsorted*, in the
+    order of the tiles *sorted*. Sorted arrays are padded to a multiple of 32 with entries that
+    touch no micro-tile.
     """
 
     order: UInt32  # (N,): rank -> index of the Gaussian
@@ -58,16 +58,16 @@ class TileBins:
 
     @property
     def num_sums(self) -> int:
-        """Numbers that the adjoint sums for each splat: moments, and derivatives of features."""
+        """Number of sums of the adjoint for each splat: moments, and derivatives of features."""
         return self.model.falloff.num_moments + self.num_features
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """The stored splats that tiles and compositing read: a row each.
+    """The stored inputs of binning and compositing: a row per splat.
 
-    Splats of several of these, put behind one another, are binned as if they had been projected
-    together, since every number depends on one splat alone.
+    Concatenated rows of several objects are binned as if they had been projected together, because
+    a row depends on its own splat only.
     """
 
     boxes: Rows  # first column and row of tiles, columns, number of tiles
@@ -86,9 +86,8 @@ def footprints_of(
 ) -> Footprints:
     """Store ``splats`` for binning, evaluated.
 
-    features: columns, one value per Gaussian, that compositing will read beside the geometry;
-    keys: more of them, that it will not composite. Neither they nor the splats need to be
-    evaluated: the kernel that computes them stores rows.
+    features: columns, Float (N,) each, to composite; keys: further columns, for the order. Neither
+    they nor the splats need to be evaluated: the kernel that computes them stores the rows.
     """
     boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
     return Footprints(boxes, rows, depths, len(features), len(keys))
@@ -97,13 +96,13 @@ def footprints_of(
 def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel) -> TileBins:
     """Distribute splats over the tiles of ``grid``, front to back.
 
-    Not differentiated: integer work. The host reads one value, the number of entries.
+    Not differentiated. The host reads one value, the number of entries.
 
     Raises UserError if there are more than 2^26 Gaussians.
     """
     boxes, rows, depths = footprints.boxes, footprints.rows, footprints.depths
     num_features, num_keys = footprints.num_features, footprints.num_keys
-    del footprints  # or what is stored would wait in memory for the end of the function
+    del footprints  # releases its arrays before the function ends
     t = types_of(type(depths))
     if dr.width(depths) > 1 << _RANK_BITS:
         raise UserError(
@@ -112,7 +111,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
         )
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = t.UInt32(dr.argsort(depths))
-    # A kernel of its own: loads that wait for memory, and for no arithmetic, wait together.
+    # In a separate kernel: loads without arithmetic overlap their latencies.
     box = boxes.load(order)
     boxes, rows, counts = (
         Rows.from_columns(box),
@@ -181,7 +180,7 @@ def _reach(geometry: list[Float], grid: TileGrid, model: FootprintModel) -> Floa
 def _tile_box(
     splats: Splats2D, geometry: list[Float], grid: TileGrid, model: FootprintModel
 ) -> list[Float]:
-    """First column and row, columns, and number of tiles: whole numbers, exact up to 2^24."""
+    """Return first column and row, columns, and number of tiles: integers, exact up to 2^24."""
     t = types_of(type(splats.depths))
     center, radius = model.falloff.bounds(splats, geometry, _reach(geometry, grid, model))
     radius = radius + model.positions.margin
@@ -212,7 +211,7 @@ def _make_entries(
 ) -> tuple[UInt32, UInt32]:
     """Return the tile of each entry, and two words: see :func:`_pack`.
 
-    Entries of the padding touch nothing, in the last tile: a stable sort leaves them at the end.
+    Padding entries are in the last tile and touch nothing: a stable sort leaves them at the end.
     """
     t = types_of(rows.Float)
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
@@ -247,22 +246,22 @@ _RANK_BITS = 26  # with 64 - 16 - 26 bits for the tile
 def _pack(rank: UInt32, tile: UInt32, mask: UInt32) -> list[UInt32]:
     """Pack an entry into two words: 26 bits of rank, 22 of tile, 16 of mask.
 
-    2^22 tiles have 2^30 pixels, whose four planes are more numbers than an array of Dr.Jit holds;
-    more ranks are refused by :func:`bin_footprints`.
+    2^22 tiles have 2^30 pixels; four planes of them exceed an array of Dr.Jit. More ranks are
+    refused by :func:`bin_footprints`.
     """
     return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
 
 
 def _unpack(first: UInt32, second: UInt32) -> tuple[UInt32, UInt32, UInt32]:
-    """Rank, tile and mask of an entry."""
+    """Return rank, tile and mask of an entry."""
     tile = (second >> MICROS) | ((first >> _RANK_BITS) << MICROS)
     return first & ((1 << _RANK_BITS) - 1), tile, second & ((1 << MICROS) - 1)
 
 
 def stable_order(keys: UInt32, bound: int) -> UInt32:
-    """The stable order of ``keys``, all below ``bound``: one pass with a bucket for each key.
+    """Return the stable order of ``keys`` below ``bound``, in one pass with a bucket for each key.
 
-    ``dr.argsort`` does not know the bound and needs three passes for 32 bits.
+    ``dr.argsort`` has no bound and needs three passes for 32 bits.
     """
     buckets = 1 << (bound - 1).bit_length()
     return bucket_order(keys, dr.width(keys), max(buckets, 2))
@@ -271,7 +270,7 @@ def stable_order(keys: UInt32, bound: int) -> UInt32:
 def _touched_micros(
     geometry: list[Float], tile_x: UInt32, tile_y: UInt32, grid: TileGrid, model: FootprintModel
 ) -> UInt32:
-    """Bit m is set where the ellipse alpha >= cut reaches a pixel centre of micro-tile m.
+    """Return a mask: bit m is set if the ellipse alpha >= cut reaches a pixel of micro-tile m.
 
     |U d|^2 is convex, so its minimum over a rectangle that does not contain the mean lies on
     one of the (at most two) sides that face the mean: for such a side, one coordinate is given
