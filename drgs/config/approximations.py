@@ -153,7 +153,7 @@ class Approximations:
     )
     order_window: int = _declare(
         4,
-        "Splats that a pixel keeps waiting to put them in order, where order is pixel.",
+        "Number of splats that a pixel buffers to sort them, if order is pixel.",
         Limits("from 1 to 64", ge=1, le=64),
     )
     sh_direction: str = _declare(
@@ -169,23 +169,23 @@ class Approximations:
     )
     alpha_cut: float = _declare(
         ALPHA_CUT,
-        "Splats end where their alpha is smaller; 0: they do not.",
+        "Minimum alpha, which bounds the extent of splats; 0: unbounded.",
         Limits("from 0 to below 1", ge=0, lt=1),
         unrounded=1 / 255,
     )
     transmittance_stop: float = _declare(
         TRANSMITTANCE_STOP,
-        "A pixel ends before its transmittance is smaller; 0: never.",
+        "Minimum transmittance of a pixel, at which compositing stops; 0: never.",
         Limits("from 0 to below 1", ge=0, lt=1),
     )
     extent: float = _declare(
         math.inf,
-        "Standard deviations at which splats end.",
+        "Extent of splats, in standard deviations.",
         Limits("above 0, and at most 1e9 or infinite", gt=0, le=1e9, or_infinite=True),
     )
     low_pass: float = _declare(
         LOW_PASS,
-        "Variance that is added to each splat on the film, in square pixels; 0: none.",
+        "Variance added to the image-space covariance of each splat, px²; 0: none.",
         Limits("finite and not negative", ge=0, lt=math.inf),
     )
     antialiased: bool = _declare(

@@ -45,7 +45,7 @@ def test_help_says_units_and_what_is_behind(main):
     assert "--fov DEGREES" in text
     assert "--size W H" in text
     assert "default: 400 400" in text
-    assert ("without one, black" in text) == (main is render.main)
+    assert ("or black without one" in text) == (main is render.main)
     assert ("background is transparent" in text) == (main is capture.main)
 
 

@@ -104,7 +104,7 @@ def test_the_page_says_what_viewers_are_to_open():
     measured = {"psnr": 29.876, "ssim": 0.9, "num_views": 4, "split": "test"}
     text = report._viewers({**metrics(), "viewers": measured})
     assert '<a href="point_cloud_viewers.ply" download>point_cloud_viewers.ply</a>' in text
-    assert text.endswith(": they show the test views with 29.88 dB")
+    assert text.endswith(": they show the test views at 29.88 dB")
 
 
 def test_everything_is_written_and_nothing_temporary(out):
