@@ -78,7 +78,10 @@ class FileFormat:
         return True
 
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        """Return the Gaussians of a file, in its axes, and their ``rendered_with``."""
+        """Return the Gaussians of a file, in its axes, and their ``rendered_with``.
+
+        Raises :class:`UserError` naming the file, the place, what was expected and what was got.
+        """
         raise UserError(f"{path}: files of this format can be written, but not read")
 
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
@@ -147,9 +150,7 @@ def read_gaussians(
     """Return a file's format, its Gaussians in the axes of the file, and their ``rendered_with``.
 
     A file with an unknown suffix is read as PLY. Where shipped formats share the last part of a
-    suffix, the content decides.
-
-    Raises :class:`UserError` naming the file, the place and what is wrong there.
+    suffix, the content decides. Raises as :meth:`FileFormat.read`.
     """
     open_regular(path).close()
     named = format_for(path) or FORMATS.get("ply")

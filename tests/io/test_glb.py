@@ -10,7 +10,7 @@ from support.formats import gaussians_within_ranges
 
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.glb import read_gaussians
+from drgs.io.glb import Glb
 
 NAME = "KHR_gaussian_splatting"
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -57,7 +57,7 @@ def parts(gaussians):
 def refusal(path, document, binary):
     path.write_bytes(joined(document, binary))
     with pytest.raises(UserError) as error:
-        read_gaussians(path)
+        Glb().read(path)
     return str(error.value).removeprefix(f"{path}: ")
 
 
@@ -104,7 +104,7 @@ def test_extras_of_others_are_ignored(tmp_path, parts, extras):
     document, binary = parts
     primitive_of(document)["extras"] = extras
     (tmp_path / "a.glb").write_bytes(joined(document, binary))
-    assert read_gaussians(tmp_path / "a.glb")[1] == {}
+    assert Glb().read(tmp_path / "a.glb")[1] == {}
 
 
 @pytest.mark.parametrize(
