@@ -181,7 +181,7 @@ def _values(
             "(colmap image_undistorter), or have COLMAP find another model"
         )
     width, height = _size_as_calibrated(file, camera, image, folder)
-    named = camera.named_values()
+    named = dict(camera.values)
     scale_x, scale_y = width / camera.width, height / camera.height
     focal = named.pop("f", None)
     return FrameValues.model_construct(

@@ -43,7 +43,7 @@ def test_an_animation_loops_and_holds_every_frame(tmp_path):
     assert rendered.info["loop"] == 0
     assert len(decoded) == len(frames)
     for frame, expected in zip(decoded, frames, strict=True):
-        assert np.abs(frame - expected).max() <= images.FLAT_STEP / 2 / 255 + 1e-9
+        assert np.abs(frame - expected).max() <= images.LOSSLESS_STEP / 2 / 255 + 1e-9
 
 
 @pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (131, 97, 202)])
@@ -61,7 +61,7 @@ def test_before_a_flat_background_there_is_no_haze(tmp_path, background):
         empty = (expected == color).all(axis=2)
         assert 0.3 < empty.mean() < 0.9
         assert (np.round(frame[empty] * 255) == background).all()
-        assert np.abs(frame - expected).max() <= (images.FLAT_STEP + 1) / 2 / 255
+        assert np.abs(frame - expected).max() <= (images.LOSSLESS_STEP + 1) / 2 / 255
 
 
 def test_images_that_fill_the_frame_are_coded_with_loss(tmp_path, monkeypatch):
@@ -72,7 +72,7 @@ def test_images_that_fill_the_frame_are_coded_with_loss(tmp_path, monkeypatch):
         frame[:, 32:] = 1
     images.write_animation(tmp_path / "half.webp", noise)
     assert b"VP8L" in (tmp_path / "half.webp").read_bytes()
-    monkeypatch.setattr(images, "FLAT_WEBP_BYTES", 10_000)
+    monkeypatch.setattr(images, "LOSSLESS_WEBP_BYTES", 10_000)
     images.write_animation(tmp_path / "small.webp", noise)
     assert b"VP8 " in (tmp_path / "small.webp").read_bytes()
 
