@@ -13,7 +13,6 @@ scaled from the size that COLMAP saw to that of the photograph.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
 from pathlib import Path
 
 from typing_extensions import override
@@ -47,8 +46,7 @@ class ColmapReader(DatasetReader):
     """Reads a model of COLMAP and its photographs."""
 
     @override
-    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        del names
+    def recognizes(self, folder: Path) -> bool:
         return find_model(folder) is not None
 
     @override

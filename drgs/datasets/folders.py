@@ -40,12 +40,8 @@ MARKERS = ("transforms_train.json", "transforms.json")
 GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 
 
-NO_SECTIONS: Mapping[str, BaseModel | None] = MappingProxyType({})
-"""Sections of extensions where none has one."""
-
-
 def find_reader(
-    config: DataConfig, sections: Mapping[str, BaseModel | None] = NO_SECTIONS
+    config: DataConfig, sections: Mapping[str, BaseModel | None] = MappingProxyType({})
 ) -> tuple[str, DatasetReader]:
     """Return the name and the reader of ``data.type``, or of the first that recognizes the folder.
 
@@ -54,7 +50,7 @@ def find_reader(
     Raises :class:`UserError` for a folder that no reader recognizes, with what to do.
     """
     try:
-        names = os.listdir(config.path)
+        os.listdir(config.path)
     except FileNotFoundError:
         source = f", or get it from {config.source}" if config.source else ""
         raise UserError(
@@ -70,8 +66,8 @@ def find_reader(
     else:
         candidates = [READERS.get(config.type, "data.type")]
     for extension in candidates:
-        reader = extension.value.from_config(section_of(extension, sections))
-        if not is_auto or reader.recognizes(config.path, names):
+        reader = extension.value(section_of(extension, sections))
+        if not is_auto or reader.recognizes(config.path):
             return extension.name, reader
     raise UserError(f"{config.path}: {explain(config.path)}")
 

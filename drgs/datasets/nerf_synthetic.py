@@ -10,7 +10,6 @@ Frames may have a lens, a second pose, a mask and depths, as there.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.notices import Notices
-from drgs.datasets.reader import DatasetReader, ViewIntrinsics, describe_extras, load_views
+from drgs.datasets.reader import DatasetReader, Intrinsics, describe_extras, load_views
 from drgs.datasets.transforms import (
     TransformsFile,
     TransformsFrame,
@@ -45,9 +44,8 @@ class NerfSyntheticReader(DatasetReader):
     """Reads folders of NeRF-synthetic."""
 
     @override
-    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        del folder
-        return "transforms_train.json" in names
+    def recognizes(self, folder: Path) -> bool:
+        return (folder / "transforms_train.json").exists()
 
     @override
     def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
@@ -124,7 +122,7 @@ def _load_split(
 
     def intrinsics(
         frame: TransformsFrame, shape: tuple[int, ...], size: tuple[int, int]
-    ) -> ViewIntrinsics:
+    ) -> Intrinsics:
         file, angle = frame.files["image"], frame.values.camera_angle_x
         if shape[2] != 4:
             raise UserError(
@@ -141,6 +139,6 @@ def _load_split(
             raise UserError(f"{frame.location('camera_angle_x')} is missing")
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(angle, size[0])
-        return {"fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}
+        return focal, focal, size[0] / 2, size[1] / 2
 
     return load_views(config, frames, intrinsics, keeps, notices)

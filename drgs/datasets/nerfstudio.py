@@ -11,7 +11,6 @@ have unit length.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 
 from typing_extensions import override
@@ -35,9 +34,8 @@ class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
     @override
-    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        del folder
-        return "transforms.json" in names
+    def recognizes(self, folder: Path) -> bool:
+        return (folder / "transforms.json").exists()
 
     @override
     def photographs(self, config: DataConfig) -> Photographs:

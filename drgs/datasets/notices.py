@@ -23,16 +23,15 @@ class Notices:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._transparent: list[str] = []
-        self._unused: dict[str, list[str]] = {}
+        self._findings: dict[str, list[str]] = {}  # names of photographs
 
     def inspect(self, file: Path, pixels: np.ndarray) -> None:
         """Record findings on a photograph; pixels: (H, W, C), as they were read."""
-        name = self._name(file)
+        findings = unused_content(file)
         if pixels.shape[2] == 4 and not pixels[:, :, 3].any():
-            self._transparent.append(name)
-        for what in unused_content(file):
-            self._unused.setdefault(what, []).append(name)
+            findings.append("that are transparent everywhere")
+        for finding in findings:
+            self._findings.setdefault(finding, []).append(self._name(file))
 
     def emit(
         self,
@@ -43,13 +42,7 @@ class Notices:
     ) -> None:
         """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
         files = {path for view in (*train, *test) for path in view.files.values()}
-        own = [
-            f"photographs {what}: {_format_files(names)}" for what, names in self._unused.items()
-        ]
-        if self._transparent:
-            own.append(
-                f"photographs that are transparent everywhere: {_format_files(self._transparent)}"
-            )
+        own = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
         if outside := self._files_outside(files if cloud is None else {*files, cloud}):
             own.append(f"files from outside of the folder: {_format_files(outside)}")
         own += self._equal(train, test)
