@@ -3,8 +3,7 @@
 The model is in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``, beside the photographs, or in
 ``dense/0`` as COLMAP's automatic reconstruction leaves it. The photographs are in ``images`` (or
 beside the model's folder) or, at a half, a quarter or an eighth of their size, in ``images_2``,
-``images_4``, ``images_8``; masks are in ``masks``, black where pixels do not count: see
-``drgs.datasets.files``.
+``images_4``, ``images_8``; masks: see ``drgs.datasets.files``.
 
 Cameras are rendered with the lens that COLMAP found, without undistorting. Their intrinsics are
 scaled from the size that COLMAP saw to that of the photograph.
@@ -30,8 +29,7 @@ from drgs.io.images import MAX_SIDE, read_header
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")  # folders of COLMAP's models in datasets
 
-WORKSPACES = ("", "dense/0", "dense")
-"""Folders of that kind in COLMAP's automatic reconstruction, with their photographs."""
+WORKSPACES = ("", "dense/0", "dense")  # where COLMAP's automatic reconstruction has these folders
 
 FACTORS = {"images": 1, "images_2": 2, "images_4": 4, "images_8": 8}
 """Divisors of the size of photographs, by folder."""
@@ -83,7 +81,7 @@ class ColmapReader(DatasetReader):
 def find_model(folder: Path) -> tuple[Path, Path] | None:
     """Return the folder of the photographs' folders and masks, and the model's; None: no model.
 
-    The first that has both photographs and a model; else the first model in a place of its own.
+    The first place with both photographs and a model, else the first model in MODEL_FOLDERS.
     """
     for workspace in WORKSPACES:
         root = folder / workspace
@@ -97,9 +95,8 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
 
 
 def _has_photographs(root: Path) -> bool:
-    if any((root / name).is_dir() for name in FACTORS):
-        return True
-    return any(map(images_in, (root, *folders_in(root))))
+    has_folder = any((root / name).is_dir() for name in FACTORS)
+    return has_folder or any(map(images_in, (root, *folders_in(root))))
 
 
 def folders_in(folder: Path) -> list[Path]:
@@ -126,14 +123,13 @@ def _root_and_model(folder: Path) -> tuple[Path, Path]:
 def _images_and_files(
     config: DataConfig, folder: Path, model: ColmapModel, notes: list[str]
 ) -> tuple[list[ColmapImage], list[Path]]:
-    """Return the images by name, and their files; images without one are left out."""
+    """Return the sorted images, and their files; images without one are left out."""
     if not model.images:
         raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
     images = sorted(model.images, key=lambda image: image.name)
     names = [image.name for image in images]
-    below = image_folder(config, model)
-
     places = [f"{folder}: image {one_line(name, 100)}" for name in names]
+    below = image_folder(config, model)
     found = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
     images = [image for image in images if image.name in found]
     return images, [found[image.name] for image in images]
@@ -142,8 +138,8 @@ def _images_and_files(
 def image_folder(config: DataConfig, model: ColmapModel) -> Path:
     """Return the folder of the photographs to read.
 
-    ``data.downscale`` chooses it; by default, the smallest photographs that have at least the width
-    ``data.image_size``, or the largest ones.
+    The one of ``data.downscale``; by default, that of the smallest photographs of at least the
+    width ``data.image_size``, or of the largest ones.
     """
     root, _ = _root_and_model(config.path)
     folders = [path for path in sorted(root.iterdir()) if path.is_dir()]

@@ -3,9 +3,8 @@
 Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle and one horizontal
 field of view, ``camera_angle_x``, for all frames that have none of their own; images of one size in
 a split, with straight alpha. An image without alpha is refused: its background would be fitted as
-part of the object. Opaque photographs need the nerfstudio layout.
-
-Frames may have a lens, a second pose, a mask and depths, as there.
+part of the object. Opaque photographs need the nerfstudio layout. Frames may have a lens, a second
+pose, a mask and depths, as there.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from drgs.core.errors import UserError
 from drgs.datasets.notices import Notices
 from drgs.datasets.reader import DatasetReader, Intrinsics, describe_extras, load_views
 from drgs.datasets.transforms import (
-    TransformsFile,
     TransformsFrame,
     focal_from_angle,
     frames_with_files,
@@ -31,9 +29,7 @@ from drgs.datasets.transforms import (
 from drgs.datasets.types import Dataset, Keeps, View, all_views
 from drgs.io.images import image_size
 
-START_HALF_EXTENT = 1.3
-"""The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes
-(``readNerfSyntheticInfo``)."""
+START_HALF_EXTENT = 1.3  # of the random start points of the 3DGS reference, readNerfSyntheticInfo
 
 UNUSED_KEYS = ("camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
 """Intrinsics that the layout does not have."""
@@ -58,7 +54,7 @@ class NerfSyntheticReader(DatasetReader):
         test = train
         if test_split != "train":
             test = _load_split(config, frames[test_split], keeps, notices)
-            test = tuple(replace(view, alpha=None) for view in test)  # only training looks at it
+            test = tuple(replace(view, alpha=None) for view in test)  # only training uses it
         notices.emit(notes, train, () if test_split == "train" else test)
         ignored, extras = describe_extras(config, [f for each in frames.values() for f in each])
         return Dataset(
@@ -101,17 +97,13 @@ def _transforms_path(config: DataConfig, split: str) -> Path:
 def _frames(config: DataConfig, split: str, notes: list[str]) -> list[TransformsFrame]:
     """Return the frames of a split whose images are there."""
     meta = read_transforms(_transforms_path(config, split))
-    if unread := [*meta.unread, *_unused_keys(meta)]:
+    values = [frame.values for frame in meta.frames]
+    unread = [key for key in UNUSED_KEYS if any(getattr(v, key) is not None for v in values)]
+    unread += [] if meta.point_cloud is None else ["ply_file_path"]
+    unread += [f"{split}_filenames" for split in meta.lists]
+    if unread := [*meta.unread, *unread]:
         notes.append(note_unread(meta.path, unread))
     return frames_with_files(config, meta, notes)
-
-
-def _unused_keys(meta: TransformsFile) -> list[str]:
-    """Return keys that other layouts read."""
-    values = [frame.values for frame in meta.frames]
-    keys = [key for key in UNUSED_KEYS if any(getattr(v, key) is not None for v in values)]
-    keys += [] if meta.point_cloud is None else ["ply_file_path"]
-    return keys + [f"{split}_filenames" for split in meta.lists]
 
 
 def _load_split(

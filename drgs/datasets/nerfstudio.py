@@ -1,12 +1,9 @@
 """The nerfstudio / instant-ngp layout: one ``transforms.json`` with intrinsics, and photographs.
 
-Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, in a frame; where
-focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. ``train_filenames``,
-``val_filenames`` and ``test_filenames`` list the photographs of the splits.
-
-Frames may have a lens, a second pose, a mask and depths: see ``drgs.datasets.transforms``. Depths
-are z in the camera; with a fisheye, the distance from it, as in nerfstudio, where a fisheye's rays
-have unit length.
+Intrinsics are ``fl_x, fl_y, cx, cy, w, h``; where focal lengths are missing, ``camera_angle_x``
+(and ``_y``) give them. Frames may have a lens, a second pose, a mask and depths: see
+``drgs.datasets.transforms``. Depths are z in the camera; with a fisheye, the distance from it, as
+in nerfstudio, where a fisheye's rays have unit length.
 """
 
 from __future__ import annotations
