@@ -126,7 +126,7 @@ def test_the_middle_half_is_averaged():
     counts = (0, 1, 2, 4, 7, 11)
     for point, count in enumerate(counts):
         samples[rng.permutation(11)[count:], point] = np.inf
-    actual = point_colors._middle(samples)
+    actual = point_colors._middle_mean(samples)
     assert np.isnan(actual[0]).all()
     for point, count in enumerate(counts[1:], 1):
         for channel in range(3):
