@@ -1,8 +1,8 @@
 """Placement of a capture's cameras: around a scene, inside it, or where its own sensors are.
 
 Settings that are not given follow from the scene (:func:`settings_for`). A room is photographed
-from inside: its walls are dark, or not there, from behind. Sensors of the scene decide up
-direction, target and distance; if there are many of them, their own images are taken.
+from inside, as its walls are dark or transparent from behind. Sensors of the scene decide up
+direction, target and distance; if there are many, the cameras stand where they are.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from drgs.capture.path_tracing import (
     CaptureView,
     bounding_box,
     lit_part,
+    scale_fov,
 )
 from drgs.core.errors import UserError
 from drgs.core.types import Float
@@ -39,10 +40,8 @@ ELEVATIONS = {"around": (0.0, 90.0), "inside": (-60.0, 60.0)}
 
 INSIDE_FOV = math.radians(70)  # in a room, walls are near
 INSIDE_PART = 0.6  # place of a camera on the way from the target to the wall behind it
-ENOUGH_SENSORS = 10  # number of sensors from which a scene is photographed from where they are
-
-TEST_EVERY = 8
-"""Interval of the scene's own sensors that are for testing, as in the nerfstudio layout."""
+ENOUGH_SENSORS = 10  # number of sensors from which on the cameras stand where they are
+TEST_EVERY = 8  # interval of the sensors that are for testing, as in the nerfstudio layout
 
 COUNTS = {"views", "val_views", "test_views"}
 
@@ -56,14 +55,12 @@ UNUSED = {
 """Settings that a kind of cameras does not use."""
 
 MIN_ENCLOSED_SHARE = 0.75
-"""Least part of all directions with a surface in a room. Cornell's box, which has five of six
-sides, has 5/6."""
+"""Least part of all directions with a surface in a room. Cornell's box, with five of six sides, has
+5/6."""
 
-NUM_SPOTS, NUM_DIRECTIONS = 128, 128
-"""Points of the bounding box that may be in a room, and rays from each."""
+NUM_SPOTS, NUM_DIRECTIONS = 128, 128  # points that may be in a room, and rays from each
 
-ROOM_QUANTILE = 0.1
-"""Quantile of the distances from a spot to its surroundings that measures its room."""
+ROOM_QUANTILE = 0.1  # of the distances from a spot to its surroundings: the size of its room
 
 PREVIEWS, PREVIEW_SIZE, PREVIEW_SPP = 12, (16, 16), 4
 
@@ -91,8 +88,7 @@ def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
         pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
         width, height = sensor.film().size()
         fov = math.radians(cast("Float", parameters["x_fov"])[0])
-        if height < width:
-            fov = 2 * math.atan(height / width * math.tan(fov / 2))
+        fov = scale_fov(fov, min(1.0, height / width))
         found.append(OwnCamera(pose @ OPENGL_TO_MITSUBA, fov))
     return found
 
@@ -122,7 +118,7 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
 
 
 def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
-    """Return all views, split after split; settings: of :func:`settings_for`."""
+    """Return all views, split after split; settings: from :func:`settings_for`."""
     if settings.cameras == "sensors":
         return views_of_sensors(own_cameras(scene), settings)
     if settings.cameras == "inside":
@@ -166,7 +162,7 @@ def _is_lit(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> bool
 def _around_settings(
     scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
 ) -> dict[str, object]:
-    """Return settings to look at the scene as its own sensors do, if they look at its middle."""
+    """Return settings for the view of the scene's sensors, if they look at its middle."""
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
     ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in own]
     seen = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
@@ -179,7 +175,6 @@ def _around_settings(
 
 
 def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
-    """Return as many views as there are sensors."""
     if not own:
         raise UserError(
             "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
@@ -199,16 +194,11 @@ def _up_axis(own: list[OwnCamera]) -> str:
 def _fov(settings: CaptureSettings, narrower: float) -> float:
     """Return the horizontal field of view, radians, from that along the image's smaller side."""
     width, height = settings.size
-    if height >= width:
-        return narrower
-    return 2 * math.atan(width / height * math.tan(narrower / 2))
+    return scale_fov(narrower, max(1.0, width / height))
 
 
 def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]:
-    """Return the place with most room, (3,) world, and whether something is in most directions.
-
-    Places where this is so come first.
-    """
+    """Return the spot with most room, (3,) world, in a room if any is, and whether it is in one."""
     low, high = np.array(bounding_box(scene), np.float64)
     if settings.target is not None:
         spots = np.array([settings.target])
@@ -226,7 +216,7 @@ def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]
 def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the part of all directions with a surface, and the room, (N,), at places (N, 3).
 
-    A surface that is seen from behind does not count: the place is inside an object.
+    Surfaces seen from behind do not count: the place is inside an object.
     """
     spots = np.array(spots, np.float64).reshape(-1, 3)
     up = hemisphere(NUM_DIRECTIONS // 2, 0.0, np.random.default_rng(0))
@@ -241,9 +231,9 @@ def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndar
 def _free_way(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances to the first surface, lamps included, (N,), infinite where there is none.
+    """Return distances (N,) to the first surface, lamps included, or infinity.
 
-    And whether there is one that reflects or transmits on the side that is seen, (N,) bool.
+    And whether it reflects or transmits on the side that is seen, (N,) bool.
     """
     if not len(origins):
         return np.empty(0), np.empty(0, bool)
@@ -261,9 +251,9 @@ def _free_way(
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
     """Return the target of cameras around a scene, (3,) world, and their distance from it.
 
-    Without ``distance``, the bounding box's sphere just fits between the edges of the image:
-    radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
-    has empty corners.
+    By default, the bounding box's sphere just fits between the edges of the image: radius /
+    sin(fov / 2), with the narrower field of view. NeRF-synthetic's 4.03 is 10% less: its box has
+    empty corners.
     """
     low, high = bounding_box(scene)
     target = (low + high) / 2 if settings.target is None else np.array(settings.target)
@@ -326,7 +316,7 @@ def _views(
     up = np.eye(3)["xyz".index(axis)] * (-1 if settings.up.startswith("-") else 1)
     for number, split in enumerate(SPLITS):
         rng = np.random.default_rng([settings.seed, number])
-        # Test views lie evenly; training views at random, but without gaps.
+        # Test views are spread evenly; training views at random, but without gaps.
         jitter = 0.0 if split == "test" else 1.0
         directions = remap_to_ranges(hemisphere(settings.count(split), jitter, rng), settings)
         directions = np.roll(directions, "zxy".index(axis), axis=1) * up.sum()
@@ -355,8 +345,7 @@ def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarra
     """Return unit vectors (count, 3) with z > 0, of equal density per solid angle.
 
     A golden-angle spiral from the rim to the pole: equal steps of height are equal areas (the
-    sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all; ``rng``
-    turns the whole spiral.
+    sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all.
     """
     step = np.arange(count)
     offset = rng.uniform(0, 2 * math.pi)

@@ -48,13 +48,12 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 ALL_PAIRS = 100  # most photographs of which every two are compared by default
 
 NEIGHBOURS, STRIDE = 10, 8
-"""Pairs of more photographs: each with so many that follow it by name and those at distances of
-powers of two, and every so many-th with each other."""
+"""Pairs of more photographs: each with NEIGHBOURS that follow it by name and those at distances of
+powers of two, and every STRIDE-th with each other."""
 
 PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # per call of COLMAP, which uses all cores within one
 
-MAX_SIDE_PX = 3200
-"""Features are extracted from photographs scaled down to this, which is COLMAP's default."""
+MAX_SIDE_PX = 3200  # of photographs for features, COLMAP's default: larger ones are scaled down
 
 MIN_PHOTOGRAPHS = 3  # photographs with which there is a model at all
 
@@ -68,12 +67,10 @@ TEMPORARY = ".drgs-poses-"  # beginning of the names of temporary folders
 SEED = 0
 
 REMEDY = "if memory or the disk is full, free some of it, or take fewer or smaller photographs"
-"""Remedy where COLMAP gives up, which does not always tell the reason."""
 
 T = TypeVar("T")
 
-Watch = Callable[[str, int, int], None]
-"""Takes the name of what is counted, the number done, and the total."""
+Watch = Callable[[str, int, int], None]  # takes the name of counted items, number done, and total
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class Search:
 
     camera_model: str = "OPENCV"  # of CAMERA_MODELS
     compare: str = "auto"  # pairs: all, neighbours by name, or auto: by ALL_PAIRS
-    share: str = "alike"  # a camera for all of the same size and EXIF (alike), for one, for each
+    share: str = "alike"  # one camera for all, for all of the same size and EXIF (alike), for each
 
     def compares_all(self, count: int) -> bool:
         """Return whether every two of ``count`` photographs are compared."""
@@ -114,8 +111,9 @@ class Placed:
 def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     """Return the folder of photographs, ``folder/images`` or ``folder``, and their names there.
 
-    Those that COLMAP does not read are left out, with a :class:`UserNote`. Raises
-    :class:`UserError` where there are no others, or one that cannot be fitted.
+    Photographs that COLMAP does not read are left out, with a :class:`UserNote`.
+
+    Raises :class:`UserError` where there are none, or one that cannot be fitted.
     """
     below = folder / "images"
     photographs = below if below.is_dir() else folder
@@ -140,7 +138,7 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
         note = f"{photographs}: left out, as COLMAP does not read them: {others}"
         warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
-        check_readable(file)  # what a fit refuses is refused before hours of work
+        check_readable(file)  # a fit would refuse it after hours of work
         if os.fsencode(file) != str(file).encode(errors="replace"):
             raise UserError(f"{file}: COLMAP knows names in UTF-8 only; rename it")
     return photographs, [file.relative_to(photographs).as_posix() for file in files]
@@ -155,11 +153,10 @@ def _numeric_order(file: Path) -> list[tuple[int, str]]:
 def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     """Write ``folder/sparse/0``, COLMAP's model of the photographs in ``folder``.
 
-    replace: the model that is there, if it was written here. Nothing is written where none is
-    found, and other files in that folder stay.
+    replace: the model that is there, if it was written here; other files in that folder stay.
 
-    Raises :class:`UserError`, with what to do, where no cameras are found, where a model is there
-    that is not to be replaced, and while another process writes to ``folder``.
+    Raises :class:`UserError` where no cameras are found, where a model is there that is not to be
+    replaced, and while another process writes to ``folder``.
     """
     photographs, names = photographs_in(folder)
     model = folder / "sparse" / "0"
@@ -209,9 +206,9 @@ def _remove_left_behind(folder: Path, model: Path) -> None:
 
 
 def _put(written: Path, model: Path) -> None:
-    """Move the files of a model to their place, where an earlier one is replaced.
+    """Move the files of a model to their place.
 
-    Before the first of them is in place the last one is gone: there is no mixture of two models.
+    The last file of an earlier model is removed first: there is no mixture of two models.
     """
     record = FolderRecord(model, COMMAND)
     record.claim(MODEL_FILES)
@@ -343,9 +340,9 @@ class _Reconstruction:
         return cameras[names[0]]
 
     def _masks_for_all(self) -> Path | None:
-        """Return a folder with a mask for each photograph, as a fit reads it; None: there are none.
+        """Return a folder with a mask for each photograph; None: there are none.
 
-        White for photographs without a mask, which COLMAP would leave out.
+        Photographs without one, which COLMAP would leave out, have white ones.
         """
         masks = masks_of(self.dataset, self.names, [], self.photographs)
         if not any(masks):
@@ -359,10 +356,9 @@ class _Reconstruction:
         return folder
 
     def _match(self) -> None:
-        """Compare pairs.
+        """Compare pairs, for which photographs are named by numbers.
 
-        COLMAP's lists of pairs have spaces between names, which may hold some themselves: for as
-        long as they are compared, photographs are called by their numbers.
+        COLMAP's lists of pairs have spaces between names, which may contain some.
         """
         pycolmap, pairs = self.pycolmap, list(self._pairs())
         options = pycolmap.ImportedPairingOptions()
@@ -412,7 +408,7 @@ class _Reconstruction:
 
 
 def _size_and_lens(file: Path) -> tuple[object, ...]:
-    """Return the same for photographs of one size and, as far as EXIF shows, one lens."""
+    """Return a key of photographs of one size and, as far as EXIF shows, one lens."""
     tags = ExifTags.Base
     try:
         with Image.open(file) as image:
