@@ -126,9 +126,7 @@ def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
     return views_around(settings, *target_and_distance(scene, settings))
 
 
-# ----------------------------------------------------------------------------------------------
 # Settings from the scene
-# ----------------------------------------------------------------------------------------------
 
 
 def _kind_for(
@@ -243,9 +241,7 @@ def _free_way(
     return np.array(hit.t, np.float64), np.array(is_front)
 
 
-# ----------------------------------------------------------------------------------------------
 # Cameras
-# ----------------------------------------------------------------------------------------------
 
 
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:

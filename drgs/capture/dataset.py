@@ -244,10 +244,7 @@ def write_transforms(path: Path, settings: CaptureSettings, views: list[CaptureV
 
 def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
     """Write a PLY of points: positions (N, 3) world, colours (N, 3) uint8 display space."""
-    columns = dict(zip("xyz", positions.T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), colors.T, strict=True))
-    dtype = [(name, column.dtype) for name, column in columns.items()]
-    rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
+    rows = np.rec.fromarrays([*positions.T, *colors.T], names="x,y,z,red,green,blue")
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode_elements({"vertex": rows}))
 

@@ -25,7 +25,7 @@ from drgs.datasets.reader import MAX_WIDTH, DatasetReader, Photographs
 from drgs.datasets.splits import unlisted_splits
 from drgs.datasets.transforms import LENS_OF_MODEL, FrameValues, TransformsFrame
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
-from drgs.io.images import MAX_SIDE, read_header
+from drgs.io.images import FIRST_TRANSPOSED_ORIENTATION, MAX_SIDE, read_header
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")  # folders of COLMAP's models in datasets
 
@@ -33,8 +33,6 @@ WORKSPACES = ("", "dense/0", "dense")  # where COLMAP's automatic reconstruction
 
 FACTORS = {"images": 1, "images_2": 2, "images_4": 4, "images_8": 8}
 """Divisors of the size of photographs, by folder."""
-
-FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange width and height
 
 PHOTOGRAPHS = FileKind("photographs", remedy="put the photographs there that COLMAP saw")
 
@@ -50,7 +48,7 @@ class ColmapReader(DatasetReader):
     @override
     def photographs(self, config: DataConfig) -> Photographs:
         notes: list[str] = []
-        root, folder = _root_and_model(config.path)
+        root, folder = require_model(config.path)
         model = read_model(folder)
         images, files = _images_and_files(config, folder, model, notes)
         below = image_folder(config, model)
@@ -73,7 +71,7 @@ class ColmapReader(DatasetReader):
     @override
     def image_files(self, config: DataConfig) -> list[Path]:
         """Return the photographs of all images, as large as they are there."""
-        folder = model_folder(config.path)
+        _, folder = require_model(config.path)
         widest = config.model_copy(update={"image_size": MAX_SIDE})
         return _images_and_files(widest, folder, read_model(folder), [])[1]
 
@@ -109,12 +107,8 @@ def folders_in(folder: Path) -> list[Path]:
     ]
 
 
-def model_folder(folder: Path) -> Path:
-    """Return the folder of the model. Raises :class:`UserError` where there is none."""
-    return _root_and_model(folder)[1]
-
-
-def _root_and_model(folder: Path) -> tuple[Path, Path]:
+def require_model(folder: Path) -> tuple[Path, Path]:
+    """Return the folders of :func:`find_model`; raise :class:`UserError` where there is none."""
     if (found := find_model(folder)) is None:
         raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(MODEL_FOLDERS)}")
     return found
@@ -141,7 +135,7 @@ def image_folder(config: DataConfig, model: ColmapModel) -> Path:
     The one of ``data.downscale``; by default, that of the smallest photographs of at least the
     width ``data.image_size``, or of the largest ones.
     """
-    root, _ = _root_and_model(config.path)
+    root, _ = require_model(config.path)
     folders = [path for path in sorted(root.iterdir()) if path.is_dir()]
     there = {FACTORS[key]: path for path in folders if (key := key_of(path.name)) in FACTORS}
     if 1 not in there and any((root / image.name).is_file() for image in model.images):

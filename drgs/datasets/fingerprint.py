@@ -1,8 +1,4 @@
-"""Fingerprints of datasets, by which another dataset and its differences are recognized.
-
-For each view: name, size and camera as configured, and digests of its files. The dataset's folder
-is no part of it.
-"""
+"""Fingerprints of datasets, by which another dataset and its differences are recognized."""
 
 from __future__ import annotations
 
@@ -18,8 +14,6 @@ from drgs.datasets.types import Dataset, Keeps, View, all_views
 
 CAMERA_TOLERANCE = 1e-9
 """Relative and absolute, of a camera's numbers: rounding of another machine's mathematics."""
-
-FILE_NAMES = {"image": "the image", "mask": "the mask", "depth": "the depth"}
 
 
 class ViewPrint(BaseModel):
@@ -62,7 +56,7 @@ class ViewPrint(BaseModel):
             yield "the camera"
         for what in {**self.files, **now.files}:
             if _is_different(self.files.get(what), now.files.get(what)):
-                yield FILE_NAMES.get(what, what)
+                yield f"the {what}"
 
 
 class Fingerprint(BaseModel):
@@ -105,8 +99,6 @@ def fingerprint_of(dataset: Dataset, reads: Keeps = all_views) -> Fingerprint:
     """Return the fingerprint of a dataset, for which the files of its views are read.
 
     reads: accepts views by name; the files of others have empty digests.
-
-    Raises :class:`drgs.core.errors.UserError` where one is gone.
     """
     views = [view for view in (*dataset.train, *dataset.test) if reads(view.name)]
     files = sorted({path for view in views for path in view.files.values()})

@@ -45,9 +45,7 @@ def find_reader(
 ) -> tuple[str, DatasetReader]:
     """Return the name and the reader of ``data.type``, or of the first that recognizes the folder.
 
-    sections: those of extensions, by name.
-
-    Raises :class:`UserError` for a folder that no reader recognizes, with what to do.
+    sections: of extensions, by name.
     """
     try:
         os.listdir(config.path)
@@ -75,9 +73,7 @@ def find_reader(
 def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, str]:
     """Return a configuration for the dataset in ``folder``, and the reasons for it, as text.
 
-    overrides: as for :func:`drgs.config.load.load_config`; these values are not chosen.
-
-    Raises :class:`UserError` for a folder that is no dataset, with what to do.
+    overrides: given values, as for :func:`drgs.config.load.load_config`.
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)

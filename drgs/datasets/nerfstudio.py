@@ -51,7 +51,6 @@ class NerfstudioReader(DatasetReader):
 
 
 def _lists(meta: TransformsFile, notes: list[str]) -> Lists | None:
-    """Return the splits that the file lists, or other files, or folders."""
     names = [frame.file_path for frame in meta.frames]
     if not meta.lists:
         return unlisted_splits((meta.path.parent,), names, notes)

@@ -108,10 +108,7 @@ class DatasetReader:
 
 
 def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_views) -> Dataset:
-    """Return all views, sorted by file name, in splits: see :func:`drgs.datasets.splits.split_of`.
-
-    Raises :class:`UserError` as that does, and for a photograph or a frame that cannot be read.
-    """
+    """Return all views, sorted by file name, in the splits of :func:`split_of`."""
     frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
     names = [frame.file_path for frame in frames]
     split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
@@ -155,8 +152,6 @@ def load_views(
     """Return the views of frames; images that ``keeps`` does not accept by name are not read.
 
     intrinsics: takes a frame, the shape of its photograph (H, W, C) and the size W, H of the view.
-
-    Raises :class:`UserError` where the images do not fit into memory or cannot be read.
     """
     names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]

@@ -269,10 +269,7 @@ class TransformsFile:
 
 
 def read_transforms(path: Path) -> TransformsFile:
-    """Read and check a transforms file.
-
-    Raises :class:`UserError` naming the file, the key, what was expected and what was got.
-    """
+    """Read and check a transforms file."""
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     try:
         meta = Transforms.model_validate(json.loads(text))
@@ -450,10 +447,7 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
 
 
 def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:
-    """Return the camera's motion while the shutter was open; None: it stands still.
-
-    samples: see :class:`drgs.datasets.types.CameraMotion`.
-    """
+    """Return the camera's motion while the shutter was open; None: it stands still."""
     close = frame.values.transform_matrix_close
     return None if close is None else CameraMotion(close, frame.values.shutter or "global", samples)
 

@@ -57,12 +57,10 @@ BOUNDED = {
 """Names of what has bounds in ``chunk``, by the word that it is in."""
 
 QUATERNION_RANGE = 1 / np.sqrt(2)  # no component but the largest is beyond it
-
 SH_RANGE = 4.0
 SH_LEVELS = 256
 
-MAX_LOG_SCALE = 20.0
-"""Larger ones are cut off, as PlayCanvas does: viewers compute with their exponentials."""
+MAX_LOG_SCALE = 20.0  # PlayCanvas's limit: viewers compute with its exponential
 
 
 @FORMATS.register("compressed-ply")

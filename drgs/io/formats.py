@@ -6,8 +6,7 @@ A format is a subclass of :class:`FileFormat`, registered under its name::
     class Npz(FileFormat): ...
 
 ``Gaussians.load`` and ``save``, the plugins' ``filename``, and the commands choose a format by the
-suffix of a file's name. :func:`read_gaussians` and :func:`encode` check what goes in and comes out,
-so that a format need not.
+suffix of a file's name. :func:`read_gaussians` and :func:`encode` check all arrays.
 """
 
 from __future__ import annotations
@@ -135,7 +134,7 @@ def _shipped_formats() -> list[Extension[type[FileFormat]]]:
 def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
     """Return the format with the longest suffix that a file's name ends in; None: there is none.
 
-    Installed packages are imported only where no format that drgs ships has such a suffix.
+    Installed packages are imported only if no shipped format has such a suffix.
     """
     for formats in (_shipped_formats, FORMATS.installed_extensions):
         found = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
@@ -169,11 +168,9 @@ def read_gaussians(
 
 
 def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return the content of a file in the format ``name``; data that it cannot hold is left out.
+    """Return the content of a file in the format ``name``, as :meth:`FileFormat.encode`.
 
-    gaussians, rendered_with: as for :meth:`FileFormat.encode`.
-
-    Raises :class:`UserError` where the format cannot hold the Gaussians.
+    Values of ``rendered_with`` that the format cannot hold are left out.
     """
     extension = FORMATS.get(name)
     if "smoothing" in gaussians and not extension.value.has_smoothing:
@@ -216,10 +213,7 @@ def _check_finite(gaussians: Arrays, start: str) -> None:
 
 
 def pop_origin(path: str | Path, rendered_with: dict[str, Scalar]) -> Origin:
-    """Remove the coordinates of the origin from ``rendered_with``, and return them.
-
-    Raises :class:`UserError` where some are missing, or are no numbers.
-    """
+    """Remove the coordinates of the origin from ``rendered_with``, and return them."""
     values = [rendered_with.pop(name, None) for name in ORIGIN]
     if values == [None, None, None]:
         return WORLD

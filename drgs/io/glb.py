@@ -419,10 +419,7 @@ def _validate_part(path: Path, place: str, kind: type[Part], content: object) ->
 
 
 def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, float, float]:
-    """Add up the translations of the node that shows the splats, and of its parents.
-
-    Raises :class:`UserError` for nodes that rotate or scale them.
-    """
+    """Add up the translations of the node that shows the splats, and of its parents."""
     showing = [index for index, node in enumerate(nodes) if node.mesh == mesh]
     if len(showing) > 1:
         raise UserError(f"{path}: the splats must be shown once, got {len(showing)} nodes")

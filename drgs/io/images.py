@@ -45,21 +45,7 @@ MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
 """Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several images."""
 
 
-def _transpose(pixels: np.ndarray) -> np.ndarray:
-    return pixels.swapaxes(0, 1)
-
-
-ORIENTATIONS = {
-    1: (),
-    2: (np.fliplr,),
-    3: (np.flipud, np.fliplr),
-    4: (np.flipud,),
-    5: (_transpose,),
-    6: (_transpose, np.fliplr),
-    7: (_transpose, np.flipud, np.fliplr),
-    8: (_transpose, np.flipud),
-}
-"""Turns that make an image upright, by EXIF's orientation."""
+FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange width and height
 
 INVERSE_ORIENTATIONS = {6: 8, 8: 6}  # other orientations are their own inverses
 
@@ -122,7 +108,7 @@ def _orientation(image: Image.Image) -> int:
         number = image.getexif().get(ExifTags.Base.Orientation, 1)
     except Exception:  # Pillow raises many types for broken EXIF, which is ignored
         return 1
-    return number if number in ORIENTATIONS else 1
+    return number if number in range(1, 9) else 1
 
 
 def _has_alpha(image: Image.Image) -> bool:
@@ -132,9 +118,11 @@ def _has_alpha(image: Image.Image) -> bool:
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return pixels (H, W, C) turned by EXIF's ``orientation``, a view."""
-    for turn in ORIENTATIONS[orientation]:
-        pixels = turn(pixels)
-    return pixels
+    if orientation >= FIRST_TRANSPOSED_ORIENTATION:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = np.flipud(pixels)
+    return np.fliplr(pixels) if orientation in (2, 3, 6, 7) else pixels
 
 
 def unused_content(path: Path) -> list[str]:
@@ -279,10 +267,7 @@ def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
 
 
 def encode(image: np.ndarray, suffix: str, **options: Any) -> bytes:
-    """Return a file with ``suffix``, png or webp, of an image or the frames of an animation.
-
-    options: of Pillow's writer.
-    """
+    """Return a PNG or WebP file of an image or the frames of an animation, by Pillow's options."""
     pixels = image if image.dtype == np.uint8 else to_uint8(image)
     return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
 

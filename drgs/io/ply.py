@@ -51,11 +51,9 @@ COLOR = ("red", "green", "blue")
 
 NUM_REST = (0, 9, 24, 45)  # ``f_rest`` properties, by SH degree
 
-ROWS_AND_COPIES = 3
-"""Memory that reading takes, in rows: Gaussians take 2.8 times theirs, from text as well."""
+MEMORY_RATIO = 3  # memory that reading takes, in bytes of the rows: measured 2.8, also from text
 
-MAX_HEADER_BYTES = 1 << 20
-"""The header of 62 properties takes 1.5 kB; the rest is room for comments."""
+MAX_HEADER_BYTES = 1 << 20  # the header of 62 properties takes 1.5 kB; the rest is for comments
 
 STATEMENT = re.compile(r"drgs ([a-z][a-z_]{0,39}) ([!-~]{1,40})")
 """A comment of ours: a name and its value. Others are ignored."""
@@ -196,7 +194,7 @@ def read_elements(
     with _open_after_header(path) as (file, header):
         wanted = [each for each in header.elements if each.name in names]
         size = sum(header.counts[each.name] * each.dtype().itemsize for each in wanted)
-        require_memory(path, ROWS_AND_COPIES * size, header.expected_rows)
+        require_memory(path, MEMORY_RATIO * size, header.expected_rows)
         rows = (_text_rows if header.text else _binary_rows)(path, file, header, names)
         for name in ("vertex", *(each.name for each in wanted)):
             if name not in rows or not len(rows[name]):

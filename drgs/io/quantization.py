@@ -1,7 +1,4 @@
-"""Numbers rounded to bits, as several file formats hold them, and the order of Gaussians in files.
-
-Arrays are of numpy, a row per Gaussian.
-"""
+"""Numbers rounded to bits, as several file formats hold them, and Morton order."""
 
 from __future__ import annotations
 
@@ -19,8 +16,7 @@ MAX_LOGIT = 23 * math.log(2)
 MIN_LOGIT = -125 * math.log(2)
 """Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
 
-MIN_LOG_SCALE = -126 * math.log(2)
-"""Logarithm of the smallest normal float32: what a scale of 0 becomes."""
+MIN_LOG_SCALE = -126 * math.log(2)  # of the smallest normal float32: what a scale of 0 becomes
 
 _REMAINING_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the other three components, by the index of one of four."""
@@ -31,7 +27,7 @@ def require_scene_memory(
 ) -> None:
     """Raise :class:`UserError` unless there is the memory to decode so many Gaussians.
 
-    harmonics: coefficients of each; turned: whether a format's axes are turned to ours afterwards.
+    harmonics: coefficients of each; turned: whether the axes are turned to ours afterwards.
     Measured: 276 bytes at degree 0, 808 at degree 3, and 1,372 where they are turned.
     """
     needed = count * (240 + (72 if turned else 36) * harmonics)
@@ -74,10 +70,7 @@ def sh0_from_colors(colors: np.ndarray) -> np.ndarray:
 
 
 def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
-    """Return quaternions (N, 4) float64 of length 1; one of length 0 is the identity.
-
-    quats: (N, 4) wxyz.
-    """
+    """Return quaternions (N, 4) wxyz, float64, of length 1; one of length 0 is the identity."""
     quats = quats.astype(np.float64)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     usable = lengths > 0
@@ -104,8 +97,7 @@ def restore_largest_component(index: np.ndarray, others: np.ndarray) -> np.ndarr
     return quats
 
 
-MORTON_BITS = 21
-"""Per axis: three of them in 63 bits. A cell is half a millionth of the box's longest side."""
+MORTON_BITS = 21  # per axis: a cell is half a millionth of the box's longest side
 
 _SPREAD = (
     (32, 0x1F00000000FFFF),
@@ -119,8 +111,7 @@ _SPREAD = (
 def morton_order(positions: np.ndarray) -> np.ndarray:
     """Return indices (N,) that sort positions (N, 3) along the Z-order curve; ties by index.
 
-    Morton 1966, "A computer oriented geodetic data base": the bits of the three coordinates in
-    turn.
+    Morton 1966, "A computer oriented geodetic data base".
     """
     positions = positions.astype(np.float64)
     low = positions.min(axis=0, initial=np.inf)

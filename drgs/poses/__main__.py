@@ -19,9 +19,9 @@ from drgs.cli.progress import RunProgress
 from drgs.config.schema import DataConfig
 from drgs.core.errors import format_names
 from drgs.datasets.folders import find_reader
+from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.poses.structure_from_motion import (
     ALL_PAIRS,
-    CAMERA_MODELS,
     NEIGHBOURS,
     Placed,
     Search,
@@ -46,10 +46,10 @@ def add_arguments(parser: CommandParser) -> None:
     )
     parser.add_argument(
         "--camera-model",
-        choices=CAMERA_MODELS,
+        choices=LENS_OF_MODEL,
         default=usual.camera_model,
         metavar="MODEL",
-        help=f"COLMAP's name of the lens: {', '.join(CAMERA_MODELS)} (default: %(default)s)",
+        help=f"COLMAP's name of the lens: {', '.join(LENS_OF_MODEL)} (default: %(default)s)",
     )
     parser.add_argument(
         "--share",

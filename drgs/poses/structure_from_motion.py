@@ -32,13 +32,10 @@ from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
-from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.io.images import check_readable, image_size, write_png
 
 if TYPE_CHECKING:
     import pycolmap
-
-CAMERA_MODELS = tuple(LENS_OF_MODEL)
 
 SIMPLE = "SIMPLE_RADIAL"  # the model with the fewest parameters that suits photographs
 
@@ -77,7 +74,7 @@ Watch = Callable[[str, int, int], None]  # takes the name of counted items, numb
 class Search:
     """Settings of structure from motion."""
 
-    camera_model: str = "OPENCV"  # of CAMERA_MODELS
+    camera_model: str = "OPENCV"  # of drgs.datasets.transforms.LENS_OF_MODEL
     compare: str = "auto"  # pairs: all, neighbours by name, or auto: by ALL_PAIRS
     share: str = "alike"  # one camera for all, for all of the same size and EXIF (alike), for each
 

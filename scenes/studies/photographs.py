@@ -29,7 +29,7 @@ from drgs.bench.output import machine, markdown_table
 from drgs.config.schema import FitConfig
 from drgs.core.environment import require_module
 from drgs.datasets import load_dataset
-from drgs.datasets.colmap import image_folder, model_folder
+from drgs.datasets.colmap import image_folder, require_model
 from drgs.datasets.folders import config_for, find_reader
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
@@ -62,7 +62,7 @@ def undistort(config: FitConfig, folder: Path) -> Path:
     It has no masks: COLMAP undistorts photographs alone.
     """
     pycolmap = require_module("pycolmap", "colmap", "undistorting")
-    model = model_folder(config.data.path)
+    _, model = require_model(config.data.path)
     renders = image_folder(config.data, read_model(model))
     found = pycolmap.Reconstruction(str(model))
     sizes = {}
@@ -152,7 +152,7 @@ def main() -> None:
         metrics = fit_words(words, folder / "fit", args.threads)
         name, as_taken = case.name, ""
         if case.has_own_world:
-            name += f" ({len(read_model(model_folder(data)).images)} placed)"
+            name += f" ({len(read_model(require_model(data)[1]).images)} placed)"
         else:
             as_taken = f"{psnr_as_taken(folder / 'fit', config):.2f} dB"
         quality = f"{metrics['test']['psnr']:.2f} dB", f"{metrics['test']['ssim']:.4f}"
