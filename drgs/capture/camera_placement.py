@@ -229,10 +229,7 @@ def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndar
 def _free_way(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances (N,) to the first surface, lamps included, or infinity.
-
-    And whether it reflects or transmits on the side that is seen, (N,) bool.
-    """
+    """Return distances (N,) to surfaces or lamps, and whether these scatter on the seen side."""
     if not len(origins):
         return np.empty(0), np.empty(0, bool)
     hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T)))

@@ -70,10 +70,7 @@ class CaptureFolder:
         }
 
     def check(self) -> None:
-        """Raise :class:`UserError` for a folder that is neither new, nor empty, nor this capture's.
-
-        Hidden files, a desktop's or temporary ones, do not count.
-        """
+        """Raise :class:`UserError` for a folder that is not new, empty or of this capture."""
         remedy = "choose another --out, or remove it"
         if self.path.exists() and not self.path.is_dir():
             raise UserError(f"{self.path}: --out must be a folder, got a file")
@@ -108,6 +105,7 @@ class CaptureFolder:
         remove_stale_temporaries(self.path)
 
     def _is_empty(self) -> bool:
+        """Return whether there are hidden files only: a desktop's, or temporary ones."""
         path = self.path
         return not path.exists() or all(child.name.startswith(".") for child in path.iterdir())
 
@@ -116,10 +114,7 @@ class CaptureFolder:
         return self.path / f"{view.file_path}.png"
 
     def take_images(self, scene: mi.Scene, views: list[CaptureView]) -> None:
-        """Take the images that are not there yet; warn if most of the first show nothing.
-
-        The folder is claimed with the first image, until which the scene may be refused.
-        """
+        """Take the images that are not there yet; warn if most of the first show nothing."""
         camera = CaptureCamera(scene, self._settings)
         missing = spread_first([view for view in views if not self.image_path(view).exists()])
         if num_done := len(views) - len(missing):
@@ -130,7 +125,7 @@ class CaptureFolder:
         with RunProgress("image", len(views), num_done) as progress:
             for done, view in enumerate(missing, num_done + 1):
                 image = camera.image(view)
-                if not shown:
+                if not shown:  # until now, the scene may have been refused
                     self.claim()
                 write_png(self.image_path(view), image)
                 shown.append(shows_something(image))

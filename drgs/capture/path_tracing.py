@@ -285,15 +285,12 @@ class CaptureCamera:
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
-    """Return (H, W, 4) uint8 straight sRGB and alpha, from premultiplied linear radiance and alpha.
-
-    Where alpha rounds to zero the colour is black, not noise.
-    """
+    """Return (H, W, 4) uint8 straight sRGB and alpha, from premultiplied radiance and alpha."""
     alpha = np.clip(linear[:, :, 3:], 0, 1)
     color = np.clip(linear[:, :, :3] / np.maximum(alpha, 1e-9), 0, 1)
     display = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
     rgba = to_uint8(np.concatenate([display, alpha], axis=2))
-    rgba[rgba[:, :, 3] == 0] = 0
+    rgba[rgba[:, :, 3] == 0] = 0  # not noise
     return rgba
 
 

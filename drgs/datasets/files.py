@@ -275,7 +275,6 @@ def _format_files(folder: Path, files: Sequence[Path]) -> str:
 
 
 def _mask_files(folder: Path) -> list[Path]:
-    """Return the images in the folders of masks, and below them."""
     tops = [name for name in os.listdir(folder) if key_of(name) in MASK_FOLDERS]
     walks = (walk for top in tops for walk in os.walk(folder / top))
     return _png_first(

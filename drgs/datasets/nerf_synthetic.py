@@ -95,7 +95,6 @@ def _transforms_path(config: DataConfig, split: str) -> Path:
 
 
 def _frames(config: DataConfig, split: str, notes: list[str]) -> list[TransformsFrame]:
-    """Return the frames of a split whose images are there."""
     meta = read_transforms(_transforms_path(config, split))
     values = [frame.values for frame in meta.frames]
     unread = [key for key in UNUSED_KEYS if any(getattr(v, key) is not None for v in values)]

@@ -89,10 +89,7 @@ class DatasetReader:
         return False
 
     def photographs(self, config: DataConfig) -> Photographs:
-        """Return where the photographs of a folder are, with their cameras.
-
-        A :class:`TransformsFrame` for each: ``from_camera`` makes those of pinhole cameras.
-        """
+        """Return a frame for each photograph in a folder: see :class:`TransformsFrame`."""
         raise NotImplementedError
 
     def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:

@@ -294,22 +294,20 @@ def note_unread(path: Path, keys: Sequence[str]) -> str:
 
 
 def _extra(values: CameraValues) -> dict[str, object]:
-    """Return the values of keys that are no fields."""
     return values.model_extra or {}
 
 
 def _unread_keys(meta: Transforms) -> list[str]:
     """Return sorted keys; those of frames as ``frames[].key``."""
     models = {values.camera_model for values in (meta, *meta.frames)}
-    known = IGNORED_KEYS.union(*map(_coefficients, models))
+    known = IGNORED_KEYS.union(*map(_coefficient_names, models))
     top = _extra(meta).keys() - known
     in_frames = set().union(*map(_extra, meta.frames)) - known
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 
 
-def _coefficients(model: str | None) -> tuple[str, ...]:
-    """Return the names of a lens's coefficients."""
+def _coefficient_names(model: str | None) -> tuple[str, ...]:
     if model is None or model in LENS_OF_MODEL:
         return DISTORTION
     from drgs.cameras.lens import LENSES
@@ -329,7 +327,6 @@ def _explain_error(error: ErrorDetails) -> str:
 
 
 def _show(value: object) -> str:
-    """Return the value as JSON writes it, shortened."""
     return one_line(json.dumps(value), limit=60)
 
 
@@ -413,7 +410,8 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     model, values = frame.values.camera_model, frame.values
     name = "opencv" if model is None else LENS_OF_MODEL.get(model, model)
     is_of_colmap = model is None or model in LENS_OF_MODEL
-    given = {k: v for k in _coefficients(model) if (v := getattr(values, k, None)) is not None}
+    names = _coefficient_names(model)
+    given = {k: v for k in names if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             raise UserError(f"{frame.location(key)} must be a finite number, got {_show(value)}")

@@ -210,7 +210,6 @@ def _num_points(init: InitConfig) -> int:
 
 
 def _random_points(config: FitConfig, dataset: Dataset) -> Start:
-    """Return random points in a box, or in all that the cameras see."""
     num_points, rng = _num_points(config.init), np.random.default_rng(config.seed)
     what, box = f"{num_points:,} random points", box_to_start_in(config.init, dataset)
     if box is not None:

@@ -73,10 +73,7 @@ class Silhouette:
 
 
 def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
-    """Return silhouettes of views that have alpha and a camera that does not move.
-
-    Pixels that a mask leaves out are part of it: they are not known to be empty.
-    """
+    """Return silhouettes of views that have alpha and a camera that does not move."""
     views = [v for v in thin_out(views) if v.alpha is not None and is_projectable(v)]
     return [_silhouette(view) for view in views]
 
@@ -91,9 +88,9 @@ def _silhouette(view: View) -> Silhouette:
     opaque, solid = alpha > MAX_EMPTY_ALPHA, alpha >= MIN_POINT_ALPHA
     transparent = 1 - float(opaque.mean())
     if view.mask is not None:
-        unknown = np.asarray(view.mask) == 0
-        opaque |= unknown
-        solid |= unknown
+        left_out = np.asarray(view.mask) == 0  # not known to be empty
+        opaque |= left_out
+        solid |= left_out
     scale = -(-max(opaque.shape) // MAX_SIDE_PX)
     opaque, solid = (_any_of(pixels, scale) for pixels in (opaque, solid))
     table = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int32)
@@ -220,10 +217,7 @@ def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
 def _shown_by_all(
     silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float
 ) -> np.ndarray:
-    """Return which (N,) cubes no image shows empty, and enough of the images show.
-
-    centers: (N, 3) world; edge 0: points.
-    """
+    """Return which (N,) cubes, points if edge is 0, no image shows empty and enough images show."""
     columns = [np.ascontiguousarray(c) for c in centers.T]
     rows, seen = np.arange(len(centers)), np.zeros(len(centers), np.int32)
     for silhouette in silhouettes:

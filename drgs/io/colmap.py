@@ -115,10 +115,7 @@ class ColmapModel:
 
 
 def model_files(folder: Path) -> dict[str, Path] | None:
-    """Return the files ``cameras``, ``images`` and, if it exists, ``points3D``, binary if possible.
-
-    None: no model.
-    """
+    """Return ``cameras``, ``images`` and maybe ``points3D``, binary if possible; None: no model."""
     for suffix in (".bin", ".txt"):
         files = {name: folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D")}
         there = {name: path for name, path in files.items() if path.is_file()}
@@ -246,16 +243,13 @@ class _BinaryFile:
 
     @property
     def place(self) -> Place:
-        """Place of the next byte."""
         return Place(self._path, "byte", self._at)
 
     @property
     def left(self) -> int:
-        """Number of bytes that follow."""
         return len(self._data) - self._at
 
     def skip(self, size: int) -> None:
-        """Skip bytes."""
         if size > self.left:
             raise UserError(
                 f"{self.place}: {size:,} bytes were expected, and {self.left:,} are left; the file "

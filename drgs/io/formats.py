@@ -92,7 +92,6 @@ class FileFormat:
         raise UserError("files of this format can be read, but not written")
 
     def __init_subclass__(cls) -> None:
-        """Raise TypeError for a format without a suffix or a description."""
         if not getattr(cls, "suffix", "").startswith(".") or cls.suffix != cls.suffix.lower():
             raise TypeError(f"{cls.__name__}.suffix must be a suffix in small letters, as .npz")
         if not getattr(cls, "description", ""):

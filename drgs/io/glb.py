@@ -253,8 +253,6 @@ class _Part(BaseModel):
 
 
 class _Accessor(_Part):
-    """Layout of numbers in a part of the buffer."""
-
     buffer_view: Index
     byte_offset: Index = 0
     component_type: Literal[5120, 5121, 5122, 5123, 5126]
@@ -334,7 +332,6 @@ class _Document:
         return settings
 
     def accessor(self, name: str) -> _Accessor:
-        """Return how an attribute's numbers lie in a part of the buffer."""
         index = self.primitive.attributes[name]
         return self._item("accessors", self.file.accessors, index, _Accessor)
 

@@ -176,7 +176,7 @@ def as_numbers(pixels: np.ndarray) -> np.ndarray:
 def check_readable(path: Path) -> None:
     """Raise :class:`UserError` as :func:`read_pixels` does, as far as the header shows it."""
     with _open_image(path) as image:
-        _check(path, image)
+        _check_supported(path, image)
 
 
 def read_pixels(path: Path) -> np.ndarray:
@@ -185,7 +185,7 @@ def read_pixels(path: Path) -> np.ndarray:
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
     """
     with _open_image(path) as image:
-        _check(path, image)  # before memory is allocated for it
+        _check_supported(path, image)  # before memory is allocated for it
         needed = image.width * image.height * PIXEL_BYTES
         require_memory(path, needed, f"an image of {image.width} x {image.height} px")
         # Pillow turns TIFFs, and no others.
@@ -209,8 +209,7 @@ def read_pixels(path: Path) -> np.ndarray:
     return pixels
 
 
-def _check(path: Path, image: Image.Image) -> None:
-    """Raise :class:`UserError` for images that are too large, or of another mode."""
+def _check_supported(path: Path, image: Image.Image) -> None:
     if image.width * image.height > MAX_PIXELS:
         raise UserError(
             f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "

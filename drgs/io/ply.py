@@ -155,8 +155,7 @@ def encode_elements(
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None.
 
-    Integer colours count from 0 to 255, or to 65535 in unsigned 16 bits. Raises as
-    :meth:`Ply.read`.
+    Integer colours count to 255, or to 65535 in unsigned 16 bits.
     """
     rows, statements = read_elements(path, ["vertex"])
     vertex = rows["vertex"]
@@ -218,7 +217,6 @@ class _Header:
 
     @property
     def expected_rows(self) -> str:
-        """The rows, as messages name them."""
         return format_names([f"{n} of {one_line(name, 60)}" for name, n in self.counts.items()])
 
 
@@ -339,13 +337,12 @@ def _refuse_end(path: str | Path, name: str, promised: int, got: int) -> None:
     )
 
 
-def _check_end(path: str | Path, header: _Header, more: int) -> None:
-    """Refuse bytes after the last row; more: their number."""
-    if more:
+def _check_end(path: str | Path, header: _Header, num_left: int) -> None:
+    if num_left:
         raise UserError(
             f"{path}: the file must end after the rows that its header promises "
-            f"({header.expected_rows}), got {more:,} bytes more; correct the header's counts, or "
-            "get the file again"
+            f"({header.expected_rows}), got {num_left:,} bytes more; correct the header's counts, "
+            "or get the file again"
         )
 
 

@@ -78,10 +78,7 @@ def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
 
 
 def drop_largest_component(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index (N,) of the largest component, and the other three (N, 3), in their order.
-
-    quats: (N, 4) of length 1; the sign is chosen such that the largest is positive.
-    """
+    """Return the index (N,) of the largest component, made positive, and the other three (N, 3)."""
     rows = np.arange(len(quats))
     index = np.argmax(np.abs(quats), axis=1)
     sign = np.where(quats[rows, index] < 0, -1.0, 1.0)

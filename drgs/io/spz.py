@@ -206,8 +206,6 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Header:
-    """Content of the header, before the numbers."""
-
     version: int
     num: int
     degree: int
@@ -301,21 +299,15 @@ def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
             f"{Place(path, 'byte', 15)}: a table of {len(sizes)} streams within the file was "
             f"expected, got {num_streams} at byte {table:,}; the file is damaged, or was cut off"
         )
-    parts = []
+    zstandard, parts = require_module("zstandard", "spz", f"{path}: an SPZ file of version 4"), []
     for index, size in enumerate(sizes):
         packed, _ = TABLE_ENTRY.unpack_from(content, table + index * TABLE_ENTRY.size)
         place = Place(path, "byte", start)
         part = _checked_size(place, content[start : start + packed], packed)
-        parts.append(_unpacked_stream(place, part, size))
+        try:
+            stream = zstandard.ZstdDecompressor().stream_reader(part)
+            parts.append(_checked_size(place, stream.read(size), size))
+        except zstandard.ZstdError as error:
+            raise UserError(f"{place}: the Zstandard stream is damaged: {error}") from None
         start += packed
     return header, parts + [b""] * (len(header.sizes) - len(parts))
-
-
-def _unpacked_stream(place: Place, packed: bytes, expected: int) -> bytes:
-    what = f"{place.path}: an SPZ file of version 4"
-    zstandard = require_module("zstandard", "spz", what)
-    try:
-        stream = zstandard.ZstdDecompressor().stream_reader(packed)
-        return _checked_size(place, stream.read(expected), expected)
-    except zstandard.ZstdError as error:
-        raise UserError(f"{place}: the Zstandard stream is damaged: {error}") from None

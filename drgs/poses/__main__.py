@@ -117,7 +117,6 @@ class _Steps:
         self._stack, self._what, self._most = stack, "", 0
 
     def update(self, what: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` items are done."""
         if what != self._what:
             self._stack.close()
             self._what, self._most = what, -1

@@ -160,8 +160,10 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
     with DeferredInterrupts() as interrupts, sole_writer(folder) as keep:
         _check_free(folder, model, replace)
         try:
-            if keep():
-                _remove_left_behind(folder, model)
+            if keep():  # remove files of runs that were killed
+                for path in (folder, model.parent, model):
+                    for left in path.glob(f"{TEMPORARY}*"):
+                        shutil.rmtree(left, ignore_errors=True)
             # On the disk to which the files are moved.
             parent = next(path for path in (model, *model.parents) if path.is_dir())
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
@@ -193,13 +195,6 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
             "then used instead"
         )
     FolderRecord(model, COMMAND).check(MODEL_FILES)
-
-
-def _remove_left_behind(folder: Path, model: Path) -> None:
-    """Remove temporary files of runs that were killed; to be called by the only writer."""
-    for path in (folder, model.parent, model):
-        for left in path.glob(f"{TEMPORARY}*"):
-            shutil.rmtree(left, ignore_errors=True)
 
 
 def _put(written: Path, model: Path) -> None:
@@ -383,7 +378,6 @@ class _Reconstruction:
                 yield i, j
 
     def _map(self) -> list[pycolmap.Reconstruction]:
-        """Reconstruct cameras and points."""
         options = self.pycolmap.IncrementalPipelineOptions()
         options.random_seed = SEED
         total, placed = len(self.names), 0
