@@ -36,7 +36,7 @@ from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries
 from drgs.io.images import read_image, to_uint8, write_png
-from drgs.io.ply import encode_elements
+from drgs.io.ply import COLOR, POSITION, encode_elements
 
 POINTS = "points3d.ply"
 MANIFEST = "capture.json"
@@ -239,7 +239,9 @@ def write_transforms(path: Path, settings: CaptureSettings, views: list[CaptureV
 
 def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
     """Write a PLY of points: positions (N, 3) world, colours (N, 3) uint8 display space."""
-    rows = np.rec.fromarrays([*positions.T, *colors.T], names="x,y,z,red,green,blue")
+    columns = dict(zip((*POSITION, *COLOR), (*positions.T, *colors.T), strict=True))
+    dtype = [(name, column.dtype) for name, column in columns.items()]
+    rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode_elements({"vertex": rows}))
 
