@@ -70,14 +70,14 @@ PLASTIC_RATIO = 1.2207440846057596
 """The root of x^4 = x + 1: its powers spread points evenly over a box (Roberts 2018, "R_3")."""
 
 
-class OwnCamera(NamedTuple):
+class SceneSensor(NamedTuple):
     """A sensor of the scene itself."""
 
     pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes
     narrower_fov: float  # radians, along the film's smaller side
 
 
-def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
+def perspective_sensors(scene: mi.Scene) -> list[SceneSensor]:
     """Return the scene's sensors of the types ``perspective`` and ``thinlens``."""
     found = []
     for sensor in scene.sensors():
@@ -89,7 +89,7 @@ def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
         width, height = sensor.film().size()
         fov = math.radians(cast("Float", parameters["x_fov"])[0])
         fov = scale_fov(fov, min(1.0, height / width))
-        found.append(OwnCamera(pose @ OPENGL_TO_MITSUBA, fov))
+        found.append(SceneSensor(pose @ OPENGL_TO_MITSUBA, fov))
     return found
 
 
@@ -98,7 +98,7 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
 
     Raises :class:`UserError` for a setting that the cameras do not use.
     """
-    own = own_cameras(scene)
+    own = perspective_sensors(scene)
     if "cameras" not in given:
         kind = _kind_for(scene, settings, given, own)
         return settings_for(scene, replace(settings, cameras=kind), {*given, "cameras"})
@@ -120,7 +120,7 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
 def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
     """Return all views, split after split; settings: from :func:`settings_for`."""
     if settings.cameras == "sensors":
-        return views_of_sensors(own_cameras(scene), settings)
+        return views_of_sensors(perspective_sensors(scene), settings)
     if settings.cameras == "inside":
         return views_inside(scene, settings)
     return views_around(settings, *target_and_distance(scene, settings))
@@ -130,7 +130,7 @@ def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
 
 
 def _kind_for(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[SceneSensor]
 ) -> str:
     if given & ORBITING:
         return "around"
@@ -140,7 +140,7 @@ def _kind_for(
     if not is_closed:
         return "around"
     author_is_inside = any(
-        _look_around(scene, [o.pose[:3, 3] for o in own])[0] >= MIN_ENCLOSED_SHARE
+        _measure_enclosure(scene, [o.pose[:3, 3] for o in own])[0] >= MIN_ENCLOSED_SHARE
     )
     if not author_is_inside and _is_lit(scene, replace(settings, cameras="around"), given):
         return "around"
@@ -158,7 +158,7 @@ def _is_lit(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> bool
 
 
 def _around_settings(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[SceneSensor]
 ) -> dict[str, object]:
     """Return settings for the view of the scene's sensors, if they look at its middle."""
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
@@ -172,7 +172,7 @@ def _around_settings(
     return {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
 
 
-def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
+def _sensor_settings(own: list[SceneSensor]) -> dict[str, object]:
     if not own:
         raise UserError(
             "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
@@ -182,7 +182,7 @@ def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
     return {"views": len(own) - tests, "val_views": 0, "test_views": tests}
 
 
-def _up_axis(own: list[OwnCamera]) -> str:
+def _up_axis(own: list[SceneSensor]) -> str:
     """Return the axis that is nearest to up in the sensors' images, such as ``z`` or ``-y``."""
     up = np.mean([o.pose[:3, 1] for o in own], axis=0)
     axis = int(np.argmax(np.abs(up)))
@@ -205,13 +205,13 @@ def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]
     else:
         steps = np.arange(NUM_SPOTS)[:, None] * PLASTIC_RATIO ** -np.arange(1.0, 4.0)
         spots = low + (high - low) * ((0.5 + steps) % 1)
-    closed, room = _look_around(scene, spots)
+    closed, room = _measure_enclosure(scene, spots)
     is_closed = closed >= MIN_ENCLOSED_SHARE
     best = np.argmax(np.where(is_closed, room, -1)) if is_closed.any() else np.argmax(closed)
     return spots[best], bool(is_closed.any())
 
 
-def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def _measure_enclosure(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the part of all directions with a surface, and the room, (N,), at places (N, 3).
 
     Surfaces seen from behind do not count: the place is inside an object.
@@ -220,13 +220,13 @@ def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndar
     up = hemisphere(NUM_DIRECTIONS // 2, 0.0, np.random.default_rng(0))
     directions = np.concatenate([up, -up])
     pairs = np.repeat(spots, len(directions), axis=0), np.tile(directions, (len(spots), 1))
-    distances, is_front = _free_way(scene, *pairs)
+    distances, is_front = _first_surfaces(scene, *pairs)
     shape = len(spots), len(directions)
     room = np.quantile(distances.reshape(shape), ROOM_QUANTILE, axis=1, method="lower")
     return is_front.reshape(shape).mean(axis=1), room
 
 
-def _free_way(
+def _first_surfaces(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (N,) to surfaces or lamps, and whether these scatter on the seen side."""
@@ -283,13 +283,13 @@ def views_inside(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView
         with np.errstate(divide="ignore"):
             leaving = (np.where(directions > 0, high, low) - target) / directions
         leaving = np.where(directions == 0, np.inf, leaving).min(axis=1)
-        way, _ = _free_way(scene, np.tile(target, (len(directions), 1)), directions)
+        way, _ = _first_surfaces(scene, np.tile(target, (len(directions), 1)), directions)
         return INSIDE_PART * np.minimum(way, leaving)
 
     return _views(settings, target, distances)
 
 
-def views_of_sensors(own: list[OwnCamera], settings: CaptureSettings) -> list[CaptureView]:
+def views_of_sensors(own: list[SceneSensor], settings: CaptureSettings) -> list[CaptureView]:
     """Return the views of the scene's own sensors."""
     has_tests = settings.test_views > 0
     tests = own[::TEST_EVERY] if has_tests else []

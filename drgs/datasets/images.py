@@ -250,7 +250,7 @@ def compact_mask(mask: np.ndarray) -> LazyImage:
     return LazyImage(mask.shape, lambda: kept.astype(np.float32), kept.nbytes)
 
 
-def check_room(files: Sequence[Path], max_width: int | None) -> None:
+def check_memory(files: Sequence[Path], max_width: int | None) -> None:
     """Raise :class:`UserError` where photographs, as they are kept, do not fit into memory."""
     needed = 0
     for file in files:
@@ -269,7 +269,7 @@ def check_room(files: Sequence[Path], max_width: int | None) -> None:
         )
 
 
-def threads_for(files: Sequence[Path]) -> int:
+def num_threads(files: Sequence[Path]) -> int:
     """Return the number of photographs to read at a time, for memory."""
     width, height = image_size(files[0])
     return max(1, min(MAX_THREADS, MAX_PIXELS_AT_ONCE // (width * height)))

@@ -26,7 +26,7 @@ from drgs.datasets.transforms import (
     note_unread,
     read_transforms,
 )
-from drgs.datasets.types import Dataset, Keeps, View, all_views
+from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.images import image_size
 
 START_HALF_EXTENT = 1.3  # of the random start points of the 3DGS reference, readNerfSyntheticInfo
@@ -44,7 +44,7 @@ class NerfSyntheticReader(DatasetReader):
         return (folder / "transforms_train.json").exists()
 
     @override
-    def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
+    def load(self, config: DataConfig, keeps: ViewFilter = all_views) -> Dataset:
         """Return split ``train``, and ``config.test_split`` (default: ``test`` or ``val``)."""
         if config.background is None:
             config = config.model_copy(update={"background": "white"})
@@ -106,7 +106,7 @@ def _frames(config: DataConfig, split: str, notes: list[str]) -> list[Transforms
 
 
 def _load_split(
-    config: DataConfig, frames: list[TransformsFrame], keeps: Keeps, notices: Notices
+    config: DataConfig, frames: list[TransformsFrame], keeps: ViewFilter, notices: Notices
 ) -> tuple[View, ...]:
     first = frames[0].files["image"]
     width, height = image_size(first)

@@ -45,7 +45,7 @@ class Notices:
         own = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
         if outside := self._files_outside(files if cloud is None else {*files, cloud}):
             own.append(f"files from outside of the folder: {_format_files(outside)}")
-        own += self._equal(train, test)
+        own += self._duplicate_notes(train, test)
         for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
             warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
 
@@ -66,7 +66,7 @@ class Notices:
                 found.append(real)
         return found
 
-    def _equal(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
+    def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
         """Return a note on photographs that are there more than once, or none."""
         groups = [[*train, *test]]
         for key in (os.path.getsize, digest):

@@ -21,17 +21,17 @@ from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.images import (
     Pixels,
-    check_room,
+    check_memory,
     compact_mask,
     compact_photograph,
     downscale_depth,
     downscale_mask,
     downscaled_size,
     is_array,
+    num_threads,
     placeholder_pixels,
     read_depth,
     read_mask,
-    threads_for,
     unread_image,
 )
 from drgs.datasets.notices import Notices
@@ -46,7 +46,7 @@ from drgs.datasets.transforms import (
     principal_point,
     unique_names,
 )
-from drgs.datasets.types import Dataset, Keeps, View, all_views
+from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.images import read_header, read_pixels, upright
 
 __all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame", "dataset_of"]
@@ -92,7 +92,7 @@ class DatasetReader:
         """Return a frame for each photograph in a folder: see :class:`TransformsFrame`."""
         raise NotImplementedError
 
-    def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
+    def load(self, config: DataConfig, keeps: ViewFilter = all_views) -> Dataset:
         """Return the dataset, with the images of the views whose names ``keeps`` accepts.
 
         Splits, sizes, masks and backgrounds follow the section ``data``.
@@ -104,7 +104,9 @@ class DatasetReader:
         return [frame.files["image"] for frame in self.photographs(config).frames]
 
 
-def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_views) -> Dataset:
+def dataset_of(
+    config: DataConfig, photographs: Photographs, keeps: ViewFilter = all_views
+) -> Dataset:
     """Return all views, sorted by file name, in the splits of :func:`split_of`."""
     frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
     names = [frame.file_path for frame in frames]
@@ -143,7 +145,7 @@ def load_views(
     config: DataConfig,
     frames: Sequence[TransformsFrame],
     intrinsics: Callable[[TransformsFrame, tuple[int, ...], tuple[int, int]], Intrinsics],
-    keeps: Keeps,
+    keeps: ViewFilter,
     notices: Notices,
 ) -> tuple[View, ...]:
     """Return the views of frames; images that ``keeps`` does not accept by name are not read.
@@ -153,11 +155,11 @@ def load_views(
     names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]
     kept = [file for file, name in zip(files, names, strict=True) if keeps(name)]
-    check_room(kept, config.image_size)
+    check_memory(kept, config.image_size)
 
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
-        pixels = as_calibrated((read_pixels if is_read else placeholder_pixels)(file), frame)
+        pixels = orient_as_calibrated((read_pixels if is_read else placeholder_pixels)(file), frame)
         if is_read:
             notices.inspect(file, pixels)
         height, width = pixels.shape[:2]
@@ -179,10 +181,10 @@ def load_views(
             files=frame.files,
         )
 
-    return in_parallel(load, frames, names, threads=threads_for(files))
+    return map_on_threads(load, frames, names, threads=num_threads(files))
 
 
-def in_parallel(
+def map_on_threads(
     function: Callable[..., T], *arguments: Sequence[object], threads: int | None = None
 ) -> tuple[T, ...]:
     """Map a function on threads, in order: decoding images releases Python's lock."""
@@ -190,7 +192,7 @@ def in_parallel(
         return tuple(pool.map(function, *arguments))
 
 
-def as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
+def orient_as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
     """Return the pixels (H, W, C) of a photograph, turned by EXIF if that gives the frame's size.
 
     Viewers, OpenCV and Agisoft turn such a photograph; COLMAP, PyTorch's readers and the 3DGS

@@ -67,11 +67,11 @@ def _match_names(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str]
     exact = {"/".join(parts_of(name)): name for name in names}
     loose: dict[str, set[str]] = {}
     for name in names:
-        loose.setdefault(_loose(name), set()).add(name)
+        loose.setdefault(_loose_key(name), set()).add(name)
     found, unknown = set(), []
     for name in listing:
         same = exact.get("/".join(parts_of(name)))
-        candidates = loose.get(_loose(name), set()) if same is None else {same}
+        candidates = loose.get(_loose_key(name), set()) if same is None else {same}
         if len(candidates) == 1:
             found |= candidates
         else:
@@ -79,7 +79,7 @@ def _match_names(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str]
     return found, unknown
 
 
-def _loose(name: str) -> str:
+def _loose_key(name: str) -> str:
     """Return a name without the image's suffix and the folder of photographs, in any case."""
     parts = [key_of(part) for part in parts_of(name)] or [""]
     if len(parts) > 1 and parts[0] in IMAGE_FOLDERS:
@@ -132,8 +132,8 @@ def split_of(
             f"{source}: at least 2 views are needed, one of them to test; got {len(names)}"
         )
     if lists is None:
-        return _every_nth(config, source, len(names))
-    name, train, test = _members(config, source, lists, set(names))
+        return _split_every_nth(config, source, len(names))
+    name, train, test = _listed_split(config, source, lists, set(names))
     both = sorted(train & test)
     if both and name != "train":
         raise UserError(
@@ -156,7 +156,7 @@ def split_of(
     return Split(trained, measured, name, f"split {name}, by {lists.where}")
 
 
-def _members(
+def _listed_split(
     config: DataConfig, source: Path, lists: Lists, names: set[str]
 ) -> tuple[str, set[str], set[str]]:
     """Return the split to measure on, and ``names`` to train on and to measure on.
@@ -174,7 +174,7 @@ def _members(
     return name, train, test
 
 
-def _every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
+def _split_every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
     if config.test_split not in (None, "test"):
         raise UserError(
             f"{source}: this layout has no split {config.test_split}; leave data.test_split out "

@@ -122,7 +122,7 @@ class View(Viewpoint):
     files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
 
 
-Keeps = Callable[[str], bool]
+ViewFilter = Callable[[str], bool]
 """Accepts a view by its name if its images are to be read; others have only sizes."""
 
 

@@ -20,13 +20,13 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start_box import (
     FARTHEST,
     MIN_FACING_SHARE,
-    box_looked_at,
-    box_to_start_in,
+    focus_box,
     focus_of,
     focus_text,
     format_point,
     num_views_facing,
     points_in_view,
+    start_box_of,
 )
 from drgs.io.ply import read_points
 
@@ -103,7 +103,7 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
 
         silhouettes = silhouettes_of(dataset.train)
         if are_masks(silhouettes, dataset.train):
-            if (start := _on_hull(config, dataset, silhouettes)) is not None:
+            if (start := _hull_start(config, dataset, silhouettes)) is not None:
                 _check_unfiltered(init, start.description)
                 return start
             note = f" (the masks of {len(silhouettes)} images have no hull to start from)"
@@ -114,10 +114,12 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
                 f"{num_transparent(silhouettes)} are; cut out what is to be fitted, or set "
                 "init.start=auto"
             )
-    cloud = _cloud_of(init, dataset)
+    cloud = _cloud_file(init, dataset)
     if cloud is None or cloud.name not in COLMAP_POINT_FILES:
         _check_unfiltered(init, "random points" if cloud is None else str(cloud))
-    start = _random_points(config, dataset) if cloud is None else _of_cloud(config, dataset, cloud)
+    start = (
+        _random_start(config, dataset) if cloud is None else _cloud_start(config, dataset, cloud)
+    )
     return replace(start, description=start.description + note)
 
 
@@ -126,7 +128,7 @@ def description_of_start(config: FitConfig, start: Start) -> str:
     return f"starts from {start.description}; near plane at {config.model.near:g}"
 
 
-def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
+def _cloud_file(init: InitConfig, dataset: Dataset) -> Path | None:
     """Return the file that a fit starts from; None: random points."""
     if init.start == "random":
         return None
@@ -150,14 +152,14 @@ def _check_unfiltered(init: InitConfig, start: str) -> None:
             )
 
 
-def _on_hull(
+def _hull_start(
     config: FitConfig, dataset: Dataset, silhouettes: Sequence[Silhouette]
 ) -> Start | None:
     """Return points on the visual hull of the masks; None: it is empty."""
     from drgs.initialization.visual_hull import hull_points
 
     try:
-        box = box_to_start_in(config.init, dataset) or box_looked_at(dataset.train)
+        box = start_box_of(config.init, dataset) or focus_box(dataset.train)
     except UserError:
         if config.init.half_extent is not None:
             raise
@@ -169,7 +171,7 @@ def _on_hull(
     return _with_colors(Start(means.astype(np.float32), None, what), dataset)
 
 
-def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
+def _cloud_start(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
     means, colors, num_read = _read_cloud(config.init, cloud)
     means = (means - dataset.origin).astype(np.float32)
     if colors is not None and not np.any(colors):
@@ -209,9 +211,9 @@ def _num_points(init: InitConfig) -> int:
     return init.num_points
 
 
-def _random_points(config: FitConfig, dataset: Dataset) -> Start:
+def _random_start(config: FitConfig, dataset: Dataset) -> Start:
     num_points, rng = _num_points(config.init), np.random.default_rng(config.seed)
-    what, box = f"{num_points:,} random points", box_to_start_in(config.init, dataset)
+    what, box = f"{num_points:,} random points", start_box_of(config.init, dataset)
     if box is not None:
         return Start(box.points(num_points, rng), None, f"{what} in {box}")
     means = points_in_view(dataset.train, num_points, rng)

@@ -58,7 +58,7 @@ class Box:
         return f"the cube of half width {self.half_extent:.3g} around {center}"
 
 
-def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
+def start_box_of(init: InitConfig, dataset: Dataset) -> Box | None:
     """Return the box of the random points of a start; None: :func:`points_in_view`.
 
     It is the layout's where the cameras are about as far from it as those of the reference.
@@ -82,10 +82,10 @@ def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
     is_near = np.abs(focus - reference.center).max() <= reference.half_extent
     if is_near and FILL_RANGE[0] <= reference.half_extent / seen <= FILL_RANGE[1]:
         return reference
-    return box_looked_at(dataset.train)
+    return focus_box(dataset.train)
 
 
-def box_looked_at(views: Sequence[Viewpoint]) -> Box:
+def focus_box(views: Sequence[Viewpoint]) -> Box:
     """Return a box nearly as wide as the views at the cameras' focus, as the reference's is."""
     focus, distance = focus_of(views)
     return Box(focus, REFERENCE_FILL * distance * _half_width(views))

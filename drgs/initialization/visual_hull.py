@@ -74,11 +74,11 @@ class Silhouette:
 
 def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
     """Return silhouettes of views that have alpha and a camera that does not move."""
-    views = [v for v in thin_out(views) if v.alpha is not None and is_projectable(v)]
+    views = [v for v in subsample_views(views) if v.alpha is not None and is_projectable(v)]
     return [_silhouette(view) for view in views]
 
 
-def thin_out(views: Sequence[View]) -> Sequence[View]:
+def subsample_views(views: Sequence[View]) -> Sequence[View]:
     """Return all views, or every n-th of many."""
     return views[:: -(-len(views) // MAX_VIEWS) or 1]
 
@@ -92,14 +92,14 @@ def _silhouette(view: View) -> Silhouette:
         opaque |= left_out
         solid |= left_out
     scale = -(-max(opaque.shape) // MAX_SIDE_PX)
-    opaque, solid = (_any_of(pixels, scale) for pixels in (opaque, solid))
+    opaque, solid = (_merge_pixels(pixels, scale) for pixels in (opaque, solid))
     table = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int32)
     np.cumsum(opaque, axis=0, dtype=np.int32, out=table[1:, 1:])
     np.cumsum(table[1:, 1:], axis=1, out=table[1:, 1:])
     return Silhouette(view, scale, solid, table, transparent)
 
 
-def _any_of(pixels: np.ndarray, scale: int) -> np.ndarray:
+def _merge_pixels(pixels: np.ndarray, scale: int) -> np.ndarray:
     """Return whether any pixel is set in squares of ``scale``; the last ones may be smaller."""
     for axis in (0, 1):
         pixels = np.logical_or.reduceat(pixels, np.arange(0, pixels.shape[axis], scale), axis)
@@ -113,7 +113,7 @@ def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
     """Return whether the alpha of nearly all ``views`` cuts out the object."""
-    wanted = MIN_MASKED_SHARE * len(thin_out(views))
+    wanted = MIN_MASKED_SHARE * len(subsample_views(views))
     return num_transparent(silhouettes) >= max(MIN_MASKED_VIEWS, wanted)
 
 

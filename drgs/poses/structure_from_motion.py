@@ -67,11 +67,11 @@ REMEDY = "if memory or the disk is full, free some of it, or take fewer or small
 
 T = TypeVar("T")
 
-Watch = Callable[[str, int, int], None]  # takes the name of counted items, number done, and total
+Progress = Callable[[str, int, int], None]  # takes name of the items, number done, and total
 
 
 @dataclass(frozen=True)
-class Search:
+class SfmSettings:
     """Settings of structure from motion."""
 
     camera_model: str = "OPENCV"  # of drgs.datasets.transforms.LENS_OF_MODEL
@@ -94,7 +94,7 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Placed:
+class SfmResult:
     """Result of structure from motion."""
 
     names: tuple[str, ...]  # of the photographs that have a camera
@@ -147,7 +147,7 @@ def _numeric_order(file: Path) -> list[tuple[int, str]]:
     return [(int(part[:18]), part) if part.isdecimal() else (0, part) for part in parts]
 
 
-def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
+def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progress) -> SfmResult:
     """Write ``folder/sparse/0``, COLMAP's model of the photographs in ``folder``.
 
     replace: the model that is there, if it was written here; other files in that folder stay.
@@ -168,10 +168,10 @@ def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
             parent = next(path for path in (model, *model.parents) if path.is_dir())
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
                 found = run_in_child(
-                    _find, search, photographs, folder, names, Path(temporary),
+                    _reconstruct_in_child, settings, photographs, folder, names, Path(temporary),
                     watch=watch, interrupts=interrupts,
                 )  # fmt: skip
-                _put(Path(temporary, "model"), model)
+                _install_model(Path(temporary, "model"), model)
         except BrokenPipeError:  # of the output, whose reader has gone
             raise
         except OSError as error:
@@ -197,7 +197,7 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
     FolderRecord(model, COMMAND).check(MODEL_FILES)
 
 
-def _put(written: Path, model: Path) -> None:
+def _install_model(written: Path, model: Path) -> None:
     """Move the files of a model to their place.
 
     The last file of an earlier model is removed first: there is no mixture of two models.
@@ -210,20 +210,20 @@ def _put(written: Path, model: Path) -> None:
     record.seal()
 
 
-def _find(
-    search: Search,
+def _reconstruct_in_child(
+    settings: SfmSettings,
     photographs: Path,
     dataset: Path,
     names: Sequence[str],
     folder: Path,
-    watch: Watch,
-) -> Placed:
+    watch: Progress,
+) -> SfmResult:
     """Write ``folder/model``: the function of the child process."""
     pycolmap = require_module("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # errors are reported below
     try:
         found, count = _Reconstruction(
-            pycolmap, folder, photographs, dataset, names, search, watch
+            pycolmap, folder, photographs, dataset, names, settings, watch
         ).largest()
         written = folder / "model"
         written.mkdir()
@@ -245,8 +245,8 @@ class _Reconstruction:
     photographs: Path
     dataset: Path  # which may have masks
     names: Sequence[str]
-    search: Search
-    watch: Watch
+    settings: SfmSettings
+    watch: Progress
 
     def largest(self) -> tuple[pycolmap.Reconstruction, int]:
         """Return the largest reconstruction, and the number of all."""
@@ -263,7 +263,7 @@ class _Reconstruction:
                 f"{self.photographs}: no cameras were found; take more photographs, neither "
                 "blurred nor of something plain, each showing most of what its neighbours show, "
                 "while walking around (not turning on the spot), or try "
-                f"{self.search.alternative_options(len(self.names))}"
+                f"{self.settings.alternative_options(len(self.names))}"
             )
         return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), len(models)
 
@@ -288,7 +288,7 @@ class _Reconstruction:
         masks = self._masks_for_all()
         for group in self._groups():
             reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = self.search.camera_model
+            reader.camera_model = self.settings.camera_model
             if masks is not None:
                 reader.mask_path = masks
             sizes = PHOTOGRAPHS_AT_ONCE, done, len(self.names)
@@ -307,7 +307,7 @@ class _Reconstruction:
     def _groups(self) -> list[list[str]]:
         """Return groups of the names of photographs that share a camera."""
         sizes = sorted({image_size(self.photographs / name) for name in self.names})
-        if self.search.share == "one" and len(sizes) > 1:
+        if self.settings.share == "one" and len(sizes) > 1:
             (w, h), (other_w, other_h), *_ = sizes
             raise UserError(
                 f"{self.photographs}: photographs that share one camera must have one size, got "
@@ -315,7 +315,7 @@ class _Reconstruction:
             )
         groups: dict[object, list[str]] = {}
         for name in self.names:
-            key = {"one": 0, "each": name}.get(self.search.share)
+            key = {"one": 0, "each": name}.get(self.settings.share)
             key = _size_and_lens(self.photographs / name) if key is None else key
             groups.setdefault(key, []).append(name)
         return list(groups.values())
@@ -371,7 +371,7 @@ class _Reconstruction:
 
     def _pairs(self) -> Iterator[tuple[int, int]]:
         count = len(self.names)
-        compares_all = self.search.compares_all(count)
+        compares_all = self.settings.compares_all(count)
         steps = {*range(1, NEIGHBOURS + 1), *(2**k for k in range(count.bit_length()))}
         for i, j in combinations(range(count), 2):
             if compares_all or j - i in steps or (i % STRIDE == 0 and j % STRIDE == 0):
@@ -411,7 +411,7 @@ def _size_and_lens(file: Path) -> tuple[object, ...]:
     return *image_size(file), *map(str, lens)
 
 
-def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> Placed:
+def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> SfmResult:
     placed = {image.name for image in found.images.values() if image.has_pose}
     cameras = tuple(
         f"{camera.model.name} {camera.width} x {camera.height} px "
@@ -419,7 +419,7 @@ def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models:
         f"{', '.join(f'{value:.5g}' for value in camera.params)})"
         for _, camera in sorted(found.cameras.items())
     )
-    return Placed(
+    return SfmResult(
         names=tuple(name for name in names if name in placed),
         missing=tuple(name for name in names if name not in placed),
         cameras=cameras,

@@ -35,7 +35,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
 from drgs.io.images import image_size, read_image, write_png
-from drgs.poses.structure_from_motion import Search, place
+from drgs.poses.structure_from_motion import SfmSettings, reconstruct
 from drgs.results.files import GAUSSIANS
 from drgs.results.folder import load_run_config
 from drgs.results.metrics import mean_of
@@ -94,9 +94,9 @@ def find_cameras(config: FitConfig, folder: Path) -> Path:
             mask = folder / "masks" / f"{name}.png"
             mask.parent.mkdir(parents=True, exist_ok=True)
             write_png(mask, read_image(files["mask"])[:, :, :3])
-    placed = place(folder, Search(), True, lambda *_: None)
-    count = len(placed.names)
-    print(f"placed {count} of {count + len(placed.missing)}, error {placed.error:.2f} px")
+    found = reconstruct(folder, SfmSettings(), True, lambda *_: None)
+    count = len(found.names)
+    print(f"placed {count} of {count + len(found.missing)}, error {found.error:.2f} px")
     return folder
 
 

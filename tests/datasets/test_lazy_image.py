@@ -10,12 +10,12 @@ from support.datasets import load, refusal, view_at
 from drgs.datasets import images, reader
 from drgs.datasets.images import (
     LazyImage,
-    check_room,
+    check_memory,
     compact_mask,
     compact_photograph,
     downscale,
+    num_threads,
     smaller_view,
-    threads_for,
 )
 
 RNG = np.random.default_rng(8)
@@ -127,7 +127,7 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
     iio.imwrite(photographs / "images" / "01.png", rgba)
     files = sorted((photographs / "images").iterdir())
     monkeypatch.setattr(images, "available_memory", lambda: 1488)
-    check_room(files, None)
+    check_memory(files, None)
     monkeypatch.setattr(images, "available_memory", lambda: 1487)
     monkeypatch.setattr(reader, "read_pixels", None)
     message = (
@@ -135,10 +135,10 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
         "1.49 kB are available; set a smaller data.image_size, or use fewer of them"
     )
     assert refusal(photographs) == message
-    check_room(files, 2)
+    check_memory(files, 2)
 
 
 def test_large_photographs_are_read_one_after_the_other(tmp_path):
     for width, expected in ((400, 8), (6000, 1)):
         iio.imwrite(tmp_path / "a.png", np.zeros((width, width), np.uint8))
-        assert threads_for([tmp_path / "a.png"]) == expected
+        assert num_threads([tmp_path / "a.png"]) == expected

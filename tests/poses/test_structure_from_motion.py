@@ -16,7 +16,7 @@ from drgs.core.child_process import ChildEndedError
 from drgs.core.errors import UserError, UserNote
 from drgs.core.folders import sole_writer
 from drgs.poses import structure_from_motion as sfm
-from drgs.poses.structure_from_motion import Search, photographs_in, place
+from drgs.poses.structure_from_motion import SfmSettings, photographs_in, reconstruct
 
 NAMES = [f"corner {k}.png" for k in range(7, 14)]  # 10 follows 9, and has a space
 
@@ -32,7 +32,9 @@ def placed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("corner")
     poses = write_photographs(folder, NAMES)
     watched = []
-    found = place(folder, Search(camera_model="PINHOLE"), False, lambda *step: watched.append(step))
+    found = reconstruct(
+        folder, SfmSettings(camera_model="PINHOLE"), False, lambda *step: watched.append(step)
+    )
     return folder, found, poses, watched
 
 
@@ -79,7 +81,7 @@ def test_images_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
     for k in range(3):
         Image.new("RGB", (64, 48), (40 * k, 20, 90)).save(tmp_path / f"{k}.png")
     with pytest.raises(UserError, match="no cameras were found; take more photographs, neither"):
-        place(tmp_path, Search(), False, said)
+        reconstruct(tmp_path, SfmSettings(), False, said)
     assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
 
 
@@ -89,7 +91,7 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
     write_photographs(tmp_path, names)
     (tmp_path / "masks").mkdir()
     Image.new("L", SIZE, 255).save(tmp_path / "masks" / "b.png.png")
-    assert place(tmp_path, Search(), False, said).names == tuple(names)
+    assert reconstruct(tmp_path, SfmSettings(), False, said).names == tuple(names)
 
 
 def masks_for_colmap(folder, masks):
@@ -146,7 +148,7 @@ def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"needs pycolmap, which is not installed; pip install 'drgs\[colmap\]'"
     ) as error:
-        sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
+        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, said)
     assert "\n" not in str(error.value)
 
 
@@ -160,7 +162,7 @@ def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"COLMAP reports: \[reader.cc:1\] no such image; if memory"
     ):
-        sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
+        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, said)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -186,7 +188,7 @@ def search(tmp_path, monkeypatch):
             return content
 
         monkeypatch.setattr(sfm, "run_in_child", run)
-        return place(tmp_path, Search(), replace, said)
+        return reconstruct(tmp_path, SfmSettings(), replace, said)
 
     return found
 
@@ -262,7 +264,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(search, tmp_path):
 def test_a_second_search_in_the_same_folder_is_refused(search, tmp_path):
     def second(temporary):
         with pytest.raises(UserError, match="another command is writing to this folder; wait"):
-            place(tmp_path, Search(), True, said)
+            reconstruct(tmp_path, SfmSettings(), True, said)
         assert temporary.is_dir()
 
     search("first", act=second)
@@ -333,7 +335,7 @@ def test_temporary_files_are_on_the_disk_of_the_model(search, tmp_path):
 
 
 def work(folder, names, **search):
-    return sfm._Reconstruction(None, folder, folder, folder, names, Search(**search), said)
+    return sfm._Reconstruction(None, folder, folder, folder, names, SfmSettings(**search), said)
 
 
 def test_masks_beside_photographs_are_no_photographs(tmp_path):
@@ -391,21 +393,21 @@ def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below
     write_dataset(folder, below=below)
     message = rf"{below}: is there already; drgs fit '.*my photos' uses it, --overwrite writes "
     with pytest.raises(UserError, match=message):
-        place(folder, Search(), False, said)
+        reconstruct(folder, SfmSettings(), False, said)
 
 
 def test_options_that_are_offered_are_others():
     few, many = sfm.ALL_PAIRS, sfm.ALL_PAIRS + 1
-    assert "--compare all" not in Search().alternative_options(few) + Search(
+    assert "--compare all" not in SfmSettings().alternative_options(few) + SfmSettings(
         compare="all"
     ).alternative_options(many)
-    assert "--compare all" in Search().alternative_options(many) + Search(
+    assert "--compare all" in SfmSettings().alternative_options(many) + SfmSettings(
         compare="neighbours"
     ).alternative_options(few)
-    assert "--share one" in Search().alternative_options(
+    assert "--share one" in SfmSettings().alternative_options(
         9
-    ) and "--camera-model SIMPLE" in Search().alternative_options(9)
-    assert Search("SIMPLE_RADIAL", "all", "one").alternative_options(9) == (
+    ) and "--camera-model SIMPLE" in SfmSettings().alternative_options(9)
+    assert SfmSettings("SIMPLE_RADIAL", "all", "one").alternative_options(9) == (
         "--camera-model OPENCV_FISHEYE (a fisheye)"
     )
 
