@@ -49,7 +49,7 @@ from drgs.datasets.transforms import (
 from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.images import read_header, read_pixels, upright
 
-__all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame", "dataset_of"]
+__all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame"]
 
 MAX_WIDTH = 1600
 """px: wider photographs are scaled down to this, as in the 3DGS reference, unless a size is set."""
@@ -93,52 +93,46 @@ class DatasetReader:
         raise NotImplementedError
 
     def load(self, config: DataConfig, keeps: ViewFilter = all_views) -> Dataset:
-        """Return the dataset, with the images of the views whose names ``keeps`` accepts.
+        """Return all views, sorted by file name, in the splits of :func:`split_of`.
 
-        Splits, sizes, masks and backgrounds follow the section ``data``.
+        keeps: accepts, by name, the views whose images are read.
         """
-        return dataset_of(config, self.photographs(config), keeps)
+        photographs = self.photographs(config)
+        frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
+        names = [frame.file_path for frame in frames]
+        split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
+        changes: dict[str, object] = {}
+        if config.background is None:
+            is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
+            changes["background"] = "white" if is_any_transparent else "black"
+        if config.image_size is None:
+            changes["image_size"] = MAX_WIDTH
+        config, notices = config.model_copy(update=changes), Notices(config.path)
+        used = sorted({*split.train, *split.test})
+        views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
+        views = dict(zip(used, views, strict=True))
+        train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
+        measured = () if split.name == "train" else test
+        notices.emit(photographs.notes, train, measured, photographs.point_cloud)
+        ignored, extras = describe_extras(config, frames)
+        return Dataset(
+            train=train,
+            test=test,
+            test_split=split.name,
+            background=config.background_rgb,
+            start_half_extent=None,
+            description=(
+                f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, "
+                f"measured on {len(test)} views ({split.how}), {train[0].width}x{train[0].height}, "
+                f"background {config.background}{extras}{photographs.note}"
+            ),
+            ignored=ignored,
+            point_cloud=photographs.point_cloud,
+        )
 
     def image_files(self, config: DataConfig) -> Sequence[Path]:
         """Return the files of the photographs, from whose sizes a configuration is chosen."""
         return [frame.files["image"] for frame in self.photographs(config).frames]
-
-
-def dataset_of(
-    config: DataConfig, photographs: Photographs, keeps: ViewFilter = all_views
-) -> Dataset:
-    """Return all views, sorted by file name, in the splits of :func:`split_of`."""
-    frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
-    names = [frame.file_path for frame in frames]
-    split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
-    changes: dict[str, object] = {}
-    if config.background is None:
-        is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
-        changes["background"] = "white" if is_any_transparent else "black"
-    if config.image_size is None:
-        changes["image_size"] = MAX_WIDTH
-    config, notices = config.model_copy(update=changes), Notices(config.path)
-    used = sorted({*split.train, *split.test})
-    views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
-    views = dict(zip(used, views, strict=True))
-    train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
-    measured = () if split.name == "train" else test
-    notices.emit(photographs.notes, train, measured, photographs.point_cloud)
-    ignored, extras = describe_extras(config, frames)
-    return Dataset(
-        train=train,
-        test=test,
-        test_split=split.name,
-        background=config.background_rgb,
-        start_half_extent=None,
-        description=(
-            f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, measured "
-            f"on {len(test)} views ({split.how}), {train[0].width}x{train[0].height}, background "
-            f"{config.background}{extras}{photographs.note}"
-        ),
-        ignored=ignored,
-        point_cloud=photographs.point_cloud,
-    )
 
 
 def load_views(

@@ -555,7 +555,6 @@ def test_keys_of_other_layouts_are_said_not_to_be_read(blender):
 
 
 def test_a_note_on_a_strange_name_is_one_line(photographs):
-    """Which load_noting checks."""
     (photographs / "images" / "03.png").rename(photographs / "images" / "a\nb.png")
     (photographs / "images" / "04.png").write_bytes(
         (photographs / "images" / "a\nb.png").read_bytes()

@@ -34,7 +34,6 @@ def change(folder, function):
 
 
 def differences(folder, function, **settings):
-    """Between the data before and after it is changed."""
     before = fingerprint_of(load(folder))
     function()
     return before.differences(fingerprint_of(load(folder, **settings)))
@@ -71,7 +70,6 @@ def test_what_a_frame_says_is_named(rich, text):
     ("name", "what"), [("mask.png", "mask"), ("depth.npy", "depth"), ("images/05.png", "image")]
 )
 def test_the_content_of_each_file_counts(rich, name, what):
-    """Though the pixels may be the same: bytes are compared."""
     found = differences(rich, lambda: (rich / name).open("ab").write(b"\0"))
     assert found == [f"the {what} of training view 05"]
 

@@ -23,7 +23,6 @@ def frame_of(meta, name="01.png"):
 
 
 def give(folder, name="01.png", **values):
-    """Values of one photograph's frame."""
     edit(folder / "transforms.json", lambda m: frame_of(m, name).update(values))
 
 
@@ -363,7 +362,6 @@ def test_a_unit_of_depth_is_positive(photographs):
     ],
 )
 def test_a_second_pose_is_read(photographs, place, values, shutter):
-    """In the axes of the first."""
     center = (3.9, 0.5, 1.1)
     give(photographs, transform_matrix_close=look_at(center, (0, 0, 0)).tolist())
     if place == "top":
@@ -416,7 +414,6 @@ def test_transparency_is_kept(photographs):
 
 
 def test_transparency_of_synthetic_images_is_kept(blender):
-    """Alpha is kept for training views."""
     folder, images = blender
     for width, shape in ((None, (4, 1, 6, 1)), (3, (2, 2, 3, 2))):
         view = load(folder, image_size=width).train[1]

@@ -79,7 +79,6 @@ def test_a_mask_is_kept_in_a_byte_a_pixel():
 
 
 def test_a_dataset_takes_the_bytes_of_its_files(photographs):
-    """And a quarter of it again for masks; not four times that for numbers."""
     iio.imwrite(photographs / "images" / "01.png", RNG.integers(0, 256, (6, 8, 4), np.uint8))
     dataset = load(photographs)
     for view in (*dataset.train, *dataset.test):

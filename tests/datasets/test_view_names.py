@@ -12,7 +12,6 @@ def test_views_are_named_as_their_files_with_folders_where_needed():
 
 
 def test_names_lead_nowhere_else():
-    """An absolute name beside a folder would replace it."""
     names = unique_names(["/data/a/0.png", "/data/b/0.png"])
     assert names == ["data_a_0", "data_b_0"]
 

@@ -14,7 +14,6 @@ CONFIG = FitConfig(data={"path": "unused"}, iterations=1000)
 
 
 def photographs_of(width, height, count=10):
-    """From all around, all of them opaque."""
     angles = 2 * np.pi * np.arange(count) / count
     centers = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.ones(count)], axis=1)
     return dataset_of([view_at(center, (0, 0, 0), width, height) for center in centers])

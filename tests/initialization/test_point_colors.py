@@ -42,7 +42,6 @@ def test_points_have_the_colours_of_the_surface(ball):
 
 
 def test_what_is_behind_transparent_pixels_does_not_show(ball):
-    """Whatever it is: images over another background give the same colours."""
     points, spacing = on_the_ball()
     black = images_of(sphere(0.8), 16, background=(0.0, 0.0, 0.0))
     expected = colors_from_images(points, spacing, ball, WHITE)

@@ -168,7 +168,6 @@ def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
 
 
 def test_what_is_decided_is_written_down():
-    """So that it is the same when the configuration of a fit is used again."""
     dataset = dataset_of(views_from(AROUND), 1.3)
     decided = resolve_defaults(config(), dataset)
     assert (decided.model.near, decided.data.background) == (0.2, "white")

@@ -108,7 +108,6 @@ def test_masks_are_carved_within_the_box_that_is_given(masks):
 
 @pytest.mark.parametrize("distance", [DISTANCE, 0.01 * DISTANCE])
 def test_where_no_box_is_known_it_follows_from_the_cameras(masks, distance):
-    """Whatever the unit of length."""
     scale = distance / DISTANCE
 
     def scaled(view):

@@ -18,7 +18,6 @@ EARTH = (4200000.0, 170000.5, -4780000.25)
 
 
 def world(gaussians: Gaussians) -> np.ndarray:
-    """Positions (N, 3) float64."""
     return gaussians.means.astype(np.float64) + gaussians.origin
 
 

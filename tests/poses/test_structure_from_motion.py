@@ -21,8 +21,8 @@ from drgs.poses.structure_from_motion import SfmSettings, photographs_in, recons
 NAMES = [f"corner {k}.png" for k in range(7, 14)]  # 10 follows 9, and has a space
 
 
-def said(*_):
-    """Watches, and says nothing."""
+def ignore_progress(*_):
+    """Ignore the progress."""
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_images_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
     for k in range(3):
         Image.new("RGB", (64, 48), (40 * k, 20, 90)).save(tmp_path / f"{k}.png")
     with pytest.raises(UserError, match="no cameras were found; take more photographs, neither"):
-        reconstruct(tmp_path, SfmSettings(), False, said)
+        reconstruct(tmp_path, SfmSettings(), False, ignore_progress)
     assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
 
 
@@ -91,7 +91,7 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
     write_photographs(tmp_path, names)
     (tmp_path / "masks").mkdir()
     Image.new("L", SIZE, 255).save(tmp_path / "masks" / "b.png.png")
-    assert reconstruct(tmp_path, SfmSettings(), False, said).names == tuple(names)
+    assert reconstruct(tmp_path, SfmSettings(), False, ignore_progress).names == tuple(names)
 
 
 def masks_for_colmap(folder, masks):
@@ -148,7 +148,7 @@ def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"needs pycolmap, which is not installed; pip install 'drgs\[colmap\]'"
     ) as error:
-        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, said)
+        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, ignore_progress)
     assert "\n" not in str(error.value)
 
 
@@ -162,7 +162,7 @@ def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"COLMAP reports: \[reader.cc:1\] no such image; if memory"
     ):
-        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, said)
+        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, ignore_progress)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -188,7 +188,7 @@ def search(tmp_path, monkeypatch):
             return content
 
         monkeypatch.setattr(sfm, "run_in_child", run)
-        return reconstruct(tmp_path, SfmSettings(), replace, said)
+        return reconstruct(tmp_path, SfmSettings(), replace, ignore_progress)
 
     return found
 
@@ -220,7 +220,6 @@ def test_other_files_beside_a_model_stay(search, tmp_path):
 
 
 def test_a_model_of_another_program_is_not_replaced(search, tmp_path):
-    """Nor one that was changed since."""
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     for name in ("cameras.bin", "images.bin"):
@@ -248,7 +247,6 @@ def test_a_file_in_the_place_of_the_model_is_refused_before_the_search(search, t
 
 
 def test_what_a_killed_run_left_is_removed_by_the_next(search, tmp_path):
-    """But not by one that is refused, as another is running."""
     for below in (".", "sparse", "sparse/0"):
         (tmp_path / below / ".drgs-poses-abc" / "masks").mkdir(parents=True)
     (tmp_path / ".poses-notes").mkdir()  # somebody's
@@ -264,7 +262,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(search, tmp_path):
 def test_a_second_search_in_the_same_folder_is_refused(search, tmp_path):
     def second(temporary):
         with pytest.raises(UserError, match="another command is writing to this folder; wait"):
-            reconstruct(tmp_path, SfmSettings(), True, said)
+            reconstruct(tmp_path, SfmSettings(), True, ignore_progress)
         assert temporary.is_dir()
 
     search("first", act=second)
@@ -290,7 +288,6 @@ def test_an_interrupt_while_files_are_moved_leaves_a_whole_model(search, tmp_pat
 
 
 def test_a_run_killed_while_files_are_moved_leaves_no_mixture(search, tmp_path, monkeypatch):
-    """There is no model then; the next run makes one."""
     search("first")
     replace, replaced = Path.replace, []
 
@@ -335,7 +332,9 @@ def test_temporary_files_are_on_the_disk_of_the_model(search, tmp_path):
 
 
 def work(folder, names, **search):
-    return sfm._Reconstruction(None, folder, folder, folder, names, SfmSettings(**search), said)
+    return sfm._Reconstruction(
+        None, folder, folder, folder, names, SfmSettings(**search), ignore_progress
+    )
 
 
 def test_masks_beside_photographs_are_no_photographs(tmp_path):
@@ -393,7 +392,7 @@ def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below
     write_dataset(folder, below=below)
     message = rf"{below}: is there already; drgs fit '.*my photos' uses it, --overwrite writes "
     with pytest.raises(UserError, match=message):
-        reconstruct(folder, SfmSettings(), False, said)
+        reconstruct(folder, SfmSettings(), False, ignore_progress)
 
 
 def test_options_that_are_offered_are_others():
