@@ -86,7 +86,7 @@ def test_a_dataset_takes_the_bytes_of_its_files(photographs):
         assert view.image.nbytes == view.width * view.height * channels
 
 
-def test_smaller_views_keep_nothing_of_their_own():
+def test_smaller_views_take_no_memory():
     view = view_at((4, 0, 0), (0, 0, 0))
     pixels = RNG.integers(0, 255, (30, 40, 4), np.uint8)
     image, alpha = compact_photograph(pixels, GREY, None)
@@ -97,7 +97,7 @@ def test_smaller_views_keep_nothing_of_their_own():
     np.testing.assert_allclose(smaller.image, blocks, atol=2e-7)
 
 
-def test_a_kept_image_says_that_it_has_to_be_copied():
+def test_a_lazy_image_refuses_conversion_without_a_copy():
     image, _ = compact_photograph(np.zeros((2, 2, 3), np.uint8), GREY, None)
     assert np.asarray(image, np.float64).dtype == np.float64
     with pytest.raises(ValueError, match="only by a copy"):

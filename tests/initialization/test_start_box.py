@@ -40,7 +40,7 @@ def test_the_references_box_is_taken_where_the_cameras_are_as_it_expects():
 
 
 @pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
-def test_elsewhere_it_is_scaled_and_moved_to_where_the_cameras_look(scale, target):
+def test_otherwise_the_box_is_scaled_and_moved_to_the_focus(scale, target):
     dataset = dataset_of(views_from(AROUND, target, scale), 1.3)
     box = start_box_of(InitConfig(), dataset)
     np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
@@ -167,7 +167,7 @@ def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
     )
 
 
-def test_what_is_decided_is_written_down():
+def test_derived_values_are_recorded():
     dataset = dataset_of(views_from(AROUND), 1.3)
     decided = resolve_defaults(config(), dataset)
     assert (decided.model.near, decided.data.background) == (0.2, "white")

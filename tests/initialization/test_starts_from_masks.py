@@ -121,7 +121,7 @@ def test_where_no_box_is_known_it_follows_from_the_cameras(masks, distance):
     assert np.abs(np.linalg.norm(start.means / scale, axis=1) - 0.8).max() < 0.25
 
 
-def test_masks_without_a_hull_are_said_and_left_aside(masks, opaque):
+def test_masks_without_a_hull_are_reported_and_not_used(masks, opaque):
     nothing = with_alpha(masks, np.zeros_like)
     for kind in ("auto", "masks"):
         start = start_of(config(start=kind), nothing)

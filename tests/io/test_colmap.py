@@ -24,7 +24,7 @@ def model():
 
 
 @each_format
-def test_what_was_written_is_read(tmp_path, model, write):
+def test_written_models_are_read_back(tmp_path, model, write):
     read = read_model(write(tmp_path, model))
     for number, name, width, height, values in model.cameras:
         parameters = dict(zip(MODELS[name][1], values, strict=True))

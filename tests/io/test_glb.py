@@ -61,7 +61,7 @@ def refusal(path, document, binary):
     return str(error.value).removeprefix(f"{path}: ")
 
 
-def test_a_file_holds_what_the_extension_says(gaussians, parts):
+def test_a_file_follows_the_extensions_specification(gaussians, parts):
     document, binary = parts
     assert document["extensionsUsed"] == [NAME] and document["asset"]["version"] == "2.0"
     primitive = primitive_of(document)
@@ -93,7 +93,7 @@ def test_a_file_holds_what_the_extension_says(gaussians, parts):
     ]
 
 
-def test_what_it_is_rendered_with_stands_beside_it(tmp_path, gaussians):
+def test_extras_record_rendered_with(tmp_path, gaussians):
     said = {"antialiased": True, "low_pass": 0.1, "projection": "exact"}
     replace(gaussians, rendered_with=said).save(tmp_path / "a.glb")
     assert Gaussians.load(tmp_path / "a.glb").rendered_with == said

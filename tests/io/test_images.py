@@ -141,7 +141,7 @@ def write_tiff16(path, pixels):
     path.write_bytes(content + struct.pack("<3H", 16, 16, 16) + data)
 
 
-def test_colours_of_16_bits_keep_the_upper_8_and_that_is_said(tmp_path):
+def test_colours_of_16_bits_keep_the_upper_8_with_a_note(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 2**16, (4, 5, 3), np.uint16)
     mi.Bitmap(pixels).write(str(tmp_path / "a.png"))
     write_tiff16(tmp_path / "a.tif", pixels)
@@ -167,7 +167,7 @@ def test_a_colour_that_a_png_names_is_transparent(tmp_path):
         np.testing.assert_array_equal(alpha == 0, pixels[:, :, 0] == 9)
 
 
-def test_profiles_and_further_images_are_said(tmp_path):
+def test_profiles_and_further_images_are_reported(tmp_path):
     grey = Image.new("RGB", (3, 2), (90, 90, 90))
     lab, srgb = (
         ImageCms.ImageCmsProfile(ImageCms.createProfile(name)).tobytes() for name in ("LAB", "sRGB")

@@ -83,7 +83,7 @@ def test_compensated_opacities_are_a_flag(tmp_path, said):
     assert unpacked(gaussians)[FLAGS] == (1 if said else 0)
 
 
-def test_what_has_no_place_is_noted(tmp_path):
+def test_values_that_spz_cannot_record_are_noted(tmp_path):
     gaussians = replace(gaussians_within_ranges(5), rendered_with={"low_pass": 0.1})
     with pytest.warns(UserNote, match=r"the format spz has no room for low_pass 0.1: left out"):
         gaussians.save(tmp_path / "a.spz")

@@ -76,7 +76,7 @@ def test_nothing_but_the_model_is_left_behind(placed):
     assert files == {*sfm.MODEL_FILES, ".drgs-poses.json"}
 
 
-def test_images_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
+def test_plain_images_have_no_cameras_and_leave_no_files(tmp_path):
     pytest.importorskip("pycolmap")
     for k in range(3):
         Image.new("RGB", (64, 48), (40 * k, 20, 90)).save(tmp_path / f"{k}.png")
@@ -152,7 +152,7 @@ def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     assert "\n" not in str(error.value)
 
 
-def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
+def test_errors_of_colmap_are_one_line(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
 
     def refuse(self):
@@ -199,7 +199,7 @@ def model_in(folder):
     return {path.name: path.read_text() for path in files if path.name != ".drgs-poses.json"}
 
 
-def test_a_model_is_replaced_only_when_that_is_asked_for(search, tmp_path):
+def test_a_model_is_replaced_only_on_request(search, tmp_path):
     assert search("first") == "first"
     with pytest.raises(UserError, match=r"sparse/0: is there already; .*--overwrite writes "):
         search("second")
@@ -246,7 +246,7 @@ def test_a_file_in_the_place_of_the_model_is_refused_before_the_search(search, t
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next(search, tmp_path):
+def test_temporary_files_of_a_killed_run_are_removed(search, tmp_path):
     for below in (".", "sparse", "sparse/0"):
         (tmp_path / below / ".drgs-poses-abc" / "masks").mkdir(parents=True)
     (tmp_path / ".poses-notes").mkdir()  # somebody's
@@ -305,7 +305,7 @@ def test_a_run_killed_while_files_are_moved_leaves_no_mixture(search, tmp_path, 
     assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "third")
 
 
-def test_a_crash_is_a_sentence_and_leaves_nothing_behind(search, tmp_path):
+def test_a_crash_is_reported_and_leaves_no_files(search, tmp_path):
     def crash(temporary):
         (temporary / "database.db").touch()
         raise ChildEndedError("SIGKILL")
@@ -361,7 +361,7 @@ def test_a_name_that_colmap_cannot_hold_is_refused(tmp_path):
         photographs_in(tmp_path)
 
 
-def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
+def test_files_that_colmap_does_not_read_are_left_out_with_a_note(tmp_path):
     for name in ("b.jpg", "a.tif", "c.webp"):
         Image.new("RGB", (8, 8)).save(tmp_path / name)
     for name in ("a.heic", "b.DNG", "._b.jpg"):
@@ -380,14 +380,14 @@ def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
     ("CMYK", (8, 8), r"Pillow's mode CMYK; convert it"),
     ("1", (8193, 8192), r"at most 67,108,864 pixels, got 8193 x 8192"),
 ])  # fmt: skip
-def test_what_a_fit_refuses_is_refused_before_the_search(tmp_path, mode, size, message):
+def test_unreadable_images_are_refused_before_reconstruction(tmp_path, mode, size, message):
     Image.new(mode, size).save(tmp_path / "a.tif", compression="group4" if mode == "1" else None)
     with pytest.raises(UserError, match=message):
         photographs_in(tmp_path)
 
 
 @pytest.mark.parametrize("below", ["sparse", "colmap/sparse/0"])
-def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below):
+def test_a_model_elsewhere_in_the_folder_is_reported(tmp_path, below):
     folder = tmp_path / "my photos"
     write_dataset(folder, below=below)
     message = rf"{below}: is there already; drgs fit '.*my photos' uses it, --overwrite writes "
@@ -395,7 +395,7 @@ def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below
         reconstruct(folder, SfmSettings(), False, ignore_progress)
 
 
-def test_options_that_are_offered_are_others():
+def test_offered_options_differ_from_the_given_ones():
     few, many = sfm.ALL_PAIRS, sfm.ALL_PAIRS + 1
     assert "--compare all" not in SfmSettings().alternative_options(few) + SfmSettings(
         compare="all"
