@@ -213,8 +213,17 @@ def masks_of(
     for index, name in enumerate(names):  # photographs whose masks are older than their format
         if chosen[index] is None and (file := loose.get(_mask_key(name))) not in used:
             chosen[index] = file
-    if any(chosen) or files:
-        _note_masks(folder, names, chosen, files, notes)
+    without = [name for name, mask in zip(names, chosen, strict=True) if mask is None]
+    if without and (any(chosen) or files):
+        notes.append(
+            f"{folder}: all pixels count of {len(without):,} of {len(names):,} photographs, which "
+            f"have no mask ({format_names(without)})"
+        )
+    if unused := sorted(set(files).difference(chosen)):
+        notes.append(
+            f"{folder}: masks of no photograph that has a camera: {_format_files(folder, unused)} "
+            "(the mask of a.jpg is a.jpg.png or a.png)"
+        )
     return chosen
 
 
@@ -248,26 +257,6 @@ def _mask_key(name: str) -> str:
 def _photograph_key(stem: str) -> str | None:
     """Return the name of the photograph; None: there is no ending of a mask."""
     return next((stem.removesuffix(end) for end in MASK_ENDINGS if stem.endswith(end)), None)
-
-
-def _note_masks(
-    folder: Path,
-    names: Sequence[str],
-    chosen: Sequence[Path | None],
-    files: Sequence[Path],
-    notes: list[str],
-) -> None:
-    without = [name for name, mask in zip(names, chosen, strict=True) if mask is None]
-    if without:
-        notes.append(
-            f"{folder}: all pixels count of {len(without):,} of {len(names):,} photographs, which "
-            f"have no mask ({format_names(without)})"
-        )
-    if unused := sorted(set(files).difference(chosen)):
-        notes.append(
-            f"{folder}: masks of no photograph that has a camera: {_format_files(folder, unused)} "
-            "(the mask of a.jpg is a.jpg.png or a.png)"
-        )
 
 
 def _format_files(folder: Path, files: Sequence[Path]) -> str:

@@ -88,28 +88,20 @@ IGNORED_KEYS = frozenset(
 CLOSE_POSE_KEY = "transform_matrix_close"
 """A frame's camera pose when the shutter closed; ``transform_matrix``: when it opened."""
 
-FILES = {
-    "image": (
-        "file_path",
-        FileKind("photographs", remedy="put them there, or take their frames out of the file"),
+FILE_KEYS = {"image": "file_path", "mask": "mask_path", "depth": "depth_file_path"}
+
+FILE_KINDS = {
+    "image": FileKind("photographs", remedy="put them there, or take their frames out of the file"),
+    "mask": FileKind(
+        *("masks", "their photographs are left out"),
+        remedy="put them there, or set data.ignore_masks",
     ),
-    "mask": (
-        "mask_path",
-        FileKind(
-            *("masks", "their photographs are left out"),
-            "put them there, or set data.ignore_masks",
-        ),
-    ),
-    "depth": (
-        "depth_file_path",
-        FileKind(
-            *("files of depth", "their photographs have no depth"),
-            "put them there, or set data.ignore_depth",
-            suffixes=frozenset(),
-        ),
+    "depth": FileKind(
+        *("files of depth", "their photographs have no depth"),
+        remedy="put them there, or set data.ignore_depth",
+        suffixes=frozenset(),
     ),
 }
-"""Files of frames: their keys and kinds."""
 
 POINT_CLOUD = FileKind(
     "point cloud", "the fit starts without", suffixes=frozenset(), is_needed=False
@@ -345,13 +337,13 @@ def frames_with_files(
         raise UserError(f"{nameless[0].location('file_path')} is missing")
     ignored = {"mask": config.ignore_masks, "depth": config.ignore_depth}
     frames = list(meta.frames)
-    for what, (key, kind) in FILES.items():
+    for what, key in FILE_KEYS.items():
         naming = [frame for frame in frames if getattr(frame.values, key) is not None]
         if ignored.get(what) or not naming:
             continue
         names = [getattr(frame.values, key) for frame in naming]
         places = [frame.location(key) for frame in naming]
-        found = find_files(config.path, meta.path, names, kind, places, notes)
+        found = find_files(config.path, meta.path, names, FILE_KINDS[what], places, notes)
         kept = []
         for frame in frames:
             name = getattr(frame.values, key)
