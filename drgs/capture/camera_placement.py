@@ -1,8 +1,7 @@
 """Placement of a capture's cameras: around a scene, inside it, or where its own sensors are.
 
-Settings that are not given follow from the scene (:func:`settings_for`). A room is photographed
-from inside, as its walls are dark or transparent from behind. Sensors of the scene decide up
-direction, target and distance; if there are many, the cameras stand where they are.
+Settings that are not given follow from the scene and its sensors (:func:`settings_for`). A room is
+photographed from inside, as its walls are dark or transparent from behind.
 """
 
 from __future__ import annotations

@@ -130,10 +130,9 @@ def _images_and_files(
 
 
 def image_folder(config: DataConfig, model: ColmapModel) -> Path:
-    """Return the folder of the photographs to read.
+    """Return the folder of the photographs to read, by ``data.downscale``.
 
-    The one of ``data.downscale``; by default, that of the smallest photographs of at least the
-    width ``data.image_size``, or of the largest ones.
+    By default, the smallest photographs of at least the width ``data.image_size``, or the largest.
     """
     root, _ = require_model(config.path)
     folders = [path for path in sorted(root.iterdir()) if path.is_dir()]

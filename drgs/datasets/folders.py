@@ -43,10 +43,7 @@ GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 def find_reader(
     config: DataConfig, sections: Mapping[str, BaseModel | None] = MappingProxyType({})
 ) -> tuple[str, DatasetReader]:
-    """Return the name and the reader of ``data.type``, or of the first that recognizes the folder.
-
-    sections: of extensions, by name.
-    """
+    """Return name and reader of ``data.type``, or of the first that recognizes the folder."""
     try:
         os.listdir(config.path)
     except FileNotFoundError:

@@ -82,7 +82,7 @@ def _test_split(config: DataConfig) -> str:
     if config.test_split is not None:
         return config.test_split
     for split in ("test", "val"):
-        if _transforms_path(config, split).is_file():
+        if (config.path / f"transforms_{split}.json").is_file():
             return split
     raise UserError(
         f"{config.path}: there are no test views: neither transforms_test.json nor "
@@ -90,12 +90,8 @@ def _test_split(config: DataConfig) -> str:
     )
 
 
-def _transforms_path(config: DataConfig, split: str) -> Path:
-    return config.path / f"transforms_{split}.json"
-
-
 def _frames(config: DataConfig, split: str, notes: list[str]) -> list[TransformsFrame]:
-    meta = read_transforms(_transforms_path(config, split))
+    meta = read_transforms(config.path / f"transforms_{split}.json")
     values = [frame.values for frame in meta.frames]
     unread = [key for key in UNUSED_KEYS if any(getattr(v, key) is not None for v in values)]
     unread += [] if meta.point_cloud is None else ["ply_file_path"]

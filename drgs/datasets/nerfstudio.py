@@ -18,7 +18,6 @@ from drgs.datasets.files import warn_of_unnamed_masks
 from drgs.datasets.reader import DatasetReader, Photographs
 from drgs.datasets.splits import Lists, listed_frames, unlisted_splits
 from drgs.datasets.transforms import (
-    TransformsFile,
     find_point_cloud,
     frames_with_files,
     note_unread,
@@ -46,16 +45,14 @@ class NerfstudioReader(DatasetReader):
             warn_of_unnamed_masks(config.path, notes)
         is_ignored = meta.point_cloud is not None and config.ignore_points
         note = "; point cloud (ply_file_path) ignored" if is_ignored else ""
-        lists = _lists(meta, notes)
+        names = [frame.file_path for frame in meta.frames]
+        if meta.lists:
+            keys = {split: f"{split}_filenames" for split in meta.lists}
+            listed = {
+                split: listed_frames(meta.path, keys[split], listing, names, notes)
+                for split, listing in meta.lists.items()
+            }
+            lists = Lists(listed, " and ".join(keys.values()))
+        else:
+            lists = unlisted_splits((config.path,), names, notes)
         return Photographs("nerfstudio", meta.path, frames, lists, cloud, note, notes)
-
-
-def _lists(meta: TransformsFile, notes: list[str]) -> Lists | None:
-    names = [frame.file_path for frame in meta.frames]
-    if not meta.lists:
-        return unlisted_splits((meta.path.parent,), names, notes)
-    found = {
-        split: listed_frames(meta.path, f"{split}_filenames", listing, names, notes)
-        for split, listing in meta.lists.items()
-    }
-    return Lists(found, " and ".join(f"{split}_filenames" for split in found))

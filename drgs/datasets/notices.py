@@ -50,10 +50,8 @@ class Notices:
             warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
 
     def _name(self, file: Path) -> str:
-        try:
-            return str(file.relative_to(self._folder))
-        except ValueError:
-            return str(file)
+        is_below = file.is_relative_to(self._folder)
+        return str(file.relative_to(self._folder) if is_below else file)
 
     def _files_outside(self, files: Iterable[Path]) -> list[str]:
         """Return files that lie elsewhere, by their names or by links."""

@@ -139,8 +139,7 @@ def orbit_size(views: Sequence[Viewpoint]) -> tuple[int, int]:
 def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, float]:
     """Return the opaque Gaussians' median position (3,) and the distance of a ``share`` of them.
 
-    Where all are at one place, the distance is the largest standard deviation, between the least
-    float32 and 1e9.
+    Where all are at one place, the distance is the largest standard deviation.
     """
     g = gaussians.numpy()
     means = g.means.astype(np.float64)

@@ -289,10 +289,7 @@ def _depth_unit(frame: TransformsFrame) -> float:
 def describe_extras(
     config: DataConfig, frames: Sequence[TransformsFrame]
 ) -> tuple[tuple[str, ...], str]:
-    """Return the names of data that ``data.ignore_*`` leaves out, and a description of all.
-
-    Names: ``distortion``, ``motion``, ``masks``, ``depth``.
-    """
+    """Return the names of ignored data (distortion, motion, masks, depth) and a description."""
     lenses = list(filter(None, map(lens_of, frames)))
     found = {
         "distortion": lenses,

@@ -1,8 +1,4 @@
-"""Cameras without photographs, for new images of a scene; and the point that cameras look at.
-
-They are read from a file or placed by hand with :func:`look_at`; for orbits, see
-``drgs.datasets.orbits``.
-"""
+"""Cameras without photographs, for new images of a scene; and the point that cameras look at."""
 
 from __future__ import annotations
 

@@ -75,8 +75,7 @@ class CompressedPly(FileFormat):
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         """Return Gaussians, and the values in the header's comments.
 
-        Opacities of 0 and 1 become the next ones that sigmoids tell apart. Files without bounds of
-        colours, as older programs write them, are read as well.
+        Files without bounds of colours, as older programs write them, are read as well.
         """
         rows, statements = read_elements(path, ["chunk", "vertex", "sh"])
         vertex, chunk, sh = rows["vertex"], rows["chunk"], rows.get("sh")

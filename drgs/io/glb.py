@@ -83,7 +83,6 @@ class Glb(FileFormat):
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         """Return Gaussians, y up, and our values in ``extras``; other meshes are passed over.
 
-        Opacities of 0 and 1, and scales of 0, become the next ones that have logits and logarithms.
         Scales, rotations and opacities may be quantised as the extension allows. A translation is
         added to the means or, where it is far away, is their origin.
 
@@ -132,15 +131,8 @@ class Glb(FileFormat):
         length = HEADER.size + 2 * CHUNK.size + len(text) + len(binary)
         if length > MAX_BYTES:
             raise UserError(f"the format glb holds at most {MAX_BYTES:,} bytes, got {length:,}")
-        return b"".join(
-            [
-                HEADER.pack(MAGIC, VERSION, length),
-                CHUNK.pack(len(text), JSON),
-                text,
-                CHUNK.pack(len(binary), BINARY),
-                binary,
-            ]
-        )
+        start = HEADER.pack(MAGIC, VERSION, length) + CHUNK.pack(len(text), JSON)
+        return b"".join([start, text, CHUNK.pack(len(binary), BINARY), binary])
 
 
 def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -153,10 +153,7 @@ def encode_elements(
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None.
-
-    Integer colours count to 255, or to 65535 in unsigned 16 bits.
-    """
+    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None."""
     rows, statements = read_elements(path, ["vertex"])
     vertex = rows["vertex"]
     _require(path, vertex, POSITION, "points")
@@ -186,9 +183,7 @@ def read_elements(
 ) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
     """Return rows of elements as structured arrays, and the values in the header's comments.
 
-    Elements of ``names`` other than ``vertex`` may be missing.
-
-    Raises :class:`UserError` for a file that is not whole, and for elements with lists.
+    Elements of ``names`` other than ``vertex`` may be missing; they must have no lists.
     """
     with _open_after_header(path) as (file, header):
         wanted = [each for each in header.elements if each.name in names]
@@ -234,10 +229,7 @@ def _open_after_header(path: str | Path) -> Iterator[tuple[IO[bytes], _Header]]:
 
 
 def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
-    """Read the header, by plyfile, and leave the file at its end.
-
-    Counts of more rows than the file has bytes are refused before memory is allocated for them.
-    """
+    """Read the header, by plyfile, and leave the file at its end."""
     content = file.read(MAX_HEADER_BYTES)
     newline = next((n for n in (b"\r\n", b"\r") if content.startswith(b"ply" + n)), b"\n")
     header, end, _ = content.partition(newline + b"end_header" + newline)
@@ -254,7 +246,7 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
             _, name, count = line.decode().split()
             counts[name] = int(count)
             lines[index] = b"element %s 0" % name.encode()  # plyfile is to read no rows
-            if not 0 <= counts[name] <= size:
+            if not 0 <= counts[name] <= size:  # refused before memory is allocated
                 _refuse_end(path, name, counts[name], size)
     ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b"end_header", b""])))
     return _Header(ply.elements, counts, _statements(path, lines), ply.text, ply.byte_order, size)

@@ -45,7 +45,7 @@ def opacities_from_logits(logits: np.ndarray) -> np.ndarray:
 
 
 def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
-    """Return finite logits (N,) float32 of opacities (N,) in [0, 1]."""
+    """Return logits (N,) float32 of opacities (N,); 0 and 1 become what sigmoids tell apart."""
     opacities = opacities.astype(np.float64)
     with np.errstate(divide="ignore"):
         logits = np.log(opacities) - np.log1p(-opacities)
@@ -53,7 +53,7 @@ def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
 
 
 def log_scales_from_scales(scales: np.ndarray) -> np.ndarray:
-    """Return finite logarithms (N, 3) float32 of standard deviations (N, 3) >= 0."""
+    """Return finite logarithms (N, 3) float32 of standard deviations (N, 3), also of 0."""
     with np.errstate(divide="ignore"):
         logarithms = np.log(scales.astype(np.float64))
     return np.maximum(logarithms, MIN_LOG_SCALE).astype(np.float32)

@@ -46,10 +46,6 @@ class Splat(FileFormat):
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        """Return Gaussians of degree 0, and an empty dictionary.
-
-        Opacities of 0 and 1, and scales of 0, become the next ones that have logits and logarithms.
-        """
         content = read_bytes(path, "file", MAX_BYTES)
         if not content or len(content) % ROW.itemsize:
             raise UserError(

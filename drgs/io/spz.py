@@ -91,8 +91,7 @@ class Spz(FileFormat):
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         """Return Gaussians, y up, and whether ``antialiased``.
 
-        Opacities of 0 and 1 become the next ones that sigmoids tell apart. Extensions of vendors
-        are passed over, with a :class:`UserNote`.
+        Extensions of vendors are passed over, with a :class:`UserNote`.
         """
         content = read_bytes(path, "file", MAX_BYTES)
         if content.startswith(GZIP_MAGIC):

@@ -198,13 +198,9 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
 
 
 def _install_model(written: Path, model: Path) -> None:
-    """Move the files of a model to their place.
-
-    The last file of an earlier model is removed first: there is no mixture of two models.
-    """
     record = FolderRecord(model, COMMAND)
     record.claim(MODEL_FILES)
-    (model / MODEL_FILES[-1]).unlink(missing_ok=True)
+    (model / MODEL_FILES[-1]).unlink(missing_ok=True)  # first: there is no mixture of two models
     for name in MODEL_FILES:
         (written / name).replace(model / name)
     record.seal()
