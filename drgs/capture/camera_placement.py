@@ -53,9 +53,7 @@ UNUSED = {
 }
 """Settings that a kind of cameras does not use."""
 
-MIN_ENCLOSED_SHARE = 0.75
-"""Least part of all directions with a surface in a room. Cornell's box, with five of six sides, has
-5/6."""
+MIN_ENCLOSED_SHARE = 0.75  # of all directions, which have a surface in a room: 5/6 in Cornell's box
 
 NUM_SPOTS, NUM_DIRECTIONS = 128, 128  # points that may be in a room, and rays from each
 

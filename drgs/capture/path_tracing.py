@@ -219,12 +219,9 @@ class CaptureCamera:
         self._scene, self._settings = scene, settings
         low, high = bounding_box(scene)
         diagonal = float(np.linalg.norm(high - low))
+        depth, hides = settings.max_depth, settings.hides_lights
         self._integrator = mi.load_dict(
-            {
-                "type": "path",
-                "max_depth": settings.max_depth,
-                "hide_emitters": settings.hides_lights,
-            }
+            {"type": "path", "max_depth": depth, "hide_emitters": hides}
         )
         self._sensor = mi.load_dict(
             {
@@ -325,17 +322,14 @@ def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -
 
 
 def first_hits(
-    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, past_lamps: bool
+    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, ignores_lamps: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool.
-
-    past_lamps: whether surfaces that shine do not count.
-    """
+    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool."""
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
 
     def intersect(ray: mi.Ray3f) -> tuple[mi.SurfaceInteraction3f, Bool]:
         hit = scene.ray_intersect(ray)
-        return hit, hit.is_valid() & hit.shape.is_emitter() & past_lamps
+        return hit, hit.is_valid() & hit.shape.is_emitter() & ignores_lamps
 
     hit, lamp = intersect(ray)
     for _ in range(MAX_LAMPS_IN_A_ROW - 1):

@@ -34,8 +34,7 @@ NAMES = {
     "colmap": "photographs with the cameras of COLMAP's model",
 }
 
-MARKERS = ("transforms_train.json", "transforms.json")
-"""Files by which folders of the layouts NeRF-synthetic and nerfstudio are recognized."""
+MARKERS = ("transforms_train.json", "transforms.json")  # of NeRF-synthetic and nerfstudio
 
 GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 

@@ -1,10 +1,9 @@
 """The NeRF-synthetic ("Blender") layout: ``transforms_{train,val,test}.json`` and RGBA images.
 
-Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle and one horizontal
-field of view, ``camera_angle_x``, for all frames that have none of their own; images of one size in
-a split, with straight alpha. An image without alpha is refused: its background would be fitted as
-part of the object. Opaque photographs need the nerfstudio layout. Frames may have a lens, a second
-pose, a mask and depths, as there.
+Mildenhall et al. 2020. Cameras have the principal point in the middle and a horizontal field of
+view, ``camera_angle_x``; images have one size in a split and straight alpha. An image without alpha
+is refused: its background would be fitted as part of the object. Opaque photographs need the
+nerfstudio layout. Frames may have a lens, a second pose, a mask and depths, as there.
 """
 
 from __future__ import annotations

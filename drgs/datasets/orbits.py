@@ -24,11 +24,9 @@ OPAQUE, SPREAD = 0.5, 0.98
 them that it keeps in the image. The rest may be outliers."""
 
 MAX_GAP = math.radians(100)
-"""Azimuth between two neighbouring cameras of a capture from all sides. A side beyond a larger gap
-was not photographed."""
+"""Azimuth between two neighbouring cameras; a side beyond a larger gap was not photographed."""
 
-SWAYING_ARC_SHARE = 0.8
-"""Share of the cameras' arc of an orbit that sways instead of going all the way round."""
+SWAYING_ARC_SHARE = 0.8  # of the cameras' arc, through which an orbit sways that is not all round
 
 NEAR_RANGE, NEAR_SHARE = (0.01, 0.5), 0.1
 """Shares of the median distance of Gaussians from their middle: the range of the reference's near

@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 MAX_BYTES = 1 << 28  # of a file: a thousand for each of a quarter of a million views
 
 RIGID_TOLERANCE = 1e-4
-"""Largest entry of |R R^T - I|, eighty times that of files written with float32 (1.3e-6), and error
-of the last row."""
+"""Largest entry of |R R^T - I|, 80 times that of float32 (1.3e-6), and error of the last row."""
 
 MEMORY_RATIO = 30  # memory that JSON takes as Python's objects, in bytes of the text
 
@@ -158,10 +157,7 @@ Model = Annotated[str, AfterValidator(_known_model)]
 
 
 class CameraValues(BaseModel):
-    """Values at the top of a file, for all frames, or in a frame. None: not given.
-
-    Other keys may be coefficients of a lens: see :func:`lens_of`.
-    """
+    """Values at the top of a file or in a frame, None if not given; others may be a lens's."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
 

@@ -122,8 +122,7 @@ class View(Viewpoint):
     files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
 
 
-ViewFilter = Callable[[str], bool]
-"""Accepts a view by its name if its images are to be read; others have only sizes."""
+ViewFilter = Callable[[str], bool]  # accepts names of views whose images are to be read
 
 
 def all_views(name: str) -> bool:

@@ -21,8 +21,7 @@ NEAR_RANGE = (1e-9, 1e9)  # scene units that a configuration accepts
 
 MAX_NEAR_SHARE = 0.5  # of that distance: a farther near plane would cut into the scene
 
-GAUSSIANS_PER_PIXEL_OF_SIDE = 250
-"""Numbers of Gaussians that strategies grow to are in proportion to the images' sides."""
+GAUSSIANS_PER_PIXEL_OF_SIDE = 250  # that strategies grow to, in proportion to the images' sides
 
 SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
 """Share of such a number that a fit starts with; and its number for other strategies."""

@@ -1,9 +1,9 @@
 """Colours of points from the images that show them.
 
-An image shows a point if no other point is clearly nearer to its camera at about the same place: in
-a z-buffer whose pixels are as wide as the points are apart. On a surface that turns away from the
-camera, points hide each other, so that images count that look onto it. The middle half of a point's
-colours is averaged: the rest may be highlights, or something that hides the point.
+An image shows a point if no other point is clearly nearer to its camera in a z-buffer whose pixels
+are as wide as the points are apart. On a surface that turns away from the camera, points hide each
+other, so that images count that look onto it. The middle half of a point's colours is averaged: the
+rest may be highlights or occluders.
 """
 
 from __future__ import annotations

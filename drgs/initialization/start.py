@@ -39,8 +39,7 @@ their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about uni
 
 NUM_NEIGHBOURS = 3
 
-COLMAP_POINT_FILES = ("points3D.bin", "points3D.txt")
-"""Names of files with errors and observations of points besides positions and colours."""
+COLMAP_POINT_FILES = ("points3D.bin", "points3D.txt")  # have errors and observations of points
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,7 @@ FAR_SHARE, FARTHEST = 0.5, 10.0
 MAX_BATCHES = 200  # batches of points to draw: enough where half a percent of the box is in view
 
 REFERENCE_FILL = 0.9
-"""Share of half of an image's width that the reference's box takes up at the focus of
-NeRF-synthetic's cameras, 1.3 / (4.03 tan(0.69 / 2))."""
+"""Share of half of an image's width that the reference's box fills: 1.3 / (4.03 tan(0.69 / 2))."""
 
 FILL_RANGE = (0.5, 2.0)  # shares of half of an image's width at which that box is taken as it is
 

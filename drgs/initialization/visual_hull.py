@@ -23,13 +23,9 @@ from drgs.initialization.start_box import Box
 
 MAX_EMPTY_ALPHA = 4 / 255  # of empty pixels: mattes have noise
 
-MIN_POINT_ALPHA = 0.5
-"""Least alpha of pixels that show points. Parts that are nowhere more opaque are found as thin
-parts are."""
+MIN_POINT_ALPHA = 0.5  # of pixels that show points; fainter parts are found as thin parts are
 
-MIN_TRANSPARENT_SHARE = 0.02
-"""Transparent share of an image whose alpha is a mask. Corners that are empty since distortion was
-removed have a smaller share."""
+MIN_TRANSPARENT_SHARE = 0.02  # of an image with a mask; corners emptied by undistortion have less
 
 MIN_MASKED_SHARE, MIN_MASKED_VIEWS = 0.95, 3
 """Share and number of the views that must have a mask. With fewer, a hull is mostly the cones that
@@ -153,8 +149,8 @@ class Cubes:
 def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: int) -> np.ndarray:
     """Return points (M, 3) float64, world, on the surface of the visual hull within ``box``.
 
-    At most ``count``, and about so many, evenly spread: each at a random place within a cube of its
-    own. M = 0: images contradict each other, and there is no hull.
+    At most ``count``, and about so many unless images contradict each other, evenly spread: each at
+    a random place within a cube of its own.
     """
     corners = box.center - box.half_extent, box.center + box.half_extent
     coarse = Cubes.filling(*corners, 2 * box.half_extent / ROOT_CUBES_PER_SIDE)

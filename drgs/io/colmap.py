@@ -1,9 +1,8 @@
 """COLMAP models: cameras, images with their poses, and points, in binary or in text files.
 
 The formats are those of COLMAP's documentation ("Output Format") and of its ``reconstruction_io``.
-Observations are skipped, and so are rigs and frames, which repeat what images contain. Each record
-is checked; a :class:`UserError` names the file, the byte or the line, and the expected and the got
-value.
+Observations are skipped, and so are rigs and frames, which repeat what images contain. Errors in
+records name the file, the byte or the line, what was expected and what was got.
 """
 
 from __future__ import annotations

@@ -39,8 +39,7 @@ Arrays = Mapping[str, np.ndarray]
 wxyz, ``log_scales`` (N, 3), ``logit_opacities`` (N,), ``sh0`` (N, 1, 3), ``shN`` (N, K - 1, 3), and
 ``smoothing`` (N,) where there is a smoothing filter."""
 
-ORIGIN = ("origin_x", "origin_y", "origin_z")
-"""Names in ``rendered_with``: world coordinates that the means are relative to."""
+ORIGIN = ("origin_x", "origin_y", "origin_z")  # in ``rendered_with``: world, of the means
 
 MAX_ORIGIN = 1e12  # world units
 
@@ -60,8 +59,7 @@ class FileFormat:
 
     description: str  # one phrase, for help texts
 
-    up: str | None = None
-    """Axis that the format defines as up, ``"y"`` or ``"z"``; None: it defines none."""
+    up: str | None = None  # axis that the format defines as up, ``"y"`` or ``"z"``
 
     has_harmonics = True  # harmonics above degree 0 are kept
 

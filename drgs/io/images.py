@@ -1,9 +1,8 @@
-"""Images from files and to files; all that drgs reads or writes goes through here.
+"""All images that drgs reads from files or writes to files.
 
 Read: 8 bits, with and without alpha, and grey of 16 bits; of colours of 16 bits, the upper 8.
-Written: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as EXR. Images are
-(H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here; files are written whole or
-not at all.
+Written, whole or not at all: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as
+EXR. Images are (H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here.
 """
 
 from __future__ import annotations
@@ -63,8 +62,8 @@ MIN_BACKGROUND_SHARE, LOSSLESS_WEBP_BYTES = 0.1, 4_000_000
 pixels: a flat background."""
 
 LOSSLESS_STEP = 255 / 31
-"""Levels of 255 between two values of a channel in front of a flat background: a smaller error than
-that of lossy coding, which halves the resolution of colours, and two thirds of the bytes."""
+"""Levels of 255 between two values of a channel without loss: a smaller error than that of lossy
+coding, which halves the resolution of colours, and two thirds of the bytes."""
 
 GIF_WIDTH = 300  # px: a GIF needs about five times the bytes of a WebP of the same size
 
@@ -289,8 +288,7 @@ def check_animation(frames: int, width: int, height: int) -> None:
 def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
     """Write ``path``, an animated WebP that loops, and beside it a GIF of at most 300 px width.
 
-    Every browser shows the WebP; the GIF is for mail, slides and old viewers. frames: of one size,
-    at least one.
+    The GIF is for mail, slides and old viewers. frames: at least one, of one size.
     """
     large = np.stack([to_uint8(frame) for frame in frames])
     data = _encode_lossless(large)
@@ -340,19 +338,15 @@ def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _write_gif(path: Path, large: np.ndarray) -> None:
-    frames = [_shrink(Image.fromarray(frame)) for frame in large]
+    frames = [Image.fromarray(frame) for frame in large]
+    if (width := large.shape[2]) > GIF_WIDTH:
+        size = GIF_WIDTH, max(1, round(large.shape[1] * GIF_WIDTH / width))
+        frames = [frame.resize(size, Image.Resampling.BOX) for frame in frames]
     palette = _common_palette(frames)
     first, *rest = [frame.quantize(palette=palette) for frame in frames]
     options = {"append_images": rest, "duration": FRAME_MS, "loop": 0, "optimize": False}
     with atomic_path(path) as temporary:
         first.save(temporary, "GIF", save_all=True, **options)
-
-
-def _shrink(frame: Image.Image) -> Image.Image:
-    if frame.width <= GIF_WIDTH:
-        return frame
-    height = max(1, round(frame.height * GIF_WIDTH / frame.width))
-    return frame.resize((GIF_WIDTH, height), Image.Resampling.BOX)
 
 
 def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:

@@ -254,11 +254,9 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
 
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
     found: dict[str, str] = {}
-    comments = [line for line in lines if line.startswith(b"comment ")]
-    for comment in comments:
-        match = STATEMENT.fullmatch(comment.decode("ascii", "replace")[len("comment ") :].strip())
-        if match is None:
-            continue
+    comments = [line.removeprefix(b"comment ") for line in lines if line.startswith(b"comment ")]
+    texts = (comment.decode("ascii", "replace").strip() for comment in comments)
+    for match in filter(None, map(STATEMENT.fullmatch, texts)):
         name, text = match.groups()
         if found.setdefault(name, text) != text:
             raise UserError(

@@ -100,8 +100,7 @@ def description_of(result: SfmResult, settings: SfmSettings) -> str:
     ]
     if result.missing:
         lines.append(f"without a camera: {format_names(result.missing, MAX_NAMES)}")
-        others = result.num_models - 1
-        if others:
+        if others := result.num_models - 1:
             lines.append(f"smaller models that do not hang together with this one: {others}")
         lines.append(
             "photographs that show what lies between would place them; so may "
