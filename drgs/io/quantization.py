@@ -13,7 +13,7 @@ from drgs.core.memory import require_memory
 MAX_LOGIT = 23 * math.log(2)
 """Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
 
-MIN_LOGIT = -125 * math.log(2)  # of about the smallest one: exp of less is zero in float32
+MIN_LOGIT = -125 * math.log(2)  # of about the smallest: exp of less is no number in float32
 
 MIN_LOG_SCALE = -126 * math.log(2)  # of the smallest normal float32: what a scale of 0 becomes
 
