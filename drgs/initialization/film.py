@@ -26,6 +26,7 @@ def is_projectable(view: Viewpoint) -> bool:
 def to_camera(view: Viewpoint, points: Columns, dtype: type = np.float64) -> list[np.ndarray]:
     """Return float64 world points in the camera's axes (x right, y down, z forward)."""
     center, axes = view.center.tolist(), view.camera_to_world[:3, :3].T.tolist()
+    # Single precision is enough for offsets from a camera, wherever both are.
     offsets = [(p - c).astype(dtype, copy=False) for p, c in zip(points, center, strict=True)]
     return [a * offsets[0] + b * offsets[1] + c * offsets[2] for a, b, c in axes]
 

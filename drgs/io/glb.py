@@ -236,7 +236,6 @@ IDENTITY: dict[str, list[float]] = {
     "scale": [1, 1, 1],
 }
 
-
 Part = TypeVar("Part", bound=BaseModel)
 
 
