@@ -1,12 +1,9 @@
 """``python -m drgs.capture SCENE --out DIR``: turn a Mitsuba scene into a training set.
 
 SCENE is an XML file, or a Python file with a function ``scene()`` that returns a scene dictionary.
-Its images are path traced and written in the NeRF-synthetic layout: see ``drgs.capture.dataset``. A
-second run of the same command continues an interrupted one.
-
-By default the scene decides where the cameras stand (``drgs.capture.camera_placement``): around it,
-inside it if it is a room, or where its own sensors are if it has many. Its own integrator is not
-used; one with splats is refused, as they would be missing.
+Its images are path traced, not by its own integrator, from cameras around it, inside it if it is a
+room, or at its own sensors if it has many. They are written in the NeRF-synthetic layout: see
+``drgs.capture.dataset``. A second run of the same command continues an interrupted one.
 """
 
 from __future__ import annotations
@@ -33,8 +30,6 @@ from drgs.core.errors import UserError
 from drgs.core.files import refusal_reason
 from drgs.core.folders import sole_writer
 from drgs.core.memory import too_large_reason
-
-UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 WHOLE_NUMBERS = {
     "views": (1, 100_000, "images to train on"),
@@ -110,7 +105,7 @@ def _add_cameras(parser: CommandParser) -> None:
     )
     add(
         "--up",
-        choices=UP_AXES,
+        choices=("x", "y", "z", "-x", "-y", "-z"),
         metavar="AXIS",
         help="x, y, z or, as in --up=-z, an opposite (default: z)",
     )

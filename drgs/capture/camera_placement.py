@@ -1,8 +1,7 @@
 """Placement of a capture's cameras: around a scene, inside it, or where its own sensors are.
 
-Settings that are not given follow from the scene (:func:`settings_for`). A room is photographed
-from inside: its walls are dark, or not there, from behind. Sensors of the scene decide up
-direction, target and distance; if there are many of them, their own images are taken.
+Settings that are not given follow from the scene and its sensors (:func:`settings_for`). A room is
+photographed from inside, as its walls are dark or transparent from behind.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from drgs.capture.path_tracing import (
     CaptureView,
     bounding_box,
     lit_part,
+    scale_fov,
 )
 from drgs.core.errors import UserError
 from drgs.core.types import Float
@@ -39,10 +39,8 @@ ELEVATIONS = {"around": (0.0, 90.0), "inside": (-60.0, 60.0)}
 
 INSIDE_FOV = math.radians(70)  # in a room, walls are near
 INSIDE_PART = 0.6  # place of a camera on the way from the target to the wall behind it
-ENOUGH_SENSORS = 10  # number of sensors from which a scene is photographed from where they are
-
-TEST_EVERY = 8
-"""Interval of the scene's own sensors that are for testing, as in the nerfstudio layout."""
+ENOUGH_SENSORS = 10  # number of sensors from which on the cameras stand where they are
+TEST_EVERY = 8  # interval of the sensors that are for testing, as in the nerfstudio layout
 
 COUNTS = {"views", "val_views", "test_views"}
 
@@ -55,15 +53,11 @@ UNUSED = {
 }
 """Settings that a kind of cameras does not use."""
 
-MIN_ENCLOSED_SHARE = 0.75
-"""Least part of all directions with a surface in a room. Cornell's box, which has five of six
-sides, has 5/6."""
+MIN_ENCLOSED_SHARE = 0.75  # of all directions, which have a surface in a room: 5/6 in Cornell's box
 
-NUM_SPOTS, NUM_DIRECTIONS = 128, 128
-"""Points of the bounding box that may be in a room, and rays from each."""
+NUM_SPOTS, NUM_DIRECTIONS = 128, 128  # points that may be in a room, and rays from each
 
-ROOM_QUANTILE = 0.1
-"""Quantile of the distances from a spot to its surroundings that measures its room."""
+ROOM_QUANTILE = 0.1  # of the distances from a spot to its surroundings: the size of its room
 
 PREVIEWS, PREVIEW_SIZE, PREVIEW_SPP = 12, (16, 16), 4
 
@@ -73,14 +67,14 @@ PLASTIC_RATIO = 1.2207440846057596
 """The root of x^4 = x + 1: its powers spread points evenly over a box (Roberts 2018, "R_3")."""
 
 
-class OwnCamera(NamedTuple):
+class SceneSensor(NamedTuple):
     """A sensor of the scene itself."""
 
     pose: np.ndarray  # (4, 4) float64 camera to world, OpenGL axes
     narrower_fov: float  # radians, along the film's smaller side
 
 
-def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
+def perspective_sensors(scene: mi.Scene) -> list[SceneSensor]:
     """Return the scene's sensors of the types ``perspective`` and ``thinlens``."""
     found = []
     for sensor in scene.sensors():
@@ -91,9 +85,8 @@ def own_cameras(scene: mi.Scene) -> list[OwnCamera]:
         pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
         width, height = sensor.film().size()
         fov = math.radians(cast("Float", parameters["x_fov"])[0])
-        if height < width:
-            fov = 2 * math.atan(height / width * math.tan(fov / 2))
-        found.append(OwnCamera(pose @ OPENGL_TO_MITSUBA, fov))
+        fov = scale_fov(fov, min(1.0, height / width))
+        found.append(SceneSensor(pose @ OPENGL_TO_MITSUBA, fov))
     return found
 
 
@@ -102,7 +95,7 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
 
     Raises :class:`UserError` for a setting that the cameras do not use.
     """
-    own = own_cameras(scene)
+    own = perspective_sensors(scene)
     if "cameras" not in given:
         kind = _kind_for(scene, settings, given, own)
         return settings_for(scene, replace(settings, cameras=kind), {*given, "cameras"})
@@ -122,21 +115,19 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
 
 
 def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
-    """Return all views, split after split; settings: of :func:`settings_for`."""
+    """Return all views, split after split; settings: from :func:`settings_for`."""
     if settings.cameras == "sensors":
-        return views_of_sensors(own_cameras(scene), settings)
+        return views_of_sensors(perspective_sensors(scene), settings)
     if settings.cameras == "inside":
         return views_inside(scene, settings)
     return views_around(settings, *target_and_distance(scene, settings))
 
 
-# ----------------------------------------------------------------------------------------------
 # Settings from the scene
-# ----------------------------------------------------------------------------------------------
 
 
 def _kind_for(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[SceneSensor]
 ) -> str:
     if given & ORBITING:
         return "around"
@@ -146,7 +137,7 @@ def _kind_for(
     if not is_closed:
         return "around"
     author_is_inside = any(
-        _look_around(scene, [o.pose[:3, 3] for o in own])[0] >= MIN_ENCLOSED_SHARE
+        _measure_enclosure(scene, [o.pose[:3, 3] for o in own])[0] >= MIN_ENCLOSED_SHARE
     )
     if not author_is_inside and _is_lit(scene, replace(settings, cameras="around"), given):
         return "around"
@@ -164,9 +155,9 @@ def _is_lit(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> bool
 
 
 def _around_settings(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[OwnCamera]
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[SceneSensor]
 ) -> dict[str, object]:
-    """Return settings to look at the scene as its own sensors do, if they look at its middle."""
+    """Return settings for the view of the scene's sensors, if they look at its middle."""
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
     ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in own]
     seen = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
@@ -178,8 +169,7 @@ def _around_settings(
     return {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
 
 
-def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
-    """Return as many views as there are sensors."""
+def _sensor_settings(own: list[SceneSensor]) -> dict[str, object]:
     if not own:
         raise UserError(
             "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
@@ -189,7 +179,7 @@ def _sensor_settings(own: list[OwnCamera]) -> dict[str, object]:
     return {"views": len(own) - tests, "val_views": 0, "test_views": tests}
 
 
-def _up_axis(own: list[OwnCamera]) -> str:
+def _up_axis(own: list[SceneSensor]) -> str:
     """Return the axis that is nearest to up in the sensors' images, such as ``z`` or ``-y``."""
     up = np.mean([o.pose[:3, 1] for o in own], axis=0)
     axis = int(np.argmax(np.abs(up)))
@@ -199,16 +189,11 @@ def _up_axis(own: list[OwnCamera]) -> str:
 def _fov(settings: CaptureSettings, narrower: float) -> float:
     """Return the horizontal field of view, radians, from that along the image's smaller side."""
     width, height = settings.size
-    if height >= width:
-        return narrower
-    return 2 * math.atan(width / height * math.tan(narrower / 2))
+    return scale_fov(narrower, max(1.0, width / height))
 
 
 def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]:
-    """Return the place with most room, (3,) world, and whether something is in most directions.
-
-    Places where this is so come first.
-    """
+    """Return the spot with most room, (3,) world, in a room if any is, and whether it is in one."""
     low, high = np.array(bounding_box(scene), np.float64)
     if settings.target is not None:
         spots = np.array([settings.target])
@@ -217,34 +202,31 @@ def _room(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, bool]
     else:
         steps = np.arange(NUM_SPOTS)[:, None] * PLASTIC_RATIO ** -np.arange(1.0, 4.0)
         spots = low + (high - low) * ((0.5 + steps) % 1)
-    closed, room = _look_around(scene, spots)
+    closed, room = _measure_enclosure(scene, spots)
     is_closed = closed >= MIN_ENCLOSED_SHARE
     best = np.argmax(np.where(is_closed, room, -1)) if is_closed.any() else np.argmax(closed)
     return spots[best], bool(is_closed.any())
 
 
-def _look_around(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def _measure_enclosure(scene: mi.Scene, spots: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the part of all directions with a surface, and the room, (N,), at places (N, 3).
 
-    A surface that is seen from behind does not count: the place is inside an object.
+    Surfaces seen from behind do not count: the place is inside an object.
     """
     spots = np.array(spots, np.float64).reshape(-1, 3)
     up = hemisphere(NUM_DIRECTIONS // 2, 0.0, np.random.default_rng(0))
     directions = np.concatenate([up, -up])
     pairs = np.repeat(spots, len(directions), axis=0), np.tile(directions, (len(spots), 1))
-    distances, is_front = _free_way(scene, *pairs)
+    distances, is_front = _first_surfaces(scene, *pairs)
     shape = len(spots), len(directions)
     room = np.quantile(distances.reshape(shape), ROOM_QUANTILE, axis=1, method="lower")
     return is_front.reshape(shape).mean(axis=1), room
 
 
-def _free_way(
+def _first_surfaces(
     scene: mi.Scene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances to the first surface, lamps included, (N,), infinite where there is none.
-
-    And whether there is one that reflects or transmits on the side that is seen, (N,) bool.
-    """
+    """Return distances (N,) to surfaces or lamps, and whether these scatter on the seen side."""
     if not len(origins):
         return np.empty(0), np.empty(0, bool)
     hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T)))
@@ -253,17 +235,15 @@ def _free_way(
     return np.array(hit.t, np.float64), np.array(is_front)
 
 
-# ----------------------------------------------------------------------------------------------
 # Cameras
-# ----------------------------------------------------------------------------------------------
 
 
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
     """Return the target of cameras around a scene, (3,) world, and their distance from it.
 
-    Without ``distance``, the bounding box's sphere just fits between the edges of the image:
-    radius / sin(fov / 2), with the narrower field of view. The original's 4.03 is 10% less: its box
-    has empty corners.
+    By default, the bounding box's sphere just fits between the edges of the image: radius /
+    sin(fov / 2), with the narrower field of view. NeRF-synthetic's 4.03 is 10% less: its box has
+    empty corners.
     """
     low, high = bounding_box(scene)
     target = (low + high) / 2 if settings.target is None else np.array(settings.target)
@@ -300,13 +280,13 @@ def views_inside(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView
         with np.errstate(divide="ignore"):
             leaving = (np.where(directions > 0, high, low) - target) / directions
         leaving = np.where(directions == 0, np.inf, leaving).min(axis=1)
-        way, _ = _free_way(scene, np.tile(target, (len(directions), 1)), directions)
+        way, _ = _first_surfaces(scene, np.tile(target, (len(directions), 1)), directions)
         return INSIDE_PART * np.minimum(way, leaving)
 
     return _views(settings, target, distances)
 
 
-def views_of_sensors(own: list[OwnCamera], settings: CaptureSettings) -> list[CaptureView]:
+def views_of_sensors(own: list[SceneSensor], settings: CaptureSettings) -> list[CaptureView]:
     """Return the views of the scene's own sensors."""
     has_tests = settings.test_views > 0
     tests = own[::TEST_EVERY] if has_tests else []
@@ -326,7 +306,7 @@ def _views(
     up = np.eye(3)["xyz".index(axis)] * (-1 if settings.up.startswith("-") else 1)
     for number, split in enumerate(SPLITS):
         rng = np.random.default_rng([settings.seed, number])
-        # Test views lie evenly; training views at random, but without gaps.
+        # Test views are spread evenly; training views at random, but without gaps.
         jitter = 0.0 if split == "test" else 1.0
         directions = remap_to_ranges(hemisphere(settings.count(split), jitter, rng), settings)
         directions = np.roll(directions, "zxy".index(axis), axis=1) * up.sum()
@@ -355,8 +335,7 @@ def hemisphere(count: int, jitter: float, rng: np.random.Generator) -> np.ndarra
     """Return unit vectors (count, 3) with z > 0, of equal density per solid angle.
 
     A golden-angle spiral from the rim to the pole: equal steps of height are equal areas (the
-    sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all; ``rng``
-    turns the whole spiral.
+    sphere's hat-box theorem). ``jitter`` 1 moves each within its own step, 0 not at all.
     """
     step = np.arange(count)
     offset = rng.uniform(0, 2 * math.pi)

@@ -3,15 +3,14 @@
 - ``transforms_{train,val,test}.json``: ``camera_angle_x`` and camera to world, OpenGL axes
 - ``{train,val,test}/r_0.png``, ...: RGBA, 8 bits, straight alpha, colour in sRGB
 - ``points3d.ply``: first hits of the training cameras' rays, a start for ``init.point_cloud``
-- ``capture.json``: what decides the bytes of the others
+- ``capture.json``: scene and settings
 
-Files that are there stay: they are whole, and may have been edited since.
+Files that exist are not written again: they are whole, and may have been edited since.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 import shlex
@@ -22,7 +21,6 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from plyfile import PlyData, PlyElement
 
 from drgs.capture.path_tracing import (
     MIN_LIT_PART,
@@ -38,13 +36,14 @@ from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text, remove_stale_temporaries
 from drgs.io.images import read_image, to_uint8, write_png
+from drgs.io.ply import COLOR, POSITION, encode_elements
 
 POINTS = "points3d.ply"
 MANIFEST = "capture.json"
 MAX_MANIFEST_BYTES = 1 << 20
 
 NUM_FIRST = 10  # images after which a warning is printed if most are empty or black
-MIN_COVERED = 0.01  # part of an image that is not empty
+MIN_COVERED_PART = 0.01  # of an image that is not empty
 
 REMEDIES = {
     "around": "give --cameras inside for a room, or --azimuth, --elevation, --target and "
@@ -52,7 +51,7 @@ REMEDIES = {
     "inside": "give --target, or --cameras around",
     "sensors": "give --cameras around or inside",
 }
-"""Against empty images, by kind of cameras."""
+"""Remedies for empty images, by kind of cameras."""
 
 
 class CaptureFolder:
@@ -71,10 +70,7 @@ class CaptureFolder:
         }
 
     def check(self) -> None:
-        """Raise :class:`UserError` for a folder that is neither new, nor empty, nor this capture's.
-
-        Hidden files do not count: a desktop's, or temporary ones of a capture that was killed.
-        """
+        """Raise :class:`UserError` for a folder that is not new, empty or of this capture."""
         remedy = "choose another --out, or remove it"
         if self.path.exists() and not self.path.is_dir():
             raise UserError(f"{self.path}: --out must be a folder, got a file")
@@ -100,7 +96,7 @@ class CaptureFolder:
                 )
 
     def claim(self) -> None:
-        """Make the folder that of the capture, or raise as :meth:`check`."""
+        """Create the folder with its manifest, or raise as :meth:`check`."""
         self._keep()
         self.check()
         if self._is_empty():
@@ -109,6 +105,7 @@ class CaptureFolder:
         remove_stale_temporaries(self.path)
 
     def _is_empty(self) -> bool:
+        """Return whether there are hidden files only: a desktop's, or temporary ones."""
         path = self.path
         return not path.exists() or all(child.name.startswith(".") for child in path.iterdir())
 
@@ -117,10 +114,7 @@ class CaptureFolder:
         return self.path / f"{view.file_path}.png"
 
     def take_images(self, scene: mi.Scene, views: list[CaptureView]) -> None:
-        """Take the images that are not there yet; warn if most of the first show nothing.
-
-        The folder is claimed with the first image: until then the scene may be refused.
-        """
+        """Take the images that are not there yet; warn if most of the first show nothing."""
         camera = CaptureCamera(scene, self._settings)
         missing = spread_first([view for view in views if not self.image_path(view).exists()])
         if num_done := len(views) - len(missing):
@@ -131,21 +125,18 @@ class CaptureFolder:
         with RunProgress("image", len(views), num_done) as progress:
             for done, view in enumerate(missing, num_done + 1):
                 image = camera.image(view)
-                if not shown:
+                if not shown:  # until now, the scene may have been refused
                     self.claim()
                 write_png(self.image_path(view), image)
                 shown.append(shows_something(image))
                 if len(shown) == num_first and sum(shown) < num_first / 2:
-                    self._warn_of_empty(num_first - sum(shown), num_first)
+                    warning = (
+                        f"warning: {num_first - sum(shown)} of the first {num_first} images are "
+                        f"empty or black: {REMEDIES[self._settings.cameras]}, and another --out; "
+                        "or give the scene light"
+                    )
+                    print(warning, file=sys.stderr, flush=True)
                 progress.update(done, len(views))
-
-    def _warn_of_empty(self, num_empty: int, num_first: int) -> None:
-        print(
-            f"warning: {num_empty} of the first {num_first} images are empty or black: "
-            f"{REMEDIES[self._settings.cameras]}, and another --out; or give the scene light",
-            file=sys.stderr,
-            flush=True,
-        )
 
     def write_dataset(self, scene: mi.Scene, views: list[CaptureView]) -> None:
         """Write points and transforms files, and print the command that fits the dataset."""
@@ -178,8 +169,8 @@ class CaptureFolder:
         """Return first hits of random rays: (N, 3) float32 world, and colours (N, 3) uint8.
 
         Each training view has the same share of ``settings.points``, spread evenly over the covered
-        part of its image; the colour is that of the pixel in the written image. N may be smaller,
-        even 0, where the few paths of a pixel met nothing.
+        part of its written image, whose colours they have. N may be smaller, even 0, where the few
+        paths of a pixel met nothing.
         """
         settings, train = self._settings, [view for view in views if view.split == "train"]
         positions, colors = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)]
@@ -190,7 +181,7 @@ class CaptureFolder:
             weights = image[:, 3].astype(np.float64)
             if not weights.any():
                 continue
-            # At the edge of a surface a ray can miss it, so draw more than are kept.
+            # At the edge of a surface a ray can miss it: draw more than are kept.
             pixels = rng.choice(len(image), 2 * share + 64, p=weights / weights.sum())
             rows, columns = np.divmod(pixels, settings.size[0])
             spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
@@ -222,10 +213,7 @@ def fingerprint(path: Path) -> str:
 
 
 def spread_first(views: list[CaptureView]) -> list[CaptureView]:
-    """Return the views in another order: the first are spread over all of them.
-
-    Neighbours in the list are at similar heights, and may all be dark.
-    """
+    """Return the views in an order in which the first are spread over all heights."""
     chosen = range(0, len(views), max(1, len(views) // NUM_FIRST))[:NUM_FIRST]
     rest = sorted(set(range(len(views))) - set(chosen))
     return [views[index] for index in (*chosen, *rest)]
@@ -234,11 +222,11 @@ def spread_first(views: list[CaptureView]) -> list[CaptureView]:
 def shows_something(image: np.ndarray) -> bool:
     """Return whether an image, (H, W, 4) uint8, is not empty, and most of its surfaces are lit."""
     covered = float((image[:, :, 3] > 0).mean())
-    return covered >= MIN_COVERED and lit_part(image) >= MIN_LIT_PART
+    return covered >= MIN_COVERED_PART and lit_part(image) >= MIN_LIT_PART
 
 
 def write_transforms(path: Path, settings: CaptureSettings, views: list[CaptureView]) -> None:
-    """Write one ``transforms_*.json``; numbers have all digits of their float64."""
+    """Write one ``transforms_*.json``."""
     frames = [
         {"file_path": view.file_path, "transform_matrix": view.pose.tolist()}
         | ({} if view.fov == settings.fov else {"camera_angle_x": view.fov})
@@ -251,15 +239,11 @@ def write_transforms(path: Path, settings: CaptureSettings, views: list[CaptureV
 
 def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
     """Write a PLY of points: positions (N, 3) world, colours (N, 3) uint8 display space."""
-    columns = dict(zip("xyz", positions.T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), colors.T, strict=True))
+    columns = dict(zip((*POSITION, *COLOR), (*positions.T, *colors.T), strict=True))
     dtype = [(name, column.dtype) for name, column in columns.items()]
     rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
-    # Not to the file itself: numpy's errors of a full disk name neither the file nor the reason.
-    stream = io.BytesIO()
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(stream.getbuffer())
+        temporary.write_bytes(encode_elements({"vertex": rows}))
 
 
 def _value_text(key: str, value: object) -> str:

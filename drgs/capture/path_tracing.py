@@ -1,14 +1,12 @@
 """Path traced images of a Mitsuba scene.
 
-From around a scene, lights are not seen, only what they light: alpha is the part of a pixel that
-surfaces cover (an opacity mask counts, glass is opaque).
+From around a scene, lights themselves are hidden. Alpha is the part of a pixel that surfaces cover
+(an opacity mask counts, glass is opaque); the colour is the mean colour c of that part, as both
+channels of the film's premultiplied linear image (a c, a) come from the same samples. The colour is
+encoded first and composited then, a srgb(c) + (1 - a) background, as in Blender's images of
+NeRF-synthetic and as splats are composited.
 
-A pixel that is half covered is stored as the mean colour c of its covered part and alpha a = 1/2.
-The colour is encoded first and composited then, a srgb(c) + (1 - a) background, as Blender wrote
-the original and as splats are composited. In the premultiplied linear image (a c, a) of the film
-both channels come from the same samples, so c is exactly their quotient.
-
-Each pixel is the plain mean of the samples inside it (a box filter), the only one that Mitsuba
+Each pixel is the plain mean of the samples inside it (a box filter), which alone Mitsuba
 accumulates in a reproducible order: the same settings give the same bytes.
 """
 
@@ -33,22 +31,21 @@ from drgs.integrator.types import is_splats
 from drgs.io.images import to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
 
-NERF_SYNTHETIC_FOV = 0.6911112070083618  # radians: the original's ``camera_angle_x``
+NERF_SYNTHETIC_FOV = 0.6911112070083618  # radians: its ``camera_angle_x``
 
 SPLITS = ("train", "val", "test")
 
 PATHS_PER_PASS = 2**24  # paths traced at once, at most: their state takes a few hundred MiB
 
 SAMPLES_PER_PASS = 64
-"""Per pixel, a square: they are stratified together (8x8 multi-jittered), which leaves about half
-the noise variance of as many independent ones."""
+"""Per pixel, a square: together stratified (8x8 multi-jittered) samples have about half the noise
+variance of independent ones."""
 
 NEAR_CLIP, FAR_CLIP = 1e-5, 1e5  # of the bounding box's diagonal
 MAX_BLACK = 2  # largest channel of a black pixel, of 255
-MIN_LIT_PART = 0.5  # part of the covered pixels that are lit: less where a camera stands wrong
+MIN_LIT_PART = 0.5  # of the covered pixels: fewer are lit where a camera stands wrong
 
-MAX_LAMPS_IN_A_ROW = 16
-"""Surfaces that shine are passed through on the way to the first hit, this many at most."""
+MAX_LAMPS_IN_A_ROW = 16  # surfaces that shine, before the first hit of a ray that passes them
 
 SIGHT_RAYS = 64
 """Rays through an image along both sides: a fit cannot use anything smaller than their spacing."""
@@ -56,7 +53,7 @@ SIGHT_RAYS = 64
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """The settings that decide the images, beside the scene."""
+    """Settings of the images."""
 
     views: int = 100  # to train on
     val_views: int = 0
@@ -92,20 +89,23 @@ class CaptureSettings:
 
     @property
     def narrower_fov(self) -> float:
-        """Radians: the smaller one of the horizontal and the vertical field of view."""
+        """The smaller one of the horizontal and the vertical field of view, radians."""
         width, height = self.size
-        if height >= width:
-            return self.fov
-        return 2 * math.atan(height / width * math.tan(self.fov / 2))
+        return scale_fov(self.fov, min(1.0, height / width))
 
     @property
     def hides_lights(self) -> bool:
-        """True if shining surfaces are left out: an object's studio is, a room's lamps are not."""
+        """True if shining surfaces are left out: not the lamps of a room."""
         return self.cameras != "inside"
 
     def count(self, split: str) -> int:
         """Return the number of views of a split."""
         return {"train": self.views, "val": self.val_views, "test": self.test_views}[split]
+
+
+def scale_fov(fov: float, ratio: float) -> float:
+    """Return the field of view, radians, along a side that is ``ratio`` times as long."""
+    return fov if ratio == 1 else 2 * math.atan(ratio * math.tan(fov / 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,10 +124,7 @@ class CaptureView:
 
 
 def load_scene(path: Path) -> mi.Scene:
-    """Load a scene from an XML file, or from a Python file with a function ``scene()``.
-
-    Raises :class:`UserError` where there is none, or one of another variant than the active.
-    """
+    """Load a scene from an XML file, or from a Python file with a function ``scene()``."""
     try:
         if path.suffix == ".py":
             scene = load_scene_dictionary(_scene_dictionary(path), path)
@@ -181,7 +178,7 @@ def _import(path: Path) -> ModuleType:
     assert spec is not None and spec.loader is not None, "the file's name ends in .py"
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
-    # As for a script: its neighbours can be imported.
+    # As a script, it can import its neighbours.
     sys.path.insert(0, str(path.parent.resolve()))
     spec.loader.exec_module(module)
     return module
@@ -216,18 +213,15 @@ def bounding_box(scene: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 class CaptureCamera:
-    """A Mitsuba sensor that is moved around to take images of a scene."""
+    """A Mitsuba sensor that is moved from view to view of a scene."""
 
     def __init__(self, scene: mi.Scene, settings: CaptureSettings) -> None:
         self._scene, self._settings = scene, settings
         low, high = bounding_box(scene)
         diagonal = float(np.linalg.norm(high - low))
+        depth, hides = settings.max_depth, settings.hides_lights
         self._integrator = mi.load_dict(
-            {
-                "type": "path",
-                "max_depth": settings.max_depth,
-                "hide_emitters": settings.hides_lights,
-            }
+            {"type": "path", "max_depth": depth, "hide_emitters": hides}
         )
         self._sensor = mi.load_dict(
             {
@@ -288,20 +282,17 @@ class CaptureCamera:
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
-    """Return (H, W, 4) uint8 straight sRGB and alpha, from premultiplied linear radiance and alpha.
-
-    Light beyond white is cut off. Where alpha rounds to zero the colour is black, not noise.
-    """
+    """Return (H, W, 4) uint8 straight sRGB and alpha, from premultiplied radiance and alpha."""
     alpha = np.clip(linear[:, :, 3:], 0, 1)
     color = np.clip(linear[:, :, :3] / np.maximum(alpha, 1e-9), 0, 1)
     display = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
     rgba = to_uint8(np.concatenate([display, alpha], axis=2))
-    rgba[rgba[:, :, 3] == 0] = 0
+    rgba[rgba[:, :, 3] == 0] = 0  # not noise
     return rgba
 
 
 def lit_part(rgba: np.ndarray) -> float:
-    """Return the part of the covered pixels of (..., 4) uint8 that is not black; 0 without any."""
+    """Return the part of the covered pixels of (..., 4) uint8 that is not black."""
     covered = rgba[..., 3] > 0
     lit = covered & (rgba[..., :3].max(axis=-1) > MAX_BLACK)
     return float(lit.sum() / max(1, covered.sum()))
@@ -331,17 +322,14 @@ def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -
 
 
 def first_hits(
-    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, past_lamps: bool
+    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, ignores_lamps: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool.
-
-    past_lamps: whether surfaces that shine do not count.
-    """
+    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool."""
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
 
     def intersect(ray: mi.Ray3f) -> tuple[mi.SurfaceInteraction3f, Bool]:
         hit = scene.ray_intersect(ray)
-        return hit, hit.is_valid() & hit.shape.is_emitter() & past_lamps
+        return hit, hit.is_valid() & hit.shape.is_emitter() & ignores_lamps
 
     hit, lamp = intersect(ray)
     for _ in range(MAX_LAMPS_IN_A_ROW - 1):

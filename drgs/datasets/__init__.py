@@ -16,14 +16,14 @@ from pydantic import BaseModel
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.origin import WORLD, choose_origin, format_origin
-from drgs.datasets.types import Dataset, Keeps, View, Viewpoint, all_views
+from drgs.datasets.types import Dataset, View, ViewFilter, Viewpoint, all_views
 
 __all__ = ["Dataset", "View", "Viewpoint", "load_dataset"]
 
 
 def load_dataset(
     source: str | Path | DataConfig,
-    keeps: Keeps = all_views,
+    keeps: ViewFilter = all_views,
     sections: Mapping[str, BaseModel | None] = MappingProxyType({}),
     **settings: object,
 ) -> Dataset:

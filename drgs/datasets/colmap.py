@@ -3,8 +3,7 @@
 The model is in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``, beside the photographs, or in
 ``dense/0`` as COLMAP's automatic reconstruction leaves it. The photographs are in ``images`` (or
 beside the model's folder) or, at a half, a quarter or an eighth of their size, in ``images_2``,
-``images_4``, ``images_8``; masks are in ``masks``, black where pixels do not count: see
-``drgs.datasets.files``.
+``images_4``, ``images_8``; masks: see ``drgs.datasets.files``.
 
 Cameras are rendered with the lens that COLMAP found, without undistorting. Their intrinsics are
 scaled from the size that COLMAP saw to that of the photograph.
@@ -13,7 +12,6 @@ scaled from the size that COLMAP saw to that of the photograph.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
 from pathlib import Path
 
 from typing_extensions import override
@@ -27,17 +25,14 @@ from drgs.datasets.reader import MAX_WIDTH, DatasetReader, Photographs
 from drgs.datasets.splits import unlisted_splits
 from drgs.datasets.transforms import LENS_OF_MODEL, FrameValues, TransformsFrame
 from drgs.io.colmap import ColmapCamera, ColmapImage, ColmapModel, model_files, read_model
-from drgs.io.images import MAX_SIDE, read_header
+from drgs.io.images import FIRST_TRANSPOSED_ORIENTATION, MAX_SIDE, read_header
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")  # folders of COLMAP's models in datasets
 
-WORKSPACES = ("", "dense/0", "dense")
-"""Folders of that kind in COLMAP's automatic reconstruction, with their photographs."""
+WORKSPACES = ("", "dense/0", "dense")  # where COLMAP's automatic reconstruction has these folders
 
 FACTORS = {"images": 1, "images_2": 2, "images_4": 4, "images_8": 8}
 """Divisors of the size of photographs, by folder."""
-
-FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange width and height
 
 PHOTOGRAPHS = FileKind("photographs", remedy="put the photographs there that COLMAP saw")
 
@@ -47,14 +42,13 @@ class ColmapReader(DatasetReader):
     """Reads a model of COLMAP and its photographs."""
 
     @override
-    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        del names
+    def recognizes(self, folder: Path) -> bool:
         return find_model(folder) is not None
 
     @override
     def photographs(self, config: DataConfig) -> Photographs:
         notes: list[str] = []
-        root, folder = _root_and_model(config.path)
+        root, folder = require_model(config.path)
         model = read_model(folder)
         images, files = _images_and_files(config, folder, model, notes)
         below = image_folder(config, model)
@@ -77,7 +71,7 @@ class ColmapReader(DatasetReader):
     @override
     def image_files(self, config: DataConfig) -> list[Path]:
         """Return the photographs of all images, as large as they are there."""
-        folder = model_folder(config.path)
+        _, folder = require_model(config.path)
         widest = config.model_copy(update={"image_size": MAX_SIDE})
         return _images_and_files(widest, folder, read_model(folder), [])[1]
 
@@ -85,7 +79,7 @@ class ColmapReader(DatasetReader):
 def find_model(folder: Path) -> tuple[Path, Path] | None:
     """Return the folder of the photographs' folders and masks, and the model's; None: no model.
 
-    The first that has both photographs and a model; else the first model in a place of its own.
+    The first place with both photographs and a model, else the first model in MODEL_FOLDERS.
     """
     for workspace in WORKSPACES:
         root = folder / workspace
@@ -99,9 +93,8 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
 
 
 def _has_photographs(root: Path) -> bool:
-    if any((root / name).is_dir() for name in FACTORS):
-        return True
-    return any(map(images_in, (root, *folders_in(root))))
+    has_folder = any((root / name).is_dir() for name in FACTORS)
+    return has_folder or any(map(images_in, (root, *folders_in(root))))
 
 
 def folders_in(folder: Path) -> list[Path]:
@@ -114,12 +107,8 @@ def folders_in(folder: Path) -> list[Path]:
     ]
 
 
-def model_folder(folder: Path) -> Path:
-    """Return the folder of the model. Raises :class:`UserError` where there is none."""
-    return _root_and_model(folder)[1]
-
-
-def _root_and_model(folder: Path) -> tuple[Path, Path]:
+def require_model(folder: Path) -> tuple[Path, Path]:
+    """Return the folders of :func:`find_model`; raise :class:`UserError` where there is none."""
     if (found := find_model(folder)) is None:
         raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(MODEL_FOLDERS)}")
     return found
@@ -128,26 +117,24 @@ def _root_and_model(folder: Path) -> tuple[Path, Path]:
 def _images_and_files(
     config: DataConfig, folder: Path, model: ColmapModel, notes: list[str]
 ) -> tuple[list[ColmapImage], list[Path]]:
-    """Return the images by name, and their files; images without one are left out."""
+    """Return the sorted images, and their files; images without one are left out."""
     if not model.images:
         raise UserError(f"{folder}: at least 2 views are needed, one of them to test; got 0")
     images = sorted(model.images, key=lambda image: image.name)
     names = [image.name for image in images]
-    below = image_folder(config, model)
-
     places = [f"{folder}: image {one_line(name, 100)}" for name in names]
+    below = image_folder(config, model)
     found = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
     images = [image for image in images if image.name in found]
     return images, [found[image.name] for image in images]
 
 
 def image_folder(config: DataConfig, model: ColmapModel) -> Path:
-    """Return the folder of the photographs to read.
+    """Return the folder of the photographs to read, by ``data.downscale``.
 
-    ``data.downscale`` chooses it; by default, the smallest photographs that have at least the width
-    ``data.image_size``, or the largest ones.
+    By default, the smallest photographs of at least the width ``data.image_size``, or the largest.
     """
-    root, _ = _root_and_model(config.path)
+    root, _ = require_model(config.path)
     folders = [path for path in sorted(root.iterdir()) if path.is_dir()]
     there = {FACTORS[key]: path for path in folders if (key := key_of(path.name)) in FACTORS}
     if 1 not in there and any((root / image.name).is_file() for image in model.images):
@@ -181,7 +168,7 @@ def _values(
             "(colmap image_undistorter), or have COLMAP find another model"
         )
     width, height = _size_as_calibrated(file, camera, image, folder)
-    named = camera.named_values()
+    named = dict(camera.values)
     scale_x, scale_y = width / camera.width, height / camera.height
     focal = named.pop("f", None)
     return FrameValues.model_construct(

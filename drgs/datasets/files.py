@@ -5,7 +5,7 @@ whole path of another machine before them, and separate folders by backslashes.
 
 A photograph ``a.jpg`` has the mask ``a.jpg.png`` (COLMAP), ``a.png``, ``a_mask.png`` (Metashape),
 ``a.jpg.mask.png`` or ``a.mask.png`` (RealityScan), in any case and with the suffix of any image, in
-the folder ``masks`` or ``mask``. The last three may lie beside the photographs as well.
+the folder ``masks`` or ``mask``, or, for the last three, beside the photographs.
 """
 
 from __future__ import annotations
@@ -28,17 +28,15 @@ IMAGE_SUFFIXES = frozenset(
     }
 )
 
-IMAGE_FOLDERS = ("images", "input", "photos", "rgb")
-"""Folders in which converters expect or put photographs."""
+IMAGE_FOLDERS = ("images", "input", "photos", "rgb")  # of photographs, for converters
 
 _IMAGE_FOLDER = re.compile(rf"(?:{'|'.join(IMAGE_FOLDERS)})(?:_[0-9]+)?")
 
 MASK_FOLDERS = ("masks", "mask")
 
-MASK_ENDINGS = (".mask", "_mask", "-mask")
-"""Between the name of a photograph and the suffix of its mask."""
+MASK_ENDINGS = (".mask", "_mask", "-mask")  # before the suffix of a photograph's mask
 
-LEAST_SHARE, LEAST_LEFT = 0.5, 2
+MIN_FOUND_SHARE, MIN_FOUND = 0.5, 2
 """Smallest share, and number, of the named files of a kind that must be there."""
 
 
@@ -59,7 +57,7 @@ def stem_of(name: str) -> str:
 
 
 def is_image(name: str) -> bool:
-    """Judge by the name; hidden files, as systems leave beside photographs, are none."""
+    """Judge by the name; hidden files, which systems leave beside photographs, are no images."""
     return not name.startswith(".") and os.path.splitext(name)[1].lower() in IMAGE_SUFFIXES
 
 
@@ -95,12 +93,12 @@ def find_files(
 
     Raises :class:`UserError` where fewer than half were found, or only one of several.
     """
-    finder = _FileFinder(folder)
-    found = {name: path for name in dict.fromkeys(names) if (path := finder.exact(name))}
-    near = {
-        n: finder.find_similar(n, kind.suffixes) for n in dict.fromkeys(names) if n not in found
-    }
-    near = {name: paths[0] for name, paths in near.items() if len(paths) == 1}
+    finder, found, near = _FileFinder(folder), {}, {}
+    for name in dict.fromkeys(names):
+        if path := finder.exact(name):
+            found[name] = path
+        elif len(paths := finder.find_similar(name, kind.suffixes)) == 1:
+            near[name] = paths[0]
     counts = Counter([*found.values(), *near.values()])
     near = {name: path for name, path in near.items() if counts[path] == 1}
     if near:
@@ -113,7 +111,7 @@ def find_files(
     missing = [index for index, name in enumerate(names) if name not in found]
     if missing:
         count = f"{len(missing):,} of {len(names):,} {kind.plural}"
-        enough = max(LEAST_SHARE * len(names), LEAST_LEFT)
+        enough = max(MIN_FOUND_SHARE * len(names), MIN_FOUND)
         if kind.is_needed and len(names) - len(missing) < enough:
             raise UserError(
                 f"{places[missing[0]]}: there is no image {one_line(folder / names[missing[0]])} "
@@ -125,7 +123,7 @@ def find_files(
 
 
 class _FileFinder:
-    """Files below a folder; each folder is listed once, when a name is not right."""
+    """Files below a folder; a folder is listed once, when a name in it is not exact."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._listing = folder, cache(_listing)
@@ -158,13 +156,11 @@ class _FileFinder:
         folders = [self._folder]
         for part in parts[:-1]:
             folders = [f / name for f in folders for name in self._match_name(f, part)]
-        last = parts[-1]
-        found = [f / name for f in folders for name in self._match_name(f, last)]
+        found = [f / name for f in folders for name in self._match_name(f, parts[-1])]
         if not found:
-            names = (
-                (f, name) for f in folders for name in self._match_name(f, f"{stem_of(last)}.*")
-            )
-            found = [f / n for f, n in names if os.path.splitext(n)[1].lower() in suffixes]
+            stem = f"{stem_of(parts[-1])}.*"
+            found = [f / name for f in folders for name in self._match_name(f, stem)]
+            found = [path for path in found if path.suffix.lower() in suffixes]
         return [path for path in found if os.path.isfile(path)]
 
     def _match_name(self, folder: Path, name: str) -> list[str]:
@@ -196,8 +192,8 @@ def masks_of(
     """Return the mask of each photograph; None: it has none.
 
     folder: contains the folder of masks; names: relative to ``images``, the folder of the
-    photographs, which is searched as well if it is given. notes: one is added on photographs
-    without a mask, and one on files that are no photograph's mask.
+    photographs, which is searched as well if it is given. notes: gets one on photographs without a
+    mask, and one on files that are no photograph's mask.
     """
     files = _mask_files(folder)
     exact, marked, loose = ({} for _ in range(3))  # files by names of photographs
@@ -217,8 +213,17 @@ def masks_of(
     for index, name in enumerate(names):  # photographs whose masks are older than their format
         if chosen[index] is None and (file := loose.get(_mask_key(name))) not in used:
             chosen[index] = file
-    if any(chosen) or files:
-        _note_masks(folder, names, chosen, files, notes)
+    without = [name for name, mask in zip(names, chosen, strict=True) if mask is None]
+    if without and (any(chosen) or files):
+        notes.append(
+            f"{folder}: all pixels count of {len(without):,} of {len(names):,} photographs, which "
+            f"have no mask ({format_names(without)})"
+        )
+    if unused := sorted(set(files).difference(chosen)):
+        notes.append(
+            f"{folder}: masks of no photograph that has a camera: {_format_files(folder, unused)} "
+            "(the mask of a.jpg is a.jpg.png or a.png)"
+        )
     return chosen
 
 
@@ -254,32 +259,11 @@ def _photograph_key(stem: str) -> str | None:
     return next((stem.removesuffix(end) for end in MASK_ENDINGS if stem.endswith(end)), None)
 
 
-def _note_masks(
-    folder: Path,
-    names: Sequence[str],
-    chosen: Sequence[Path | None],
-    files: Sequence[Path],
-    notes: list[str],
-) -> None:
-    without = [name for name, mask in zip(names, chosen, strict=True) if mask is None]
-    if without:
-        notes.append(
-            f"{folder}: all pixels count of {len(without):,} of {len(names):,} photographs, which "
-            f"have no mask ({format_names(without)})"
-        )
-    if unused := sorted(set(files).difference(chosen)):
-        notes.append(
-            f"{folder}: masks of no photograph that has a camera: {_format_files(folder, unused)} "
-            "(the mask of a.jpg is a.jpg.png or a.png)"
-        )
-
-
 def _format_files(folder: Path, files: Sequence[Path]) -> str:
     return format_names([one_line(file.relative_to(folder), 100) for file in files])
 
 
 def _mask_files(folder: Path) -> list[Path]:
-    """Return the images in the folders of masks, and below them."""
     tops = [name for name in os.listdir(folder) if key_of(name) in MASK_FOLDERS]
     walks = (walk for top in tops for walk in os.walk(folder / top))
     return _png_first(

@@ -1,8 +1,4 @@
-"""Fingerprints of datasets, by which another dataset and its differences are recognized.
-
-For each view: name, size and camera as configured, and digests of its files. The dataset's folder
-is no part of it.
-"""
+"""Fingerprints of datasets, by which another dataset and its differences are recognized."""
 
 from __future__ import annotations
 
@@ -13,13 +9,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drgs.core.folders import digest
-from drgs.datasets.reader import in_parallel
-from drgs.datasets.types import Dataset, Keeps, View, all_views
+from drgs.datasets.reader import map_on_threads
+from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 
 CAMERA_TOLERANCE = 1e-9
 """Relative and absolute, of a camera's numbers: rounding of another machine's mathematics."""
-
-FILE_NAMES = {"image": "the image", "mask": "the mask", "depth": "the depth"}
 
 
 class ViewPrint(BaseModel):
@@ -62,7 +56,7 @@ class ViewPrint(BaseModel):
             yield "the camera"
         for what in {**self.files, **now.files}:
             if _is_different(self.files.get(what), now.files.get(what)):
-                yield FILE_NAMES.get(what, what)
+                yield f"the {what}"
 
 
 class Fingerprint(BaseModel):
@@ -101,16 +95,14 @@ class Fingerprint(BaseModel):
         ]
 
 
-def fingerprint_of(dataset: Dataset, reads: Keeps = all_views) -> Fingerprint:
+def fingerprint_of(dataset: Dataset, reads: ViewFilter = all_views) -> Fingerprint:
     """Return the fingerprint of a dataset, for which the files of its views are read.
 
     reads: accepts views by name; the files of others have empty digests.
-
-    Raises :class:`drgs.core.errors.UserError` where one is gone.
     """
     views = [view for view in (*dataset.train, *dataset.test) if reads(view.name)]
     files = sorted({path for view in views for path in view.files.values()})
-    digests = dict(zip(files, in_parallel(digest, files), strict=True))
+    digests = dict(zip(files, map_on_threads(digest, files), strict=True))
     train, test = (
         [ViewPrint.from_view(view, digests) for view in views]
         for views in (dataset.train, dataset.test)

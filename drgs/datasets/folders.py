@@ -34,27 +34,17 @@ NAMES = {
     "colmap": "photographs with the cameras of COLMAP's model",
 }
 
-MARKERS = ("transforms_train.json", "transforms.json")
-"""Files by which folders of the layouts NeRF-synthetic and nerfstudio are recognized."""
+MARKERS = ("transforms_train.json", "transforms.json")  # of NeRF-synthetic and nerfstudio
 
 GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 
 
-NO_SECTIONS: Mapping[str, BaseModel | None] = MappingProxyType({})
-"""Sections of extensions where none has one."""
-
-
 def find_reader(
-    config: DataConfig, sections: Mapping[str, BaseModel | None] = NO_SECTIONS
+    config: DataConfig, sections: Mapping[str, BaseModel | None] = MappingProxyType({})
 ) -> tuple[str, DatasetReader]:
-    """Return the name and the reader of ``data.type``, or of the first that recognizes the folder.
-
-    sections: those of extensions, by name.
-
-    Raises :class:`UserError` for a folder that no reader recognizes, with what to do.
-    """
+    """Return name and reader of ``data.type``, or of the first that recognizes the folder."""
     try:
-        names = os.listdir(config.path)
+        os.listdir(config.path)
     except FileNotFoundError:
         source = f", or get it from {config.source}" if config.source else ""
         raise UserError(
@@ -70,8 +60,8 @@ def find_reader(
     else:
         candidates = [READERS.get(config.type, "data.type")]
     for extension in candidates:
-        reader = extension.value.from_config(section_of(extension, sections))
-        if not is_auto or reader.recognizes(config.path, names):
+        reader = extension.value(section_of(extension, sections))
+        if not is_auto or reader.recognizes(config.path):
             return extension.name, reader
     raise UserError(f"{config.path}: {explain(config.path)}")
 
@@ -79,9 +69,7 @@ def find_reader(
 def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, str]:
     """Return a configuration for the dataset in ``folder``, and the reasons for it, as text.
 
-    overrides: as for :func:`drgs.config.load.load_config`; these values are not chosen.
-
-    Raises :class:`UserError` for a folder that is no dataset, with what to do.
+    overrides: given values, as for :func:`drgs.config.load.load_config`.
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)

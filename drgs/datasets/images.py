@@ -1,7 +1,6 @@
 """Images of views: read, composited over a background, scaled, and kept in little memory.
 
-A photograph of three times 8 bits becomes four times as large as float32, so the file's integers
-are kept, and floats computed at each access.
+The file's integers are kept, and floats, which take four times the memory, computed at each access.
 """
 
 from __future__ import annotations
@@ -26,8 +25,9 @@ from drgs.io.images import (
     read_image,
 )
 
-MAX_PIXELS_AT_ONCE, MAX_THREADS = 1 << 25, 8
-"""Pixels of photographs that are read at a time: of 40 bytes each, at most."""
+MAX_PIXELS_AT_ONCE = 1 << 25  # of photographs that are read at a time: 40 bytes each, at most
+
+MAX_THREADS = 8
 
 MIN_WHOLE_SHARE = 1 - 1e-4  # share of a pixel's area that counts as all of it, up to rounding
 
@@ -40,8 +40,7 @@ DEPTH_BYTES = 24  # memory for a depth of an ``.npy`` file while it is converted
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Return a mask (H, W) float32: 1 where opaque and brighter than half, else 0; size: W, H.
 
-    The mask may be for a larger photograph of the same shape: a pixel counts if all of its area
-    does.
+    Of a mask for a larger photograph, a pixel counts if all of its area does.
     """
     stored = image_size(path)
     is_larger = stored[0] > size[0] and is_scaled(size, stored)
@@ -52,14 +51,14 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     if image.shape[2] == 4:
         counts &= image[:, :, 3] > 0.5
     mask = counts.astype(np.float32)
-    return _round_share(_resize(mask, *size)) if is_larger else mask
+    return (_resize(mask, *size) > MIN_WHOLE_SHARE).astype(np.float32) if is_larger else mask
 
 
 def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
     """Return whether an image of ``size`` may be one of ``original``, scaled; each W, H, px.
 
-    Sides are whole numbers: each is less than 1 px away from the product of the factor and the
-    original's. An image with one side of the original and another one beside is cropped.
+    Rounded sides are less than 1 px from the scaled ones. An image that shares one side only with
+    the original is cropped.
     """
     (width, height), (full_width, full_height) = size, original
     if width == full_width or height == full_height:
@@ -71,7 +70,7 @@ def is_scaled(size: tuple[int, int], original: tuple[int, int]) -> bool:
 def read_depth(path: Path, unit: float, size: tuple[int, int]) -> np.ndarray:
     """Return depths (H, W) float32, scene units; 0 where not known: not finite or not positive.
 
-    unit: scene units per number of the ``.npy`` file, or step of the 16 bit image; size: W, H.
+    unit: scene units of a number in the file; size: W, H.
     """
     if is_array(path):
         depth = _stored_depth(path)
@@ -137,9 +136,8 @@ def composite(image: np.ndarray, background: tuple[float, float, float]) -> np.n
 def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
     """Return the image at width ``max_width`` if it is wider; the height in proportion.
 
-    Each new pixel is the exact average over its area, in which partly covered pixels have the
-    weights of their coverage. Applied after compositing, which gives what scaling premultiplied
-    colours and alpha would.
+    Each new pixel is the exact average over its area. After compositing, the result is that of
+    scaling premultiplied colours and alpha.
     """
     height, width = image.shape[:2]
     new_width, new_height = downscaled_size(width, height, max_width)
@@ -147,7 +145,7 @@ def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:
 
 
 def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int, int]:
-    """Return width and height of a downscaled image: see :func:`downscale`."""
+    """Return the width and height of a downscaled image."""
     if max_width is None or width <= max_width:
         return width, height
     return max_width, max(1, round(height * max_width / width))
@@ -155,11 +153,7 @@ def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int
 
 def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
     """Return a mask (H, W) of 1 and 0: a pixel counts where all that it covers does."""
-    return _round_share(downscale(mask, max_width))
-
-
-def _round_share(share: np.ndarray) -> np.ndarray:
-    return (share > MIN_WHOLE_SHARE).astype(np.float32)
+    return (downscale(mask, max_width) > MIN_WHOLE_SHARE).astype(np.float32)
 
 
 def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
@@ -224,10 +218,7 @@ def compact_photograph(
     """Return ``image`` and ``alpha`` of a :class:`View` in a form that takes little memory.
 
     That is the file's pixels, or floats where they take less; numbers of 16 bits where scaling is
-    by no whole factor, which takes long.
-
-    pixels: of :func:`drgs.io.images.read_pixels`; background: behind transparent pixels, display
-    space; max_width: see :func:`downscale`.
+    by no whole factor, which takes long. pixels: of :func:`drgs.io.images.read_pixels`.
     """
     height, width, channels = pixels.shape
     new_width, new_height = downscaled_size(width, height, max_width)
@@ -259,11 +250,8 @@ def compact_mask(mask: np.ndarray) -> LazyImage:
     return LazyImage(mask.shape, lambda: kept.astype(np.float32), kept.nbytes)
 
 
-def check_room(files: Sequence[Path], max_width: int | None) -> None:
-    """Raise :class:`UserError` where photographs do not fit into memory as they would be kept.
-
-    Before any is decoded, from the files' headers; max_width: see :func:`downscale`.
-    """
+def check_memory(files: Sequence[Path], max_width: int | None) -> None:
+    """Raise :class:`UserError` where photographs, as they are kept, do not fit into memory."""
     needed = 0
     for file in files:
         header = read_header(file)
@@ -281,8 +269,8 @@ def check_room(files: Sequence[Path], max_width: int | None) -> None:
         )
 
 
-def threads_for(files: Sequence[Path]) -> int:
-    """Return the number of photographs to read at a time, so that their pixels fit into memory."""
+def num_threads(files: Sequence[Path]) -> int:
+    """Return the number of photographs to read at a time, for memory."""
     width, height = image_size(files[0])
     return max(1, min(MAX_THREADS, MAX_PIXELS_AT_ONCE // (width * height)))
 

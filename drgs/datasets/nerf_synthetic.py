@@ -1,16 +1,13 @@
 """The NeRF-synthetic ("Blender") layout: ``transforms_{train,val,test}.json`` and RGBA images.
 
-Mildenhall et al. 2020. Pinhole cameras with the principal point in the middle and one horizontal
-field of view, ``camera_angle_x``, for all frames that have none of their own; images of one size in
-a split, with straight alpha. An image without alpha is refused: its background would be fitted as
-part of the object. Opaque photographs need the nerfstudio layout.
-
-Frames may have a lens, a second pose, a mask and depths, as there.
+Mildenhall et al. 2020. Cameras have the principal point in the middle and a horizontal field of
+view, ``camera_angle_x``; images have one size in a split and straight alpha. An image without alpha
+is refused: its background would be fitted as part of the object. Opaque photographs need the
+nerfstudio layout. Frames may have a lens, a second pose, a mask and depths, as there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,21 +17,18 @@ from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.notices import Notices
-from drgs.datasets.reader import DatasetReader, ViewIntrinsics, describe_extras, load_views
+from drgs.datasets.reader import DatasetReader, Intrinsics, describe_extras, load_views
 from drgs.datasets.transforms import (
-    TransformsFile,
     TransformsFrame,
     focal_from_angle,
     frames_with_files,
     note_unread,
     read_transforms,
 )
-from drgs.datasets.types import Dataset, Keeps, View, all_views
+from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.images import image_size
 
-START_HALF_EXTENT = 1.3
-"""The 3DGS reference starts from random points in [-1.3, 1.3]^3 for these scenes
-(``readNerfSyntheticInfo``)."""
+START_HALF_EXTENT = 1.3  # of the random start points of the 3DGS reference, readNerfSyntheticInfo
 
 UNUSED_KEYS = ("camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
 """Intrinsics that the layout does not have."""
@@ -45,12 +39,11 @@ class NerfSyntheticReader(DatasetReader):
     """Reads folders of NeRF-synthetic."""
 
     @override
-    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        del folder
-        return "transforms_train.json" in names
+    def recognizes(self, folder: Path) -> bool:
+        return (folder / "transforms_train.json").exists()
 
     @override
-    def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
+    def load(self, config: DataConfig, keeps: ViewFilter = all_views) -> Dataset:
         """Return split ``train``, and ``config.test_split`` (default: ``test`` or ``val``)."""
         if config.background is None:
             config = config.model_copy(update={"background": "white"})
@@ -60,7 +53,7 @@ class NerfSyntheticReader(DatasetReader):
         test = train
         if test_split != "train":
             test = _load_split(config, frames[test_split], keeps, notices)
-            test = tuple(replace(view, alpha=None) for view in test)  # only training looks at it
+            test = tuple(replace(view, alpha=None) for view in test)  # only training uses it
         notices.emit(notes, train, () if test_split == "train" else test)
         ignored, extras = describe_extras(config, [f for each in frames.values() for f in each])
         return Dataset(
@@ -88,7 +81,7 @@ def _test_split(config: DataConfig) -> str:
     if config.test_split is not None:
         return config.test_split
     for split in ("test", "val"):
-        if _transforms_path(config, split).is_file():
+        if (config.path / f"transforms_{split}.json").is_file():
             return split
     raise UserError(
         f"{config.path}: there are no test views: neither transforms_test.json nor "
@@ -96,35 +89,26 @@ def _test_split(config: DataConfig) -> str:
     )
 
 
-def _transforms_path(config: DataConfig, split: str) -> Path:
-    return config.path / f"transforms_{split}.json"
-
-
 def _frames(config: DataConfig, split: str, notes: list[str]) -> list[TransformsFrame]:
-    """Return the frames of a split whose images are there."""
-    meta = read_transforms(_transforms_path(config, split))
-    if unread := [*meta.unread, *_unused_keys(meta)]:
+    meta = read_transforms(config.path / f"transforms_{split}.json")
+    values = [frame.values for frame in meta.frames]
+    unread = [key for key in UNUSED_KEYS if any(getattr(v, key) is not None for v in values)]
+    unread += [] if meta.point_cloud is None else ["ply_file_path"]
+    unread += [f"{split}_filenames" for split in meta.lists]
+    if unread := [*meta.unread, *unread]:
         notes.append(note_unread(meta.path, unread))
     return frames_with_files(config, meta, notes)
 
 
-def _unused_keys(meta: TransformsFile) -> list[str]:
-    """Return keys that other layouts read."""
-    values = [frame.values for frame in meta.frames]
-    keys = [key for key in UNUSED_KEYS if any(getattr(v, key) is not None for v in values)]
-    keys += [] if meta.point_cloud is None else ["ply_file_path"]
-    return keys + [f"{split}_filenames" for split in meta.lists]
-
-
 def _load_split(
-    config: DataConfig, frames: list[TransformsFrame], keeps: Keeps, notices: Notices
+    config: DataConfig, frames: list[TransformsFrame], keeps: ViewFilter, notices: Notices
 ) -> tuple[View, ...]:
     first = frames[0].files["image"]
     width, height = image_size(first)
 
     def intrinsics(
         frame: TransformsFrame, shape: tuple[int, ...], size: tuple[int, int]
-    ) -> ViewIntrinsics:
+    ) -> Intrinsics:
         file, angle = frame.files["image"], frame.values.camera_angle_x
         if shape[2] != 4:
             raise UserError(
@@ -141,6 +125,6 @@ def _load_split(
             raise UserError(f"{frame.location('camera_angle_x')} is missing")
         # The angle spans the full width, so the focal length in pixels follows the image's size.
         focal = focal_from_angle(angle, size[0])
-        return {"fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}
+        return focal, focal, size[0] / 2, size[1] / 2
 
     return load_views(config, frames, intrinsics, keeps, notices)

@@ -1,17 +1,13 @@
 """The nerfstudio / instant-ngp layout: one ``transforms.json`` with intrinsics, and photographs.
 
-Intrinsics (``fl_x, fl_y, cx, cy, w, h``) stand at the top or, overriding that, in a frame; where
-focal lengths are missing, ``camera_angle_x`` (and ``_y``) give them. ``train_filenames``,
-``val_filenames`` and ``test_filenames`` list the photographs of the splits.
-
-Frames may have a lens, a second pose, a mask and depths: see ``drgs.datasets.transforms``. Depths
-are z in the camera; with a fisheye, the distance from it, as in nerfstudio, where a fisheye's rays
-have unit length.
+Intrinsics are ``fl_x, fl_y, cx, cy, w, h``; where focal lengths are missing, ``camera_angle_x``
+(and ``_y``) give them. Frames may have a lens, a second pose, a mask and depths: see
+``drgs.datasets.transforms``. Depths are z in the camera; with a fisheye, the distance from it, as
+in nerfstudio, where a fisheye's rays have unit length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 
 from typing_extensions import override
@@ -22,7 +18,6 @@ from drgs.datasets.files import warn_of_unnamed_masks
 from drgs.datasets.reader import DatasetReader, Photographs
 from drgs.datasets.splits import Lists, listed_frames, unlisted_splits
 from drgs.datasets.transforms import (
-    TransformsFile,
     find_point_cloud,
     frames_with_files,
     note_unread,
@@ -35,9 +30,8 @@ class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
     @override
-    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        del folder
-        return "transforms.json" in names
+    def recognizes(self, folder: Path) -> bool:
+        return (folder / "transforms.json").exists()
 
     @override
     def photographs(self, config: DataConfig) -> Photographs:
@@ -51,17 +45,14 @@ class NerfstudioReader(DatasetReader):
             warn_of_unnamed_masks(config.path, notes)
         is_ignored = meta.point_cloud is not None and config.ignore_points
         note = "; point cloud (ply_file_path) ignored" if is_ignored else ""
-        lists = _lists(meta, notes)
+        names = [frame.file_path for frame in meta.frames]
+        if meta.lists:
+            keys = {split: f"{split}_filenames" for split in meta.lists}
+            listed = {
+                split: listed_frames(meta.path, keys[split], listing, names, notes)
+                for split, listing in meta.lists.items()
+            }
+            lists = Lists(listed, " and ".join(keys.values()))
+        else:
+            lists = unlisted_splits((config.path,), names, notes)
         return Photographs("nerfstudio", meta.path, frames, lists, cloud, note, notes)
-
-
-def _lists(meta: TransformsFile, notes: list[str]) -> Lists | None:
-    """Return the splits that the file lists, or other files, or folders."""
-    names = [frame.file_path for frame in meta.frames]
-    if not meta.lists:
-        return unlisted_splits((meta.path.parent,), names, notes)
-    found = {
-        split: listed_frames(meta.path, f"{split}_filenames", listing, names, notes)
-        for split, listing in meta.lists.items()
-    }
-    return Lists(found, " and ".join(f"{split}_filenames" for split in found))

@@ -23,16 +23,15 @@ class Notices:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._transparent: list[str] = []
-        self._unused: dict[str, list[str]] = {}
+        self._findings: dict[str, list[str]] = {}  # names of photographs
 
     def inspect(self, file: Path, pixels: np.ndarray) -> None:
         """Record findings on a photograph; pixels: (H, W, C), as they were read."""
-        name = self._name(file)
+        findings = unused_content(file)
         if pixels.shape[2] == 4 and not pixels[:, :, 3].any():
-            self._transparent.append(name)
-        for what in unused_content(file):
-            self._unused.setdefault(what, []).append(name)
+            findings.append("that are transparent everywhere")
+        for finding in findings:
+            self._findings.setdefault(finding, []).append(self._name(file))
 
     def emit(
         self,
@@ -43,24 +42,16 @@ class Notices:
     ) -> None:
         """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
         files = {path for view in (*train, *test) for path in view.files.values()}
-        own = [
-            f"photographs {what}: {_format_files(names)}" for what, names in self._unused.items()
-        ]
-        if self._transparent:
-            own.append(
-                f"photographs that are transparent everywhere: {_format_files(self._transparent)}"
-            )
+        own = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
         if outside := self._files_outside(files if cloud is None else {*files, cloud}):
             own.append(f"files from outside of the folder: {_format_files(outside)}")
-        own += self._equal(train, test)
+        own += self._duplicate_notes(train, test)
         for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
             warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
 
     def _name(self, file: Path) -> str:
-        try:
-            return str(file.relative_to(self._folder))
-        except ValueError:
-            return str(file)
+        is_below = file.is_relative_to(self._folder)
+        return str(file.relative_to(self._folder) if is_below else file)
 
     def _files_outside(self, files: Iterable[Path]) -> list[str]:
         """Return files that lie elsewhere, by their names or by links."""
@@ -73,7 +64,7 @@ class Notices:
                 found.append(real)
         return found
 
-    def _equal(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
+    def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
         """Return a note on photographs that are there more than once, or none."""
         groups = [[*train, *test]]
         for key in (os.path.getsize, digest):

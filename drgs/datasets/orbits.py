@@ -17,44 +17,34 @@ from drgs.gaussians.parameters import Gaussians
 ELEVATION, MAX_ELEVATION = math.radians(30), math.radians(80)
 """Elevation of an orbit without cameras; and of any orbit, which would spin in place beyond."""
 
-SCALE_LIMITS = np.finfo(np.float32).tiny, 1e9
-"""Scene units: distances that are taken from standard deviations."""
-
 MAX_ORBIT_SIDE_PX = 400
 
 OPAQUE, SPREAD = 0.5, 0.98
-"""Opacity from which Gaussians decide where an orbit without cameras looks; and the share of them
-that it keeps in the image. The others may be outliers."""
+"""Least opacity of Gaussians that decide where an orbit without cameras looks; and the share of
+them that it keeps in the image. The rest may be outliers."""
 
 MAX_GAP = math.radians(100)
-"""Azimuth between two neighbouring cameras of a capture from all sides. What is beyond a larger gap
-was not photographed."""
+"""Azimuth between two neighbouring cameras; a side beyond a larger gap was not photographed."""
 
-SWAYING_ARC_SHARE = 0.8
-"""Share of the cameras' arc of an orbit that sways instead of going all the way round."""
+SWAYING_ARC_SHARE = 0.8  # of the cameras' arc, through which an orbit sways that is not all round
 
 NEAR_RANGE, NEAR_SHARE = (0.01, 0.5), 0.1
 """Shares of the median distance of Gaussians from their middle: the range of the reference's near
 plane, and the near plane outside of it."""
 
-TILT_WEIGHT = 1e-3
-"""Weight of the mean of the cameras' up vectors where their right vectors leave ``up`` open."""
+MEAN_UP_WEIGHT = 1e-3  # of the cameras' up vectors, where their right vectors leave ``up`` open
 
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """A closed path around ``focus`` at constant height, all of whose cameras look at it.
-
-    The azimuth runs all the way round (``half_arc`` None), or sways by ``half_arc`` about its
-    start: there and back again, where the scene was photographed from one side only.
-    """
+    """A closed path around ``focus`` at constant height, all of whose cameras look at it."""
 
     focus: np.ndarray  # (3,) world
     up: np.ndarray  # (3,) unit, world: the axis of rotation
     start: np.ndarray  # (3,) unit, world, perpendicular to up: from the focus to azimuth zero
     radius: float  # world units: distance of the cameras to the focus
     elevation: float  # radians above the plane through the focus
-    half_arc: float | None  # radians
+    half_arc: float | None  # radians: the azimuth sways by this; None: it runs all the way round
 
     def viewpoints(self, count: int, width: int, height: int, fov: float) -> list[Viewpoint]:
         """Return ``count`` cameras in equal steps of time; fov: degrees, horizontal."""
@@ -73,7 +63,8 @@ class Orbit:
 def orbit_of_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> Orbit:
     """Return the orbit at the cameras' mean height and median distance around their focus.
 
-    Where their optical axes do not meet, it is around the middle of ``gaussians``.
+    Where their optical axes do not meet, it is around the middle of ``gaussians``. Where they took
+    the scene from one side only, it sways.
     """
     centers = np.stack([view.center for view in views])
     try:
@@ -123,15 +114,15 @@ def near_plane_of(gaussians: Gaussians) -> float:
 
 
 def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
-    """Return the world's up direction (3,), unit, estimated from how cameras were held.
+    """Return the world's up direction (3,), unit, estimated from the cameras' poses.
 
-    Minimises mean((r_i . u)^2) over unit vectors, r_i the cameras' right vectors: a camera that
-    is tilted but not rolled keeps it horizontal. A small term draws u to the mean of the cameras'
-    own up vectors, which decides where the right vectors are parallel, and the sign.
+    Minimises mean((r_i . u)^2) over unit vectors u, with r_i the cameras' right vectors, which are
+    horizontal unless a camera is rolled. A small term draws u to the mean of the cameras' own up
+    vectors: it decides where the right vectors are parallel, and the sign.
     """
     right = np.stack([view.camera_to_world[:3, 0] for view in views])
     mean_up = np.mean([-view.camera_to_world[:3, 1] for view in views], axis=0)
-    matrix = right.T @ right / len(views) - TILT_WEIGHT * np.outer(mean_up, mean_up)
+    matrix = right.T @ right / len(views) - MEAN_UP_WEIGHT * np.outer(mean_up, mean_up)
     up = np.linalg.eigh(matrix)[1][:, 0]
     return up if up @ mean_up >= 0 else -up
 
@@ -146,7 +137,7 @@ def orbit_size(views: Sequence[Viewpoint]) -> tuple[int, int]:
 def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, float]:
     """Return the opaque Gaussians' median position (3,) and the distance of a ``share`` of them.
 
-    The distance is the largest standard deviation where all are at one place.
+    Where all are at one place, the distance is the largest standard deviation.
     """
     g = gaussians.numpy()
     means = g.means.astype(np.float64)
@@ -154,7 +145,7 @@ def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, fl
     means = opaque if len(opaque) else means
     middle = np.median(means, axis=0)
     distance = float(np.quantile(np.linalg.norm(means - middle, axis=1), share))
-    return middle, distance or float(np.clip(g.scales.max(), *SCALE_LIMITS))
+    return middle, distance or float(np.clip(g.scales.max(), np.finfo(np.float32).tiny, 1e9))
 
 
 def _level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,7 +159,7 @@ def _level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _covered_arc(azimuths: np.ndarray) -> tuple[float, float | None]:
-    """Return the azimuth at which an orbit starts, and how far it sways: None if all around."""
+    """Return the azimuth at which an orbit starts, and its ``half_arc``."""
     azimuths = np.sort(azimuths)
     gaps = np.diff(azimuths, append=azimuths[0] + 2 * math.pi)
     widest = int(np.argmax(gaps))

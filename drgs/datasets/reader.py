@@ -1,20 +1,17 @@
 """Readers of dataset folders: an extension point; and the views that every reader makes of frames.
 
 A reader is a subclass of :class:`DatasetReader`, registered by ``READERS.register(NAME)``. A
-configuration chooses it by ``data.type: NAME``, or by none: ``auto`` takes the first reader that
-recognizes the folder.
-
-Views are sorted by file name, and every ``data.test_every``-th is for testing, as in Mip-NeRF 360
-and 3DGS, unless the dataset lists the views of its splits: see ``drgs.datasets.splits``.
+configuration chooses it by ``data.type: NAME``; ``auto`` takes the first reader that recognizes the
+folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypedDict, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -24,17 +21,17 @@ from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.images import (
     Pixels,
-    check_room,
+    check_memory,
     compact_mask,
     compact_photograph,
     downscale_depth,
     downscale_mask,
     downscaled_size,
     is_array,
+    num_threads,
     placeholder_pixels,
     read_depth,
     read_mask,
-    threads_for,
     unread_image,
 )
 from drgs.datasets.notices import Notices
@@ -49,19 +46,23 @@ from drgs.datasets.transforms import (
     principal_point,
     unique_names,
 )
-from drgs.datasets.types import Dataset, Keeps, View, all_views
+from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.images import read_header, read_pixels, upright
 
-__all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame", "dataset_of"]
+__all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame"]
 
 MAX_WIDTH = 1600
 """px: wider photographs are scaled down to this, as in the 3DGS reference, unless a size is set."""
 
 DEPTH_IMAGE_UNIT = 1e-3
-"""Scene units in a step of a depth image without ``depth_unit_scale_factor``, as in nerfstudio; an
-``.npy`` file then contains scene units."""
+"""Scene units in a step of a depth image without ``depth_unit_scale_factor``, as in nerfstudio."""
 
 T = TypeVar("T")
+
+Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy of a view, px
+
+Images = tuple[Pixels, Pixels | None, Pixels | None, Pixels | None]
+"""Image, alpha, mask and depth of a view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,139 +81,104 @@ class Photographs:
 class DatasetReader:
     """Base class of readers of a layout of folders."""
 
-    def __init__(self, section: BaseModel | None = None) -> None:
-        """section: the one that the reader has registered."""
+    def __init__(self, section: BaseModel | None) -> None:
+        """section: the one that the reader has registered, or None."""
 
-    @classmethod
-    def from_config(cls, section: BaseModel | None) -> DatasetReader:
-        """Return the reader; section: the one that it has registered, or None."""
-        return cls() if section is None else cls(section)
-
-    def recognizes(self, folder: Path, names: Collection[str]) -> bool:
-        """Return whether a folder has this layout; names: of the files and folders in it."""
-        del folder, names
+    def recognizes(self, folder: Path) -> bool:
+        """Return whether a folder has this layout."""
         return False
 
     def photographs(self, config: DataConfig) -> Photographs:
-        """Return where the photographs of a folder are, with their cameras.
-
-        A :class:`TransformsFrame` for each: ``from_camera`` makes those of pinhole cameras.
-        """
+        """Return a frame for each photograph in a folder: see :class:`TransformsFrame`."""
         raise NotImplementedError
 
-    def load(self, config: DataConfig, keeps: Keeps = all_views) -> Dataset:
-        """Return the dataset, with the images of the views whose names ``keeps`` accepts.
+    def load(self, config: DataConfig, keeps: ViewFilter = all_views) -> Dataset:
+        """Return all views, sorted by file name, in the splits of :func:`split_of`.
 
-        Splits, sizes, masks and backgrounds follow the section ``data``.
+        keeps: accepts, by name, the views whose images are read.
         """
-        return dataset_of(config, self.photographs(config), keeps)
+        photographs = self.photographs(config)
+        frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
+        names = [frame.file_path for frame in frames]
+        split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
+        changes: dict[str, object] = {}
+        if config.background is None:
+            is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
+            changes["background"] = "white" if is_any_transparent else "black"
+        if config.image_size is None:
+            changes["image_size"] = MAX_WIDTH
+        config, notices = config.model_copy(update=changes), Notices(config.path)
+        used = sorted({*split.train, *split.test})
+        views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
+        views = dict(zip(used, views, strict=True))
+        train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
+        measured = () if split.name == "train" else test
+        notices.emit(photographs.notes, train, measured, photographs.point_cloud)
+        ignored, extras = describe_extras(config, frames)
+        return Dataset(
+            train=train,
+            test=test,
+            test_split=split.name,
+            background=config.background_rgb,
+            start_half_extent=None,
+            description=(
+                f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, "
+                f"measured on {len(test)} views ({split.how}), {train[0].width}x{train[0].height}, "
+                f"background {config.background}{extras}{photographs.note}"
+            ),
+            ignored=ignored,
+            point_cloud=photographs.point_cloud,
+        )
 
     def image_files(self, config: DataConfig) -> Sequence[Path]:
         """Return the files of the photographs, from whose sizes a configuration is chosen."""
         return [frame.files["image"] for frame in self.photographs(config).frames]
 
 
-def dataset_of(config: DataConfig, photographs: Photographs, keeps: Keeps = all_views) -> Dataset:
-    """Return all views of the splits, by :func:`drgs.datasets.splits.split_of`, with notes.
-
-    Raises :class:`UserError` as that does, and for a photograph or a frame that cannot be read.
-    """
-    frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
-    names = [frame.file_path for frame in frames]
-    split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
-    changes: dict[str, object] = {}
-    if config.background is None:
-        is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
-        changes["background"] = "white" if is_any_transparent else "black"
-    if config.image_size is None:
-        changes["image_size"] = MAX_WIDTH
-    config, notices = config.model_copy(update=changes), Notices(config.path)
-    used = sorted({*split.train, *split.test})
-    views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
-    views = dict(zip(used, views, strict=True))
-    train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
-    measured = () if split.name == "train" else test
-    notices.emit(photographs.notes, train, measured, photographs.point_cloud)
-    ignored, extras = describe_extras(config, frames)
-    return Dataset(
-        train=train,
-        test=test,
-        test_split=split.name,
-        background=config.background_rgb,
-        start_half_extent=None,
-        description=(
-            f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, measured "
-            f"on {len(test)} views ({split.how}), {train[0].width}x{train[0].height}, background "
-            f"{config.background}{extras}{photographs.note}"
-        ),
-        ignored=ignored,
-        point_cloud=photographs.point_cloud,
-    )
-
-
-class ViewIntrinsics(TypedDict):
-    """Intrinsics of a :class:`View`, px."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
-class ViewImages(TypedDict):
-    """Images of a :class:`View`."""
-
-    image: Pixels
-    alpha: Pixels | None
-    mask: Pixels | None
-    depth: Pixels | None
-
-
-Intrinsics = Callable[[TransformsFrame, tuple[int, ...], tuple[int, int]], ViewIntrinsics]
-"""Takes a frame, the shape of its photograph (H, W, C) and the size W, H at which that is rendered;
-returns the intrinsics at that size."""
-
-
 def load_views(
     config: DataConfig,
     frames: Sequence[TransformsFrame],
-    intrinsics: Intrinsics,
-    keeps: Keeps,
+    intrinsics: Callable[[TransformsFrame, tuple[int, ...], tuple[int, int]], Intrinsics],
+    keeps: ViewFilter,
     notices: Notices,
 ) -> tuple[View, ...]:
     """Return the views of frames; images that ``keeps`` does not accept by name are not read.
 
-    Raises :class:`UserError` where the others do not fit into memory or cannot be read.
+    intrinsics: takes a frame, the shape of its photograph (H, W, C) and the size W, H of the view.
     """
     names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]
     kept = [file for file, name in zip(files, names, strict=True) if keeps(name)]
-    check_room(kept, config.image_size)
+    check_memory(kept, config.image_size)
 
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
-        pixels = as_calibrated((read_pixels if is_read else placeholder_pixels)(file), frame)
+        pixels = orient_as_calibrated((read_pixels if is_read else placeholder_pixels)(file), frame)
         if is_read:
             notices.inspect(file, pixels)
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
-        camera = intrinsics(frame, pixels.shape, size)
+        image, alpha, mask, depth = (
+            _read_images(config, frame, pixels) if is_read else _unread_images(frame, pixels, size)
+        )
         return View(
-            name=name,
-            camera_to_world=frame.values.transform_matrix,
-            width=size[0],
-            height=size[1],
-            files=frame.files,
+            name,
+            frame.values.transform_matrix,
+            *intrinsics(frame, pixels.shape, size),
+            *size,
             lens=None if config.ignore_distortion else lens_of(frame),
             motion=None if config.ignore_motion else motion_of(frame, config.shutter_samples),
-            **camera,
-            **(_read_images if is_read else _unread_images)(config, frame, pixels, size),
+            image=image,
+            alpha=alpha,
+            mask=mask,
+            depth=depth,
+            files=frame.files,
         )
 
-    return in_parallel(load, frames, names, threads=threads_for(files))
+    return map_on_threads(load, frames, names, threads=num_threads(files))
 
 
-def in_parallel(
+def map_on_threads(
     function: Callable[..., T], *arguments: Sequence[object], threads: int | None = None
 ) -> tuple[T, ...]:
     """Map a function on threads, in order: decoding images releases Python's lock."""
@@ -220,11 +186,11 @@ def in_parallel(
         return tuple(pool.map(function, *arguments))
 
 
-def as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
+def orient_as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
     """Return the pixels (H, W, C) of a photograph, turned by EXIF if that gives the frame's size.
 
     Viewers, OpenCV and Agisoft turn such a photograph; COLMAP, PyTorch's readers and the 3DGS
-    reference do not. Raises :class:`UserError` where the camera's size does not decide it.
+    reference do not.
     """
     file, values = frame.files["image"], frame.values
     orientation = read_header(file).orientation
@@ -248,7 +214,7 @@ def as_calibrated(pixels: np.ndarray, frame: TransformsFrame) -> np.ndarray:
 
 def _intrinsics(
     frame: TransformsFrame, shape: tuple[int, ...], size: tuple[int, int]
-) -> ViewIntrinsics:
+) -> Intrinsics:
     values, (height, width) = frame.values, shape[:2]
     for key, given, actual in (("w", values.w, width), ("h", values.h, height)):
         if given is not None and given != actual:
@@ -261,7 +227,7 @@ def _intrinsics(
     fy = _focal(frame, "y", height) if has_fy else fx
     cx, cy = (_principal(frame, key, side) for key, side in (("cx", width), ("cy", height)))
     x, y = size[0] / width, size[1] / height
-    return {"fx": fx * x, "fy": fy * y, "cx": cx * x, "cy": cy * y}
+    return fx * x, fy * y, cx * x, cy * y
 
 
 def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
@@ -283,33 +249,23 @@ def _principal(frame: TransformsFrame, key: str, side: int) -> float:
 # Images, masks and depths of a frame
 
 
-def _read_images(
-    config: DataConfig, frame: TransformsFrame, pixels: np.ndarray, size: tuple[int, int]
-) -> ViewImages:
-    """Return the images of a :class:`View`, at ``size``."""
-    del size
+def _read_images(config: DataConfig, frame: TransformsFrame, pixels: np.ndarray) -> Images:
     image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size)
     files, stored, depth = frame.files, (pixels.shape[1], pixels.shape[0]), None
     mask = _mask(config, files["mask"], stored) if "mask" in files else None
     if "depth" in files:
         depth = read_depth(files["depth"], _depth_unit(frame), stored)
         depth = downscale_depth(depth, config.image_size)
-    return {"image": image, "alpha": alpha, "mask": mask, "depth": depth}
+    return image, alpha, mask, depth
 
 
-def _unread_images(
-    config: DataConfig, frame: TransformsFrame, pixels: np.ndarray, size: tuple[int, int]
-) -> ViewImages:
+def _unread_images(frame: TransformsFrame, pixels: np.ndarray, size: tuple[int, int]) -> Images:
     """Return images that raise if their numbers are read."""
-    del config
-    files, (width, height), file = frame.files, size, frame.files["image"]
+    (width, height), file = size, frame.files["image"]
     plane = unread_image((height, width), file)
-    return {
-        "image": unread_image((height, width, 3), file),
-        "alpha": plane if pixels.shape[2] == 4 else None,
-        "mask": plane if "mask" in files else None,
-        "depth": plane if "depth" in files else None,
-    }
+    there = (pixels.shape[2] == 4, "mask" in frame.files, "depth" in frame.files)
+    alpha, mask, depth = (plane if is_there else None for is_there in there)
+    return unread_image((height, width, 3), file), alpha, mask, depth
 
 
 def _mask(config: DataConfig, file: Path, size: tuple[int, int]) -> Pixels:
@@ -333,10 +289,7 @@ def _depth_unit(frame: TransformsFrame) -> float:
 def describe_extras(
     config: DataConfig, frames: Sequence[TransformsFrame]
 ) -> tuple[tuple[str, ...], str]:
-    """Return the names of data that ``data.ignore_*`` leaves out, and a description of all.
-
-    Names: ``distortion``, ``motion``, ``masks``, ``depth``.
-    """
+    """Return the names of ignored data (distortion, motion, masks, depth) and a description."""
     lenses = list(filter(None, map(lens_of, frames)))
     found = {
         "distortion": lenses,

@@ -1,9 +1,9 @@
 """Views to train on and views to measure on, where a dataset specifies them.
 
-Lists are those of ``transforms.json`` (``train_filenames``, ``val_filenames``, ``test_filenames``,
-as nerfstudio has them), and those of ``train.txt``, ``val.txt`` and ``test.txt`` beside COLMAP's
-model or in the dataset's folder, a name a line: the 3DGS reference reads ``sparse/0/test.txt``.
-Photographs that all lie in folders ``train`` and ``test`` or ``val`` are listed by these.
+Lists are in ``transforms.json`` (``train_filenames``, ``val_filenames``, ``test_filenames``, as in
+nerfstudio), or in ``train.txt``, ``val.txt`` and ``test.txt`` beside COLMAP's model or in the
+dataset's folder, a name a line: the 3DGS reference reads ``sparse/0/test.txt``. Without lists,
+folders ``train`` and ``test`` or ``val`` that contain all photographs are the splits.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import read_text
-from drgs.datasets.files import IMAGE_FOLDERS, LEAST_SHARE, key_of, parts_of, stem_of
+from drgs.datasets.files import IMAGE_FOLDERS, MIN_FOUND_SHARE, key_of, parts_of, stem_of
 
 SPLITS = ("train", "val", "test")
 
@@ -26,8 +26,8 @@ MAX_LIST_BYTES = 1 << 26
 class Lists:
     """Names of the photographs of each split."""
 
-    names: Mapping[str, Collection[str]]  # by SPLITS: those of frames; at least one
-    where: str  # for the description: what contains the lists
+    names: Mapping[str, Collection[str]]  # of frames, by SPLITS; at least one
+    where: str  # keys or files that contain the lists, for the description
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,21 @@ class Split:
     train: Sequence[int]
     test: Sequence[int]
     name: str  # of the split that ``test`` is
-    how: str  # it was chosen, for the description
+    how: str  # reason of the choice, for the description
 
 
 def listed_frames(
     source: Path, key: str, listing: Sequence[str], names: Sequence[str], notes: list[str]
 ) -> set[str]:
-    """Return those of ``names``, of frames, that a list contains.
+    """Return the ``names`` of frames that a list contains; source, key: of the list, for messages.
 
-    source, key: of the list, for messages. A name may differ in its suffix, in case and by the
-    folder of the photographs, where only one frame has such a name.
+    A name may differ in its suffix, in case and by the folder of the photographs, where only one
+    frame has such a name.
 
     Raises :class:`UserError` where fewer than half of a list are names of frames.
     """
     found, unknown = _match_names(listing, names)
-    if len(unknown) > (1 - LEAST_SHARE) * len(listing):
+    if len(unknown) > (1 - MIN_FOUND_SHARE) * len(listing):
         raise UserError(
             f"{source}: {key} must list the photographs of frames, but {len(unknown):,} of its "
             f"{len(listing):,} names are not theirs: {format_names(unknown)}"
@@ -67,11 +67,11 @@ def _match_names(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str]
     exact = {"/".join(parts_of(name)): name for name in names}
     loose: dict[str, set[str]] = {}
     for name in names:
-        loose.setdefault(_loose(name), set()).add(name)
+        loose.setdefault(_loose_key(name), set()).add(name)
     found, unknown = set(), []
     for name in listing:
         same = exact.get("/".join(parts_of(name)))
-        candidates = loose.get(_loose(name), set()) if same is None else {same}
+        candidates = loose.get(_loose_key(name), set()) if same is None else {same}
         if len(candidates) == 1:
             found |= candidates
         else:
@@ -79,7 +79,7 @@ def _match_names(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str]
     return found, unknown
 
 
-def _loose(name: str) -> str:
+def _loose_key(name: str) -> str:
     """Return a name without the image's suffix and the folder of photographs, in any case."""
     parts = [key_of(part) for part in parts_of(name)] or [""]
     if len(parts) > 1 and parts[0] in IMAGE_FOLDERS:
@@ -93,8 +93,7 @@ def unlisted_splits(
     """Return the splits of a layout without lists of its own, by files or by folders.
 
     The first of ``folders`` with ``test.txt``, ``val.txt`` or ``train.txt`` decides; a file without
-    a name of a frame is another program's. Otherwise each photograph must be in a folder of a
-    split, not all in ``train``.
+    a name of a frame is another program's.
     """
     for folder in folders:
         found = {}
@@ -122,7 +121,8 @@ def split_of(
 ) -> Split:
     """Divide views of frames called ``names``, in this order.
 
-    Without lists, those at indices 0, n, 2n, ... are to measure on, n being ``data.test_every``.
+    Without lists, the views at indices 0, n, 2n, ... are to measure on, as in Mip-NeRF 360 and
+    3DGS, with n = ``data.test_every``.
 
     Raises :class:`UserError` where there is no split as configured, nothing to train or to measure
     on, or a photograph for both.
@@ -132,8 +132,8 @@ def split_of(
             f"{source}: at least 2 views are needed, one of them to test; got {len(names)}"
         )
     if lists is None:
-        return _every_nth(config, source, len(names))
-    name, train, test = _members(config, source, lists, set(names))
+        return _split_every_nth(config, source, len(names))
+    name, train, test = _listed_split(config, source, lists, set(names))
     both = sorted(train & test)
     if both and name != "train":
         raise UserError(
@@ -156,7 +156,7 @@ def split_of(
     return Split(trained, measured, name, f"split {name}, by {lists.where}")
 
 
-def _members(
+def _listed_split(
     config: DataConfig, source: Path, lists: Lists, names: set[str]
 ) -> tuple[str, set[str], set[str]]:
     """Return the split to measure on, and ``names`` to train on and to measure on.
@@ -174,7 +174,7 @@ def _members(
     return name, train, test
 
 
-def _every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
+def _split_every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
     if config.test_split not in (None, "test"):
         raise UserError(
             f"{source}: this layout has no split {config.test_split}; leave data.test_split out "

@@ -1,12 +1,11 @@
 """Files ``transforms*.json`` of the NeRF-synthetic and nerfstudio layouts, and their frames.
 
-Both store camera-to-world matrices in OpenGL axes (x right, y up, z backward). A file is checked as
-a whole against :class:`Transforms`; keys that it does not name are not read (``unread``).
+Both store camera-to-world matrices in OpenGL axes (x right, y up, z backward). Values at the top of
+a file hold for every frame without its own; poses are in frames only.
 
 ``mask_path`` names an image that is black where pixels do not count. ``depth_file_path`` names an
 image of 16 bits or an ``.npy`` file; ``depth_unit_scale_factor`` is the number of scene units of
-one of its numbers. But for poses, values at the top of a file are those of every frame without its
-own.
+one of its numbers.
 """
 
 from __future__ import annotations
@@ -44,25 +43,20 @@ from drgs.io.images import MAX_SIDE
 if TYPE_CHECKING:
     from drgs.cameras.lens import Lens
 
-MAX_BYTES = 1 << 28
-"""Largest transforms file: a thousand bytes for each of a quarter of a million views."""
+MAX_BYTES = 1 << 28  # of a file: a thousand for each of a quarter of a million views
 
-RIGID_TOLERANCE, LAST_ROW = 1e-4, (0, 0, 0, 1)
-"""Largest entry of |R R^T - I|, eighty times that of files written with float32 (1.3e-6), and error
-of the last row."""
+RIGID_TOLERANCE = 1e-4
+"""Largest entry of |R R^T - I|, 80 times that of float32 (1.3e-6), and error of the last row."""
 
 MEMORY_RATIO = 30  # memory that JSON takes as Python's objects, in bytes of the text
 
-MAX_COORDINATE = 1e9
-"""Scene units, of a camera's position: far beyond what float32 resolves within a scene."""
+MAX_COORDINATE = 1e9  # of a camera, scene units: far beyond what float32 resolves within a scene
 
-FOCAL_RANGE = (1e-2, 1e4)
-"""Focal lengths, in image sizes: full angles of view from 178 degrees down to 0.006."""
+FOCAL_RANGE = (1e-2, 1e4)  # in image sizes: full angles of view from 178 degrees down to 0.006
 
-MAX_OFFSET = 100  # image sizes: how far the principal point may lie from the image
+MAX_OFFSET = 100  # of the principal point from the image, in image sizes
 
-SMALLEST_ANGLE, LARGEST_ANGLE = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))
-"""Radians: the same as full angles of view."""
+MIN_ANGLE, MAX_ANGLE = (2 * math.atan(0.5 / focal) for focal in reversed(FOCAL_RANGE))  # radians
 
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 
@@ -80,41 +74,33 @@ LENS_OF_MODEL = {
 }
 """Lenses of COLMAP's models; other values of ``camera_model`` are names of lenses."""
 
-WITHOUT_EFFECT = frozenset(
+IGNORED_KEYS = frozenset(
     {
         *("applied_transform", "applied_scale", "orientation_override"),  # nerfstudio: done already
-        *("aabb_scale", "scale", "offset", "up"),  # instant-ngp: where its grid lies
+        *("aabb_scale", "scale", "offset", "up"),  # instant-ngp: place of its grid
         *("colmap_im_id", "sharpness", "rotation"),
-        *("origin", "lens_change"),  # ours: what a fit has used, beside cameras in the world
+        *("origin", "lens_change"),  # ours: used by a fit, beside cameras in the world
     }
 )
-"""Keys that change nothing of what is read here: none is missed."""
+"""Keys that are not read, without a note: they change nothing here."""
 
 CLOSE_POSE_KEY = "transform_matrix_close"
 """A frame's camera pose when the shutter closed; ``transform_matrix``: when it opened."""
 
-FILES = {
-    "image": (
-        "file_path",
-        FileKind("photographs", remedy="put them there, or take their frames out of the file"),
+FILE_KEYS = {"image": "file_path", "mask": "mask_path", "depth": "depth_file_path"}
+
+FILE_KINDS = {
+    "image": FileKind("photographs", remedy="put them there, or take their frames out of the file"),
+    "mask": FileKind(
+        *("masks", "their photographs are left out"),
+        remedy="put them there, or set data.ignore_masks",
     ),
-    "mask": (
-        "mask_path",
-        FileKind(
-            *("masks", "their photographs are left out"),
-            "put them there, or set data.ignore_masks",
-        ),
-    ),
-    "depth": (
-        "depth_file_path",
-        FileKind(
-            *("files of depth", "their photographs have no depth"),
-            "put them there, or set data.ignore_depth",
-            suffixes=frozenset(),
-        ),
+    "depth": FileKind(
+        *("files of depth", "their photographs have no depth"),
+        remedy="put them there, or set data.ignore_depth",
+        suffixes=frozenset(),
     ),
 }
-"""Files of frames: their keys and kinds."""
 
 POINT_CLOUD = FileKind(
     "point cloud", "the fit starts without", suffixes=frozenset(), is_needed=False
@@ -130,7 +116,9 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
         raise ValueError("must be 4 x 4 numbers")
     matrix = np.array(rows, np.float64)
     rotation = matrix[:3, :3]
-    error = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - LAST_ROW).max())
+    error = max(
+        np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max()
+    )
     with np.errstate(all="ignore"):  # NumPy takes logarithms, of a determinant of 0 as well
         sign = np.linalg.det(rotation)
     if error > RIGID_TOLERANCE or sign < 0:
@@ -156,7 +144,7 @@ def _known_model(model: str) -> str:
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Side = Annotated[float, Field(ge=1, le=MAX_SIDE)]
-Angle = Annotated[Number, Field(ge=SMALLEST_ANGLE, le=LARGEST_ANGLE)]
+Angle = Annotated[Number, Field(ge=MIN_ANGLE, le=MAX_ANGLE)]
 Text = Annotated[str, Field(min_length=1)]
 Rows = list[list[Annotated[Number, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]]]
 Pose = Annotated[
@@ -169,10 +157,7 @@ Model = Annotated[str, AfterValidator(_known_model)]
 
 
 class CameraValues(BaseModel):
-    """Values at the top of a file, for all frames, or in a frame. None: not given.
-
-    Other keys may be coefficients of a lens: see :func:`lens_of`.
-    """
+    """Values at the top of a file or in a frame, None if not given; others may be a lens's."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
 
@@ -184,8 +169,8 @@ class CameraValues(BaseModel):
     cy: Number | None = None
     w: Side | None = None  # px
     h: Side | None = None
-    camera_model: Model | None = None  # as nerfstudio writes it, or the name of a lens
-    is_fisheye: Annotated[bool | None, Strict(False)] = None  # as instant-ngp does
+    camera_model: Model | None = None  # nerfstudio's, or the name of a lens
+    is_fisheye: Annotated[bool | None, Strict(False)] = None  # instant-ngp's
     shutter: Literal["global", "rolling"] | None = None  # all pixels at once, or row after row
     mask_path: Text | None = None
     depth_file_path: Text | None = None
@@ -232,9 +217,8 @@ class TransformsFrame:
     ) -> TransformsFrame:
         """Return the frame of a photograph by a pinhole camera.
 
-        source: the file or folder that has the pose, for messages; index: among the frames;
-        camera_to_world: (4, 4), OpenCV axes; focal, principal: px of the photograph (None: its
-        middle).
+        source: the file or folder with the pose, and index: the frame's, for messages;
+        camera_to_world: (4, 4), OpenCV axes; focal, principal: px (None: the image's middle).
 
         Raises :class:`UserError` for a pose that is not rigid and finite.
         """
@@ -273,10 +257,7 @@ class TransformsFile:
 
 
 def read_transforms(path: Path) -> TransformsFile:
-    """Read and check a transforms file.
-
-    Raises :class:`UserError` naming the file, the key, what was expected and what was got.
-    """
+    """Read and check a transforms file."""
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     try:
         meta = Transforms.model_validate(json.loads(text))
@@ -301,22 +282,20 @@ def note_unread(path: Path, keys: Sequence[str]) -> str:
 
 
 def _extra(values: CameraValues) -> dict[str, object]:
-    """Return the values of keys that are no fields."""
     return values.model_extra or {}
 
 
 def _unread_keys(meta: Transforms) -> list[str]:
     """Return sorted keys; those of frames as ``frames[].key``."""
     models = {values.camera_model for values in (meta, *meta.frames)}
-    known = WITHOUT_EFFECT.union(*map(_coefficients, models))
+    known = IGNORED_KEYS.union(*map(_coefficient_names, models))
     top = _extra(meta).keys() - known
     in_frames = set().union(*map(_extra, meta.frames)) - known
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 
 
-def _coefficients(model: str | None) -> tuple[str, ...]:
-    """Return the names of the coefficients of a lens."""
+def _coefficient_names(model: str | None) -> tuple[str, ...]:
     if model is None or model in LENS_OF_MODEL:
         return DISTORTION
     from drgs.cameras.lens import LENSES
@@ -336,7 +315,6 @@ def _explain_error(error: ErrorDetails) -> str:
 
 
 def _show(value: object) -> str:
-    """Return the value as JSON writes it, shortened."""
     return one_line(json.dumps(value), limit=60)
 
 
@@ -346,24 +324,22 @@ def _show(value: object) -> str:
 def frames_with_files(
     config: DataConfig, meta: TransformsFile, notes: list[str]
 ) -> list[TransformsFrame]:
-    """Return the frames whose files are there, with the paths of those that are not ignored.
+    """Return the frames whose files are there, with the files that are not ignored.
 
-    A frame without its depth stays. notes: gets one on files with another name, and one on missing
-    files.
-
-    Raises :class:`UserError` where fewer than half of the files of a kind are there.
+    A frame without its depth stays. notes: see :func:`drgs.datasets.files.find_files`, which also
+    raises :class:`UserError`.
     """
     if nameless := [frame for frame in meta.frames if frame.values.file_path is None]:
         raise UserError(f"{nameless[0].location('file_path')} is missing")
     ignored = {"mask": config.ignore_masks, "depth": config.ignore_depth}
     frames = list(meta.frames)
-    for what, (key, kind) in FILES.items():
+    for what, key in FILE_KEYS.items():
         naming = [frame for frame in frames if getattr(frame.values, key) is not None]
         if ignored.get(what) or not naming:
             continue
         names = [getattr(frame.values, key) for frame in naming]
         places = [frame.location(key) for frame in naming]
-        found = find_files(config.path, meta.path, names, kind, places, notes)
+        found = find_files(config.path, meta.path, names, FILE_KINDS[what], places, notes)
         kept = []
         for frame in frames:
             name = getattr(frame.values, key)
@@ -379,8 +355,8 @@ def find_point_cloud(config: DataConfig, meta: TransformsFile, notes: list[str])
     """Return the point cloud that the file names, if it is there and not ignored."""
     if meta.point_cloud is None or config.ignore_points:
         return None
-    names = [meta.point_cloud]
-    found = find_files(config.path, meta.path, names, POINT_CLOUD, ["ply_file_path"], notes)
+    names, places = [meta.point_cloud], ["ply_file_path"]
+    found = find_files(config.path, meta.path, names, POINT_CLOUD, places, notes)
     return found.get(meta.point_cloud)
 
 
@@ -416,14 +392,14 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
 
     Raises :class:`UserError` for coefficients that the lens does not have, and for a k4 that may be
     OpenCV's, the first coefficient of a denominator, or nerfstudio's, the fourth of the polynomial.
-    Files that have k5 or k6 mean OpenCV's.
     """
     from drgs.cameras.lens import LENSES
 
     model, values = frame.values.camera_model, frame.values
     name = "opencv" if model is None else LENS_OF_MODEL.get(model, model)
     is_of_colmap = model is None or model in LENS_OF_MODEL
-    given = {k: v for k in _coefficients(model) if (v := getattr(values, k, None)) is not None}
+    names = _coefficient_names(model)
+    given = {k: v for k in names if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             raise UserError(f"{frame.location(key)} must be a finite number, got {_show(value)}")
@@ -435,7 +411,7 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
             name = "fisheye"
     if name == "pinhole":
         return None
-    is_rational = model == RATIONAL_MODEL or {"k5", "k6"} & given.keys()
+    is_rational = model == RATIONAL_MODEL or {"k5", "k6"} & given.keys()  # OpenCV's only
     if is_of_colmap and name == "opencv" and "k4" in given and not is_rational:
         raise UserError(
             f"{frame.location('k4')} is read as OpenCV's, of a denominator 1 + k4 r^2, where "
@@ -457,10 +433,7 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
 
 
 def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:
-    """Return the camera's motion while the shutter was open; None: it stands still.
-
-    samples: times at which what a global shutter blurs is rendered.
-    """
+    """Return the camera's motion while the shutter was open; None: it stands still."""
     close = frame.values.transform_matrix_close
     return None if close is None else CameraMotion(close, frame.values.shutter or "global", samples)
 
@@ -468,7 +441,7 @@ def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:
 def unique_names(files: Sequence[str]) -> list[str]:
     """Return a name for the outputs of each ``file_path``: the file's, with folders where needed.
 
-    Where that is not enough, or too long for a file's name, numbers precede it.
+    Numbers precede names that are still not unique, or too long.
     """
     paths = [PurePosixPath(file.replace("\\", "/")) for file in files]
     names = [path.stem for path in paths]

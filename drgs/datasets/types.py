@@ -21,14 +21,13 @@ if TYPE_CHECKING:
 class LazyImage:
     """An image whose numbers are computed at each access: by ``np.asarray`` or an index."""
 
-    shape: tuple[int, ...]  # of the array: (H, W) or (H, W, 3), float32
-    compute: Callable[[], np.ndarray]
-    nbytes: int  # that are kept; 0: those of another image
+    shape: tuple[int, ...]  # (H, W) or (H, W, 3)
+    compute: Callable[[], np.ndarray]  # returns float32
+    nbytes: int  # kept in memory, beside another image's
 
     dtype: ClassVar = np.dtype(np.float32)
 
     def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
-        """Return the numbers."""
         if copy is False:
             raise ValueError("a lazy image becomes an array only by a copy")
         return np.asarray(self.compute(), dtype)
@@ -36,11 +35,9 @@ class LazyImage:
     def __getitem__(
         self, index: int | slice | tuple[int | slice | EllipsisType | None, ...] | np.ndarray
     ) -> np.ndarray:
-        """Return some of the numbers."""
         return self.compute()[index]
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return self.shape[0]
 
 
@@ -52,7 +49,7 @@ class CameraMotion:
     """Motion of a camera while its shutter is open."""
 
     close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: the pose at the end
-    shutter: str  # global: all pixels were open all the time; rolling: row after row
+    shutter: str  # global: all pixels are exposed at once; rolling: row after row
     samples: int = SHUTTER_SAMPLES  # global: times at which the image is rendered
 
 
@@ -93,12 +90,10 @@ class Viewpoint:
         """Return the same camera with ``offset`` (3,) added to its position."""
         if not np.any(offset):
             return self
-        motion = self.motion
+        pose, motion = _translate_pose(self.camera_to_world, offset), self.motion
         if motion is not None:
             motion = replace(motion, close_to_world=_translate_pose(motion.close_to_world, offset))
-        return replace(
-            self, camera_to_world=_translate_pose(self.camera_to_world, offset), motion=motion
-        )
+        return replace(self, camera_to_world=pose, motion=motion)
 
 
 V = TypeVar("V", bound=Viewpoint)
@@ -127,8 +122,7 @@ class View(Viewpoint):
     files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
 
 
-Keeps = Callable[[str], bool]
-"""Accepts a view by its name if its images are to be read; others have only sizes."""
+ViewFilter = Callable[[str], bool]  # accepts names of views whose images are to be read
 
 
 def all_views(name: str) -> bool:
@@ -144,13 +138,13 @@ class Dataset:
     train: tuple[View, ...]
     test: tuple[View, ...]
     test_split: str  # name of the split that ``test`` is
-    background: tuple[float, float, float]  # display space, what the images were composited over
+    background: tuple[float, float, float]  # display space, under transparent pixels of the images
     start_half_extent: float | None  # of the layout's own start box [-h, h]^3; None: it has none
     description: str  # one line: source and assumptions
-    ignored: tuple[str, ...] = ()  # that frames have and ``data.ignore_*`` leaves out
+    ignored: tuple[str, ...] = ()  # data of frames that ``data.ignore_*`` leaves out
     rendered: bool = False  # the images are another renderer's, not photographs
-    point_cloud: Path | None = None  # that the dataset names, to start from: a PLY file
-    origin: Origin = WORLD  # world: what the positions of the views are relative to
+    point_cloud: Path | None = None  # to start from: a PLY file that the dataset names
+    origin: Origin = WORLD  # world: positions of the views are relative to it
 
     @property
     def extent(self) -> float:

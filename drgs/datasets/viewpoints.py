@@ -1,8 +1,4 @@
-"""Cameras without photographs, for new images of a scene; and the point that cameras look at.
-
-Read from a file of poses, placed by hand with :func:`look_at`, or on an orbit that follows from the
-cameras of a dataset or from the Gaussians alone (``drgs.datasets.orbits``).
-"""
+"""Cameras without photographs, for new images of a scene; and the point that cameras look at."""
 
 from __future__ import annotations
 
@@ -43,10 +39,9 @@ def pinhole(name: str, pose: np.ndarray, width: int, height: int, fov: float) ->
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
-    """Return the pose of a camera at ``origin`` that looks at ``target``.
+    """Return the pose (4, 4), camera to world, OpenCV axes, of a camera that looks at ``target``.
 
-    The pose is (4, 4), camera to world, OpenCV axes. origin, target, up: (3,) world; ``up`` points
-    up in the image and has any length.
+    origin, target, up: (3,) world; ``up`` points up in the image and has any length.
 
     Raises :class:`UserError` where they determine no camera.
     """
@@ -74,7 +69,7 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
 
 
 def field_of_view(views: Sequence[Viewpoint]) -> float:
-    """Degrees: the median horizontal field of view."""
+    """Return the median horizontal field of view, degrees."""
     return math.degrees(np.median([2 * math.atan(0.5 * v.width / v.fx) for v in views]))
 
 
@@ -83,12 +78,8 @@ def read_viewpoints(
 ) -> list[Viewpoint]:
     """Return the cameras of a file in the layout of ``transforms.json``, without its images.
 
-    ``camera_angle_x``, or ``fl_x`` in pixels of ``w`` (and ``fl_y`` and ``cy`` of ``h``, ``cx`` of
-    ``w``), and lens distortion, at the top or, overriding that, in a frame; a second pose in a
-    frame. size: width and height, px; None for those of the file. shutter_samples: times at which
-    motion blur is rendered.
-
-    Raises :class:`UserError` naming the file, the key, what was expected and what was got.
+    size: width and height, px; None for the file's. ``fl_x`` and ``cx`` are px of the file's ``w``,
+    ``fl_y`` and ``cy`` of its ``h``. shutter_samples: times at which motion blur is rendered.
     """
     meta = read_transforms(path)
     if meta.unread:

@@ -13,26 +13,22 @@ from drgs.datasets.types import Dataset
 from drgs.datasets.viewpoints import focus_of
 
 NEAR_SHARE = 0.04
-"""Share of the cameras' distance to what they look at, rounded to one digit: the near plane. It
-gives the reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, as well as for
-distances of 4 to 6, which photographs often have in COLMAP's unit of length."""
+"""The near plane is this share of the cameras' distance to their focus, rounded to one digit: the
+reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, and for distances of 4 to 6,
+which photographs often have in COLMAP's unit of length."""
 
 NEAR_RANGE = (1e-9, 1e9)  # scene units that a configuration accepts
 
-MAX_NEAR_SHARE = 0.5
-"""Share of that distance beyond which a near plane would cut into what is looked at."""
+MAX_NEAR_SHARE = 0.5  # of that distance: a farther near plane would cut into the scene
 
-GAUSSIANS_PER_PIXEL_OF_SIDE = 250
-"""Numbers of Gaussians that strategies grow to are in proportion to the images' sides."""
+GAUSSIANS_PER_PIXEL_OF_SIDE = 250  # that strategies grow to, in proportion to the images' sides
 
 SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
-"""Share of such a number that a fit starts with; and its number where there is no such number."""
+"""Share of such a number that a fit starts with; and its number for other strategies."""
 
-COARSE_SHARE = 0.35
-"""Share of a fit's iterations with photographs at half their size: see ``bench recipes``."""
+COARSE_SHARE = 0.35  # of a fit's iterations, with photographs at half size: see ``bench recipes``
 
-MIN_COARSE_SIDE_PX = 100
-"""Smallest side of photographs that are made smaller still. SSIM's window is 11 px wide."""
+MIN_COARSE_SIDE_PX = 100  # of photographs that are made smaller still; SSIM's window has 11 px
 
 NUM_ALPHA_VIEWS = 15  # images, at most, by which a dataset is judged to be cut out
 
@@ -89,10 +85,7 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
 
 
 def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
-    """Return coarse stages for photographs, in which distant Gaussians begin anywhere.
-
-    None for what is cut out of its images, which begins where it is.
-    """
+    """Return coarse stages for photographs; none for cut-out objects, which start in place."""
     until = round(COARSE_SHARE * config.iterations)
     sides = [min(view.width, view.height) for view in dataset.train]
     is_small = min(sides, default=0) < MIN_COARSE_SIDE_PX

@@ -1,6 +1,6 @@
-"""Projection of world points to a view's image, of a million start points in hundreds of views.
+"""Projection of world points to a view's image: a million start points in hundreds of views.
 
-Without matrix products, whose rounding depends on the number of threads of linear algebra.
+Matrix products are not used: their rounding depends on the number of threads.
 """
 
 from __future__ import annotations
@@ -24,24 +24,26 @@ def is_projectable(view: Viewpoint) -> bool:
 
 
 def to_camera(view: Viewpoint, points: Columns, dtype: type = np.float64) -> list[np.ndarray]:
-    """Return points in the camera's axes (x right, y down, z forward), scene units.
-
-    points: world, float64; dtype: of the result. It is enough to have offsets from the camera in
-    single precision, wherever both are.
-    """
+    """Return float64 world points in the camera's axes (x right, y down, z forward)."""
     center, axes = view.center.tolist(), view.camera_to_world[:3, :3].T.tolist()
+    # Single precision is enough for offsets from a camera, wherever both are.
     offsets = [(p - c).astype(dtype, copy=False) for p, c in zip(points, center, strict=True)]
     return [a * offsets[0] + b * offsets[1] + c * offsets[2] for a, b, c in axes]
 
 
 def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return places u, v (N,) on the film, px, and depths (N,), scene units.
+    """Return places u, v (N,) on the film, px, also beside it, and depths (N,), scene units.
 
-    position: in the camera's axes. The depth is 0 where the lens does not see a point. What is seen
-    may lie off the film; places of what is not seen are finite and mean nothing.
+    position: in the camera's axes. Where the lens does not see a point, the depth is 0 and the
+    place is finite without a meaning.
     """
     if view.lens is None:
-        return _through_pinhole(view, *position)
+        x, y, z = position
+        seen = z > 0
+        inverse = 1 / np.where(seen, z, 1)
+        u = float(view.fx) * (x * inverse) + float(view.cx)
+        v = float(view.fy) * (y * inverse) + float(view.cy)
+        return u, v, np.where(seen, z, 0)
     Float = {4: llvm.Float, 8: llvm.Float64}[position[0].itemsize]
     point = types_of(Float).Array3f(*(from_host(Float, column) for column in position))
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
@@ -53,13 +55,3 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
     film, depth = lens.project_point(camera, point), dr.select(seen, depth, 0)
     dr.eval(film, depth)
     return film.x.numpy(), film.y.numpy(), depth.numpy()
-
-
-def _through_pinhole(
-    view: Viewpoint, x: np.ndarray, y: np.ndarray, z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    seen = z > 0
-    inverse = 1 / np.where(seen, z, 1)
-    u = float(view.fx) * (x * inverse) + float(view.cx)
-    v = float(view.fy) * (y * inverse) + float(view.cy)
-    return u, v, np.where(seen, z, 0)

@@ -1,9 +1,9 @@
 """Colours of points from the images that show them.
 
-An image shows a point if no other point is clearly nearer to its camera at about the same place: in
-a z-buffer whose pixels are as wide as the points are apart. On a surface that turns away from the
-camera, points hide each other there, so that images count that look onto it. Of a point's colours
-in its images, the middle half is averaged: the rest may be highlights, or what hides the point.
+An image shows a point if no other point is clearly nearer to its camera in a z-buffer whose pixels
+are as wide as the points are apart. On a surface that turns away from the camera, points hide each
+other, so that images count that look onto it. The middle half of a point's colours is averaged: the
+rest may be highlights or occluders.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ MAX_VIEWS, MIN_VIEWS = 60, 8
 
 MAX_BYTES = 1 << 27  # memory for colours: of a million points, fewer views are read
 
-PIXEL, BEHIND = 1.5, 1.5
-"""Width of a pixel of the z-buffer, and distance behind its depth of points that are seen, in
+PIXEL_WIDTH, MAX_BEHIND = 1.5, 1.5
+"""Width of a pixel of the z-buffer, and largest distance behind its depth of shown points, in
 distances of the points. In smaller pixels, points are seen through gaps of a surface."""
 
-MIN_ALPHA = 0.5  # least alpha: less opaque pixels have mostly the colour of what is behind them
+MIN_ALPHA = 0.5  # less opaque pixels have mostly the colour of what is behind them
 
-SORTED_AT_ONCE = 1 << 13  # points
+POINTS_PER_SORT = 1 << 13
 
 
 def colors_from_images(
@@ -41,7 +41,7 @@ def colors_from_images(
 
     points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: of
     the composited images, display space. A point that no image shows gets the colour of the nearest
-    one that is shown.
+    point that is shown.
     """
     views = [view for view in views if is_projectable(view)]
     most = max(MIN_VIEWS, min(MAX_VIEWS, MAX_BYTES // (12 * len(points))))
@@ -52,7 +52,10 @@ def colors_from_images(
         rows, colors = _find_shown_points(view, columns, spacing, background)
         sample[rows] = colors
     colors = np.concatenate(
-        [_middle(samples[:, k : k + SORTED_AT_ONCE]) for k in range(0, len(points), SORTED_AT_ONCE)]
+        [
+            _middle_mean(samples[:, k : k + POINTS_PER_SORT])
+            for k in range(0, len(points), POINTS_PER_SORT)
+        ]
     )
     unseen = np.isnan(colors[:, 0])
     if unseen.all():
@@ -77,12 +80,12 @@ def _find_shown_points(
     if not len(rows):
         return rows, np.empty((0, 3), np.float32)
     u, v, depth = u[rows], v[rows], depth[rows]
-    pixel = max(1.0, PIXEL * view.fx * float(np.median(spacing[rows] / depth)))
+    pixel = max(1.0, PIXEL_WIDTH * view.fx * float(np.median(spacing[rows] / depth)))
     place = np.floor(v / pixel).astype(np.int64) * (int(view.width / pixel) + 1)
     place += np.floor(u / pixel).astype(np.int64)
     nearest = np.full(place.max() + 1, np.inf)
     np.minimum.at(nearest, place, depth)
-    seen = depth <= nearest[place] + BEHIND * spacing[rows]
+    seen = depth <= nearest[place] + MAX_BEHIND * spacing[rows]
     rows, at = rows[seen], (v[seen].astype(np.int64), u[seen].astype(np.int64))
     colors, opaque = np.asarray(view.image)[at], np.ones(len(rows), bool)
     if view.alpha is not None:
@@ -95,7 +98,7 @@ def _find_shown_points(
     return rows[opaque], np.clip(colors[opaque], 0, 1)
 
 
-def _middle(samples: np.ndarray) -> np.ndarray:
+def _middle_mean(samples: np.ndarray) -> np.ndarray:
     """Return means (N, 3) of the middle half of (V, N, 3), channel by channel; NaN: there are none.
 
     inf: not a sample. Of n, floor(n / 4) are left out at either end.

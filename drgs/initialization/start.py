@@ -20,13 +20,13 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start_box import (
     FARTHEST,
     MIN_FACING_SHARE,
-    box_looked_at,
-    box_to_start_in,
+    focus_box,
     focus_of,
     focus_text,
     format_point,
     num_views_facing,
     points_in_view,
+    start_box_of,
 )
 from drgs.io.ply import read_points
 
@@ -34,13 +34,12 @@ if TYPE_CHECKING:
     from drgs.initialization.visual_hull import Silhouette
 
 MIN_SPACING = 2.5e-4
-"""Smallest first scale, for points that coincide, relative to the median distance of points from
-their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about that size."""
+"""Smallest first scale, for points that coincide, as a share of the median distance of points from
+their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about unit size."""
 
 NUM_NEIGHBOURS = 3
 
-COLMAP_POINT_FILES = ("points3D.bin", "points3D.txt")
-"""Names of files with errors and observations of points besides positions and colours."""
+COLMAP_POINT_FILES = ("points3D.bin", "points3D.txt")  # have errors and observations of points
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,31 +52,45 @@ class Start:
 
 
 def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
-    """Return Gaussians at iteration 0, numpy float32, with the SH degree of ``config.model``.
-
-    At the points of :func:`start_of`, with the opacity and the scale of ``config.init``.
-    """
+    """Return Gaussians at iteration 0: :func:`gaussians_at` the points of :func:`start_of`."""
     config = resolve_defaults(config, dataset)
     return replace(gaussians_at(start_of(config, dataset), config), origin=dataset.origin)
 
 
 def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
-    """Return the Gaussians of :func:`initial_gaussians` at given points."""
-    init, degree = config.init, config.model.sh_degree
-    return gaussians_from_points(start.means, start.colors, init.opacity, degree, init.scale)
+    """Return isotropic Gaussians at 4 points or more, numpy float32, as large as the gaps between.
+
+    The standard deviation is ``init.scale`` times the root mean square distance to the 3 nearest
+    other points, which is that of the 3DGS reference (``distCUDA2``). The opacity is
+    ``init.opacity``, the degree ``model.sh_degree``. Without colours: grey. Identity rotations; SH
+    coefficients above degree 0 are zero.
+    """
+    num, init = len(start.means), config.init
+    means = np.ascontiguousarray(start.means, np.float32)
+    colors = np.full((num, 3), 0.5) if start.colors is None else start.colors
+    spacing = np.sqrt(mean_squared_neighbour_distance(means))
+    spacing = np.maximum(spacing, MIN_SPACING * _median_radius(means))
+    log_scales = np.repeat(np.log(init.scale * spacing)[:, None], 3, axis=1)
+    logit = np.log(init.opacity / (1 - init.opacity))
+    sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
+    return Gaussians(
+        means=means,
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1)),
+        log_scales=log_scales.astype(np.float32),
+        logit_opacities=np.full(num, logit, np.float32),
+        sh0=sh0.astype(np.float32)[:, None, :],
+        shN=np.zeros((num, (config.model.sh_degree + 1) ** 2 - 1, 3), np.float32),
+    )
 
 
 def start_of(config: FitConfig, dataset: Dataset) -> Start:
-    """Return the points that a fit starts from, by ``config.init``. The same seed gives the same.
-
-    config: with resolved defaults.
+    """Return the points that a fit starts from; config: with resolved defaults.
 
     By default: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else on
     the visual hull, where nearly all images are partly transparent; else the point cloud that the
-    dataset names; else uniform in a box that follows from the layout and the cameras
-    (``drgs.initialization.start_box``). Points on the hull, and those of a cloud without
-    colours, are coloured from the images. Where masks contradict each other, the fit starts as
-    without them, and the description mentions it.
+    dataset names; else uniform in a box that follows from the layout and the cameras. Points on the
+    hull, and those of a cloud without colours, are coloured from the images. Masks that contradict
+    each other are not used, which the description mentions.
 
     Raises :class:`UserError` for points that the cameras do not see, and for masks or a point cloud
     that ``init.start`` requires and that are not there.
@@ -89,7 +102,7 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
 
         silhouettes = silhouettes_of(dataset.train)
         if are_masks(silhouettes, dataset.train):
-            if (start := _on_hull(config, dataset, silhouettes)) is not None:
+            if (start := _hull_start(config, dataset, silhouettes)) is not None:
                 _check_unfiltered(init, start.description)
                 return start
             note = f" (the masks of {len(silhouettes)} images have no hull to start from)"
@@ -100,10 +113,12 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
                 f"{num_transparent(silhouettes)} are; cut out what is to be fitted, or set "
                 "init.start=auto"
             )
-    cloud = _cloud_of(init, dataset)
+    cloud = _cloud_file(init, dataset)
     if cloud is None or cloud.name not in COLMAP_POINT_FILES:
         _check_unfiltered(init, "random points" if cloud is None else str(cloud))
-    start = _random_points(config, dataset) if cloud is None else _of_cloud(config, dataset, cloud)
+    start = (
+        _random_start(config, dataset) if cloud is None else _cloud_start(config, dataset, cloud)
+    )
     return replace(start, description=start.description + note)
 
 
@@ -112,7 +127,7 @@ def description_of_start(config: FitConfig, start: Start) -> str:
     return f"starts from {start.description}; near plane at {config.model.near:g}"
 
 
-def _cloud_of(init: InitConfig, dataset: Dataset) -> Path | None:
+def _cloud_file(init: InitConfig, dataset: Dataset) -> Path | None:
     """Return the file that a fit starts from; None: random points."""
     if init.start == "random":
         return None
@@ -136,14 +151,14 @@ def _check_unfiltered(init: InitConfig, start: str) -> None:
             )
 
 
-def _on_hull(
+def _hull_start(
     config: FitConfig, dataset: Dataset, silhouettes: Sequence[Silhouette]
 ) -> Start | None:
     """Return points on the visual hull of the masks; None: it is empty."""
     from drgs.initialization.visual_hull import hull_points
 
     try:
-        box = box_to_start_in(config.init, dataset) or box_looked_at(dataset.train)
+        box = start_box_of(config.init, dataset) or focus_box(dataset.train)
     except UserError:
         if config.init.half_extent is not None:
             raise
@@ -155,11 +170,11 @@ def _on_hull(
     return _with_colors(Start(means.astype(np.float32), None, what), dataset)
 
 
-def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
+def _cloud_start(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
     means, colors, num_read = _read_cloud(config.init, cloud)
     means = (means - dataset.origin).astype(np.float32)
     if colors is not None and not np.any(colors):
-        colors = None  # all black: what is written where no colours were found out
+        colors = None  # all black: written by programs that found none
     _check_cloud(cloud, means, config.densify.max_gaussians, dataset)
     kept = "the" if len(means) == num_read else f"{len(means):,} of {num_read:,}"
     start = Start(means, colors, f"{kept} points of {cloud}")
@@ -167,7 +182,7 @@ def _of_cloud(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
 
 
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Positions (N, 3) float64, world, colours (N, 3) float32, 0..1, and the number read."""
+    """Return positions (N, 3) float64, world, colours (N, 3) float32, 0..1, and the number read."""
     if cloud.name not in COLMAP_POINT_FILES:
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
@@ -195,23 +210,20 @@ def _num_points(init: InitConfig) -> int:
     return init.num_points
 
 
-def _random_points(config: FitConfig, dataset: Dataset) -> Start:
-    """Return random points in a box, or in all that the cameras see."""
+def _random_start(config: FitConfig, dataset: Dataset) -> Start:
     num_points, rng = _num_points(config.init), np.random.default_rng(config.seed)
-    box = box_to_start_in(config.init, dataset)
+    what, box = f"{num_points:,} random points", start_box_of(config.init, dataset)
     if box is not None:
-        what = f"{num_points:,} random points in {box}"
-        return Start(box.points(num_points, rng), None, what)
+        return Start(box.points(num_points, rng), None, f"{what} in {box}")
     means = points_in_view(dataset.train, num_points, rng)
     focus, distance = focus_of(dataset.train)
     near = f"about within {distance:.3g} of {format_point(focus, distance)}"
     far = f"the others up to {FARTHEST:g} times as far"
-    what = f"{num_points:,} random points that the cameras see, part of them {near}, {far}"
-    return Start(means, None, what)
+    return Start(means, None, f"{what} that the cameras see, part of them {near}, {far}")
 
 
 def _with_colors(start: Start, dataset: Dataset) -> Start:
-    """Return the start with the colours of the images, if they show any of the points."""
+    """Return the start with colours from the images, if they show any of the points."""
     from drgs.initialization.point_colors import colors_from_images
 
     spacing = np.sqrt(mean_squared_neighbour_distance(start.means))
@@ -219,36 +231,6 @@ def _with_colors(start: Start, dataset: Dataset) -> Start:
     if colors is None:
         return start
     return replace(start, colors=colors, description=f"{start.description}, coloured")
-
-
-def gaussians_from_points(
-    means: np.ndarray,
-    colors: np.ndarray | None,
-    opacity: float,
-    sh_degree: int,
-    scale: float = 1.0,
-) -> Gaussians:
-    """Return isotropic Gaussians at ``means`` (N, 3), N >= 4, as large as the gaps between them.
-
-    The standard deviation is ``scale`` times the root mean square distance to the 3 nearest other
-    points, which is that of the 3DGS reference (``distCUDA2``). ``colors`` (N, 3) in display space
-    0..1; None: grey. Identity rotations; SH coefficients above degree 0 are zero.
-    """
-    num = len(means)
-    means = np.ascontiguousarray(means, np.float32)
-    colors = np.full((num, 3), 0.5) if colors is None else colors
-    spacing = np.sqrt(mean_squared_neighbour_distance(means))
-    spacing = np.maximum(spacing, MIN_SPACING * _median_radius(means))
-    log_scales = np.repeat(np.log(scale * spacing)[:, None], 3, axis=1)
-    sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
-    return Gaussians(
-        means=means,
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1)),
-        log_scales=log_scales.astype(np.float32),
-        logit_opacities=np.full(num, np.log(opacity / (1 - opacity)), np.float32),
-        sh0=sh0.astype(np.float32)[:, None, :],
-        shN=np.zeros((num, (sh_degree + 1) ** 2 - 1, 3), np.float32),
-    )
 
 
 def _median_radius(points: np.ndarray) -> float:
@@ -260,8 +242,7 @@ def _median_radius(points: np.ndarray) -> float:
 
 def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
     """Return mean squared distances (N,) float64 of (N, 3) points to the 3 nearest others."""
-    # SciPy divides points by the number next to the least. If that is taken for zero, it divides
-    # points with a coordinate of zero for ever, until the stack ends.
+    # SciPy splits points at the number next to the least: without end if that is taken for zero.
     with denormals_kept():
         distances, _ = KDTree(points).query(points, k=NUM_NEIGHBOURS + 1)
     # The nearest is the point itself, or one at the same place: at distance 0 either way.
@@ -269,7 +250,7 @@ def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:
 
 
 def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Dataset) -> None:
-    """Raise UserError for too few or too many points (N, 3), or those of another scene."""
+    """Raise UserError for too few or too many points (N, 3), or points of another scene."""
     num, views = len(points), dataset.train
     if num <= NUM_NEIGHBOURS:
         raise UserError(f"{file}: at least {NUM_NEIGHBOURS + 1} points, got {num}")

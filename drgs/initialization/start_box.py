@@ -1,7 +1,4 @@
-"""Random points of a start, in a box that the cameras look into, or in all that they see.
-
-Points that the cameras do not look at are refused.
-"""
+"""Random points of a start, in a box that the cameras look into, or in all that they see."""
 
 from __future__ import annotations
 
@@ -17,31 +14,28 @@ from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset, Viewpoint
 from drgs.datasets.viewpoints import focus_of
 
-KEEP_OUT = 0.25
-"""Share of the distance to what the cameras look at: no starting point is nearer to a camera."""
+MIN_DISTANCE = 0.25  # of starting points to cameras, in distances to the focus
 
 FAR_SHARE, FARTHEST = 0.5, 10.0
-"""Share of starting points behind what is looked at, and how far they go, in distances to it."""
+"""Share of starting points behind the focus, and their largest distance, in distances to it."""
 
 MAX_BATCHES = 200  # batches of points to draw: enough where half a percent of the box is in view
 
 REFERENCE_FILL = 0.9
-"""Share of half of an image's width that the reference's box takes up where NeRF-synthetic's
-cameras look, 1.3 / (4.03 tan(0.69 / 2))."""
+"""Share of half of an image's width that the reference's box fills: 1.3 / (4.03 tan(0.69 / 2))."""
 
 FILL_RANGE = (0.5, 2.0)  # shares of half of an image's width at which that box is taken as it is
 
-MIN_FACING_SHARE = 0.5  # share of the cameras that must look at where a fit starts
+MIN_FACING_SHARE = 0.5  # of the cameras, which must look at the points of a start
 
-CENTRAL_SHARE = 0.5  # share of an image's width and height that contains what its camera looks at
+CENTRAL_SHARE = 0.5  # of an image's width and height: its middle, at which a camera looks
 
-MIN_COVERED_SHARE = 0.005
-"""Share of an image (the median) that a box must cover: what is around it starts without points."""
+MIN_COVERED_SHARE = 0.005  # of an image (the median), which a box must cover
 
 NUM_SAMPLES, NUM_CELLS = 2000, 32
 """Points that stand for a box, and the cells of an image, in each direction, that they cover."""
 
-MAX_CLOUD_POINTS = 20_000  # points of a cloud that stand for all of it
+MAX_CLOUD_POINTS = 20_000  # points of a cloud that stand for all of it, which would take long
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +57,10 @@ class Box:
         return f"the cube of half width {self.half_extent:.3g} around {center}"
 
 
-def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
+def start_box_of(init: InitConfig, dataset: Dataset) -> Box | None:
     """Return the box of the random points of a start; None: :func:`points_in_view`.
 
-    The layout's box, where the cameras are about as far away from it as those of the reference.
+    It is the layout's where the cameras are about as far from it as those of the reference.
 
     Raises :class:`UserError` for a given one (``init.half_extent``) that the cameras do not see.
     """
@@ -81,16 +75,16 @@ def box_to_start_in(init: InitConfig, dataset: Dataset) -> Box | None:
         return reference
     try:
         focus, distance = focus_of(dataset.train)
-    except UserError:  # nothing is known that would be better
+    except UserError:
         return reference
     seen = distance * _half_width(dataset.train)
     is_near = np.abs(focus - reference.center).max() <= reference.half_extent
     if is_near and FILL_RANGE[0] <= reference.half_extent / seen <= FILL_RANGE[1]:
         return reference
-    return box_looked_at(dataset.train)
+    return focus_box(dataset.train)
 
 
-def box_looked_at(views: Sequence[Viewpoint]) -> Box:
+def focus_box(views: Sequence[Viewpoint]) -> Box:
     """Return a box nearly as wide as the views at the cameras' focus, as the reference's is."""
     focus, distance = focus_of(views)
     return Box(focus, REFERENCE_FILL * distance * _half_width(views))
@@ -104,19 +98,22 @@ def _half_width(views: Sequence[Viewpoint]) -> float:
 def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Generator) -> np.ndarray:
     """Return random points (count, 3) float64 in the cameras' views, around and behind their focus.
 
-    The cube's half extent is the distance D to the focus: it holds what is looked at and as much
-    again behind it. Half of the points are uniform in it. The others are for walls and skies: in
-    any direction uniform in one over the distance, out to 10 D, as Mip-NeRF 360 (Barron et al.
-    2022) contracts space. Points that no camera sees would never be moved or removed, and one close
-    to a camera covers its image, so only points are kept that lie in an image and nowhere nearer
-    than D / 4 to a camera.
+    Half of the points are uniform in a cube around the focus; its half extent is the distance D to
+    the cameras. The others, for walls and skies, are uniform in one over the distance, out to 10 D,
+    as Mip-NeRF 360 (Barron et al. 2022) contracts space. Points that no camera sees would never be
+    moved or removed, and one close to a camera covers its image, so only points are kept that are
+    in an image and at least D / 4 from every camera.
     """
     focus, distance = focus_of(views)
     kept = np.empty((0, 3))
     for _ in range(MAX_BATCHES):
         points = focus + distance * _near_and_far(count, rng)
-        seen = _are_seen(points, views, KEEP_OUT * distance)
-        kept = np.concatenate([kept, points[seen]])
+        seen, clear = np.zeros(count, bool), np.ones(count, bool)
+        for view in views:
+            offsets = points - view.center
+            seen |= _in_image(points, view)
+            clear &= np.einsum("ni,ni->n", offsets, offsets) >= (MIN_DISTANCE * distance) ** 2
+        kept = np.concatenate([kept, points[seen & clear]])
         if len(kept) >= count:
             return kept[:count]
     raise UserError(
@@ -134,16 +131,6 @@ def _near_and_far(count: int, rng: np.random.Generator) -> np.ndarray:
     return points
 
 
-def _are_seen(points: np.ndarray, views: Sequence[Viewpoint], keep_out: float) -> np.ndarray:
-    """Return whether (N,) points (N, 3) are in an image, and ``keep_out`` from every camera."""
-    seen, clear = np.zeros(len(points), bool), np.ones(len(points), bool)
-    for view in views:
-        offsets = points - view.center
-        seen |= _in_image(points, view)
-        clear &= np.einsum("ni,ni->n", offsets, offsets) >= keep_out**2
-    return seen & clear
-
-
 def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndarray:
     """Return whether (N,) points are in the middle ``part`` of the image's width and height."""
     x, y, z = ((points - view.center) @ view.camera_to_world[:3, :3]).T
@@ -158,10 +145,7 @@ def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndar
 
 
 def num_views_facing(points: np.ndarray, views: Sequence[Viewpoint]) -> int:
-    """Return the number of cameras that have one of the points (N, 3) in the middle of their image.
-
-    Of very many points, which would take long, every n-th is considered.
-    """
+    """Return the number of cameras with one of the points (N, 3) in the middle of their images."""
     points = points[:: max(1, len(points) // MAX_CLOUD_POINTS)]
     return sum(bool(_in_image(points, view, CENTRAL_SHARE).any()) for view in views)
 
@@ -204,7 +188,7 @@ def _coverage(points: np.ndarray, view: Viewpoint) -> float:
 
 
 def format_point(point: np.ndarray, scale: float) -> str:
-    """Return a point as messages write it; scale: distances beside which rounding is nothing."""
+    """Return a point as messages write it; scale: of distances, which decides the digits."""
     rounded = np.where(np.abs(point) < 1e-6 * scale, 0, point)
     digits = max(3, math.ceil(math.log10(max(np.abs(point).max() / scale, 1))) + 2)
     return f"({', '.join(f'{v:.{digits}g}' for v in rounded)})"

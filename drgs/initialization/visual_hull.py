@@ -3,11 +3,8 @@
 The visual hull (Laurentini 1994) is the largest body with these silhouettes. An octree finds its
 surface as in Szeliski, "Rapid octree construction from image sequences" (1993): a cube is outside
 if some image shows only transparent pixels at its place, inside if no image shows one, and else on
-the surface, and divided.
-
-A cube's place in an image is a box of pixels that contains all of it, so that no part of the hull
-is lost however thin it is. Opaque pixels in such a box are counted by a summed-area table (Crow
-1984).
+the surface, and divided. A cube's place is a box of pixels that contains all of it, so that thin
+parts of the hull are not lost. A summed-area table (Crow 1984) counts the opaque pixels in it.
 """
 
 from __future__ import annotations
@@ -24,24 +21,20 @@ from drgs.datasets.types import View
 from drgs.initialization.film import Columns, is_projectable, to_camera, to_film
 from drgs.initialization.start_box import Box
 
-MAX_EMPTY_ALPHA = 4 / 255  # alpha up to which a pixel is empty. Mattes have noise.
+MAX_EMPTY_ALPHA = 4 / 255  # of empty pixels: mattes have noise
 
-MIN_POINT_ALPHA = 0.5
-"""Least alpha of pixels that show points: others are mostly beside what there is. Parts that are
-nowhere more opaque are found as thin parts are."""
+MIN_POINT_ALPHA = 0.5  # of pixels that show points; fainter parts are found as thin parts are
 
-MIN_TRANSPARENT_SHARE = 0.02
-"""Transparent share of an image whose alpha is a mask. Corners that are empty since distortion was
-removed are less of most."""
+MIN_TRANSPARENT_SHARE = 0.02  # of an image with a mask; corners emptied by undistortion have less
 
-LEAST_MASKED, LEAST_VIEWS = 0.95, 3
+MIN_MASKED_SHARE, MIN_MASKED_VIEWS = 0.95, 3
 """Share and number of the views that must have a mask. With fewer, a hull is mostly the cones that
 they see."""
 
-MAX_VIEWS, MAX_SIDE = 120, 512
-"""Number of silhouettes, and pixels along their sides: of larger images, pixels are merged."""
+MAX_VIEWS, MAX_SIDE_PX = 120, 512
+"""Number of silhouettes, and their longest side: pixels of larger images are merged."""
 
-MIN_SEEN_SHARE = 0.5  # share of the views that must see a cube: others cannot show it empty
+MIN_SEEN_SHARE = 0.5  # of the views, which must see a cube: others cannot show it empty
 
 ROOT_CUBES_PER_SIDE = 16  # cubes along the longest side of the box that is divided first
 
@@ -50,42 +43,38 @@ COARSE_CUBES, COARSE_LEVELS = 4000, 7
 divisions, at most, to find so many: of a box 2,048 times as wide as the hull."""
 
 SPARE, MAX_CUBES = 1.25, 3
-"""In wanted numbers of points: the number promised by the first division, as some are left out; and
-cubes that are divided into eight, at most. Silhouettes of noise have a surface everywhere."""
+"""In wanted numbers of points: the number that the first division aims at, as some are left out;
+and cubes that are divided, at most. Silhouettes of noise have a surface everywhere."""
 
 SHELL, MARGIN = 1.2, 1.6
-"""Edge of a cube around a point on the surface, some pixel of which an image shows empty, in point
-distances; and how far cubes are widened so that half-empty ones contain all of that shell."""
+"""In point distances: edge of a cube around a surface point, some pixel of which an image shows
+empty; and edge to which cubes are widened so that half-empty ones contain all of that shell."""
 
 THIN, THIN_LEVELS = 1.5, 3
-"""Edges of a cube: one so far from all points of the hull is a part of it too thin to be hit; and
-divisions, at most, that tell whether it is one. Where there are many, they are noise."""
+"""Distance, in edges, of a cube from all points of the hull that makes it a thin part, which random
+points miss; and divisions, at most, that confirm it. Where there are many, they are noise."""
 
-CUBES_PER_CHUNK = 1 << 15
-"""Cubes that are projected at once: their numbers stay in the processor's cache."""
+CUBES_PER_CHUNK = 1 << 15  # projected at once: their numbers stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Opaque pixels of a view; ``scale`` of the view's pixels wide."""
+    """Opaque pixels of a view."""
 
     view: View
-    scale: int
+    scale: int  # width of a pixel in the view's
     solid: np.ndarray  # (rows, columns) bool: opaque to a half at least
     table: np.ndarray  # (rows + 1, columns + 1) int32: opaque pixels above and to the left
     transparent: float  # share of the image
 
 
 def silhouettes_of(views: Sequence[View]) -> list[Silhouette]:
-    """Return silhouettes of views that have alpha and a camera that does not move.
-
-    A pixel that a mask leaves out is not known to be empty, and so is part of the silhouette.
-    """
-    views = [v for v in thin_out(views) if v.alpha is not None and is_projectable(v)]
+    """Return silhouettes of views that have alpha and a camera that does not move."""
+    views = [v for v in subsample_views(views) if v.alpha is not None and is_projectable(v)]
     return [_silhouette(view) for view in views]
 
 
-def thin_out(views: Sequence[View]) -> Sequence[View]:
+def subsample_views(views: Sequence[View]) -> Sequence[View]:
     """Return all views, or every n-th of many."""
     return views[:: -(-len(views) // MAX_VIEWS) or 1]
 
@@ -95,18 +84,18 @@ def _silhouette(view: View) -> Silhouette:
     opaque, solid = alpha > MAX_EMPTY_ALPHA, alpha >= MIN_POINT_ALPHA
     transparent = 1 - float(opaque.mean())
     if view.mask is not None:
-        unknown = np.asarray(view.mask) == 0
-        opaque |= unknown
-        solid |= unknown
-    scale = -(-max(opaque.shape) // MAX_SIDE)
-    opaque, solid = (_any_of(pixels, scale) for pixels in (opaque, solid))
+        left_out = np.asarray(view.mask) == 0  # not known to be empty
+        opaque |= left_out
+        solid |= left_out
+    scale = -(-max(opaque.shape) // MAX_SIDE_PX)
+    opaque, solid = (_merge_pixels(pixels, scale) for pixels in (opaque, solid))
     table = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int32)
     np.cumsum(opaque, axis=0, dtype=np.int32, out=table[1:, 1:])
     np.cumsum(table[1:, 1:], axis=1, out=table[1:, 1:])
     return Silhouette(view, scale, solid, table, transparent)
 
 
-def _any_of(pixels: np.ndarray, scale: int) -> np.ndarray:
+def _merge_pixels(pixels: np.ndarray, scale: int) -> np.ndarray:
     """Return whether any pixel is set in squares of ``scale``; the last ones may be smaller."""
     for axis in (0, 1):
         pixels = np.logical_or.reduceat(pixels, np.arange(0, pixels.shape[axis], scale), axis)
@@ -114,14 +103,14 @@ def _any_of(pixels: np.ndarray, scale: int) -> np.ndarray:
 
 
 def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
-    """Return the number of those of partly transparent images."""
+    """Return the number of silhouettes of partly transparent images."""
     return sum(s.transparent >= MIN_TRANSPARENT_SHARE for s in silhouettes)
 
 
 def are_masks(silhouettes: Sequence[Silhouette], views: Sequence[View]) -> bool:
     """Return whether the alpha of nearly all ``views`` cuts out the object."""
-    wanted = LEAST_MASKED * len(thin_out(views))
-    return num_transparent(silhouettes) >= max(LEAST_VIEWS, wanted)
+    wanted = MIN_MASKED_SHARE * len(subsample_views(views))
+    return num_transparent(silhouettes) >= max(MIN_MASKED_VIEWS, wanted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +149,8 @@ class Cubes:
 def hull_points(silhouettes: Sequence[Silhouette], box: Box, count: int, seed: int) -> np.ndarray:
     """Return points (M, 3) float64, world, on the surface of the visual hull within ``box``.
 
-    At most ``count``, about evenly spread, each at a random place within a cube of its own: M is
-    about ``count``, unless images contradict each other and there is no hull, which is M = 0.
-    The same seed gives the same points.
+    At most ``count``, and about so many unless images contradict each other, evenly spread: each at
+    a random place within a cube of its own.
     """
     corners = box.center - box.half_extent, box.center + box.half_extent
     coarse = Cubes.filling(*corners, 2 * box.half_extent / ROOT_CUBES_PER_SIDE)
@@ -225,17 +213,17 @@ def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
 def _shown_by_all(
     silhouettes: Sequence[Silhouette], centers: np.ndarray, edge: float
 ) -> np.ndarray:
-    """Return which (N,) cubes no image shows empty, and enough of the images show.
-
-    centers: (N, 3) world; edge 0: points.
-    """
+    """Return which (N,) cubes, points if edge is 0, no image shows empty and enough images show."""
     columns = [np.ascontiguousarray(c) for c in centers.T]
     rows, seen = np.arange(len(centers)), np.zeros(len(centers), np.int32)
-    look = _look_at_cubes if edge > 0 else _look_at_points
     for silhouette in silhouettes:
         kept = [rows[:0]]
         for some in _chunks(rows):
-            shown, empty = look(silhouette, columns, some, edge)
+            if edge > 0:
+                is_whole, opaque, area = _opaque_pixels(silhouette, columns, some, edge)
+                shown, empty = area > 0, is_whole & (opaque == 0)
+            else:
+                shown, empty = _classify_points(silhouette, columns, some)
             seen[some] += shown
             kept.append(some[~empty])
         rows = np.concatenate(kept)
@@ -260,32 +248,22 @@ def _chunks(rows: np.ndarray) -> list[np.ndarray]:
     return [rows[start : start + CUBES_PER_CHUNK] for start in range(0, len(rows), CUBES_PER_CHUNK)]
 
 
-def _look_at_points(
-    silhouette: Silhouette, centers: Columns, rows: np.ndarray, _edge: float
+def _classify_points(
+    silhouette: Silhouette, points: Columns, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return whether points are in the image, and whether it shows them beside solid pixels."""
     view, (height, width) = silhouette.view, silhouette.solid.shape
-    u, v, depth = to_film(view, to_camera(view, [c[rows] for c in centers], np.float32))
+    u, v, depth = to_film(view, to_camera(view, [c[rows] for c in points], np.float32))
     u, v = np.floor(u / silhouette.scale), np.floor(v / silhouette.scale)
     shown = (depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     place = np.where(shown, v * width + u, 0).astype(np.int64)
     return shown, shown & ~silhouette.solid.ravel()[place]
 
 
-def _look_at_cubes(
-    silhouette: Silhouette, centers: Columns, rows: np.ndarray, edge: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether some of each cube is in the image, and whether that shows it empty."""
-    whole, opaque, area = _opaque_pixels(silhouette, centers, rows, edge)
-    return area > 0, whole & (opaque == 0)
-
-
 def _opaque_pixels(
     silhouette: Silhouette, centers: Columns, rows: np.ndarray, edge: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return whether all of each cube is in the image; its opaque pixels; all pixels at its place.
-
-    centers: (N,) each; rows: of the cubes.
+    """Return whether all of each cube is in the image; numbers of opaque and of all pixels there.
 
     A pinhole shows p + d at a distance from p of at most |J d| z / (z - d_z), with J the derivative
     at p, which differences bound in the same way.

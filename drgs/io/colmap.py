@@ -1,10 +1,8 @@
 """COLMAP models: cameras, images with their poses, and points, in binary or in text files.
 
 The formats are those of COLMAP's documentation ("Output Format") and of its ``reconstruction_io``.
-Observations are skipped, and so are rigs and frames, which repeat what images contain.
-
-Each record is checked, and an error names the file, the byte or the line, what was expected and
-what was got.
+Observations are skipped, and so are rigs and frames, which repeat what images contain. Errors in
+records name the file, the byte or the line, what was expected and what was got.
 """
 
 from __future__ import annotations
@@ -13,7 +11,6 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -74,11 +71,7 @@ class ColmapCamera:
     model: str  # of MODELS
     width: int  # px
     height: int  # px
-    values: tuple[float, ...]  # in the order of MODELS; px, and coefficients of distortion
-
-    def named_values(self) -> dict[str, float]:
-        """Return the values by name."""
-        return dict(zip(MODELS[self.model][1], self.values, strict=True))
+    values: Mapping[str, float]  # by the names in MODELS; px, and coefficients of distortion
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,18 +80,7 @@ class ColmapImage:
 
     name: str  # of its file below the folder of photographs, with ``/`` between folders
     camera: int  # the number of its camera
-    quaternion: tuple[float, ...]  # w, x, y, z: world to camera
-    translation: tuple[float, ...]  # x, y, z: world to camera, scene units
-
-    @property
-    def camera_to_world(self) -> np.ndarray:
-        """(4, 4) float64, OpenCV axes."""
-        w, *xyz = self.quaternion
-        to_world = Rotation.from_quat([*xyz, w]).inv()
-        pose = np.eye(4)
-        pose[:3, :3] = to_world.as_matrix()
-        pose[:3, 3] = -to_world.apply(self.translation)
-        return pose
+    camera_to_world: np.ndarray  # (4, 4) float64, OpenCV axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,17 +112,9 @@ class ColmapModel:
         file = self.points_file
         return file is not None and next(iter(_records(file)), None) is not None
 
-    @cached_property
-    def points(self) -> ColmapPoints:
-        """The points, read at the first access; errors as in :func:`read_model`."""
-        return _points(()) if self.points_file is None else read_points3d(self.points_file)
-
 
 def model_files(folder: Path) -> dict[str, Path] | None:
-    """Return the files ``cameras``, ``images`` and, if it exists, ``points3D``; None: no model.
-
-    Binary files are preferred.
-    """
+    """Return ``cameras``, ``images`` and maybe ``points3D``, binary if possible; None: no model."""
     for suffix in (".bin", ".txt"):
         files = {name: folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D")}
         there = {name: path for name, path in files.items() if path.is_file()}
@@ -150,11 +124,7 @@ def model_files(folder: Path) -> dict[str, Path] | None:
 
 
 def read_model(folder: str | Path) -> ColmapModel:
-    """Return the model in ``folder``, whose points are read later.
-
-    Raises :class:`UserError` naming the file, the byte or the line, what was expected and what was
-    got.
-    """
+    """Return the model in ``folder``, without its points."""
     files = model_files(Path(folder))
     if files is None:
         raise UserError(
@@ -166,15 +136,15 @@ def read_model(folder: str | Path) -> ColmapModel:
 
 
 def read_points3d(path: str | Path) -> ColmapPoints:
-    """Return the points of ``points3D.bin`` or ``.txt``; errors as in :func:`read_model`."""
+    """Return the points of ``points3D.bin`` or ``.txt``."""
     return _points(_records(Path(path)))
 
 
 def _records(path: Path) -> Iterator[tuple]:
     take, parse, form = _KINDS[path.stem]
-    return (
-        _text_records(path, parse, form) if path.suffix == ".txt" else _binary_records(path, take)
-    )
+    if path.suffix == ".txt":
+        return _text_records(path, parse, form)
+    return _binary_records(path, take)
 
 
 # Checks
@@ -202,7 +172,9 @@ def _cameras(records: Iterable[tuple]) -> dict[int, ColmapCamera]:
         _check_numbers(place, names, values)
         if number in cameras:
             raise UserError(f"{place}: each camera must be there once, got a second one {number}")
-        cameras[number] = ColmapCamera(number, model, width, height, tuple(values))
+        cameras[number] = ColmapCamera(
+            number, model, width, height, dict(zip(names, values, strict=True))
+        )
     return cameras
 
 
@@ -225,8 +197,17 @@ def _images(
         _check_numbers(place, ("TX", "TY", "TZ"), pose[4:])
         if camera not in cameras:
             raise UserError(f"{place}: the number of a camera was expected, got {camera}")
-        images[name] = ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+        images[name] = ColmapImage(name, camera, _camera_to_world(*pose))
     return tuple(images.values())
+
+
+def _camera_to_world(w: float, x: float, y: float, z: float, *translation: float) -> np.ndarray:
+    """Return the pose (4, 4) from a quaternion and a translation, world to camera."""
+    rotation = Rotation.from_quat([x, y, z, w]).inv()
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.as_matrix()
+    pose[:3, 3] = -rotation.apply(translation)
+    return pose
 
 
 def _points(records: Iterable[tuple]) -> ColmapPoints:
@@ -253,7 +234,7 @@ def _check_numbers(place: Place, names: Sequence[str], values: Sequence[float]) 
 
 
 class _BinaryFile:
-    """A file that is read from its beginning to its end."""
+    """A binary file that is read from its beginning to its end."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._at = path, 0
@@ -261,16 +242,13 @@ class _BinaryFile:
 
     @property
     def place(self) -> Place:
-        """The next byte."""
         return Place(self._path, "byte", self._at)
 
     @property
     def left(self) -> int:
-        """Number of bytes that follow."""
         return len(self._data) - self._at
 
     def skip(self, size: int) -> None:
-        """Skip bytes."""
         if size > self.left:
             raise UserError(
                 f"{self.place}: {size:,} bytes were expected, and {self.left:,} are left; the file "
@@ -407,4 +385,4 @@ _KINDS = {
         "a point (POINT3D_ID X Y Z R G B ERROR, pairs of a track)",
     ),
 }
-"""Readers of the same records from binary and from text files, and the form of a line."""
+"""Readers of the records of binary and of text files, and the form of a line."""

@@ -57,40 +57,81 @@ BOUNDED = {
 """Names of what has bounds in ``chunk``, by the word that it is in."""
 
 QUATERNION_RANGE = 1 / np.sqrt(2)  # no component but the largest is beyond it
-
 SH_RANGE = 4.0
 SH_LEVELS = 256
 
-MAX_LOG_SCALE = 20.0
-"""Larger ones are cut off, as PlayCanvas does: viewers compute with their exponentials."""
+MAX_LOG_SCALE = 20.0  # PlayCanvas's limit: viewers compute with its exponential
 
 
-def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return a file of Gaussians, in Morton order."""
-    order = morton_order(gaussians["means"])
-    g = {name: values[order] for name, values in gaussians.items()}
-    values = {
-        "packed_position": g["means"].astype(np.float64),
-        "packed_scale": np.clip(g["log_scales"].astype(np.float64), -MAX_LOG_SCALE, MAX_LOG_SCALE),
-        "packed_color": colors_from_sh0(g["sh0"]),
-    }
-    bounds = {name: _bounds(v) for name, v in values.items()}
-    parts = {name: _parts(v, *bounds[name]) for name, v in values.items()}
-    opacities = opacities_from_logits(g["logit_opacities"])
-    parts["packed_color"] = np.column_stack([parts["packed_color"], opacities])
-    index, others = drop_largest_component(normalize_quaternions(g["quats"]))
-    others = others / (2 * QUATERNION_RANGE) + 0.5
-    parts["packed_rotation"] = np.column_stack([index / 3, others])
-    words = np.column_stack([_pack_words(parts[name], bits) for name, bits in BITS.items()])
-    chunk = np.concatenate([side for pair in bounds.values() for side in pair], axis=1)
-    names = [f"{s}_{n}" for names in BOUNDED.values() for s in ("min", "max") for n in names]
-    elements = {
-        "chunk": _structured_array(names, chunk),
-        "vertex": _structured_array(list(BITS), words),
-    }
-    if g["shN"].shape[1]:
-        elements["sh"] = _packed_harmonics(g["shN"])
-    return encode_elements(elements, rendered_with)
+@FORMATS.register("compressed-ply")
+class CompressedPly(FileFormat):
+    """PlayCanvas's compressed PLY."""
+
+    suffix = ".compressed.ply"
+    description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
+    metadata = None
+
+    @override
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        """Return Gaussians, and the values in the header's comments.
+
+        Files without bounds of colours, as older programs write them, are read as well.
+        """
+        rows, statements = read_elements(path, ["chunk", "vertex", "sh"])
+        vertex, chunk, sh = rows["vertex"], rows["chunk"], rows.get("sh")
+        harmonics = 1 if sh is None else 1 + len(sh.dtype.names or ()) // 3
+        require_scene_memory(path, len(vertex), harmonics)
+        _require(path, "vertex", vertex, BITS, "u4")
+        if len(chunk) != (expected := -(-len(vertex) // CHUNK)):
+            raise UserError(
+                f"{path}: element chunk must have a row for each {CHUNK} of the {len(vertex):,} "
+                f"vertices, {expected:,}, got {len(chunk):,}"
+            )
+        rotation = _unpack_words(vertex, "packed_rotation")
+        largest = np.round(3 * rotation[:, 0]).astype(np.intp)
+        others = (rotation[:, 1:] - 0.5) * (2 * QUATERNION_RANGE)
+        arrays = {
+            "means": _dequantize(path, rows, "packed_position"),
+            "quats": restore_largest_component(largest, others).astype(np.float32),
+            "log_scales": _dequantize(path, rows, "packed_scale"),
+            "logit_opacities": logits_from_opacities(_unpack_words(vertex, "packed_color")[:, 3]),
+            "sh0": sh0_from_colors(_dequantize(path, rows, "packed_color")),
+            "shN": _harmonics(path, sh, len(vertex)),
+        }
+        return arrays, statements
+
+    @override
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        """Return a file of the Gaussians in Morton order."""
+        order = morton_order(gaussians["means"])
+        g = {name: values[order] for name, values in gaussians.items()}
+        log_scales = g["log_scales"].astype(np.float64)
+        values = {
+            "packed_position": g["means"].astype(np.float64),
+            "packed_scale": np.clip(log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE),
+            "packed_color": colors_from_sh0(g["sh0"]),
+        }
+        bounds = {name: _bounds(v) for name, v in values.items()}
+        parts = {name: _parts(v, *bounds[name]) for name, v in values.items()}
+        opacities = opacities_from_logits(g["logit_opacities"])
+        parts["packed_color"] = np.column_stack([parts["packed_color"], opacities])
+        index, others = drop_largest_component(normalize_quaternions(g["quats"]))
+        others = others / (2 * QUATERNION_RANGE) + 0.5
+        parts["packed_rotation"] = np.column_stack([index / 3, others])
+        words = np.column_stack([_pack_words(parts[name], bits) for name, bits in BITS.items()])
+        chunk = np.concatenate([side for pair in bounds.values() for side in pair], axis=1)
+        names = [f"{s}_{n}" for names in BOUNDED.values() for s in ("min", "max") for n in names]
+        elements = {
+            "chunk": _structured_array(names, chunk),
+            "vertex": _structured_array(list(BITS), words),
+        }
+        if g["shN"].shape[1]:
+            elements["sh"] = _packed_harmonics(g["shN"])
+        return encode_elements(elements, rendered_with)
+
+    @override
+    def recognizes(self, path: Path) -> bool:
+        return has_packed_vertices(path)
 
 
 def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
@@ -129,38 +170,6 @@ def _pack_words(parts: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 def _structured_array(names: list[str], rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in names])[:, 0]
-
-
-def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Return Gaussians (:data:`drgs.io.formats.Arrays`), and the values in the header's comments.
-
-    Opacities of 0 and 1 become the next ones that sigmoids tell apart. Files without bounds of
-    colours, as older programs write them, are read as well.
-
-    Raises :class:`UserError` naming the file, the element and what it lacks.
-    """
-    rows, statements = read_elements(path, ["chunk", "vertex", "sh"])
-    vertex, chunk, sh = rows["vertex"], rows["chunk"], rows.get("sh")
-    harmonics = 1 if sh is None else 1 + len(sh.dtype.names or ()) // 3
-    require_scene_memory(path, len(vertex), harmonics)
-    _require(path, "vertex", vertex, BITS, "u4")
-    if len(chunk) != (expected := -(-len(vertex) // CHUNK)):
-        raise UserError(
-            f"{path}: element chunk must have a row for each {CHUNK} of the {len(vertex):,} "
-            f"vertices, {expected:,}, got {len(chunk):,}"
-        )
-    rotation = _unpack_words(vertex, "packed_rotation")
-    largest, others = np.round(3 * rotation[:, 0]), (rotation[:, 1:] - 0.5) * (2 * QUATERNION_RANGE)
-    color = _dequantize(path, rows, "packed_color")
-    arrays = {
-        "means": _dequantize(path, rows, "packed_position"),
-        "quats": restore_largest_component(largest.astype(np.intp), others).astype(np.float32),
-        "log_scales": _dequantize(path, rows, "packed_scale"),
-        "logit_opacities": logits_from_opacities(_unpack_words(vertex, "packed_color")[:, 3]),
-        "sh0": sh0_from_colors(color),
-        "shN": _harmonics(path, sh, len(vertex)),
-    }
-    return arrays, statements
 
 
 def _require(
@@ -215,7 +224,7 @@ def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
     names = [f"f_rest_{i}" for i in range(len(sh.dtype.names or ()))]
     if len(names) not in NUM_REST or len(sh) != num:
         raise UserError(
-            f"{path}: element sh must have a row of {sorted(NUM_REST)[1:]} harmonics for each of "
+            f"{path}: element sh must have a row of {list(NUM_REST[1:])} harmonics for each of "
             f"the {num:,} vertices, got {len(sh):,} rows of {len(names)}"
         )
     _require(path, "sh", sh, names, "u1")
@@ -224,25 +233,3 @@ def _harmonics(path: str | Path, sh: np.ndarray | None, num: int) -> np.ndarray:
     values = ((parts - 0.5) * (2 * SH_RANGE)).astype(np.float32)
     rest = values[np.column_stack([sh[name] for name in names])]
     return rest.reshape(num, 3, -1).transpose(0, 2, 1)
-
-
-@FORMATS.register("compressed-ply")
-class CompressedPly(FileFormat):
-    """PlayCanvas's compressed PLY."""
-
-    suffix = ".compressed.ply"
-    description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
-    metadata = None
-
-    @override
-    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        return read_gaussians(path)
-
-    @override
-    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-        return encode(gaussians, rendered_with)
-
-    @override
-    def recognizes(self, path: Path) -> bool:
-        """Return whether the vertices are packed."""
-        return has_packed_vertices(path)

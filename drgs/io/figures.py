@@ -1,7 +1,6 @@
 """Figures of matplotlib that need no screen, to files and to pixels.
 
-Matplotlib is imported when a figure is made: it takes half a second, which a command that fails
-early should not.
+Matplotlib, which takes half a second, is imported when a figure is made.
 """
 
 from __future__ import annotations

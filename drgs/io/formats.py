@@ -6,8 +6,7 @@ A format is a subclass of :class:`FileFormat`, registered under its name::
     class Npz(FileFormat): ...
 
 ``Gaussians.load`` and ``save``, the plugins' ``filename``, and the commands choose a format by the
-suffix of a file's name. :func:`read_gaussians` and :func:`encode` check what goes in and comes out,
-so that a format need not.
+suffix of a file's name. :func:`read_gaussians` and :func:`encode` check all arrays.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ Arrays = Mapping[str, np.ndarray]
 wxyz, ``log_scales`` (N, 3), ``logit_opacities`` (N,), ``sh0`` (N, 1, 3), ``shN`` (N, K - 1, 3), and
 ``smoothing`` (N,) where there is a smoothing filter."""
 
-ORIGIN = ("origin_x", "origin_y", "origin_z")
-"""Names in ``rendered_with``: world coordinates that the means are relative to."""
+ORIGIN = ("origin_x", "origin_y", "origin_z")  # in ``rendered_with``: world, of the means
 
 MAX_ORIGIN = 1e12  # world units
 
@@ -61,8 +59,7 @@ class FileFormat:
 
     description: str  # one phrase, for help texts
 
-    up: str | None = None
-    """Axis that the format defines as up, ``"y"`` or ``"z"``; None: it defines none."""
+    up: str | None = None  # axis that the format defines as up, ``"y"`` or ``"z"``
 
     has_harmonics = True  # harmonics above degree 0 are kept
 
@@ -78,7 +75,10 @@ class FileFormat:
         return True
 
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        """Return the Gaussians of a file, in its axes, and their ``rendered_with``."""
+        """Return the Gaussians of a file, in its axes, and their ``rendered_with``.
+
+        Raises :class:`UserError` naming the file, the place, what was expected and what was got.
+        """
         raise UserError(f"{path}: files of this format can be written, but not read")
 
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
@@ -90,7 +90,6 @@ class FileFormat:
         raise UserError("files of this format can be read, but not written")
 
     def __init_subclass__(cls) -> None:
-        """Raise TypeError for a format without a suffix or a description."""
         if not getattr(cls, "suffix", "").startswith(".") or cls.suffix != cls.suffix.lower():
             raise TypeError(f"{cls.__name__}.suffix must be a suffix in small letters, as .npz")
         if not getattr(cls, "description", ""):
@@ -132,7 +131,7 @@ def _shipped_formats() -> list[Extension[type[FileFormat]]]:
 def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
     """Return the format with the longest suffix that a file's name ends in; None: there is none.
 
-    Installed packages are imported only where no format that drgs ships has such a suffix.
+    Installed packages are imported only if no shipped format has such a suffix.
     """
     for formats in (_shipped_formats, FORMATS.installed_extensions):
         found = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
@@ -147,9 +146,7 @@ def read_gaussians(
     """Return a file's format, its Gaussians in the axes of the file, and their ``rendered_with``.
 
     A file with an unknown suffix is read as PLY. Where shipped formats share the last part of a
-    suffix, the content decides.
-
-    Raises :class:`UserError` naming the file, the place and what is wrong there.
+    suffix, the content decides. Raises as :meth:`FileFormat.read`.
     """
     open_regular(path).close()
     named = format_for(path) or FORMATS.get("ply")
@@ -168,11 +165,9 @@ def read_gaussians(
 
 
 def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return the content of a file in the format ``name``; data that it cannot hold is left out.
+    """Return the content of a file in the format ``name``, as :meth:`FileFormat.encode`.
 
-    gaussians, rendered_with: as for :meth:`FileFormat.encode`.
-
-    Raises :class:`UserError` where the format cannot hold the Gaussians.
+    Values of ``rendered_with`` that the format cannot hold are left out.
     """
     extension = FORMATS.get(name)
     if "smoothing" in gaussians and not extension.value.has_smoothing:
@@ -215,10 +210,7 @@ def _check_finite(gaussians: Arrays, start: str) -> None:
 
 
 def pop_origin(path: str | Path, rendered_with: dict[str, Scalar]) -> Origin:
-    """Remove the coordinates of the origin from ``rendered_with``, and return them.
-
-    Raises :class:`UserError` where some are missing, or are no numbers.
-    """
+    """Remove the coordinates of the origin from ``rendered_with``, and return them."""
     values = [rendered_with.pop(name, None) for name in ORIGIN]
     if values == [None, None, None]:
         return WORLD

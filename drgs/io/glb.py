@@ -70,26 +70,69 @@ KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # types of accessors, by number of 
 EXTRAS_KEY = "drgs"  # key of our values in ``extras``
 
 
-def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return a file of Gaussians; the origin becomes the translation of the node."""
-    attributes, settings = _attributes(gaussians), dict(rendered_with)
-    origin = pop_origin("rendered_with", settings)
-    document = _document(attributes, {EXTRAS_KEY: settings} if settings else None, origin)
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    binary = b"".join(values.tobytes() for values in attributes.values())
-    length = HEADER.size + 2 * CHUNK.size + len(text) + len(binary)
-    if length > MAX_BYTES:
-        raise UserError(f"the format glb holds at most {MAX_BYTES:,} bytes, got {length:,}")
-    return b"".join(
-        [
-            HEADER.pack(MAGIC, VERSION, length),
-            CHUNK.pack(len(text), JSON),
-            text,
-            CHUNK.pack(len(binary), BINARY),
-            binary,
-        ]
-    )
+@FORMATS.register("glb")
+class Glb(FileFormat):
+    """Binary glTF."""
+
+    suffix = ".glb"
+    description = "binary glTF with KHR_gaussian_splatting, in full precision"
+    up = "y"
+    metadata = None
+
+    @override
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        """Return Gaussians, y up, and our values in ``extras``; other meshes are passed over.
+
+        Scales, rotations and opacities may be quantised as the extension allows. A translation is
+        added to the means or, where it is far away, is their origin.
+
+        Raises :class:`UserError` also for splats that the file rotates, scales or shows several
+        times, for compressed ones, and for other kernels and colour spaces than are written here.
+        """
+        document = _read_document(path, *_chunks(path, read_bytes(path, "file", MAX_BYTES)))
+        names = document.primitive.attributes
+        count = next((k for k in (16, 9, 4, 1) if set(_harmonics(k)) <= set(names)), 0)
+        stray = [n for n in names if ":SH_DEGREE_" in n and n not in _harmonics(count)]
+        if not count or stray:
+            what = f"all those below {stray[0]}" if stray else "at least that of degree 0"
+            raise UserError(
+                f"{path}: {document.place}: harmonics must be complete: {what} is expected"
+            )
+        require_scene_memory(path, document.accessor("POSITION").count, count, turned=True)
+        means = document.values("POSITION", 3)
+        scales = document.values(f"{EXTENSION}:SCALE", 3, 0, expected=NOT_NEGATIVE)
+        opacities = document.values(f"{EXTENSION}:OPACITY", 1, 0, 1, "from 0 to 1")
+        harmonics = np.stack(
+            [document.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
+        )
+        arrays = {
+            "quats": np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
+            "log_scales": log_scales_from_scales(scales),
+            "logit_opacities": logits_from_opacities(opacities[:, 0]),
+            "sh0": harmonics[:, :1],
+            "shN": harmonics[:, 1:],
+        }
+        arrays["means"], origin = recenter_means(means + document.translation)
+        settings = document.rendered_with
+        if origin != WORLD:  # exactly the file's
+            arrays["means"] = means
+            settings = settings | dict(zip(ORIGIN, document.translation, strict=True))
+        return arrays, settings
+
+    @override
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        """Return a file, in which the origin is the translation of the node."""
+        attributes, settings = _attributes(gaussians), dict(rendered_with)
+        origin = pop_origin("rendered_with", settings)
+        document = _document(attributes, {EXTRAS_KEY: settings} if settings else None, origin)
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        binary = b"".join(values.tobytes() for values in attributes.values())
+        length = HEADER.size + 2 * CHUNK.size + len(text) + len(binary)
+        if length > MAX_BYTES:
+            raise UserError(f"the format glb holds at most {MAX_BYTES:,} bytes, got {length:,}")
+        start = HEADER.pack(MAGIC, VERSION, length) + CHUNK.pack(len(text), JSON)
+        return b"".join([start, text, CHUNK.pack(len(binary), BINARY), binary])
 
 
 def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -165,49 +208,6 @@ def _document(
     }
 
 
-def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Return Gaussians (:data:`drgs.io.formats.Arrays`), y up, and our values in ``extras``.
-
-    Opacities of 0 and 1, and scales of 0, become the next ones that have logits and logarithms.
-    Scales, rotations and opacities may be quantised as the extension allows. Other meshes of the
-    file are passed over. A translation is added to the means or, where it is far away, is their
-    origin.
-
-    Raises :class:`UserError` naming the file, the place, what was expected and what was got: also
-    for splats that the file rotates, scales or shows several times, for compressed ones and for
-    kernels and colour spaces other than those that are written here.
-    """
-    document = _read_document(path, *_chunks(path, read_bytes(path, "file", MAX_BYTES)))
-    names = document.primitive.attributes
-    count = next((k for k in (16, 9, 4, 1) if set(_harmonics(k)) <= set(names)), 0)
-    stray = [n for n in names if ":SH_DEGREE_" in n and n not in _harmonics(count)]
-    if not count or stray:
-        what = f"all those below {stray[0]}" if stray else "at least that of degree 0"
-        raise UserError(f"{path}: {document.place}: harmonics must be complete: {what} is expected")
-    require_scene_memory(path, document.accessor("POSITION").count, count, turned=True)
-    means = document.values("POSITION", 3)
-    scales = document.values(f"{EXTENSION}:SCALE", 3, 0, expected=NOT_NEGATIVE)
-    opacities = document.values(f"{EXTENSION}:OPACITY", 1, 0, 1, "from 0 to 1")
-    harmonics = np.stack(
-        [document.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
-    )
-    arrays = {
-        "quats": np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
-        "log_scales": log_scales_from_scales(scales),
-        "logit_opacities": logits_from_opacities(opacities[:, 0]),
-        "sh0": harmonics[:, :1],
-        "shN": harmonics[:, 1:],
-    }
-    arrays["means"], origin = recenter_means(means + document.translation)
-    settings = document.rendered_with
-    if origin != WORLD:  # exactly what the file has, not what would do
-        arrays["means"], settings = (
-            means,
-            settings | dict(zip(ORIGIN, document.translation, strict=True)),
-        )
-    return arrays, settings
-
-
 def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:
     """Return the JSON part, the binary part, and the byte at which that begins."""
     refused = UserError(
@@ -236,7 +236,6 @@ IDENTITY: dict[str, list[float]] = {
     "scale": [1, 1, 1],
 }
 
-
 Part = TypeVar("Part", bound=BaseModel)
 
 
@@ -245,8 +244,6 @@ class _Part(BaseModel):
 
 
 class _Accessor(_Part):
-    """Layout of numbers in a part of the buffer."""
-
     buffer_view: Index
     byte_offset: Index = 0
     component_type: Literal[5120, 5121, 5122, 5123, 5126]
@@ -326,7 +323,6 @@ class _Document:
         return settings
 
     def accessor(self, name: str) -> _Accessor:
-        """Return how an attribute's numbers lie in a part of the buffer."""
         index = self.primitive.attributes[name]
         return self._item("accessors", self.file.accessors, index, _Accessor)
 
@@ -411,10 +407,7 @@ def _validate_part(path: Path, place: str, kind: type[Part], content: object) ->
 
 
 def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, float, float]:
-    """Add up the translations of the node that shows the splats, and of its parents.
-
-    Raises :class:`UserError` for nodes that rotate or scale them.
-    """
+    """Add up the translations of the node that shows the splats, and of its parents."""
     showing = [index for index, node in enumerate(nodes) if node.mesh == mesh]
     if len(showing) > 1:
         raise UserError(f"{path}: the splats must be shown once, got {len(showing)} nodes")
@@ -433,21 +426,3 @@ def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, floa
         total = x, y, z
         showing = [parents[index]] if index in parents else []
     return total
-
-
-@FORMATS.register("glb")
-class Glb(FileFormat):
-    """Binary glTF."""
-
-    suffix = ".glb"
-    description = "binary glTF with KHR_gaussian_splatting, in full precision"
-    up = "y"
-    metadata = None
-
-    @override
-    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        return read_gaussians(path)
-
-    @override
-    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-        return encode(gaussians, rendered_with)

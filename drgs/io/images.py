@@ -1,9 +1,8 @@
-"""Images from files and to files; all that drgs reads or writes goes through here.
+"""All images that drgs reads from files or writes to files.
 
 Read: 8 bits, with and without alpha, and grey of 16 bits; of colours of 16 bits, the upper 8.
-Written: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as EXR. Images are
-(H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here; files are written whole or
-not at all.
+Written, whole or not at all: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as
+EXR. Images are (H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here.
 """
 
 from __future__ import annotations
@@ -27,14 +26,13 @@ if TYPE_CHECKING:
     import mitsuba as mi
     from PIL.TiffImagePlugin import TiffImageFile
 
-MAX_PIXELS, PIXEL_BYTES = 1 << 26, 16
-"""Pixels of an image, as 8192 x 8192: 0.8 GB once decoded to float32; and memory for a pixel while
-it is decoded and copied."""
+MAX_PIXELS = 1 << 26  # of an image, as 8192 x 8192: 0.8 GB once decoded to float32
+
+PIXEL_BYTES = 16  # memory for a pixel while it is decoded and copied
 
 MAX_SIDE = 2**24  # px: in a larger image, float32 does not resolve pixels
 
-MAX_BYTES = 1 << 30
-"""Size of a file: twice what so many pixels of 64 bits take when they are not compressed."""
+MAX_BYTES = 1 << 30  # of a file: twice what so many pixels of 64 bits take uncompressed
 
 BITS = {"L": 8, "LA": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 16}
 """Bits of a channel, by Pillow's modes that are read. ``I`` has 32, but is what some versions of
@@ -46,46 +44,30 @@ MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
 """Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several images."""
 
 
-def _transpose(pixels: np.ndarray) -> np.ndarray:
-    return pixels.swapaxes(0, 1)
-
-
-ORIENTATIONS = {
-    1: (),
-    2: (np.fliplr,),
-    3: (np.flipud, np.fliplr),
-    4: (np.flipud,),
-    5: (_transpose,),
-    6: (_transpose, np.fliplr),
-    7: (_transpose, np.flipud, np.fliplr),
-    8: (_transpose, np.flipud),
-}
-"""Turns that make an image upright, by EXIF's orientation."""
+FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange width and height
 
 INVERSE_ORIENTATIONS = {6: 8, 8: 6}  # other orientations are their own inverses
 
 MAX_WEBP_SIDE = 16_383  # px: the largest width and height that the format can express
 
-MAX_FRAMES_BYTES = 2 << 30
-"""Memory for all frames of an animation, which are held until it is written."""
+MAX_FRAMES_BYTES = 2 << 30  # all frames of an animation, which are held until it is written
 
-FRAME_MS = 70
-"""Duration of a frame: 60 frames turn once in 4.2 s. A multiple of GIF's unit of 10 ms."""
+FRAME_MS = 70  # 60 frames turn once in 4.2 s; GIF has steps of 10 ms
 
 WEBP_QUALITIES, WEBP_BYTES = (80, 60, 40, 20), 1_500_000
 """The first quality is used that keeps an animation within so many bytes, or else the last."""
 
-FLAT_SHARE, FLAT_WEBP_BYTES = 0.1, 4_000_000
-"""An animation has a flat background if one colour has this share of all pixels; it is then coded
-without loss, in so many bytes at most."""
+MIN_BACKGROUND_SHARE, LOSSLESS_WEBP_BYTES = 0.1, 4_000_000
+"""An animation is coded without loss, in so many bytes at most, if one colour has this share of all
+pixels: a flat background."""
 
-FLAT_STEP = 255 / 31
-"""Levels of 255 between two values of a channel before a flat background: a smaller error than
-that of lossy coding, which halves the resolution of colours, and two thirds of the bytes."""
+LOSSLESS_STEP = 255 / 31
+"""Levels of 255 between two values of a channel without loss: a smaller error than that of lossy
+coding, which halves the resolution of colours, and two thirds of the bytes."""
 
-GIF_WIDTH, NEAR_BACKGROUND = 300, 8
-"""px: a GIF needs about five times the bytes of a WebP of the same size; and levels of 255: nearer
-colours of its palette become the background's."""
+GIF_WIDTH = 300  # px: a GIF needs about five times the bytes of a WebP of the same size
+
+NEAR_BACKGROUND = 8  # levels of 255: nearer colours of a GIF's palette become the background's
 
 
 # Reading: by Pillow itself, which reads an image's mode and size before decoding it
@@ -105,44 +87,41 @@ class ImageHeader:
 def read_header(path: Path) -> ImageHeader:
     """Return the header of an image; raises :class:`UserError` for a file that is none."""
     with _open_image(path) as image:
+        size = image.size
+        if image.format == "TIFF":  # Pillow's size is that of the upright image
+            tags = cast("TiffImageFile", image).tag_v2
+            size = tags[ExifTags.Base.ImageWidth], tags[ExifTags.Base.ImageLength]
         alpha, orientation = _has_alpha(image), _orientation(image)
-        return ImageHeader(_stored_size(image), image.format or "", image.mode, alpha, orientation)
+        return ImageHeader(size, image.format or "", image.mode, alpha, orientation)
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) as stored, px, from the file's header."""
-    with _open_image(path) as image:
-        return _stored_size(image)
-
-
-def _stored_size(image: Image.Image) -> tuple[int, int]:
-    if image.format == "TIFF":  # Pillow's is that of the upright image
-        tags = ExifTags.Base
-        sizes = cast("TiffImageFile", image).tag_v2
-        return sizes[tags.ImageWidth], sizes[tags.ImageLength]
-    return image.size
+    return read_header(path).size
 
 
 def _orientation(image: Image.Image) -> int:
     if image.format == "PNG" and "exif" not in image.info:
-        return 1  # Pillow would decode the image to look behind it
+        return 1  # Pillow would decode the image to find EXIF data after the pixels
     try:
         number = image.getexif().get(ExifTags.Base.Orientation, 1)
     except Exception:  # Pillow raises many types for broken EXIF, which is ignored
         return 1
-    return number if number in ORIENTATIONS else 1
+    return number if number in range(1, 9) else 1
 
 
 def _has_alpha(image: Image.Image) -> bool:
-    has_color = image.mode in ("P", "L", "RGB", "1") and "transparency" in image.info
-    return image.mode in ("LA", "RGBA") or has_color
+    has_clear_color = image.mode in ("P", "L", "RGB", "1") and "transparency" in image.info
+    return image.mode in ("LA", "RGBA") or has_clear_color
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """(H, W, C) turned by EXIF's ``orientation``; a view of ``pixels``."""
-    for turn in ORIENTATIONS[orientation]:
-        pixels = turn(pixels)
-    return pixels
+    """Return pixels (H, W, C) turned by EXIF's ``orientation``, a view."""
+    if orientation >= FIRST_TRANSPOSED_ORIENTATION:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = np.flipud(pixels)
+    return np.fliplr(pixels) if orientation in (2, 3, 6, 7) else pixels
 
 
 def unused_content(path: Path) -> list[str]:
@@ -184,7 +163,7 @@ def _colour_profile(profile: bytes | None) -> str:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(H, W, C) float32 in 0..1: see :func:`read_pixels`."""
+    """Return (H, W, C) float32 in 0..1: see :func:`read_pixels`."""
     return as_numbers(read_pixels(path))
 
 
@@ -196,18 +175,16 @@ def as_numbers(pixels: np.ndarray) -> np.ndarray:
 def check_readable(path: Path) -> None:
     """Raise :class:`UserError` as :func:`read_pixels` does, as far as the header shows it."""
     with _open_image(path) as image:
-        _check(path, image)
+        _check_supported(path, image)
 
 
 def read_pixels(path: Path) -> np.ndarray:
-    """(H, W, C) as stored (EXIF orientation is not applied), uint8 or an integer type for 16 bits.
+    """Return (H, W, C) as stored (EXIF orientation is not applied), uint8 or 16 bits in an integer.
 
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
-
-    Raises :class:`UserError` for a file that is no such image.
     """
     with _open_image(path) as image:
-        _check(path, image)  # before memory is allocated for it
+        _check_supported(path, image)  # before memory is allocated for it
         needed = image.width * image.height * PIXEL_BYTES
         require_memory(path, needed, f"an image of {image.width} x {image.height} px")
         # Pillow turns TIFFs, and no others.
@@ -231,8 +208,7 @@ def read_pixels(path: Path) -> np.ndarray:
     return pixels
 
 
-def _check(path: Path, image: Image.Image) -> None:
-    """Raise :class:`UserError` for images that are too large, or of another mode."""
+def _check_supported(path: Path, image: Image.Image) -> None:
     if image.width * image.height > MAX_PIXELS:
         raise UserError(
             f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
@@ -289,10 +265,7 @@ def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
 
 
 def encode(image: np.ndarray, suffix: str, **options: Any) -> bytes:
-    """Return a file with ``suffix``, png or webp, of an image or the frames of an animation.
-
-    options: of Pillow's writer.
-    """
+    """Return a PNG or WebP file of an image or the frames of an animation, by Pillow's options."""
     pixels = image if image.dtype == np.uint8 else to_uint8(image)
     return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
 
@@ -315,11 +288,10 @@ def check_animation(frames: int, width: int, height: int) -> None:
 def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
     """Write ``path``, an animated WebP that loops, and beside it a GIF of at most 300 px width.
 
-    Every browser shows the WebP; the GIF is for what else there is (mail, slides, old viewers).
-    frames: of one size, at least one; may be a generator, only 8 bits of each are kept.
+    The GIF is for mail, slides and old viewers. frames: at least one, of one size.
     """
     large = np.stack([to_uint8(frame) for frame in frames])
-    data = _before_flat_background(large)
+    data = _encode_lossless(large)
     if data is None:
         for quality in WEBP_QUALITIES:
             data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
@@ -327,37 +299,37 @@ def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
                 break
     assert data is not None, "there is at least one quality"
     _write(path, data)
-    _write_gif(path.with_suffix(".gif"), [_shrink(Image.fromarray(frame)) for frame in large])
+    _write_gif(path.with_suffix(".gif"), large)
 
 
-def _before_flat_background(frames: np.ndarray) -> bytes | None:
+def _encode_lossless(frames: np.ndarray) -> bytes | None:
     """Return a WebP without loss; None without a flat background, or where it is too large.
 
-    Lossy coding leaves a haze around what stands before such a background.
+    Lossy coding leaves a haze around objects in front of such a background.
     """
     background, share = _commonest_color(frames[:: len(frames) // 8 or 1])
-    if share < FLAT_SHARE:
+    if share < MIN_BACKGROUND_SHARE:
         return None
     options = {"lossless": True, "quality": 20, "method": 1}
-    first = _coarser(frames[0], background)
-    if len(frames) * len(encode(first, "webp", **options)) > 1.5 * FLAT_WEBP_BYTES:
+    first = _quantize_colors(frames[0], background)
+    if len(frames) * len(encode(first, "webp", **options)) > 1.5 * LOSSLESS_WEBP_BYTES:
         return None
-    coarse = np.stack([_coarser(frame, background) for frame in frames])
+    coarse = np.stack([_quantize_colors(frame, background) for frame in frames])
     data = encode(coarse, "webp", duration=FRAME_MS, loop=0, **options)
-    return data if len(data) <= FLAT_WEBP_BYTES else None
+    return data if len(data) <= LOSSLESS_WEBP_BYTES else None
 
 
-def _coarser(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Return uint8 in steps of :data:`FLAT_STEP`, but for the background."""
+def _quantize_colors(frame: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Return uint8 in steps of :data:`LOSSLESS_STEP`, but for the background."""
     levels = np.arange(256)
-    is_near = np.abs(levels[:, None] - background) <= FLAT_STEP / 2  # (256, 3)
-    coarse = np.round(np.round(levels / FLAT_STEP) * FLAT_STEP).astype(np.uint8)[frame]
+    is_near = np.abs(levels[:, None] - background) <= LOSSLESS_STEP / 2  # (256, 3)
+    coarse = np.round(np.round(levels / LOSSLESS_STEP) * LOSSLESS_STEP).astype(np.uint8)[frame]
     coarse[np.logical_and.reduce([is_near[frame[..., k], k] for k in range(3)])] = background
     return coarse
 
 
 def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
-    """(3,) uint8, and its share of all pixels (..., 3)."""
+    """Return the colour (3,) uint8, and its share of all pixels (..., 3)."""
     r, g, b = np.moveaxis(pixels.astype(np.uint32), -1, 0)
     numbers, counts = np.unique(r << 16 | g << 8 | b, return_counts=True)
     most = numbers[np.argmax(counts)]
@@ -365,19 +337,16 @@ def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
     return color, float(counts.max() / counts.sum())
 
 
-def _write_gif(path: Path, frames: Sequence[Image.Image]) -> None:
+def _write_gif(path: Path, large: np.ndarray) -> None:
+    frames = [Image.fromarray(frame) for frame in large]
+    if (width := large.shape[2]) > GIF_WIDTH:
+        size = GIF_WIDTH, max(1, round(large.shape[1] * GIF_WIDTH / width))
+        frames = [frame.resize(size, Image.Resampling.BOX) for frame in frames]
     palette = _common_palette(frames)
     first, *rest = [frame.quantize(palette=palette) for frame in frames]
     options = {"append_images": rest, "duration": FRAME_MS, "loop": 0, "optimize": False}
     with atomic_path(path) as temporary:
         first.save(temporary, "GIF", save_all=True, **options)
-
-
-def _shrink(frame: Image.Image) -> Image.Image:
-    if frame.width <= GIF_WIDTH:
-        return frame
-    height = max(1, round(frame.height * GIF_WIDTH / frame.width))
-    return frame.resize((GIF_WIDTH, height), Image.Resampling.BOX)
 
 
 def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:

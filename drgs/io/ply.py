@@ -49,80 +49,87 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 SMOOTHING = ("filter_3D",)
 COLOR = ("red", "green", "blue")
 
-NUM_REST = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
-"""Number of ``f_rest`` properties -> degree: 0, 9, 24, 45 -> 0, 1, 2, 3."""
+NUM_REST = (0, 9, 24, 45)  # ``f_rest`` properties, by SH degree
 
-ROWS_AND_COPIES = 3
-"""Memory that reading takes, in rows: Gaussians take 2.8 times theirs, from text as well."""
+MEMORY_RATIO = 3  # memory that reading takes, in bytes of the rows: measured 2.8, also from text
 
-MAX_HEADER_BYTES = 1 << 20
-"""The header of 62 properties takes 1.5 kB; the rest is room for comments."""
+MAX_HEADER_BYTES = 1 << 20  # the header of 62 properties takes 1.5 kB; the rest is for comments
 
 STATEMENT = re.compile(r"drgs ([a-z][a-z_]{0,39}) ([!-~]{1,40})")
 """A comment of ours: a name and its value. Others are ignored."""
 
 
-def read_gaussians(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Return Gaussians (:data:`drgs.io.formats.Arrays`), and the values in the header's comments.
+@FORMATS.register("ply")
+class Ply(FileFormat):
+    """The 3DGS reference's PLY."""
 
-    Properties are found by name, in any order and of any numeric type; others are ignored.
-    Positions of float64 that are far from the origin become relative to another one. Infinite
-    logits, which formats with opacities of 8 bits leave for 1 and 0, become the ends of what
-    sigmoids tell apart, with a :class:`UserNote`.
+    suffix = ".ply"
+    description = "the 3DGS reference's PLY, which every program reads"
+    has_smoothing = True
+    allows_nonfinite = True
+    metadata = None
 
-    Raises :class:`UserError` naming the file and what it lacks.
-    """
-    rows, statements = read_elements(path, ["vertex"])
-    vertex = rows["vertex"]
-    num_rest = sum(name.startswith("f_rest_") for name in vertex.dtype.names or ())
-    if num_rest not in NUM_REST:
-        raise UserError(
-            f"{path}: the number of f_rest properties must be one of {sorted(NUM_REST)} "
-            f"(SH degree 0 to 3), got {num_rest}"
-        )
-    names = (*POSITION, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
-    _require(path, vertex, names, "Gaussians")
-    means = _columns(vertex, POSITION, np.float64)
-    if vertex.dtype["x"] == np.float64:
-        with np.errstate(invalid="ignore", over="ignore"):  # of what is refused later
-            means, origin = recenter_means(means)
-        if origin != WORLD:
-            statements |= zip(ORIGIN, origin, strict=True)
-    sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)
-    gaussians = {
-        "means": means,
-        "quats": _columns(vertex, ROTATION),
-        "log_scales": _columns(vertex, SCALE),
-        "logit_opacities": _finite_logits(path, _columns(vertex, OPACITY)[:, 0]),
-        "sh0": _columns(vertex, SH0)[:, None, :],
-        "shN": np.ascontiguousarray(sh_rest.transpose(0, 2, 1)),
-    }
-    if set(SMOOTHING) <= set(vertex.dtype.names or ()):
-        gaussians["smoothing"] = _columns(vertex, SMOOTHING)[:, 0]
-    return gaussians, statements
+    @override
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        """Return Gaussians, and the values in the header's comments.
 
+        Properties are found by name, in any order and of any numeric type; others are ignored.
+        Positions of float64 that are far from the origin become relative to another one. Infinite
+        logits, which formats with opacities of 8 bits leave for 1 and 0, become the ends of what
+        sigmoids tell apart, with a :class:`UserNote`.
+        """
+        rows, statements = read_elements(path, ["vertex"])
+        vertex = rows["vertex"]
+        num_rest = sum(name.startswith("f_rest_") for name in vertex.dtype.names or ())
+        if num_rest not in NUM_REST:
+            raise UserError(
+                f"{path}: the number of f_rest properties must be one of {list(NUM_REST)} "
+                f"(SH degree 0 to 3), got {num_rest}"
+            )
+        names = (*POSITION, *SH0, *_rest(num_rest), *OPACITY, *SCALE, *ROTATION)
+        _require(path, vertex, names, "Gaussians")
+        means = _columns(vertex, POSITION, np.float64)
+        if vertex.dtype["x"] == np.float64:
+            with np.errstate(invalid="ignore", over="ignore"):  # of what is refused later
+                means, origin = recenter_means(means)
+            if origin != WORLD:
+                statements |= zip(ORIGIN, origin, strict=True)
+        sh_rest = _columns(vertex, _rest(num_rest)).reshape(len(vertex), 3, num_rest // 3)
+        gaussians = {
+            "means": means,
+            "quats": _columns(vertex, ROTATION),
+            "log_scales": _columns(vertex, SCALE),
+            "logit_opacities": _finite_logits(path, _columns(vertex, OPACITY)[:, 0]),
+            "sh0": _columns(vertex, SH0)[:, None, :],
+            "shN": np.ascontiguousarray(sh_rest.transpose(0, 2, 1)),
+        }
+        if set(SMOOTHING) <= set(vertex.dtype.names or ()):
+            gaussians["smoothing"] = _columns(vertex, SMOOTHING)[:, 0]
+        return gaussians, statements
 
-def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return a file of Gaussians as the 3DGS reference writes it, binary little-endian.
+    @override
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        """Return a file as the 3DGS reference writes it, binary little-endian."""
+        g = gaussians
+        num, num_rest = len(g["means"]), 3 * g["shN"].shape[1]
+        columns = {
+            POSITION: g["means"],
+            NORMAL: np.zeros((num, 3)),
+            SH0: g["sh0"].reshape(num, 3),
+            _rest(num_rest): g["shN"].transpose(0, 2, 1).reshape(num, num_rest),
+            OPACITY: g["logit_opacities"].reshape(num, 1),
+            SCALE: g["log_scales"],
+            ROTATION: g["quats"],
+        }
+        if "smoothing" in g:
+            columns[SMOOTHING] = g["smoothing"].reshape(num, 1)
+        rows = np.concatenate(list(columns.values()), axis=1).astype("<f4")
+        vertex = rows.view([(name, "<f4") for names in columns for name in names]).reshape(num)
+        return encode_elements({"vertex": vertex}, rendered_with)
 
-    Raises ValueError for values of ``rendered_with`` that are not of one word.
-    """
-    g = gaussians
-    num, num_rest = len(g["means"]), 3 * g["shN"].shape[1]
-    columns = {
-        POSITION: g["means"],
-        NORMAL: np.zeros((num, 3)),
-        SH0: g["sh0"].reshape(num, 3),
-        _rest(num_rest): g["shN"].transpose(0, 2, 1).reshape(num, num_rest),
-        OPACITY: g["logit_opacities"].reshape(num, 1),
-        SCALE: g["log_scales"],
-        ROTATION: g["quats"],
-    }
-    if "smoothing" in g:
-        columns[SMOOTHING] = g["smoothing"].reshape(num, 1)
-    rows = np.concatenate(list(columns.values()), axis=1).astype("<f4")
-    vertex = rows.view([(name, "<f4") for names in columns for name in names]).reshape(num)
-    return encode_elements({"vertex": vertex}, rendered_with)
+    @override
+    def recognizes(self, path: Path) -> bool:
+        return not has_packed_vertices(path)
 
 
 def encode_elements(
@@ -130,7 +137,7 @@ def encode_elements(
 ) -> bytes:
     """Return a binary little-endian file of structured arrays by name, in their order.
 
-    Raises ValueError as :func:`encode` does.
+    Raises ValueError for values of ``rendered_with`` that are not of one word.
     """
     comments = []
     for name, value in (rendered_with or {}).items():
@@ -146,13 +153,7 @@ def encode_elements(
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None.
-
-    Integer colours count from 0 to 255, or to 65535 in unsigned 16 bits; floats are taken as they
-    are.
-
-    Raises :class:`UserError` naming the file and what it lacks, as :func:`read_gaussians` does.
-    """
+    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None."""
     rows, statements = read_elements(path, ["vertex"])
     vertex = rows["vertex"]
     _require(path, vertex, POSITION, "points")
@@ -171,10 +172,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def has_packed_vertices(path: str | Path) -> bool:
-    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`.
-
-    Raises :class:`UserError` as :func:`read_elements` does for a header.
-    """
+    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`."""
     with _open_after_header(path) as (_, header):
         names = [p.name for each in header.elements for p in each.properties]
         return "chunk" in header.counts and "packed_position" in names
@@ -185,15 +183,12 @@ def read_elements(
 ) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
     """Return rows of elements as structured arrays, and the values in the header's comments.
 
-    Elements of ``names`` other than ``vertex`` may be missing.
-
-    Raises :class:`UserError` naming the file and what it lacks: it must be whole, and each of the
-    elements must have numbers only.
+    Elements of ``names`` other than ``vertex`` may be missing; they must have no lists.
     """
     with _open_after_header(path) as (file, header):
         wanted = [each for each in header.elements if each.name in names]
         size = sum(header.counts[each.name] * each.dtype().itemsize for each in wanted)
-        require_memory(path, ROWS_AND_COPIES * size, header.expected_rows)
+        require_memory(path, MEMORY_RATIO * size, header.expected_rows)
         rows = (_text_rows if header.text else _binary_rows)(path, file, header, names)
         for name in ("vertex", *(each.name for each in wanted)):
             if name not in rows or not len(rows[name]):
@@ -217,7 +212,6 @@ class _Header:
 
     @property
     def expected_rows(self) -> str:
-        """The rows, as messages name them."""
         return format_names([f"{n} of {one_line(name, 60)}" for name, n in self.counts.items()])
 
 
@@ -235,11 +229,7 @@ def _open_after_header(path: str | Path) -> Iterator[tuple[IO[bytes], _Header]]:
 
 
 def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
-    """Read the header, by plyfile, and leave the file at its end.
-
-    Refuses counts of rows that the file cannot hold, each row being a byte or more, before memory
-    is allocated for them.
-    """
+    """Read the header, by plyfile, and leave the file at its end."""
     content = file.read(MAX_HEADER_BYTES)
     newline = next((n for n in (b"\r\n", b"\r") if content.startswith(b"ply" + n)), b"\n")
     header, end, _ = content.partition(newline + b"end_header" + newline)
@@ -256,7 +246,7 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
             _, name, count = line.decode().split()
             counts[name] = int(count)
             lines[index] = b"element %s 0" % name.encode()  # plyfile is to read no rows
-            if not 0 <= counts[name] <= size:
+            if not 0 <= counts[name] <= size:  # refused before memory is allocated
                 _refuse_end(path, name, counts[name], size)
     ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b"end_header", b""])))
     return _Header(ply.elements, counts, _statements(path, lines), ply.text, ply.byte_order, size)
@@ -264,11 +254,9 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
 
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
     found: dict[str, str] = {}
-    comments = [line for line in lines if line.startswith(b"comment ")]
-    for comment in comments:
-        match = STATEMENT.fullmatch(comment.decode("ascii", "replace")[len("comment ") :].strip())
-        if match is None:
-            continue
+    comments = [line.removeprefix(b"comment ") for line in lines if line.startswith(b"comment ")]
+    texts = (comment.decode("ascii", "replace").strip() for comment in comments)
+    for match in filter(None, map(STATEMENT.fullmatch, texts)):
         name, text = match.groups()
         if found.setdefault(name, text) != text:
             raise UserError(
@@ -339,13 +327,12 @@ def _refuse_end(path: str | Path, name: str, promised: int, got: int) -> None:
     )
 
 
-def _check_end(path: str | Path, header: _Header, more: int) -> None:
-    """Refuse bytes after the last row; more: their number."""
-    if more:
+def _check_end(path: str | Path, header: _Header, num_left: int) -> None:
+    if num_left:
         raise UserError(
             f"{path}: the file must end after the rows that its header promises "
-            f"({header.expected_rows}), got {more:,} bytes more; correct the header's counts, or "
-            "get the file again"
+            f"({header.expected_rows}), got {num_left:,} bytes more; correct the header's counts, "
+            "or get the file again"
         )
 
 
@@ -389,27 +376,3 @@ def _columns(vertex: np.ndarray, names: tuple[str, ...], kind: type = np.float32
         for column, name in enumerate(names):
             rows[:, column] = vertex[name]
     return rows
-
-
-@FORMATS.register("ply")
-class Ply(FileFormat):
-    """The 3DGS reference's PLY."""
-
-    suffix = ".ply"
-    description = "the 3DGS reference's PLY, which every program reads"
-    has_smoothing = True
-    allows_nonfinite = True
-    metadata = None
-
-    @override
-    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        return read_gaussians(path)
-
-    @override
-    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-        return encode(gaussians, rendered_with)
-
-    @override
-    def recognizes(self, path: Path) -> bool:
-        """Return whether the vertices are not packed."""
-        return not has_packed_vertices(path)

@@ -1,7 +1,4 @@
-"""Numbers rounded to bits, as several file formats hold them, and the order of Gaussians in files.
-
-Arrays are of numpy, a row per Gaussian.
-"""
+"""Numbers rounded to bits, as several file formats hold them, and Morton order."""
 
 from __future__ import annotations
 
@@ -16,11 +13,9 @@ from drgs.core.memory import require_memory
 MAX_LOGIT = 23 * math.log(2)
 """Logit of the largest opacity below 1 that a sigmoid in float32 gives: 1 / (1 + 2^-23)."""
 
-MIN_LOGIT = -125 * math.log(2)
-"""Logit of about the smallest opacity that it gives: exp of less is no number in float32."""
+MIN_LOGIT = -125 * math.log(2)  # of about the smallest: exp of less is no number in float32
 
-MIN_LOG_SCALE = -126 * math.log(2)
-"""Logarithm of the smallest normal float32: what a scale of 0 becomes."""
+MIN_LOG_SCALE = -126 * math.log(2)  # of the smallest normal float32: what a scale of 0 becomes
 
 _REMAINING_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the other three components, by the index of one of four."""
@@ -31,7 +26,7 @@ def require_scene_memory(
 ) -> None:
     """Raise :class:`UserError` unless there is the memory to decode so many Gaussians.
 
-    harmonics: coefficients of each; turned: whether a format's axes are turned to ours afterwards.
+    harmonics: coefficients of each; turned: whether the axes are turned to ours afterwards.
     Measured: 276 bytes at degree 0, 808 at degree 3, and 1,372 where they are turned.
     """
     needed = count * (240 + (72 if turned else 36) * harmonics)
@@ -49,7 +44,7 @@ def opacities_from_logits(logits: np.ndarray) -> np.ndarray:
 
 
 def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
-    """Return finite logits (N,) float32 of opacities (N,) in [0, 1]."""
+    """Return logits (N,) float32 of opacities (N,); 0 and 1 become what sigmoids tell apart."""
     opacities = opacities.astype(np.float64)
     with np.errstate(divide="ignore"):
         logits = np.log(opacities) - np.log1p(-opacities)
@@ -57,7 +52,7 @@ def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
 
 
 def log_scales_from_scales(scales: np.ndarray) -> np.ndarray:
-    """Return finite logarithms (N, 3) float32 of standard deviations (N, 3) >= 0."""
+    """Return finite logarithms (N, 3) float32 of standard deviations (N, 3), also of 0."""
     with np.errstate(divide="ignore"):
         logarithms = np.log(scales.astype(np.float64))
     return np.maximum(logarithms, MIN_LOG_SCALE).astype(np.float32)
@@ -74,10 +69,7 @@ def sh0_from_colors(colors: np.ndarray) -> np.ndarray:
 
 
 def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
-    """Return quaternions (N, 4) float64 of length 1; one of length 0 is the identity.
-
-    quats: (N, 4) wxyz.
-    """
+    """Return quaternions (N, 4) wxyz, float64, of length 1; one of length 0 is the identity."""
     quats = quats.astype(np.float64)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     usable = lengths > 0
@@ -85,10 +77,7 @@ def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
 
 
 def drop_largest_component(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index (N,) of the largest component, and the other three (N, 3), in their order.
-
-    quats: (N, 4) of length 1; the sign is chosen such that the largest is positive.
-    """
+    """Return the index (N,) of the largest component, made positive, and the other three (N, 3)."""
     rows = np.arange(len(quats))
     index = np.argmax(np.abs(quats), axis=1)
     sign = np.where(quats[rows, index] < 0, -1.0, 1.0)
@@ -104,8 +93,7 @@ def restore_largest_component(index: np.ndarray, others: np.ndarray) -> np.ndarr
     return quats
 
 
-MORTON_BITS = 21
-"""Per axis: three of them in 63 bits. A cell is half a millionth of the box's longest side."""
+MORTON_BITS = 21  # per axis: a cell is half a millionth of the box's longest side
 
 _SPREAD = (
     (32, 0x1F00000000FFFF),
@@ -119,8 +107,7 @@ _SPREAD = (
 def morton_order(positions: np.ndarray) -> np.ndarray:
     """Return indices (N,) that sort positions (N, 3) along the Z-order curve; ties by index.
 
-    Morton 1966, "A computer oriented geodetic data base": the bits of the three coordinates in
-    turn.
+    Morton 1966, "A computer oriented geodetic data base".
     """
     positions = positions.astype(np.float64)
     low = positions.min(axis=0, initial=np.inf)

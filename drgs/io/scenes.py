@@ -1,7 +1,4 @@
-"""Mitsuba scenes from files and dictionaries of others; all that a command is given is loaded here.
-
-What would end the process while Mitsuba loads a scene, or have it wait for ever, is met before.
-"""
+"""Mitsuba scenes from files and dictionaries, without inputs that crash Mitsuba or make it hang."""
 
 from __future__ import annotations
 
@@ -38,7 +35,7 @@ def openexr_threads() -> Iterator[None]:
 def load_scene_file(path: Path, **definitions: str) -> mi.Object:
     """Load the scene of an XML file; definitions: values for its parameters ($name).
 
-    Raises RuntimeError as Mitsuba does, and :class:`UserError` for what Mitsuba would not survive.
+    Raises RuntimeError as Mitsuba does, and :class:`UserError` for inputs that would crash it.
     """
     for text in (str(path), *definitions.values()):
         try:

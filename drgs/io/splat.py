@@ -2,8 +2,8 @@
 
 Source of the layout: the README and ``convert.py`` of antimatter15/splat. A row has position and
 scale, 3 float32 each, then red, green, blue, opacity and the quaternion wxyz in 8 bits each, that
-as 128 (q + 1). What matters most comes first, so that a viewer shows it while it loads the rest:
-rows fall by the product of opacity and volume. There is no header.
+as 128 (q + 1). Rows fall by the product of opacity and volume, so that a viewer can show the most
+important Gaussians while it loads the rest. There is no header.
 """
 
 from __future__ import annotations
@@ -31,69 +31,9 @@ from drgs.io.quantization import (
 MAX_BYTES = 1 << 33  # largest file: 8.6 GB
 
 MAX_NUMBER = 1e12
-"""Largest position or scale: letters, read as numbers, are larger. There is no other sign by
-that would distinguish a file of another kind."""
+"""Largest position or scale: letters of a file of another kind, read as numbers, are larger."""
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-
-
-def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return a file of Gaussians; harmonics above degree 0 are left out.
-
-    Raises :class:`UserError` for positions of more than :data:`MAX_NUMBER`.
-    """
-    g = gaussians
-    if (extent := np.abs(g["means"]).max()) > MAX_NUMBER:
-        raise UserError(
-            f"the format splat holds positions of at most {MAX_NUMBER:g}, got {extent:g}; crop or "
-            "scale the scene"
-        )
-    opacities = opacities_from_logits(g["logit_opacities"])
-    log_scales = g["log_scales"].astype(np.float64)
-    importance = log_scales.sum(axis=1) + np.log(opacities)
-    rows = np.empty(len(opacities), ROW)
-    rows["mean"] = g["means"]
-    rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
-    rgba = np.column_stack([colors_from_sh0(g["sh0"]), opacities])
-    rows["rgba"] = round_to_uint32(rgba * 255, 255)
-    rows["quat"] = round_to_uint32(normalize_quaternions(g["quats"]) * 128 + 128, 255)
-    return rows[np.argsort(-importance, kind="stable")].tobytes()
-
-
-def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Return Gaussians of degree 0 (:data:`drgs.io.formats.Arrays`), and an empty dictionary.
-
-    Opacities of 0 and 1, and scales of 0, become the next ones that have logits and logarithms.
-
-    Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
-    """
-    content = read_bytes(path, "file", MAX_BYTES)
-    if not content or len(content) % ROW.itemsize:
-        raise UserError(
-            f"{Place(path, 'byte', len(content))}: the file must have {ROW.itemsize} bytes for "
-            "each Gaussian, at least one; it is damaged, or was cut off"
-        )
-    rows = np.frombuffer(content, ROW)
-    require_scene_memory(path, len(rows), 1)
-    for name, start, least in (("mean", 0, -MAX_NUMBER), ("scale", 12, 0)):
-        values = rows[name]
-        bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
-        if len(bad):
-            row, axis = bad[0]
-            at = row * ROW.itemsize + start + 4 * axis
-            raise UserError(
-                f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to {MAX_NUMBER:g}, "
-                f"got {values[row, axis]}; is it a .splat file?"
-            )
-    arrays = {
-        "means": rows["mean"],
-        "quats": rows["quat"].astype(np.float64) / 128 - 1,
-        "log_scales": log_scales_from_scales(rows["scale"]),
-        "logit_opacities": logits_from_opacities(rows["rgba"][:, 3] / 255),
-        "sh0": sh0_from_colors(rows["rgba"][:, :3] / 255),
-        "shN": np.zeros((len(rows), 0, 3)),
-    }
-    return arrays, {}
 
 
 @FORMATS.register("splat")
@@ -106,8 +46,49 @@ class Splat(FileFormat):
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        return read_gaussians(path)
+        content = read_bytes(path, "file", MAX_BYTES)
+        if not content or len(content) % ROW.itemsize:
+            raise UserError(
+                f"{Place(path, 'byte', len(content))}: the file must have {ROW.itemsize} bytes for "
+                "each Gaussian, at least one; it is damaged, or was cut off"
+            )
+        rows = np.frombuffer(content, ROW)
+        require_scene_memory(path, len(rows), 1)
+        for name, start, least in (("mean", 0, -MAX_NUMBER), ("scale", 12, 0)):
+            values = rows[name]
+            bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
+            if len(bad):
+                row, axis = bad[0]
+                at = row * ROW.itemsize + start + 4 * axis
+                raise UserError(
+                    f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to "
+                    f"{MAX_NUMBER:g}, got {values[row, axis]}; is it a .splat file?"
+                )
+        arrays = {
+            "means": rows["mean"],
+            "quats": rows["quat"].astype(np.float64) / 128 - 1,
+            "log_scales": log_scales_from_scales(rows["scale"]),
+            "logit_opacities": logits_from_opacities(rows["rgba"][:, 3] / 255),
+            "sh0": sh0_from_colors(rows["rgba"][:, :3] / 255),
+            "shN": np.zeros((len(rows), 0, 3)),
+        }
+        return arrays, {}
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-        return encode(gaussians, rendered_with)
+        g = gaussians
+        if (extent := np.abs(g["means"]).max()) > MAX_NUMBER:
+            raise UserError(
+                f"the format splat holds positions of at most {MAX_NUMBER:g}, got {extent:g}; crop "
+                "or scale the scene"
+            )
+        opacities = opacities_from_logits(g["logit_opacities"])
+        log_scales = g["log_scales"].astype(np.float64)
+        importance = log_scales.sum(axis=1) + np.log(opacities)
+        rows = np.empty(len(opacities), ROW)
+        rows["mean"] = g["means"]
+        rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
+        rgba = np.column_stack([colors_from_sh0(g["sh0"]), opacities])
+        rows["rgba"] = round_to_uint32(rgba * 255, 255)
+        rows["quat"] = round_to_uint32(normalize_quaternions(g["quats"]) * 128 + 128, 255)
+        return rows[np.argsort(-importance, kind="stable")].tobytes()

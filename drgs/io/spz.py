@@ -78,28 +78,73 @@ GZIP_LEVEL = 6  # the reference implementation's: the highest takes nine times a
 XYZW = np.array([1, 2, 3, 0])  # columns of a quaternion wxyz
 
 
-def encode(gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-    """Return a file of Gaussians, version 3.
+@FORMATS.register("spz")
+class Spz(FileFormat):
+    """Niantic's SPZ."""
 
-    Raises :class:`UserError` for positions of more than 2^23, or where most Gaussians are smaller
-    or larger than scales can be here; a :class:`UserNote` reports these.
-    """
-    g = gaussians
-    _check_scales(g["log_scales"])
-    num, degree = len(g["means"]), round(np.sqrt(g["shN"].shape[1] + 1)) - 1
-    bits = _fractional_bits(g["means"])
-    flags = ANTIALIASED if rendered_with.get("antialiased") else 0
-    parts = (
-        _packed_positions(g["means"], bits),
-        round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255),
-        round_to_uint32((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
-        round_to_uint32((g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255),
-        _packed_rotations(g["quats"]),
-        _packed_harmonics(g["shN"]),
-    )
-    header = HEADER.pack(MAGIC, WRITTEN_VERSION, num, degree, bits, flags, 0)
-    content = b"".join([header, *(part.astype("u1").tobytes() for part in parts)])
-    return gzip.compress(content, GZIP_LEVEL, mtime=0)
+    suffix = ".spz"
+    description = "Niantic's SPZ, the smallest"
+    up = "y"
+    metadata = frozenset({"antialiased"})
+
+    @override
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        """Return Gaussians, y up, and whether ``antialiased``.
+
+        Extensions of vendors are passed over, with a :class:`UserNote`.
+        """
+        content = read_bytes(path, "file", MAX_BYTES)
+        if content.startswith(GZIP_MAGIC):
+            header, parts = _read_gzip(path, content)
+        elif content.startswith(MAGIC):
+            header, parts = _read_streams(path, content)
+        else:
+            raise UserError(
+                f"{Place(path, 'byte', 0)}: must begin as gzip does, or with {MAGIC.decode()}: "
+                "not an SPZ file"
+            )
+        if header.flags & EXTENSIONS:
+            note = "has extensions of a vendor, which are passed over; one may mean other axes"
+            warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
+        positions, opacities, colors, scales, rotations, harmonics = (
+            np.frombuffer(part, "u1").reshape(header.num, -1) if part else np.zeros((header.num, 0))
+            for part in parts
+        )
+        arrays = {
+            "means": _unpacked_positions(positions) / 2.0**header.fractional_bits,
+            "quats": _unpacked_rotations(rotations, header.version),
+            "log_scales": scales / SCALE_STEPS + LOG_SCALE_LOW,
+            "logit_opacities": logits_from_opacities(opacities[:, 0] / 255),
+            "sh0": ((colors / 255 - 0.5) / COLOR_SCALE)[:, None, :],
+            "shN": (harmonics.astype(np.float32).reshape(header.num, -1, 3) - 128) / 128,
+        }
+        return arrays, {"antialiased": True} if header.flags & ANTIALIASED else {}
+
+    @override
+    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
+        """Return a file of version 3.
+
+        Raises :class:`UserError` where most Gaussians are smaller or larger than scales can be; a
+        :class:`UserNote` reports fewer.
+        """
+        g = gaussians
+        _check_scales(g["log_scales"])
+        num, degree = len(g["means"]), round(np.sqrt(g["shN"].shape[1] + 1)) - 1
+        bits = _fractional_bits(g["means"])
+        flags = ANTIALIASED if rendered_with.get("antialiased") else 0
+        parts = (
+            _packed_positions(g["means"], bits),
+            round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255),
+            round_to_uint32((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
+            round_to_uint32(
+                (g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255
+            ),
+            _packed_rotations(g["quats"]),
+            _packed_harmonics(g["shN"]),
+        )
+        header = HEADER.pack(MAGIC, WRITTEN_VERSION, num, degree, bits, flags, 0)
+        content = b"".join([header, *(part.astype("u1").tobytes() for part in parts)])
+        return gzip.compress(content, GZIP_LEVEL, mtime=0)
 
 
 def _check_scales(log_scales: np.ndarray) -> None:
@@ -160,8 +205,6 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Header:
-    """Content of the header, before the numbers."""
-
     version: int
     num: int
     degree: int
@@ -174,42 +217,6 @@ class _Header:
         rotation = 4 if self.version >= 3 else 3
         harmonics = 3 * ((self.degree + 1) ** 2 - 1)
         return tuple(self.num * size for size in (9, 1, 3, 3, rotation, harmonics))
-
-
-def read_gaussians(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Return Gaussians (:data:`drgs.io.formats.Arrays`), y up, and whether ``antialiased``.
-
-    Opacities of 0 and 1 become the next ones that sigmoids tell apart. Extensions of vendors are
-    passed over, with a :class:`UserNote`.
-
-    Raises :class:`UserError` naming the file, the byte, what was expected and what was got.
-    """
-    content = read_bytes(path, "file", MAX_BYTES)
-    if content.startswith(GZIP_MAGIC):
-        header, parts = _read_gzip(path, content)
-    elif content.startswith(MAGIC):
-        header, parts = _read_streams(path, content)
-    else:
-        raise UserError(
-            f"{Place(path, 'byte', 0)}: must begin as gzip does, or with {MAGIC.decode()}: not an "
-            "SPZ file"
-        )
-    if header.flags & EXTENSIONS:
-        note = "has extensions of a vendor, which are passed over; one may mean other axes"
-        warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
-    positions, opacities, colors, scales, rotations, harmonics = (
-        np.frombuffer(part, "u1").reshape(header.num, -1) if part else np.zeros((header.num, 0))
-        for part in parts
-    )
-    arrays = {
-        "means": _unpacked_positions(positions) / 2.0**header.fractional_bits,
-        "quats": _unpacked_rotations(rotations, header.version),
-        "log_scales": scales / SCALE_STEPS + LOG_SCALE_LOW,
-        "logit_opacities": logits_from_opacities(opacities[:, 0] / 255),
-        "sh0": ((colors / 255 - 0.5) / COLOR_SCALE)[:, None, :],
-        "shN": (harmonics.astype(np.float32).reshape(header.num, -1, 3) - 128) / 128,
-    }
-    return arrays, {"antialiased": True} if header.flags & ANTIALIASED else {}
 
 
 def _unpacked_positions(rows: np.ndarray) -> np.ndarray:
@@ -291,39 +298,15 @@ def _read_streams(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
             f"{Place(path, 'byte', 15)}: a table of {len(sizes)} streams within the file was "
             f"expected, got {num_streams} at byte {table:,}; the file is damaged, or was cut off"
         )
-    parts = []
+    zstandard, parts = require_module("zstandard", "spz", f"{path}: an SPZ file of version 4"), []
     for index, size in enumerate(sizes):
         packed, _ = TABLE_ENTRY.unpack_from(content, table + index * TABLE_ENTRY.size)
         place = Place(path, "byte", start)
         part = _checked_size(place, content[start : start + packed], packed)
-        parts.append(_unpacked_stream(place, part, size))
+        try:
+            stream = zstandard.ZstdDecompressor().stream_reader(part)
+            parts.append(_checked_size(place, stream.read(size), size))
+        except zstandard.ZstdError as error:
+            raise UserError(f"{place}: the Zstandard stream is damaged: {error}") from None
         start += packed
     return header, parts + [b""] * (len(header.sizes) - len(parts))
-
-
-def _unpacked_stream(place: Place, packed: bytes, expected: int) -> bytes:
-    what = f"{place.path}: an SPZ file of version 4"
-    zstandard = require_module("zstandard", "spz", what)
-    try:
-        stream = zstandard.ZstdDecompressor().stream_reader(packed)
-        return _checked_size(place, stream.read(expected), expected)
-    except zstandard.ZstdError as error:
-        raise UserError(f"{place}: the Zstandard stream is damaged: {error}") from None
-
-
-@FORMATS.register("spz")
-class Spz(FileFormat):
-    """Niantic's SPZ."""
-
-    suffix = ".spz"
-    description = "Niantic's SPZ, the smallest"
-    up = "y"
-    metadata = frozenset({"antialiased"})
-
-    @override
-    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        return read_gaussians(path)
-
-    @override
-    def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-        return encode(gaussians, rendered_with)

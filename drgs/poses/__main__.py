@@ -19,13 +19,13 @@ from drgs.cli.progress import RunProgress
 from drgs.config.schema import DataConfig
 from drgs.core.errors import format_names
 from drgs.datasets.folders import find_reader
+from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.poses.structure_from_motion import (
     ALL_PAIRS,
-    CAMERA_MODELS,
     NEIGHBOURS,
-    Placed,
-    Search,
-    place,
+    SfmResult,
+    SfmSettings,
+    reconstruct,
 )
 
 MAX_NAMES = 5  # photographs without a camera, and cameras, that are named
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
-    usual = Search()
+    usual = SfmSettings()
     parser.description = "Find out where photographs were taken, by COLMAP's structure from motion."
     parser.show_examples("%(prog)s photographs", "%(prog)s photographs --camera-model RADIAL")
     parser.add_argument(
@@ -46,10 +46,10 @@ def add_arguments(parser: CommandParser) -> None:
     )
     parser.add_argument(
         "--camera-model",
-        choices=CAMERA_MODELS,
+        choices=LENS_OF_MODEL,
         default=usual.camera_model,
         metavar="MODEL",
-        help=f"COLMAP's name of the lens: {', '.join(CAMERA_MODELS)} (default: %(default)s)",
+        help=f"COLMAP's name of the lens: {', '.join(LENS_OF_MODEL)} (default: %(default)s)",
     )
     parser.add_argument(
         "--share",
@@ -74,10 +74,10 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
     started = time.perf_counter()
-    search = Search(args.camera_model, args.compare, args.share)
+    settings = SfmSettings(args.camera_model, args.compare, args.share)
     with ExitStack() as stack:
-        placed = place(args.folder, search, args.overwrite, _Steps(stack).update)
-    print(description_of(placed, search))
+        result = reconstruct(args.folder, settings, args.overwrite, _Steps(stack).update)
+    print(description_of(result, settings))
     print(f"written: {args.folder / 'sparse' / '0'} in {time.perf_counter() - started:.0f} s")
     print(f"continue with: {fit_command(args.folder)}")
 
@@ -90,22 +90,21 @@ def fit_command(folder: Path) -> str:
     return shlex.join(words)
 
 
-def description_of(placed: Placed, search: Search) -> str:
+def description_of(result: SfmResult, settings: SfmSettings) -> str:
     """Describe the result, and how to place more photographs."""
-    count, total = len(placed.names), len(placed.names) + len(placed.missing)
+    count, total = len(result.names), len(result.names) + len(result.missing)
     lines = [
-        f"{count} of {total} photographs placed, mean reprojection error {placed.error:.2f} px, "
-        f"{placed.num_points:,} points",
-        *(f"camera: {camera}" for camera in placed.cameras[:MAX_NAMES]),
+        f"{count} of {total} photographs placed, mean reprojection error {result.error:.2f} px, "
+        f"{result.num_points:,} points",
+        *(f"camera: {camera}" for camera in result.cameras[:MAX_NAMES]),
     ]
-    if placed.missing:
-        lines.append(f"without a camera: {format_names(placed.missing, MAX_NAMES)}")
-        others = placed.num_models - 1
-        if others:
+    if result.missing:
+        lines.append(f"without a camera: {format_names(result.missing, MAX_NAMES)}")
+        if others := result.num_models - 1:
             lines.append(f"smaller models that do not hang together with this one: {others}")
         lines.append(
             "photographs that show what lies between would place them; so may "
-            f"{search.alternative_options(total)}"
+            f"{settings.alternative_options(total)}"
         )
     return "\n".join(lines)
 
@@ -117,7 +116,6 @@ class _Steps:
         self._stack, self._what, self._most = stack, "", 0
 
     def update(self, what: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` items are done."""
         if what != self._what:
             self._stack.close()
             self._what, self._most = what, -1

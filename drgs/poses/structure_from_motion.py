@@ -32,13 +32,10 @@ from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
-from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.io.images import check_readable, image_size, write_png
 
 if TYPE_CHECKING:
     import pycolmap
-
-CAMERA_MODELS = tuple(LENS_OF_MODEL)
 
 SIMPLE = "SIMPLE_RADIAL"  # the model with the fewest parameters that suits photographs
 
@@ -48,13 +45,12 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 ALL_PAIRS = 100  # most photographs of which every two are compared by default
 
 NEIGHBOURS, STRIDE = 10, 8
-"""Pairs of more photographs: each with so many that follow it by name and those at distances of
-powers of two, and every so many-th with each other."""
+"""Pairs of more photographs: each with NEIGHBOURS that follow it by name and those at distances of
+powers of two, and every STRIDE-th with each other."""
 
 PHOTOGRAPHS_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # per call of COLMAP, which uses all cores within one
 
-MAX_SIDE_PX = 3200
-"""Features are extracted from photographs scaled down to this, which is COLMAP's default."""
+MAX_SIDE_PX = 3200  # of photographs for features, COLMAP's default: larger ones are scaled down
 
 MIN_PHOTOGRAPHS = 3  # photographs with which there is a model at all
 
@@ -68,21 +64,19 @@ TEMPORARY = ".drgs-poses-"  # beginning of the names of temporary folders
 SEED = 0
 
 REMEDY = "if memory or the disk is full, free some of it, or take fewer or smaller photographs"
-"""Remedy where COLMAP gives up, which does not always tell the reason."""
 
 T = TypeVar("T")
 
-Watch = Callable[[str, int, int], None]
-"""Takes the name of what is counted, the number done, and the total."""
+Progress = Callable[[str, int, int], None]  # takes name of the items, number done, and total
 
 
 @dataclass(frozen=True)
-class Search:
+class SfmSettings:
     """Settings of structure from motion."""
 
-    camera_model: str = "OPENCV"  # of CAMERA_MODELS
+    camera_model: str = "OPENCV"  # of drgs.datasets.transforms.LENS_OF_MODEL
     compare: str = "auto"  # pairs: all, neighbours by name, or auto: by ALL_PAIRS
-    share: str = "alike"  # a camera for all of the same size and EXIF (alike), for one, for each
+    share: str = "alike"  # one camera for all, for all of the same size and EXIF (alike), for each
 
     def compares_all(self, count: int) -> bool:
         """Return whether every two of ``count`` photographs are compared."""
@@ -100,7 +94,7 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Placed:
+class SfmResult:
     """Result of structure from motion."""
 
     names: tuple[str, ...]  # of the photographs that have a camera
@@ -114,8 +108,9 @@ class Placed:
 def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     """Return the folder of photographs, ``folder/images`` or ``folder``, and their names there.
 
-    Those that COLMAP does not read are left out, with a :class:`UserNote`. Raises
-    :class:`UserError` where there are no others, or one that cannot be fitted.
+    Photographs that COLMAP does not read are left out, with a :class:`UserNote`.
+
+    Raises :class:`UserError` where there are none, or one that cannot be fitted.
     """
     below = folder / "images"
     photographs = below if below.is_dir() else folder
@@ -140,7 +135,7 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
         note = f"{photographs}: left out, as COLMAP does not read them: {others}"
         warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
-        check_readable(file)  # what a fit refuses is refused before hours of work
+        check_readable(file)  # a fit would refuse it after hours of work
         if os.fsencode(file) != str(file).encode(errors="replace"):
             raise UserError(f"{file}: COLMAP knows names in UTF-8 only; rename it")
     return photographs, [file.relative_to(photographs).as_posix() for file in files]
@@ -152,30 +147,31 @@ def _numeric_order(file: Path) -> list[tuple[int, str]]:
     return [(int(part[:18]), part) if part.isdecimal() else (0, part) for part in parts]
 
 
-def place(folder: Path, search: Search, replace: bool, watch: Watch) -> Placed:
+def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progress) -> SfmResult:
     """Write ``folder/sparse/0``, COLMAP's model of the photographs in ``folder``.
 
-    replace: the model that is there, if it was written here. Nothing is written where none is
-    found, and other files in that folder stay.
+    replace: the model that is there, if it was written here; other files in that folder stay.
 
-    Raises :class:`UserError`, with what to do, where no cameras are found, where a model is there
-    that is not to be replaced, and while another process writes to ``folder``.
+    Raises :class:`UserError` where no cameras are found, where a model is there that is not to be
+    replaced, and while another process writes to ``folder``.
     """
     photographs, names = photographs_in(folder)
     model = folder / "sparse" / "0"
     with DeferredInterrupts() as interrupts, sole_writer(folder) as keep:
         _check_free(folder, model, replace)
         try:
-            if keep():
-                _remove_left_behind(folder, model)
+            if keep():  # remove files of runs that were killed
+                for path in (folder, model.parent, model):
+                    for left in path.glob(f"{TEMPORARY}*"):
+                        shutil.rmtree(left, ignore_errors=True)
             # On the disk to which the files are moved.
             parent = next(path for path in (model, *model.parents) if path.is_dir())
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
                 found = run_in_child(
-                    _find, search, photographs, folder, names, Path(temporary),
+                    _reconstruct_in_child, settings, photographs, folder, names, Path(temporary),
                     watch=watch, interrupts=interrupts,
                 )  # fmt: skip
-                _put(Path(temporary, "model"), model)
+                _install_model(Path(temporary, "model"), model)
         except BrokenPipeError:  # of the output, whose reader has gone
             raise
         except OSError as error:
@@ -201,40 +197,29 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
     FolderRecord(model, COMMAND).check(MODEL_FILES)
 
 
-def _remove_left_behind(folder: Path, model: Path) -> None:
-    """Remove temporary files of runs that were killed; to be called by the only writer."""
-    for path in (folder, model.parent, model):
-        for left in path.glob(f"{TEMPORARY}*"):
-            shutil.rmtree(left, ignore_errors=True)
-
-
-def _put(written: Path, model: Path) -> None:
-    """Move the files of a model to their place, where an earlier one is replaced.
-
-    Before the first of them is in place the last one is gone: there is no mixture of two models.
-    """
+def _install_model(written: Path, model: Path) -> None:
     record = FolderRecord(model, COMMAND)
     record.claim(MODEL_FILES)
-    (model / MODEL_FILES[-1]).unlink(missing_ok=True)
+    (model / MODEL_FILES[-1]).unlink(missing_ok=True)  # first: there is no mixture of two models
     for name in MODEL_FILES:
         (written / name).replace(model / name)
     record.seal()
 
 
-def _find(
-    search: Search,
+def _reconstruct_in_child(
+    settings: SfmSettings,
     photographs: Path,
     dataset: Path,
     names: Sequence[str],
     folder: Path,
-    watch: Watch,
-) -> Placed:
+    watch: Progress,
+) -> SfmResult:
     """Write ``folder/model``: the function of the child process."""
     pycolmap = require_module("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # errors are reported below
     try:
         found, count = _Reconstruction(
-            pycolmap, folder, photographs, dataset, names, search, watch
+            pycolmap, folder, photographs, dataset, names, settings, watch
         ).largest()
         written = folder / "model"
         written.mkdir()
@@ -256,8 +241,8 @@ class _Reconstruction:
     photographs: Path
     dataset: Path  # which may have masks
     names: Sequence[str]
-    search: Search
-    watch: Watch
+    settings: SfmSettings
+    watch: Progress
 
     def largest(self) -> tuple[pycolmap.Reconstruction, int]:
         """Return the largest reconstruction, and the number of all."""
@@ -274,7 +259,7 @@ class _Reconstruction:
                 f"{self.photographs}: no cameras were found; take more photographs, neither "
                 "blurred nor of something plain, each showing most of what its neighbours show, "
                 "while walking around (not turning on the spot), or try "
-                f"{self.search.alternative_options(len(self.names))}"
+                f"{self.settings.alternative_options(len(self.names))}"
             )
         return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), len(models)
 
@@ -299,7 +284,7 @@ class _Reconstruction:
         masks = self._masks_for_all()
         for group in self._groups():
             reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = self.search.camera_model
+            reader.camera_model = self.settings.camera_model
             if masks is not None:
                 reader.mask_path = masks
             sizes = PHOTOGRAPHS_AT_ONCE, done, len(self.names)
@@ -318,7 +303,7 @@ class _Reconstruction:
     def _groups(self) -> list[list[str]]:
         """Return groups of the names of photographs that share a camera."""
         sizes = sorted({image_size(self.photographs / name) for name in self.names})
-        if self.search.share == "one" and len(sizes) > 1:
+        if self.settings.share == "one" and len(sizes) > 1:
             (w, h), (other_w, other_h), *_ = sizes
             raise UserError(
                 f"{self.photographs}: photographs that share one camera must have one size, got "
@@ -326,7 +311,7 @@ class _Reconstruction:
             )
         groups: dict[object, list[str]] = {}
         for name in self.names:
-            key = {"one": 0, "each": name}.get(self.search.share)
+            key = {"one": 0, "each": name}.get(self.settings.share)
             key = _size_and_lens(self.photographs / name) if key is None else key
             groups.setdefault(key, []).append(name)
         return list(groups.values())
@@ -343,9 +328,9 @@ class _Reconstruction:
         return cameras[names[0]]
 
     def _masks_for_all(self) -> Path | None:
-        """Return a folder with a mask for each photograph, as a fit reads it; None: there are none.
+        """Return a folder with a mask for each photograph; None: there are none.
 
-        White for photographs without a mask, which COLMAP would leave out.
+        Photographs without one, which COLMAP would leave out, have white ones.
         """
         masks = masks_of(self.dataset, self.names, [], self.photographs)
         if not any(masks):
@@ -359,10 +344,9 @@ class _Reconstruction:
         return folder
 
     def _match(self) -> None:
-        """Compare pairs.
+        """Compare pairs, for which photographs are named by numbers.
 
-        COLMAP's lists of pairs have spaces between names, which may hold some themselves: for as
-        long as they are compared, photographs are called by their numbers.
+        COLMAP's lists of pairs have spaces between names, which may contain some.
         """
         pycolmap, pairs = self.pycolmap, list(self._pairs())
         options = pycolmap.ImportedPairingOptions()
@@ -383,14 +367,13 @@ class _Reconstruction:
 
     def _pairs(self) -> Iterator[tuple[int, int]]:
         count = len(self.names)
-        compares_all = self.search.compares_all(count)
+        compares_all = self.settings.compares_all(count)
         steps = {*range(1, NEIGHBOURS + 1), *(2**k for k in range(count.bit_length()))}
         for i, j in combinations(range(count), 2):
             if compares_all or j - i in steps or (i % STRIDE == 0 and j % STRIDE == 0):
                 yield i, j
 
     def _map(self) -> list[pycolmap.Reconstruction]:
-        """Reconstruct cameras and points."""
         options = self.pycolmap.IncrementalPipelineOptions()
         options.random_seed = SEED
         total, placed = len(self.names), 0
@@ -412,7 +395,7 @@ class _Reconstruction:
 
 
 def _size_and_lens(file: Path) -> tuple[object, ...]:
-    """Return the same for photographs of one size and, as far as EXIF shows, one lens."""
+    """Return a key of photographs of one size and, as far as EXIF shows, one lens."""
     tags = ExifTags.Base
     try:
         with Image.open(file) as image:
@@ -424,7 +407,7 @@ def _size_and_lens(file: Path) -> tuple[object, ...]:
     return *image_size(file), *map(str, lens)
 
 
-def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> Placed:
+def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> SfmResult:
     placed = {image.name for image in found.images.values() if image.has_pose}
     cameras = tuple(
         f"{camera.model.name} {camera.width} x {camera.height} px "
@@ -432,7 +415,7 @@ def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models:
         f"{', '.join(f'{value:.5g}' for value in camera.params)})"
         for _, camera in sorted(found.cameras.items())
     )
-    return Placed(
+    return SfmResult(
         names=tuple(name for name in names if name in placed),
         missing=tuple(name for name in names if name not in placed),
         cameras=cameras,

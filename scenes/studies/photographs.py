@@ -29,13 +29,13 @@ from drgs.bench.output import machine, markdown_table
 from drgs.config.schema import FitConfig
 from drgs.core.environment import require_module
 from drgs.datasets import load_dataset
-from drgs.datasets.colmap import image_folder, model_folder
+from drgs.datasets.colmap import image_folder, require_model
 from drgs.datasets.folders import config_for, find_reader
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
 from drgs.io.images import image_size, read_image, write_png
-from drgs.poses.structure_from_motion import Search, place
+from drgs.poses.structure_from_motion import SfmSettings, reconstruct
 from drgs.results.files import GAUSSIANS
 from drgs.results.folder import load_run_config
 from drgs.results.metrics import mean_of
@@ -62,7 +62,7 @@ def undistort(config: FitConfig, folder: Path) -> Path:
     It has no masks: COLMAP undistorts photographs alone.
     """
     pycolmap = require_module("pycolmap", "colmap", "undistorting")
-    model = model_folder(config.data.path)
+    _, model = require_model(config.data.path)
     renders = image_folder(config.data, read_model(model))
     found = pycolmap.Reconstruction(str(model))
     sizes = {}
@@ -94,9 +94,9 @@ def find_cameras(config: FitConfig, folder: Path) -> Path:
             mask = folder / "masks" / f"{name}.png"
             mask.parent.mkdir(parents=True, exist_ok=True)
             write_png(mask, read_image(files["mask"])[:, :, :3])
-    placed = place(folder, Search(), True, lambda *_: None)
-    count = len(placed.names)
-    print(f"placed {count} of {count + len(placed.missing)}, error {placed.error:.2f} px")
+    found = reconstruct(folder, SfmSettings(), True, lambda *_: None)
+    count = len(found.names)
+    print(f"placed {count} of {count + len(found.missing)}, error {found.error:.2f} px")
     return folder
 
 
@@ -152,7 +152,7 @@ def main() -> None:
         metrics = fit_words(words, folder / "fit", args.threads)
         name, as_taken = case.name, ""
         if case.has_own_world:
-            name += f" ({len(read_model(model_folder(data)).images)} placed)"
+            name += f" ({len(read_model(require_model(data)[1]).images)} placed)"
         else:
             as_taken = f"{psnr_as_taken(folder / 'fit', config):.2f} dB"
         quality = f"{metrics['test']['psnr']:.2f} dB", f"{metrics['test']['ssim']:.4f}"

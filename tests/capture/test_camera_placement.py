@@ -98,7 +98,7 @@ def test_a_place_around_the_scene_that_is_given_is_kept():
 # Sensors of the scene
 
 
-def test_one_sensor_says_up_distance_target_and_field_of_view():
+def test_one_sensor_decides_up_distance_target_and_field_of_view():
     # It looks past the middle at (1.5, 2, 3); the film's smaller side spans 30 degrees.
     seen_from = sensor((1.5, 2, 9), (1.5, 2, 3), fov=30.0, width=16)
     seen_from["fov_axis"] = "smaller"
@@ -160,7 +160,7 @@ def test_many_sensors_take_the_images_themselves():
 
 
 @pytest.mark.parametrize("name", ["views", "test_views", "target", "distance", "fov", "azimuth"])
-def test_sensors_leave_nothing_to_be_placed(name):
+def test_placement_options_are_refused_with_sensors(name):
     values = {"views": 3, "test_views": 1, "target": (0.0, 0.0, 0.0), "distance": 2.0, "fov": 0.5}
     value = values.get(name, (0.0, 1.0))
     scene = loaded(ball=BALL, sky=SKY, **ring(12))

@@ -3,9 +3,9 @@
 import pytest
 
 from drgs.poses import __main__ as poses
-from drgs.poses.structure_from_motion import Placed, Search
+from drgs.poses.structure_from_motion import SfmResult, SfmSettings
 
-FOUND = Placed(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
+FOUND = SfmResult(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
 
 
 @pytest.fixture
@@ -15,13 +15,13 @@ def run(tmp_path, monkeypatch, capsys):
     def command(found, *options):
         asked = []
 
-        def place(folder, search, replace, watch):
+        def reconstruct(folder, search, replace, watch):
             for done in (0, 1, 2, 1, 2):  # of two models
                 watch("camera", done, 2)
             asked.append((folder, search, replace))
             return found
 
-        monkeypatch.setattr(poses, "place", place)
+        monkeypatch.setattr(poses, "reconstruct", reconstruct)
         monkeypatch.setattr(poses, "find_reader", lambda config: ("colmap", None))
         poses.main([str(tmp_path), *options])
         return asked[0], capsys.readouterr().out.splitlines()
@@ -31,7 +31,7 @@ def run(tmp_path, monkeypatch, capsys):
 
 def test_what_was_found_is_said(run, tmp_path):
     asked, lines = run(FOUND)
-    assert asked == (tmp_path, Search(), False)
+    assert asked == (tmp_path, SfmSettings(), False)
     *progress, found, camera, written, following = lines
     assert progress == ["camera 2/2  left 0:00"]
     assert found == "2 of 2 photographs placed, mean reprojection error 0.46 px, 1,234 points"
@@ -42,7 +42,7 @@ def test_what_was_found_is_said(run, tmp_path):
 
 def test_photographs_without_a_camera_are_named(run):
     missing = tuple(f"{k}.jpg" for k in range(7))
-    found = Placed(("a.jpg",), missing, ("x", "y"), 9, 1.0, 3)
+    found = SfmResult(("a.jpg",), missing, ("x", "y"), 9, 1.0, 3)
     _, lines = run(found)
     text = "\n".join(lines)
     assert "1 of 8 photographs placed" in text and "camera: x\ncamera: y" in text
@@ -54,7 +54,7 @@ def test_photographs_without_a_camera_are_named(run):
 def test_options_say_how_to_search(run):
     options = ["--camera-model", "RADIAL", "--share", "one", "--compare", "neighbours"]
     asked, _ = run(FOUND, *options, "--overwrite")
-    assert asked[1:] == (Search("RADIAL", "neighbours", "one"), True)
+    assert asked[1:] == (SfmSettings("RADIAL", "neighbours", "one"), True)
 
 
 def test_a_wrong_option_is_refused(run, capsys):

@@ -360,7 +360,6 @@ def test_a_photograph_is_found_under_nearly_its_name(tmp_path, call, is_said):
 
 
 def test_a_file_is_not_taken_for_two_photographs(tmp_path):
-    """Nor one that another is called by, nor one of several: none of these is the only one."""
     write_binary(tmp_path / "sparse" / "0", some(["a.jpg", "A.tif", "b.jpg", "c.jpg", "d.bmp"]))
     write_images(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
     dataset, notes = load_noting(tmp_path)
@@ -370,7 +369,6 @@ def test_a_file_is_not_taken_for_two_photographs(tmp_path):
 
 @pytest.mark.parametrize("below", ["sparse/0", "."])
 def test_test_views_are_those_of_a_list(tmp_path, below):
-    """The list is the one that the 3DGS reference reads."""
     write_dataset(tmp_path)
     (tmp_path / below / "test.txt").write_text("\ufeff# held out\r\nb.jpg\r\ncam/2.png\r\n")
     dataset, notes = load_noting(tmp_path)
@@ -446,7 +444,6 @@ def test_an_image_that_was_turned_since_is_turned_as_exif_says(tmp_path):
 
 
 def test_an_image_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
-    """Its size does not tell, but COLMAP turns nothing."""
     pycolmap = pytest.importorskip("pycolmap")
     write_dataset(tmp_path)
     exif = Image.Exif()

@@ -423,7 +423,7 @@ def test_equal_file_names_in_two_folders_stay_apart(photographs):
 
 
 # Keys and files that are passed over are said
-def test_keys_that_are_not_read_are_said_once(photographs):
+def test_unread_keys_are_reported_once(photographs):
     path = photographs / "transforms.json"
 
     def change(meta):
@@ -436,7 +436,7 @@ def test_keys_that_are_not_read_are_said_once(photographs):
     assert notes == [f"{path}: keys that are not read: from_na, skew, frames[].exposure"]
 
 
-def test_files_from_outside_of_the_folder_are_said_once(photographs, tmp_path_factory):
+def test_files_outside_of_the_folder_are_reported_once(photographs, tmp_path_factory):
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     (photographs / "images" / "03.png").rename(elsewhere / "03.png")
     (photographs / "images" / "03.png").symlink_to(elsewhere / "03.png")
@@ -449,7 +449,7 @@ def test_files_from_outside_of_the_folder_are_said_once(photographs, tmp_path_fa
     assert "files from outside of the folder: 10 (" in note
 
 
-def test_equal_and_empty_photographs_are_said(photographs):
+def test_equal_and_empty_photographs_are_reported(photographs):
     images = photographs / "images"
     (images / "05.png").write_bytes((images / "03.png").read_bytes())
     (images / "08.png").write_bytes((images / "02.png").read_bytes())  # 08 is measured on
@@ -463,7 +463,7 @@ def test_equal_and_empty_photographs_are_said(photographs):
     ]
 
 
-def test_a_photograph_that_is_listed_twice_is_said(photographs):
+def test_a_photograph_that_is_listed_twice_is_reported(photographs):
     edit(photographs / "transforms.json", lambda m: m["frames"].append(m["frames"][4]))
     assert load_noting(photographs)[1] == [
         f"{photographs}: the same photograph more than once: 1 (images/05.png = images/05.png)"
@@ -518,7 +518,7 @@ def test_depths_and_masks_are_found_under_nearly_their_names(photographs):
         (lambda name: f"images\\{name}", "Images"),
     ],
 )
-def test_photographs_are_found_where_they_lie_now(photographs, call, folder):
+def test_photographs_that_were_moved_are_found(photographs, call, folder):
     def change(meta):
         for frame in meta["frames"]:
             frame["file_path"] = call(frame["file_path"].removeprefix("images/"))
@@ -544,7 +544,7 @@ def test_one_photograph_of_two_is_too_few(photographs):
     assert refusal(photographs).endswith("; not there: 1 of 2 photographs")
 
 
-def test_keys_of_other_layouts_are_said_not_to_be_read(blender):
+def test_keys_of_other_layouts_are_reported_as_unread(blender):
     path = blender[0] / "transforms_train.json"
     edit(path, lambda m: m.update(cx=2.5, w=6, h=4, ply_file_path="a.ply", near=1))
     edit(path, lambda m: m.update(train_filenames=["a"], frames=[{**m["frames"][0], "fl_x": 9.0}]))
@@ -555,7 +555,6 @@ def test_keys_of_other_layouts_are_said_not_to_be_read(blender):
 
 
 def test_a_note_on_a_strange_name_is_one_line(photographs):
-    """Which load_noting checks."""
     (photographs / "images" / "03.png").rename(photographs / "images" / "a\nb.png")
     (photographs / "images" / "04.png").write_bytes(
         (photographs / "images" / "a\nb.png").read_bytes()

@@ -34,7 +34,6 @@ def change(folder, function):
 
 
 def differences(folder, function, **settings):
-    """Between the data before and after it is changed."""
     before = fingerprint_of(load(folder))
     function()
     return before.differences(fingerprint_of(load(folder, **settings)))
@@ -61,7 +60,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("text", CHANGES)
-def test_what_a_frame_says_is_named(rich, text):
+def test_changes_of_a_frame_are_named(rich, text):
     function = CHANGES[text]
     found = differences(rich, lambda: change(rich, lambda meta: function(meta["frames"][FRAME])))
     assert found == [text.strip()]
@@ -71,12 +70,11 @@ def test_what_a_frame_says_is_named(rich, text):
     ("name", "what"), [("mask.png", "mask"), ("depth.npy", "depth"), ("images/05.png", "image")]
 )
 def test_the_content_of_each_file_counts(rich, name, what):
-    """Though the pixels may be the same: bytes are compared."""
     found = differences(rich, lambda: (rich / name).open("ab").write(b"\0"))
     assert found == [f"the {what} of training view 05"]
 
 
-def test_what_is_not_read_does_not_count(rich):
+def test_ignored_files_do_not_count(rich):
     settings = {"ignore_masks": True, "ignore_depth": True}
     prints = [fingerprint_of(load(rich, **settings))]
     for name in ("mask.png", "depth.npy"):

@@ -70,7 +70,7 @@ def test_transforms_json_is_recognised(photographs):
     assert "cameras of transforms.json" in reasons
 
 
-def test_what_is_given_is_not_chosen(tmp_path):
+def test_given_values_are_not_chosen(tmp_path):
     write_dataset(tmp_path)
     config, _ = config_for(tmp_path, ["data.image_size=100", "iterations=30", "seed=3"])
     assert (config.data.image_size, config.iterations, config.seed) == (100, 30, 3)

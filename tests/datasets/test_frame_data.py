@@ -23,7 +23,6 @@ def frame_of(meta, name="01.png"):
 
 
 def give(folder, name="01.png", **values):
-    """Values of one photograph's frame."""
     edit(folder / "transforms.json", lambda m: frame_of(m, name).update(values))
 
 
@@ -152,7 +151,7 @@ def test_a_mask_may_be_an_alpha_channel_or_any_colour(photographs):
     assert dataset.description.endswith("; masks of 5 of 10 photographs")
 
 
-def test_a_folder_of_masks_that_nothing_names_is_said_not_to_count(photographs):
+def test_a_folder_of_unnamed_masks_is_reported(photographs):
     (photographs / "masks").mkdir()
     iio.imwrite(photographs / "masks" / "01.png", GREY_MASK)
     dataset, (note,) = load_noting(photographs)
@@ -248,7 +247,7 @@ def test_depths_of_an_array_are_in_scene_units_or_in_those_that_are_stated(
     assert dataset.description.endswith(f"; depth in units of {unit:g}")
 
 
-def test_the_units_of_all_depths_are_said(photographs):
+def test_the_description_has_the_units_of_all_depths(photographs):
     iio.imwrite(photographs / "depth.png", STEPS)
     np.save(photographs / "depth.npy", np.ones((6, 8)))
     give(photographs, "01.png", depth_file_path="depth.png")
@@ -314,7 +313,7 @@ def test_depth_may_be_ignored(photographs):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
-def test_a_fit_whose_loss_does_not_look_at_depth_does_not_open_it(photographs, weight):
+def test_a_fit_without_a_depth_loss_does_not_open_depths(photographs, weight):
     give(photographs, depth_file_path="nowhere.png")
     fit = FitConfig(data={"path": str(photographs)}, loss={"depth_weight": weight})
     assert load_dataset(fit.data_for_rendering).ignored == ("depth",)
@@ -363,7 +362,6 @@ def test_a_unit_of_depth_is_positive(photographs):
     ],
 )
 def test_a_second_pose_is_read(photographs, place, values, shutter):
-    """In the axes of the first."""
     center = (3.9, 0.5, 1.1)
     give(photographs, transform_matrix_close=look_at(center, (0, 0, 0)).tolist())
     if place == "top":
@@ -416,7 +414,6 @@ def test_transparency_is_kept(photographs):
 
 
 def test_transparency_of_synthetic_images_is_kept(blender):
-    """Alpha is kept for training views."""
     folder, images = blender
     for width, shape in ((None, (4, 1, 6, 1)), (3, (2, 2, 3, 2))):
         view = load(folder, image_size=width).train[1]

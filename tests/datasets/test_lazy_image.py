@@ -10,12 +10,12 @@ from support.datasets import load, refusal, view_at
 from drgs.datasets import images, reader
 from drgs.datasets.images import (
     LazyImage,
-    check_room,
+    check_memory,
     compact_mask,
     compact_photograph,
     downscale,
+    num_threads,
     smaller_view,
-    threads_for,
 )
 
 RNG = np.random.default_rng(8)
@@ -79,7 +79,6 @@ def test_a_mask_is_kept_in_a_byte_a_pixel():
 
 
 def test_a_dataset_takes_the_bytes_of_its_files(photographs):
-    """And a quarter of it again for masks; not four times that for numbers."""
     iio.imwrite(photographs / "images" / "01.png", RNG.integers(0, 256, (6, 8, 4), np.uint8))
     dataset = load(photographs)
     for view in (*dataset.train, *dataset.test):
@@ -87,7 +86,7 @@ def test_a_dataset_takes_the_bytes_of_its_files(photographs):
         assert view.image.nbytes == view.width * view.height * channels
 
 
-def test_smaller_views_keep_nothing_of_their_own():
+def test_smaller_views_take_no_memory():
     view = view_at((4, 0, 0), (0, 0, 0))
     pixels = RNG.integers(0, 255, (30, 40, 4), np.uint8)
     image, alpha = compact_photograph(pixels, GREY, None)
@@ -98,7 +97,7 @@ def test_smaller_views_keep_nothing_of_their_own():
     np.testing.assert_allclose(smaller.image, blocks, atol=2e-7)
 
 
-def test_a_kept_image_says_that_it_has_to_be_copied():
+def test_a_lazy_image_refuses_conversion_without_a_copy():
     image, _ = compact_photograph(np.zeros((2, 2, 3), np.uint8), GREY, None)
     assert np.asarray(image, np.float64).dtype == np.float64
     with pytest.raises(ValueError, match="only by a copy"):
@@ -127,7 +126,7 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
     iio.imwrite(photographs / "images" / "01.png", rgba)
     files = sorted((photographs / "images").iterdir())
     monkeypatch.setattr(images, "available_memory", lambda: 1488)
-    check_room(files, None)
+    check_memory(files, None)
     monkeypatch.setattr(images, "available_memory", lambda: 1487)
     monkeypatch.setattr(reader, "read_pixels", None)
     message = (
@@ -135,10 +134,10 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
         "1.49 kB are available; set a smaller data.image_size, or use fewer of them"
     )
     assert refusal(photographs) == message
-    check_room(files, 2)
+    check_memory(files, 2)
 
 
 def test_large_photographs_are_read_one_after_the_other(tmp_path):
     for width, expected in ((400, 8), (6000, 1)):
         iio.imwrite(tmp_path / "a.png", np.zeros((width, width), np.uint8))
-        assert threads_for([tmp_path / "a.png"]) == expected
+        assert num_threads([tmp_path / "a.png"]) == expected

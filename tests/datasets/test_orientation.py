@@ -54,7 +54,7 @@ def test_tiffs_are_read_as_they_are_stored_as_colmap_reads_them(tmp_path, orient
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])
-def test_numbers_that_mean_nothing_are_none(tmp_path, orientation):
+def test_invalid_orientations_are_ignored(tmp_path, orientation):
     save(tmp_path / "a.jpg", orientation)
     assert read_header(tmp_path / "a.jpg").orientation == 1
 

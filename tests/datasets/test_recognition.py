@@ -35,7 +35,7 @@ NO_DATASET = (
     ],
     ids=["empty", "model", "flat model", "video", "no training views", "output of a fit"],
 )
-def test_what_makes_a_dataset_is_said(tmp_path, names):
+def test_folders_that_are_no_dataset_are_explained(tmp_path, names):
     touch(tmp_path, *names)
     assert refusal(tmp_path) == f"{tmp_path}: {NO_DATASET}"
 

@@ -42,12 +42,12 @@ def test_the_lists_are_the_splits(photographs, keys, test_split, train, test):
         assert "2 of 10 photographs (images/08.png, images/09.png)" in notes[0]
 
 
-def test_names_are_compared_as_paths_and_by_what_programs_change(photographs):
+def test_names_are_compared_as_paths_without_case_and_suffix(photographs):
     give(photographs, train_filenames=["./images/00.png", "images\\01.png", "02", "IMAGES/03.PNG"])
     assert names(load_noting(photographs)[0].train) == [0, 1, 2, 3]
 
 
-def test_names_of_no_frame_are_said_or_if_most_are_refused(photographs):
+def test_unknown_names_are_reported_or_if_most_are_refused(photographs):
     give(photographs, test_filenames=["images/02.png", "images/xx.png"])
     dataset, notes = load_noting(photographs)
     path = photographs / "transforms.json"

@@ -11,8 +11,7 @@ def test_views_are_named_as_their_files_with_folders_where_needed():
     assert unique_names(["a.png", "a.jpg"]) == ["0000_a", "0001_a"]
 
 
-def test_names_lead_nowhere_else():
-    """An absolute name beside a folder would replace it."""
+def test_names_of_views_do_not_leave_the_folder():
     names = unique_names(["/data/a/0.png", "/data/b/0.png"])
     assert names == ["data_a_0", "data_b_0"]
 

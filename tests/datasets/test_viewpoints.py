@@ -227,7 +227,7 @@ def test_wrong_motion_of_a_camera_is_refused_with_the_key(tmp_path):
     )
 
 
-def test_keys_of_a_file_of_cameras_that_are_not_read_are_said(tmp_path):
+def test_unread_keys_of_a_file_of_cameras_are_reported(tmp_path):
     frame = {"transform_matrix": np.eye(4).tolist(), "camera_angle_x": 0.7, "dof": 0.1}
     (tmp_path / "a.json").write_text(json.dumps({"frames": [frame], "up": [0, 0, 1], "lens": 3}))
     with pytest.warns(UserNote, match=r"a.json: keys that are not read: lens, frames\[\].dof$"):

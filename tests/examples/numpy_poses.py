@@ -23,9 +23,9 @@ class NumpyPoses(DatasetReader):
     def __init__(self, section: NumpyPosesSection) -> None:
         self.unit = section.unit
 
-    def recognizes(self, folder, names):
+    def recognizes(self, folder):
         """Return whether the poses are there."""
-        return "poses.npy" in names
+        return (folder / "poses.npy").exists()
 
     def photographs(self, config):
         """Return a frame for each photograph, in the order of their names."""

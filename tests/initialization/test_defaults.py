@@ -14,7 +14,6 @@ CONFIG = FitConfig(data={"path": "unused"}, iterations=1000)
 
 
 def photographs_of(width, height, count=10):
-    """From all around, all of them opaque."""
     angles = 2 * np.pi * np.arange(count) / count
     centers = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.ones(count)], axis=1)
     return dataset_of([view_at(center, (0, 0, 0), width, height) for center in centers])
@@ -51,7 +50,7 @@ def test_photographs_are_fitted_at_half_their_size_first(photographs):
         assert stages(CONFIG, one) == [(350, 2)]
 
 
-def test_what_is_cut_out_is_not(photographs):
+def test_cut_out_objects_have_no_coarse_stages(photographs):
     assert stages(CONFIG, with_alpha(photographs, lambda index: left_of(60 + index))) == []
     many = photographs_of(120, 100, 100)
     for opaque in range(12):  # one that is not cut out does not make the others so
@@ -64,7 +63,7 @@ def test_neither_are_small_images_and_the_papers_recipe(photographs):
     assert stages(with_changes(CONFIG, {"densify.strategy": "adc"}), photographs) == []
 
 
-def test_what_is_given_stays(photographs):
+def test_given_values_stay(photographs):
     none = with_changes(CONFIG, {"coarse": []})
     assert stages(none, photographs) == []
     quarter = with_changes(CONFIG, {"coarse": [{"until": 9, "factor": 4}]})

@@ -57,7 +57,7 @@ def test_points_are_where_the_reference_projects_them(name):
     np.testing.assert_allclose(np.stack([u, v], axis=1)[seen], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_what_is_straight_ahead_is_at_the_principal_point():
+def test_points_on_the_optical_axis_are_at_the_principal_point():
     for host, _ in LENSES.values():
         view = replace(view_at((0, -2, 0), (0, 0, 0)), lens=host)
         places = to_film(view, [np.zeros(2), np.zeros(2), np.array([2.0, -2.0])])

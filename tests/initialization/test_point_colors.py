@@ -41,8 +41,7 @@ def test_points_have_the_colours_of_the_surface(ball):
     assert errors.max() < 0.1 and errors.mean() < 0.006
 
 
-def test_what_is_behind_transparent_pixels_does_not_show(ball):
-    """Whatever it is: images over another background give the same colours."""
+def test_colours_do_not_depend_on_the_background(ball):
     points, spacing = on_the_ball()
     black = images_of(sphere(0.8), 16, background=(0.0, 0.0, 0.0))
     expected = colors_from_images(points, spacing, ball, WHITE)
@@ -50,7 +49,7 @@ def test_what_is_behind_transparent_pixels_does_not_show(ball):
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
-def test_a_point_does_not_get_the_colour_of_what_hides_it():
+def test_a_point_does_not_get_the_colour_of_an_occluder():
     """A wall in front of a ball, of another colour, with points on both."""
 
     def paint(points):
@@ -97,7 +96,7 @@ def test_a_point_that_no_image_sees_is_coloured_as_the_nearest_that_one_does(bal
         np.testing.assert_array_equal(color, seen[nearest])
 
 
-def test_nothing_is_known_where_no_image_shows_a_point(ball):
+def test_points_that_no_image_shows_have_no_colours(ball):
     points, spacing = on_the_ball()
     assert colors_from_images(100 + points, spacing, ball, WHITE) is None
     assert colors_from_images(points, spacing, [], WHITE) is None
@@ -126,7 +125,7 @@ def test_the_middle_half_is_averaged():
     counts = (0, 1, 2, 4, 7, 11)
     for point, count in enumerate(counts):
         samples[rng.permutation(11)[count:], point] = np.inf
-    actual = point_colors._middle(samples)
+    actual = point_colors._middle_mean(samples)
     assert np.isnan(actual[0]).all()
     for point, count in enumerate(counts[1:], 1):
         for channel in range(3):

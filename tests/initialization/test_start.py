@@ -279,7 +279,6 @@ def test_cameras_that_determine_no_box_are_refused(views, reason):
 
 
 def test_one_camera_determines_no_box():
-    """It is parallel to nothing."""
     with pytest.raises(UserError) as error:
         initial_gaussians(config(), dataset_of([view_at((4, 0, 0), (0, 0, 0))]))
     assert str(error.value) == (

@@ -12,7 +12,7 @@ from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, initial_gaussians, start_of
-from drgs.initialization.start_box import box_to_start_in
+from drgs.initialization.start_box import start_box_of
 
 AROUND = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
 
@@ -35,14 +35,14 @@ def refusal(views, **init):
 
 # The layout's own box
 def test_the_references_box_is_taken_where_the_cameras_are_as_it_expects():
-    box = box_to_start_in(InitConfig(), dataset_of(views_from(AROUND), 1.3))
+    box = start_box_of(InitConfig(), dataset_of(views_from(AROUND), 1.3))
     assert (box.center == 0).all() and box.half_extent == 1.3
 
 
 @pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
-def test_elsewhere_it_is_scaled_and_moved_to_where_the_cameras_look(scale, target):
+def test_otherwise_the_box_is_scaled_and_moved_to_the_focus(scale, target):
     dataset = dataset_of(views_from(AROUND, target, scale), 1.3)
-    box = box_to_start_in(InitConfig(), dataset)
+    box = start_box_of(InitConfig(), dataset)
     np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
     # Views of 40 px with a focal length of 40 px see half a unit to each side at distance 1.
     assert box.half_extent == pytest.approx(0.9 * 0.5 * 4.03 * scale, rel=0.02)
@@ -75,7 +75,7 @@ def test_a_box_that_hardly_shows_in_the_images_is_refused():
 
 @pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
 def test_a_box_that_the_cameras_look_into_or_that_surrounds_them_is_taken(half_extent):
-    box = box_to_start_in(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
+    box = start_box_of(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
     assert box.half_extent == half_extent
 
 
@@ -167,8 +167,7 @@ def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
     )
 
 
-def test_what_is_decided_is_written_down():
-    """So that it is the same when the configuration of a fit is used again."""
+def test_derived_values_are_recorded():
     dataset = dataset_of(views_from(AROUND), 1.3)
     decided = resolve_defaults(config(), dataset)
     assert (decided.model.near, decided.data.background) == (0.2, "white")

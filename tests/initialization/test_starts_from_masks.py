@@ -108,7 +108,6 @@ def test_masks_are_carved_within_the_box_that_is_given(masks):
 
 @pytest.mark.parametrize("distance", [DISTANCE, 0.01 * DISTANCE])
 def test_where_no_box_is_known_it_follows_from_the_cameras(masks, distance):
-    """Whatever the unit of length."""
     scale = distance / DISTANCE
 
     def scaled(view):
@@ -122,7 +121,7 @@ def test_where_no_box_is_known_it_follows_from_the_cameras(masks, distance):
     assert np.abs(np.linalg.norm(start.means / scale, axis=1) - 0.8).max() < 0.25
 
 
-def test_masks_without_a_hull_are_said_and_left_aside(masks, opaque):
+def test_masks_without_a_hull_are_reported_and_not_used(masks, opaque):
     nothing = with_alpha(masks, np.zeros_like)
     for kind in ("auto", "masks"):
         start = start_of(config(start=kind), nothing)

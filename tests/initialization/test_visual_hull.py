@@ -100,7 +100,6 @@ def test_little_memory_is_taken(ball):
 
 
 def test_silhouettes_of_noise_take_little_memory(ball):
-    """Their surface is everywhere."""
     rng = np.random.default_rng(2)
     noisy = [replace(v, alpha=rng.uniform(0, 1, v.alpha.shape).astype(np.float32)) for v in ball]
     tracemalloc.start()
@@ -122,8 +121,7 @@ def test_large_images_are_looked_at_in_larger_pixels(ball):
             assert silhouette.table[rows, columns] == opaque[:rows, :columns].sum()
 
 
-def test_pixels_that_a_mask_leaves_out_say_nothing(ball):
-    """Wherever alpha is wrong, a mask says so."""
+def test_masked_pixels_do_not_carve_the_hull(ball):
     hole = np.zeros((64, 64), bool)
     hole[20:40, 20:40] = True
     wrong = [replace(v, alpha=np.where(hole, 0, v.alpha)) for v in ball[:2]]
@@ -156,8 +154,7 @@ def test_masks_that_contradict_each_other_have_no_hull(ball):
     assert len(carved([replace(view, alpha=0 * view.alpha) for view in ball])) == 0
 
 
-def test_what_few_images_show_is_not_part_of_the_hull(ball):
-    """Nothing there can be shown empty."""
+def test_regions_that_few_images_show_are_not_part_of_the_hull(ball):
     points = carved(ball, 300, within=Box(np.zeros(3), 2.5))
     assert np.linalg.norm(points, axis=1).max() < 1.1
 

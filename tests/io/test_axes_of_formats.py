@@ -47,7 +47,6 @@ def rendered(gaussians: Gaussians, rotation: np.ndarray) -> np.ndarray:
 
 
 def difference(found: np.ndarray, expected: np.ndarray) -> float:
-    """Root mean square, where there is anything to see."""
     seen = expected.max(axis=2) > 0.1
     return float(np.sqrt(np.square(found - expected)[seen].mean()))
 

@@ -59,7 +59,7 @@ def test_one_gaussian_is_enough(tmp_path, each):
 
 @each_format
 @pytest.mark.parametrize("degree", [0, 3])
-def test_what_does_not_fit_is_refused_before_it_is_allocated(tmp_path, monkeypatch, each, degree):
+def test_too_large_files_are_refused_before_allocation(tmp_path, monkeypatch, each, degree):
     path = tmp_path / f"a{each.value.suffix}"
     gaussians_within_ranges(50_000, degree=degree).save(path)
     Gaussians.load(path)  # imports
@@ -78,7 +78,7 @@ def test_what_does_not_fit_is_refused_before_it_is_allocated(tmp_path, monkeypat
 
 
 @checked
-def test_what_is_no_number_is_not_written(tmp_path, each):
+def test_nonfinite_numbers_are_not_written(tmp_path, each):
     gaussians = gaussians_within_ranges(5)
     gaussians.log_scales[3, 1] = np.nan
     with pytest.raises(UserError, match=r"log_scales of Gaussian 3 is nan; remove it"):
@@ -93,7 +93,7 @@ def test_smoothing_is_not_dropped_silently(tmp_path, each):
         gaussians.save(tmp_path / f"a{each.value.suffix}")
 
 
-def test_the_longest_suffix_says_the_format():
+def test_the_longest_suffix_decides_the_format():
     assert format_for("a.compressed.ply").name == "compressed-ply"
     assert format_for("A.PLY").name == "ply"
     assert format_for("a.obj") is None

@@ -10,7 +10,7 @@ from support.formats import gaussians_within_ranges
 
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.glb import read_gaussians
+from drgs.io.glb import Glb
 
 NAME = "KHR_gaussian_splatting"
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -57,11 +57,11 @@ def parts(gaussians):
 def refusal(path, document, binary):
     path.write_bytes(joined(document, binary))
     with pytest.raises(UserError) as error:
-        read_gaussians(path)
+        Glb().read(path)
     return str(error.value).removeprefix(f"{path}: ")
 
 
-def test_a_file_holds_what_the_extension_says(gaussians, parts):
+def test_a_file_follows_the_extensions_specification(gaussians, parts):
     document, binary = parts
     assert document["extensionsUsed"] == [NAME] and document["asset"]["version"] == "2.0"
     primitive = primitive_of(document)
@@ -93,7 +93,7 @@ def test_a_file_holds_what_the_extension_says(gaussians, parts):
     ]
 
 
-def test_what_it_is_rendered_with_stands_beside_it(tmp_path, gaussians):
+def test_extras_record_rendered_with(tmp_path, gaussians):
     said = {"antialiased": True, "low_pass": 0.1, "projection": "exact"}
     replace(gaussians, rendered_with=said).save(tmp_path / "a.glb")
     assert Gaussians.load(tmp_path / "a.glb").rendered_with == said
@@ -104,7 +104,7 @@ def test_extras_of_others_are_ignored(tmp_path, parts, extras):
     document, binary = parts
     primitive_of(document)["extras"] = extras
     (tmp_path / "a.glb").write_bytes(joined(document, binary))
-    assert read_gaussians(tmp_path / "a.glb")[1] == {}
+    assert Glb().read(tmp_path / "a.glb")[1] == {}
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from support.formats import FLOAT32, gaussians_within_ranges
 
-from drgs.io import compressed_ply, spz
+from drgs.io.compressed_ply import CompressedPly
+from drgs.io.spz import Spz
 
 gsply = pytest.importorskip("gsply")
 
 READERS = {
-    ".compressed.ply": (gsply.plyread, compressed_ply.read_gaussians),
-    ".spz": (gsply.read_spz, spz.read_gaussians),
+    ".compressed.ply": (gsply.plyread, CompressedPly().read),
+    ".spz": (gsply.read_spz, Spz().read),
 }
 
 

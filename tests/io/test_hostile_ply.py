@@ -153,7 +153,6 @@ def edited_headers(lines):
 
 
 def elements_reordered(lines):
-    """The last element comes first."""
     at = [index for index, line in enumerate(lines) if line.startswith(b"element")]
     return [*lines[: at[0]], *lines[at[-1] : -1], *lines[at[0] : at[-1]], lines[-1]]
 

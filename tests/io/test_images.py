@@ -43,7 +43,7 @@ def test_an_animation_loops_and_holds_every_frame(tmp_path):
     assert rendered.info["loop"] == 0
     assert len(decoded) == len(frames)
     for frame, expected in zip(decoded, frames, strict=True):
-        assert np.abs(frame - expected).max() <= images.FLAT_STEP / 2 / 255 + 1e-9
+        assert np.abs(frame - expected).max() <= images.LOSSLESS_STEP / 2 / 255 + 1e-9
 
 
 @pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (131, 97, 202)])
@@ -61,7 +61,7 @@ def test_before_a_flat_background_there_is_no_haze(tmp_path, background):
         empty = (expected == color).all(axis=2)
         assert 0.3 < empty.mean() < 0.9
         assert (np.round(frame[empty] * 255) == background).all()
-        assert np.abs(frame - expected).max() <= (images.FLAT_STEP + 1) / 2 / 255
+        assert np.abs(frame - expected).max() <= (images.LOSSLESS_STEP + 1) / 2 / 255
 
 
 def test_images_that_fill_the_frame_are_coded_with_loss(tmp_path, monkeypatch):
@@ -72,7 +72,7 @@ def test_images_that_fill_the_frame_are_coded_with_loss(tmp_path, monkeypatch):
         frame[:, 32:] = 1
     images.write_animation(tmp_path / "half.webp", noise)
     assert b"VP8L" in (tmp_path / "half.webp").read_bytes()
-    monkeypatch.setattr(images, "FLAT_WEBP_BYTES", 10_000)
+    monkeypatch.setattr(images, "LOSSLESS_WEBP_BYTES", 10_000)
     images.write_animation(tmp_path / "small.webp", noise)
     assert b"VP8 " in (tmp_path / "small.webp").read_bytes()
 
@@ -141,7 +141,7 @@ def write_tiff16(path, pixels):
     path.write_bytes(content + struct.pack("<3H", 16, 16, 16) + data)
 
 
-def test_colours_of_16_bits_keep_the_upper_8_and_that_is_said(tmp_path):
+def test_colours_of_16_bits_keep_the_upper_8_with_a_note(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 2**16, (4, 5, 3), np.uint16)
     mi.Bitmap(pixels).write(str(tmp_path / "a.png"))
     write_tiff16(tmp_path / "a.tif", pixels)
@@ -167,7 +167,7 @@ def test_a_colour_that_a_png_names_is_transparent(tmp_path):
         np.testing.assert_array_equal(alpha == 0, pixels[:, :, 0] == 9)
 
 
-def test_profiles_and_further_images_are_said(tmp_path):
+def test_profiles_and_further_images_are_reported(tmp_path):
     grey = Image.new("RGB", (3, 2), (90, 90, 90))
     lab, srgb = (
         ImageCms.ImageCmsProfile(ImageCms.createProfile(name)).tobytes() for name in ("LAB", "sRGB")

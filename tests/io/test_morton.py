@@ -5,7 +5,6 @@ from drgs.io.quantization import MORTON_BITS, morton_order
 
 
 def interleaved(cell):
-    """Bit by bit, in whole numbers of any size."""
     return sum(
         (int(value) >> bit & 1) << (3 * bit + axis)
         for bit in range(MORTON_BITS)

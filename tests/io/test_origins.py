@@ -18,7 +18,6 @@ EARTH = (4200000.0, 170000.5, -4780000.25)
 
 
 def world(gaussians: Gaussians) -> np.ndarray:
-    """Positions (N, 3) float64."""
     return gaussians.means.astype(np.float64) + gaussians.origin
 
 
@@ -34,7 +33,7 @@ def written_as_float64(path, source, offset):
     return path
 
 
-def test_what_is_near_stays_and_what_is_far_gets_a_short_origin():
+def test_only_far_scenes_get_an_origin_with_few_digits():
     assert choose_origin((0.9 * MAX_SCENE_SIZES * 4.8, 0, 0), 4.8) == WORLD
     assert choose_origin((1.1 * MAX_SCENE_SIZES * 4.8, 0, 0), 4.8) == (
         1.1 * MAX_SCENE_SIZES * 4.8,
@@ -60,7 +59,7 @@ def test_an_origin_is_read_as_it_was_written(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", [".spz", ".splat"])
 @pytest.mark.filterwarnings("ignore:.*harmonics")
-def test_a_format_without_room_for_an_origin_says_so(tmp_path, suffix):
+def test_a_format_without_an_origin_is_noted(tmp_path, suffix):
     with pytest.warns(UserNote, match=r"origin \(4200000, 170000.5, -4780000.25\)"):
         replace(blobs(), sh0=blobs().sh0, origin=EARTH).save(tmp_path / f"a{suffix}")
 

@@ -28,7 +28,6 @@ def write_elements(path, text=False, **elements):
 
 
 def rows_of(columns):
-    """A structured array from name -> values."""
     rows = np.zeros(len(next(iter(columns.values()))), [(n, v.dtype) for n, v in columns.items()])
     for name, values in columns.items():
         rows[name] = values
@@ -101,7 +100,6 @@ def test_properties_are_found_by_name_in_any_order_and_type(tmp_path, text):
 
 
 def without(tmp_path, *names):
-    """A PLY of one degree-1 Gaussian, less some properties."""
     random_gaussians(1, 1).save(tmp_path / "full.ply")
     rows = PlyData.read(str(tmp_path / "full.ply"))["vertex"].data
     keep = [name for name in rows.dtype.names if name not in names]

@@ -35,7 +35,7 @@ def test_what_is_written_is_read_back_with_its_types(tmp_path):
     assert found.to(TensorXf).numpy().rendered_with == expected
 
 
-def test_each_value_is_a_comment_behind_the_format(tmp_path):
+def test_each_value_is_a_comment_after_the_format(tmp_path):
     replace(blobs(10), rendered_with=SAID).save(tmp_path / "a.ply")
     lines = (tmp_path / "a.ply").read_bytes().split(b"\n")[1:7]
     assert lines[1:5] == [
@@ -48,7 +48,7 @@ def test_each_value_is_a_comment_behind_the_format(tmp_path):
     assert plain.read_bytes() == (tmp_path / "a.ply").read_bytes()
 
 
-def test_a_file_that_says_nothing_is_as_before(tmp_path):
+def test_a_file_without_statements_has_no_settings(tmp_path):
     for said in (None, {}):
         replace(blobs(10), rendered_with=said).save(tmp_path / "a.ply")
         assert b"comment" not in (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0]
@@ -70,7 +70,7 @@ def test_a_file_that_says_nothing_is_as_before(tmp_path):
         b"comment drgs __class__ 1",
     ],
 )
-def test_other_comments_say_nothing(tmp_path, line):
+def test_other_comments_are_ignored(tmp_path, line):
     assert Gaussians.load(with_lines(tmp_path / "a.ply", line)).rendered_with is None
 
 
@@ -158,7 +158,7 @@ def test_a_header_full_of_statements_is_read_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value"), [("a b", 1), ("low_pass", "0.1\nelement face 1"), ("A", 1)]
 )
-def test_what_a_comment_cannot_say_is_not_written(tmp_path, name, value):
+def test_values_that_a_comment_cannot_hold_are_not_written(tmp_path, name, value):
     with pytest.raises(ValueError, match="must be names and values of one word"):
         replace(blobs(10), rendered_with={name: value}).save(tmp_path / "a.ply")
     assert not list(tmp_path.iterdir())

@@ -111,7 +111,7 @@ def test_parameters_may_have_the_names_of_the_parsers_own(tmp_path, name):
     ],
     ids=["content", "name"],
 )
-def test_what_is_not_utf_8_is_refused(tmp_path, name, content, message):
+def test_files_that_are_not_utf_8_are_refused(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError) as error:
         load_scene_file(tmp_path / name)

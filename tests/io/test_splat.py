@@ -49,7 +49,7 @@ def test_rows_fall_by_opacity_times_volume(tmp_path):
         (row(scale=(1, 1, -1)), "byte 20: a scale must be from 0 to 1e+12, got -1.0; is it"),
     ],
 )
-def test_what_is_no_row_is_refused(tmp_path, content, message):
+def test_incomplete_rows_are_refused(tmp_path, content, message):
     (tmp_path / "a.splat").write_bytes(content)
     with pytest.raises(UserError) as error:
         Gaussians.load(tmp_path / "a.splat")

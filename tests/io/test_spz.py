@@ -12,7 +12,7 @@ from support.formats import FLOAT32, distance_of_ellipsoids, gaussians_within_ra
 
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.spz import read_gaussians
+from drgs.io.spz import Spz
 
 VERSION, NUM, DEGREE, BITS, FLAGS = 4, 8, 12, 13, 14  # bytes of the header
 
@@ -28,7 +28,7 @@ def written(path, content):
 
 def refusal(path):
     with pytest.raises(UserError) as error:
-        read_gaussians(path)
+        Spz().read(path)
     return str(error.value).removeprefix(f"{path}: ")
 
 
@@ -63,13 +63,13 @@ def test_positions_beyond_24_bits_are_refused():
 def test_rotations_of_version_2_are_three_bytes(tmp_path):
     gaussians = gaussians_within_ranges(50, degree=0)
     content = unpacked(gaussians)
-    arrays, _ = read_gaussians(written(tmp_path / "a.spz", content))
+    arrays, _ = Spz().read(written(tmp_path / "a.spz", content))
     w, x, y, z = arrays["quats"].T * np.sign(arrays["quats"][:, 0])
     xyz = np.floor(np.column_stack([x, y, z]) * 127.5 + 128).clip(0, 255).astype("u1")
     start = 16 + 50 * (9 + 1 + 3 + 3)
     content[start : start + 50 * 4] = xyz.tobytes()
     content[VERSION] = 2
-    found, _ = read_gaussians(written(tmp_path / "b.spz", content))
+    found, _ = Spz().read(written(tmp_path / "b.spz", content))
     # Half a step of 1 / 127.5 in each; the fourth follows, the less precisely the smaller it is.
     amplified = np.sqrt(3) / 255 / np.maximum(np.abs(w), 0.1)
     assert (distance_of_ellipsoids(arrays["quats"], found["quats"]) <= 2 * amplified).all()
@@ -83,7 +83,7 @@ def test_compensated_opacities_are_a_flag(tmp_path, said):
     assert unpacked(gaussians)[FLAGS] == (1 if said else 0)
 
 
-def test_what_has_no_place_is_noted(tmp_path):
+def test_values_that_spz_cannot_record_are_noted(tmp_path):
     gaussians = replace(gaussians_within_ranges(5), rendered_with={"low_pass": 0.1})
     with pytest.warns(UserNote, match=r"the format spz has no room for low_pass 0.1: left out"):
         gaussians.save(tmp_path / "a.spz")
@@ -91,12 +91,12 @@ def test_what_has_no_place_is_noted(tmp_path):
 
 def test_extensions_are_passed_over(tmp_path):
     content = unpacked(gaussians_within_ranges(5))
-    expected, _ = read_gaussians(written(tmp_path / "a.spz", content))
+    expected, _ = Spz().read(written(tmp_path / "a.spz", content))
     path = written(tmp_path / "b.spz", content + b"of a vendor" * 99)
     assert "the end was expected after 5 Gaussians" in refusal(path)
     content[FLAGS] |= 2
     with pytest.warns(UserNote, match=r"b.spz: has extensions of a vendor, which are passed over"):
-        found, _ = read_gaussians(written(path, content + b"of a vendor" * 99))
+        found, _ = Spz().read(written(path, content + b"of a vendor" * 99))
     assert all((found[name] == expected[name]).all() for name in expected)
 
 
@@ -166,7 +166,7 @@ def test_version_4_holds_the_same(tmp_path, degree):
     (tmp_path / "a.spz").write_bytes(gaussians.to_bytes("spz"))
     content = streams_of(gaussians, zstandard.ZstdCompressor().compress)
     (tmp_path / "b.spz").write_bytes(content)
-    (expected, _), (found, _) = (read_gaussians(tmp_path / name) for name in ("a.spz", "b.spz"))
+    (expected, _), (found, _) = (Spz().read(tmp_path / name) for name in ("a.spz", "b.spz"))
     assert all((found[name] == expected[name]).all() for name in expected)
     for end in range(len(content)):
         (tmp_path / "b.spz").write_bytes(content[:end])

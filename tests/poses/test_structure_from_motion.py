@@ -16,13 +16,13 @@ from drgs.core.child_process import ChildEndedError
 from drgs.core.errors import UserError, UserNote
 from drgs.core.folders import sole_writer
 from drgs.poses import structure_from_motion as sfm
-from drgs.poses.structure_from_motion import Search, photographs_in, place
+from drgs.poses.structure_from_motion import SfmSettings, photographs_in, reconstruct
 
 NAMES = [f"corner {k}.png" for k in range(7, 14)]  # 10 follows 9, and has a space
 
 
-def said(*_):
-    """Watches, and says nothing."""
+def ignore_progress(*_):
+    """Ignore the progress."""
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,9 @@ def placed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("corner")
     poses = write_photographs(folder, NAMES)
     watched = []
-    found = place(folder, Search(camera_model="PINHOLE"), False, lambda *step: watched.append(step))
+    found = reconstruct(
+        folder, SfmSettings(camera_model="PINHOLE"), False, lambda *step: watched.append(step)
+    )
     return folder, found, poses, watched
 
 
@@ -74,12 +76,12 @@ def test_nothing_but_the_model_is_left_behind(placed):
     assert files == {*sfm.MODEL_FILES, ".drgs-poses.json"}
 
 
-def test_images_of_nothing_have_no_cameras_and_leave_nothing_behind(tmp_path):
+def test_plain_images_have_no_cameras_and_leave_no_files(tmp_path):
     pytest.importorskip("pycolmap")
     for k in range(3):
         Image.new("RGB", (64, 48), (40 * k, 20, 90)).save(tmp_path / f"{k}.png")
     with pytest.raises(UserError, match="no cameras were found; take more photographs, neither"):
-        place(tmp_path, Search(), False, said)
+        reconstruct(tmp_path, SfmSettings(), False, ignore_progress)
     assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
 
 
@@ -89,7 +91,7 @@ def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
     write_photographs(tmp_path, names)
     (tmp_path / "masks").mkdir()
     Image.new("L", SIZE, 255).save(tmp_path / "masks" / "b.png.png")
-    assert place(tmp_path, Search(), False, said).names == tuple(names)
+    assert reconstruct(tmp_path, SfmSettings(), False, ignore_progress).names == tuple(names)
 
 
 def masks_for_colmap(folder, masks):
@@ -146,11 +148,11 @@ def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"needs pycolmap, which is not installed; pip install 'drgs\[colmap\]'"
     ) as error:
-        sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
+        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, ignore_progress)
     assert "\n" not in str(error.value)
 
 
-def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
+def test_errors_of_colmap_are_one_line(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
 
     def refuse(self):
@@ -160,7 +162,7 @@ def test_what_colmap_refuses_is_said_in_one_line(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"COLMAP reports: \[reader.cc:1\] no such image; if memory"
     ):
-        sfm._find(Search(), tmp_path, tmp_path, [], tmp_path, said)
+        sfm._reconstruct_in_child(SfmSettings(), tmp_path, tmp_path, [], tmp_path, ignore_progress)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -186,7 +188,7 @@ def search(tmp_path, monkeypatch):
             return content
 
         monkeypatch.setattr(sfm, "run_in_child", run)
-        return place(tmp_path, Search(), replace, said)
+        return reconstruct(tmp_path, SfmSettings(), replace, ignore_progress)
 
     return found
 
@@ -197,7 +199,7 @@ def model_in(folder):
     return {path.name: path.read_text() for path in files if path.name != ".drgs-poses.json"}
 
 
-def test_a_model_is_replaced_only_when_that_is_asked_for(search, tmp_path):
+def test_a_model_is_replaced_only_on_request(search, tmp_path):
     assert search("first") == "first"
     with pytest.raises(UserError, match=r"sparse/0: is there already; .*--overwrite writes "):
         search("second")
@@ -218,7 +220,6 @@ def test_other_files_beside_a_model_stay(search, tmp_path):
 
 
 def test_a_model_of_another_program_is_not_replaced(search, tmp_path):
-    """Nor one that was changed since."""
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     for name in ("cameras.bin", "images.bin"):
@@ -245,8 +246,7 @@ def test_a_file_in_the_place_of_the_model_is_refused_before_the_search(search, t
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next(search, tmp_path):
-    """But not by one that is refused, as another is running."""
+def test_temporary_files_of_a_killed_run_are_removed(search, tmp_path):
     for below in (".", "sparse", "sparse/0"):
         (tmp_path / below / ".drgs-poses-abc" / "masks").mkdir(parents=True)
     (tmp_path / ".poses-notes").mkdir()  # somebody's
@@ -262,7 +262,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(search, tmp_path):
 def test_a_second_search_in_the_same_folder_is_refused(search, tmp_path):
     def second(temporary):
         with pytest.raises(UserError, match="another command is writing to this folder; wait"):
-            place(tmp_path, Search(), True, said)
+            reconstruct(tmp_path, SfmSettings(), True, ignore_progress)
         assert temporary.is_dir()
 
     search("first", act=second)
@@ -288,7 +288,6 @@ def test_an_interrupt_while_files_are_moved_leaves_a_whole_model(search, tmp_pat
 
 
 def test_a_run_killed_while_files_are_moved_leaves_no_mixture(search, tmp_path, monkeypatch):
-    """There is no model then; the next run makes one."""
     search("first")
     replace, replaced = Path.replace, []
 
@@ -306,7 +305,7 @@ def test_a_run_killed_while_files_are_moved_leaves_no_mixture(search, tmp_path, 
     assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "third")
 
 
-def test_a_crash_is_a_sentence_and_leaves_nothing_behind(search, tmp_path):
+def test_a_crash_is_reported_and_leaves_no_files(search, tmp_path):
     def crash(temporary):
         (temporary / "database.db").touch()
         raise ChildEndedError("SIGKILL")
@@ -333,7 +332,9 @@ def test_temporary_files_are_on_the_disk_of_the_model(search, tmp_path):
 
 
 def work(folder, names, **search):
-    return sfm._Reconstruction(None, folder, folder, folder, names, Search(**search), said)
+    return sfm._Reconstruction(
+        None, folder, folder, folder, names, SfmSettings(**search), ignore_progress
+    )
 
 
 def test_masks_beside_photographs_are_no_photographs(tmp_path):
@@ -360,7 +361,7 @@ def test_a_name_that_colmap_cannot_hold_is_refused(tmp_path):
         photographs_in(tmp_path)
 
 
-def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
+def test_files_that_colmap_does_not_read_are_left_out_with_a_note(tmp_path):
     for name in ("b.jpg", "a.tif", "c.webp"):
         Image.new("RGB", (8, 8)).save(tmp_path / name)
     for name in ("a.heic", "b.DNG", "._b.jpg"):
@@ -379,33 +380,33 @@ def test_what_colmap_does_not_read_is_left_out_with_a_word(tmp_path):
     ("CMYK", (8, 8), r"Pillow's mode CMYK; convert it"),
     ("1", (8193, 8192), r"at most 67,108,864 pixels, got 8193 x 8192"),
 ])  # fmt: skip
-def test_what_a_fit_refuses_is_refused_before_the_search(tmp_path, mode, size, message):
+def test_unreadable_images_are_refused_before_reconstruction(tmp_path, mode, size, message):
     Image.new(mode, size).save(tmp_path / "a.tif", compression="group4" if mode == "1" else None)
     with pytest.raises(UserError, match=message):
         photographs_in(tmp_path)
 
 
 @pytest.mark.parametrize("below", ["sparse", "colmap/sparse/0"])
-def test_a_model_elsewhere_in_the_folder_is_said_and_not_doubled(tmp_path, below):
+def test_a_model_elsewhere_in_the_folder_is_reported(tmp_path, below):
     folder = tmp_path / "my photos"
     write_dataset(folder, below=below)
     message = rf"{below}: is there already; drgs fit '.*my photos' uses it, --overwrite writes "
     with pytest.raises(UserError, match=message):
-        place(folder, Search(), False, said)
+        reconstruct(folder, SfmSettings(), False, ignore_progress)
 
 
-def test_options_that_are_offered_are_others():
+def test_offered_options_differ_from_the_given_ones():
     few, many = sfm.ALL_PAIRS, sfm.ALL_PAIRS + 1
-    assert "--compare all" not in Search().alternative_options(few) + Search(
+    assert "--compare all" not in SfmSettings().alternative_options(few) + SfmSettings(
         compare="all"
     ).alternative_options(many)
-    assert "--compare all" in Search().alternative_options(many) + Search(
+    assert "--compare all" in SfmSettings().alternative_options(many) + SfmSettings(
         compare="neighbours"
     ).alternative_options(few)
-    assert "--share one" in Search().alternative_options(
+    assert "--share one" in SfmSettings().alternative_options(
         9
-    ) and "--camera-model SIMPLE" in Search().alternative_options(9)
-    assert Search("SIMPLE_RADIAL", "all", "one").alternative_options(9) == (
+    ) and "--camera-model SIMPLE" in SfmSettings().alternative_options(9)
+    assert SfmSettings("SIMPLE_RADIAL", "all", "one").alternative_options(9) == (
         "--camera-model OPENCV_FISHEYE (a fisheye)"
     )
 

@@ -17,7 +17,7 @@ from support.openexr import read_exr
 from support.small_capture import make_dataset, write_dataset
 
 from drgs.config.load import load_config
-from drgs.io.ply import read_gaussians
+from drgs.io.ply import Ply
 
 EARLIER = REPOSITORY / "tests" / "references" / "earlier_version"
 
@@ -42,8 +42,8 @@ def fitted(tmp_path):
 
 def test_a_checkpoint_is_continued(fitted):
     assert_fits("--resume", fitted / "out", "--data", fitted / "data")
-    after, header = read_gaussians(fitted / "out" / "point_cloud.ply")
-    expected, earlier_header = read_gaussians(EARLIER / "point_cloud.ply")
+    after, header = Ply().read(fitted / "out" / "point_cloud.ply")
+    expected, earlier_header = Ply().read(EARLIER / "point_cloud.ply")
     assert header == earlier_header and after.keys() == expected.keys()
     for name, values in expected.items():
         np.testing.assert_allclose(after[name], values, ROUNDING, ROUNDING, err_msg=name)

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.types import Dataset, View
-from drgs.initialization.start import gaussians_from_points
+from drgs.initialization.start import Start, gaussians_at
 
 
 def small_view(name, angle):
@@ -30,5 +31,6 @@ def make_trainer(**changes):
     values = {"data": {"path": "."}, "iterations": 50, **changes}
     config = FitConfig.model_validate(values)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
-    gaussians = gaussians_from_points(points, None, 0.5, config.model.sh_degree)
+    half_opaque = with_changes(config, {"init.opacity": 0.5})
+    gaussians = gaussians_at(Start(points, None, "random"), half_opaque)
     return Trainer(config, small_dataset(), gaussians)

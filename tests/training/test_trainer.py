@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from support.trainers import make_trainer, small_dataset, small_view
 
+from drgs.config.schema import FitConfig
 from drgs.datasets.images import smaller_view
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.initialization.start import gaussians_from_points
+from drgs.initialization.start import Start, gaussians_at
 from drgs.training.density import adc
 
 
@@ -115,7 +116,8 @@ def test_gaussians_are_returned_as_plain_numpy_arrays():
 def test_first_frame_comes_within_15_seconds_cold_and_3_seconds_warm(run_python, tmp_path):
     """Without and with a kernel cache (it lives in the home folder), import included."""
     points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
-    gaussians_from_points(points, None, 0.5, 3).save(tmp_path / "points.ply")
+    config = FitConfig.model_validate({"data": {"path": "."}, "init": {"opacity": 0.5}})
+    gaussians_at(Start(points, None, "random"), config).save(tmp_path / "points.ply")
     program = f"""
 import drgs, drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
