@@ -192,7 +192,7 @@ def test_a_box_filter_averages_the_samples(sampler):
     assert np.abs(image - image_of(SCENE.load())).max() > 0.01
 
 
-def test_points_are_those_of_the_sampler():
+def test_sample_points_come_from_the_sampler():
     points = exposure_of(SCENE.load(samples=16, sampler="stratified"), 16)
     cells = np.floor(points * 4).astype(int)
     number = cells[..., 1] * 4 + cells[..., 0]
@@ -203,7 +203,7 @@ def test_points_are_those_of_the_sampler():
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
-def test_a_seed_that_was_changed_in_place_gives_other_points():
+def test_seed_changed_in_place_gives_other_points():
     loaded = SCENE.load(samples=4)
     integrator, sensor = loaded.integrator(), loaded.sensors()[0]
     seed = mi.UInt32(0)
@@ -223,7 +223,7 @@ def test_a_seed_that_was_changed_in_place_gives_other_points():
     np.testing.assert_array_equal(rendered(seed), rendered(2))
 
 
-def test_samples_of_one_call_replace_those_of_the_sampler():
+def test_spp_of_a_call_overrides_the_sampler():
     few, many = SCENE.load(samples=1), SCENE.load(samples=4)
     assert np.array_equal(image_of(few, spp=4), image_of(many))
     assert np.array_equal(image_of(many, spp=1), image_of(few))
@@ -231,7 +231,7 @@ def test_samples_of_one_call_replace_those_of_the_sampler():
 
 @pytest.mark.parametrize("name", ["gaussian", "tent", "mitchell", "lanczos"])
 @pytest.mark.parametrize("samples", [1, 3])
-def test_a_filter_weighs_the_samples_around_a_pixel(name, samples):
+def test_reconstruction_filter_weights_samples_around_a_pixel(name, samples):
     """image = sum f(x - center) value / sum f, over the samples within the filter's radius."""
     loaded = SCENE.load(samples=samples, rfilter=name)
     image = image_of(loaded)
@@ -290,7 +290,7 @@ def test_gradients_are_the_transpose_of_the_tangents(samples, rfilter):
         assert size > 0 and abs(left - right) < 1e-5 * size, name
 
 
-def test_no_samples_are_taken_beyond_the_film():
+def test_no_samples_outside_the_film():
     """Whether or not it has a border for them."""
     loaded = SCENE.load(samples=2)
     images = [
@@ -303,7 +303,7 @@ def test_no_samples_are_taken_beyond_the_film():
 
 
 @pytest.mark.parametrize("action", ["develop", "adjoint"])
-def test_more_samples_need_no_longer_kernels_for_a_filter(action):
+def test_kernels_with_a_filter_do_not_grow_with_samples(action):
     """Compilers take longer than proportionally to a kernel's length."""
     sensor = SCENE.load(rfilter="gaussian").sensors()[0]
     width, height = sensor.film().crop_size()
@@ -335,7 +335,7 @@ def test_a_box_filter_gives_the_same_bytes_in_every_run():
     assert all(a.tobytes() == b.tobytes() for a, b in zip(*results, strict=True))
 
 
-def test_more_samples_come_closer_to_the_area_of_a_pixel():
+def test_more_samples_converge_to_the_pixel_area():
     """Splats smaller than a pixel, no low-pass: a pixel is the mean over its area. Errors of
     stratified samples fall at least as 1 / sqrt(n).
     """
@@ -441,7 +441,7 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypatch):
+def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch):
     monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
     monkeypatch.setattr("drgs.integrator.film.PIXELS_PER_PASS", 1)
     expected, passes = outcome(name)
@@ -475,7 +475,7 @@ def test_a_pass_of_a_large_film_has_one_sample():
     assert [p.samples for p in passes] == [at_once, at_once, 1]
 
 
-def test_more_samples_of_a_small_film_need_no_more_kernels():
+def test_samples_of_a_small_film_share_kernels():
     """But for their sums over samples, of 16 at a time."""
 
     def launches(samples) -> int:
