@@ -59,7 +59,7 @@ from drgs.splatting.projection import ewa
         ),
     ],
 )
-def test_coefficients_that_are_not_given_are_left_out(given, named):
+def test_missing_coefficients_are_left_out(given, named):
     lens = RadialTangential.from_coefficients(**given)
     assert lens.coefficients() == named
     values = {name: -value for name, value in named.items()}
@@ -67,7 +67,7 @@ def test_coefficients_that_are_not_given_are_left_out(given, named):
     assert lens.with_coefficients(values).max_squared_radius == lens.max_squared_radius
 
 
-def test_a_fisheye_leaves_out_what_is_not_given():
+def test_fisheye_leaves_out_missing_coefficients():
     assert fisheye.Fisheye.from_coefficients().coefficients() == {}
     assert fisheye.Fisheye.from_coefficients(k2=0.5).coefficients() == {"k1": 0.0, "k2": 0.5}
     assert fisheye.Fisheye.from_coefficients(k1=0.0).coefficients() == {"k1": 0.0}
@@ -91,7 +91,7 @@ def test_a_fisheye_leaves_out_what_is_not_given():
         ),
     ],
 )
-def test_a_thin_prism_fisheye_leaves_out_what_is_not_given(given, named):
+def test_thin_prism_fisheye_leaves_out_missing_coefficients(given, named):
     lens = KernelThinPrism.from_coefficients(**given)
     assert lens.coefficients() == named
     values = {name: -value for name, value in named.items()}
@@ -100,7 +100,7 @@ def test_a_thin_prism_fisheye_leaves_out_what_is_not_given(given, named):
 
 
 @every_lens
-def test_where_the_model_ends_is_where_the_reference_ends(name):
+def test_valid_region_matches_the_reference(name):
     lens = LENSES[name]
     if isinstance(lens, OpenCV):
         expected, actual = lens.valid_radius**2, kernel_lens(lens).max_squared_radius
@@ -124,7 +124,7 @@ def test_where_the_model_ends_is_where_the_reference_ends(name):
     ],
     ids=str,
 )
-def test_tangential_terms_end_the_model_where_the_reference_does(lens, ends):
+def test_valid_region_with_tangential_terms_matches_the_reference(lens, ends):
     radius = math.sqrt(kernel_lens(lens).max_squared_radius)
     assert radius == pytest.approx(lens.valid_radius, rel=1e-9)
     plain = replace(lens, p1=0.0, p2=0.0).valid_radius
@@ -143,7 +143,7 @@ def test_tangential_terms_end_the_model_where_the_reference_does(lens, ends):
     ],
     ids=str,
 )
-def test_prisms_end_the_model_where_the_reference_does(lens, ends):
+def test_valid_region_with_thin_prisms_matches_the_reference(lens, ends):
     angle = math.acos(kernel_lens(lens).min_cosine)
     assert angle == pytest.approx(lens.valid_angle, rel=1e-9)
     assert (angle < 0.99 * Fisheye(lens.k1, lens.k2, lens.k3, lens.k4).valid_angle) == ends
@@ -195,7 +195,7 @@ def test_kernels_do_not_depend_on_the_numbers_of_a_lens(lens, other):
     assert all(len(entries) >= 3 for entries in kernels.values())
 
 
-def test_each_coefficient_adds_operations_where_it_belongs():
+def test_each_coefficient_adds_operations_to_the_projection_only():
     """A lens without any has those of a pinhole with a bound; compositing never changes."""
     radial, rational = LENSES["radial"], LENSES["rational"]
     lenses_of = [effects.Pinhole(), OpenCV(), LENSES["barrel"], radial]
@@ -228,7 +228,7 @@ def test_each_coefficient_of_a_fisheye_adds_operations():
     + [("rational", unscented_shape, FLOAT32), ("fisheye", unscented_shape, FLOAT32)],
     ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
 )
-def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
+def test_nonfinite_positions_affect_no_other_gaussian(precision, name, shape):
     """The image and all other gradients are those of the same Gaussians far away."""
     case = clear(case_of(name, count=30))
     means = case.gaussians.means.copy()
@@ -263,7 +263,7 @@ def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_the_exact_projection_refuses_other_lenses_than_pinholes(name):
+def test_exact_projection_refuses_lenses_other_than_pinholes(name):
     case = LensCase("tiny", 13, 11, 0, 5, lens=LENSES[name])
     kind = type(kernel_lens(LENSES[name])).__name__
     pipeline = pipeline_of(Approximations(projection="exact"), 0)

@@ -74,7 +74,7 @@ def test_image_equals_the_reference(precision, name, antialiased):
 
 @both_precisions
 @every_lens
-def test_tiles_hold_all_that_large_splats_reach(precision, name):
+def test_tiles_contain_every_pixel_of_large_splats(precision, name):
     """The reference evaluates every splat at every pixel."""
     case = clear(case_of(name, recipe=large_scene, count=20))
     _, frame = case.render(precision)
@@ -108,7 +108,7 @@ GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 
 @pytest.mark.parametrize("name", ["rational", "fisheye", "orthographic"])
-def test_each_number_of_the_gradients_equals_a_difference_of_the_reference(name, monkeypatch):
+def test_each_gradient_entry_equals_a_difference_of_the_reference(name, monkeypatch):
     """One splat is on the axis, one so far beside the film that its slopes may be clamped."""
     lens = LENSES[name]
     case = clear(LensCase("tiny", 13, 11, 1, 5, lens=lens, recipe=tiny_scene, threshold_width=5e-4))
