@@ -77,7 +77,7 @@ def test_the_newest_library_is_selected_even_if_it_is_a_link(machine):
     assert os.environ[llvm.PATH_VARIABLE] == str(folder / "libLLVM.so.22.1")
 
 
-def test_the_users_choice_of_a_library_is_kept(machine, monkeypatch):
+def test_library_chosen_by_the_user_is_kept(machine, monkeypatch):
     machine("libLLVM.so.22.1")
     monkeypatch.setenv(llvm.PATH_VARIABLE, "/mine.so")
     select_newest_llvm()
@@ -155,7 +155,7 @@ def test_the_refusal_names_a_usable_library_that_is_installed(machine, monkeypat
         ([], "/none.so", "none that Dr.Jit can load (DRJIT_LIBLLVM_PATH=/none.so)"),
     ],
 )
-def test_where_drjit_has_no_library_the_refusal_says_what_there_is(
+def test_refusal_without_a_library_lists_the_installed_ones(
     machine, monkeypatch, names, variable, found
 ):
     folder = machine(*names)
