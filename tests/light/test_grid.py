@@ -116,7 +116,7 @@ CLOUDS = [range(104), pytest.param(range(104, 1000), marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("seeds", CLOUDS, ids=["some", "many"])
-def test_rays_meet_in_a_grid_what_they_meet_without(seeds):
+def test_rays_hit_the_same_gaussians_with_and_without_a_grid(seeds):
     """In double precision all that the reference meets, in single where that is well defined.
 
     In single precision, an offset of 1,000 sizes is rounded by 6e-5 of one, which moves alpha by

@@ -136,7 +136,7 @@ some_views = pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[10]], id
 
 @both_precisions
 @some_views
-def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
+def test_primary_rays_match_the_exact_image(precision, view):
     """The reference of images projects; rays, and the reference of rays, do not.
 
     Within what images by the kernels are.
@@ -161,7 +161,7 @@ def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
 
 
 @some_views
-def test_an_image_of_the_plugin_shows_what_the_sensors_rays_pass(view):
+def test_plugin_image_matches_rays_of_the_sensor(view):
     """Both against the reference."""
     problem = Problem.of(view)
     expected, kept = problem.planes_of_reference(MARKED[FLOAT32])
@@ -190,7 +190,7 @@ def test_an_image_of_the_plugin_shows_what_the_sensors_rays_pass(view):
 
 
 @pytest.mark.parametrize("splats", SCENES.values(), ids=SCENES.keys())
-def test_primary_rays_pass_what_volprim_shows(splats):
+def test_primary_rays_match_volprim(splats):
     """Within rounding, as the image of ``splats`` is but for what is derived there."""
     gaussians, view = splats.gaussians, splats.view
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)

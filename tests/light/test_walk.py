@@ -64,7 +64,7 @@ rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours up to 3, three ti
 @pytest.mark.parametrize(
     ("count", "spread", "size"), [(1, 1, 0.5), (30, 1, 0.5), (1000, 1, 0.05), (3000, 0.3, 0.1)]
 )
-def test_rays_pass_what_the_reference_says(precision, count, spread, size):
+def test_composited_rays_match_the_reference(precision, count, spread, size):
     gaussians, rays = random_gaussians(count, count, spread, size), random_rays(600)
     close = 0 if precision.dtype == np.float64 else 1e-4
     exact = reference.composite_segments(
@@ -82,7 +82,7 @@ def test_rays_pass_what_the_reference_says(precision, count, spread, size):
 
 
 @both_precisions
-def test_splats_that_do_not_show_let_everything_through(precision):
+def test_invisible_splats_have_full_transmittance(precision):
     """And so do Gaussians that are not finite, beside one that is."""
     gaussians, rays = random_gaussians(20), random_rays(50)
     faint = replace(gaussians, logit_opacities=np.full(20, -9.0))
