@@ -62,7 +62,7 @@ def found_by(relight, output, name) -> dict[str, list[float]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["objects", "mirror"])
-def test_what_the_image_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys, name):
+def test_parameters_of_the_target_image_are_recovered(relight, monkeypatch, tmp_path, capsys, name):
     """In 40 steps, from a start that is half as far away."""
     start = from_half_way(relight, monkeypatch, name)
     monkeypatch.setattr(relight, "BALL", [0.9, 0.2, 0.45])  # beside the knot
@@ -92,7 +92,7 @@ def test_a_models_smoothing_filter_reaches_the_integrator(relight):
     np.testing.assert_array_equal(np.array(filters[1]), smoothing)
 
 
-def test_harmonics_are_rotated_as_on_the_host(relight):
+def test_sh_rotation_matches_the_host(relight):
     rotation = Rotation.from_rotvec([0.3, -0.7, 0.4]).as_matrix()
     coefficients = np.random.default_rng(0).normal(0, 1, (5, 15, 3)).astype(np.float32)
     matrix = relight.sh_rotation(mi.Matrix3f(rotation), 3)
