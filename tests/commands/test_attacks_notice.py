@@ -88,7 +88,7 @@ BREACHES = {
 
 
 @pytest.mark.parametrize(("command", "message"), BREACHES.values(), ids=BREACHES)
-def test_what_no_command_may_do_is_noticed(attack_folder, monkeypatch, command, message):
+def test_forbidden_behaviour_is_detected(attack_folder, monkeypatch, command, message):
     monkeypatch.setattr("drgs.render.main", lambda words: command())
     seconds = 0.5 if command is wait else 20
     wrong = trial(Attack("x", "render", (), encoding="ascii", seconds=seconds), attack_folder)
@@ -105,7 +105,7 @@ def test_a_refusal_names_the_file(attack_folder, monkeypatch, message, wrong):
     assert trial(Attack("x", "render", (), named="a.yml"), attack_folder) == wrong
 
 
-def test_what_must_be_refused_and_is_not_is_noticed(attack_folder, monkeypatch):
+def test_missing_refusal_is_detected(attack_folder, monkeypatch):
     monkeypatch.setattr("drgs.render.main", lambda words: None)
     assert trial(Attack("x", "render", (), must_refuse=True), attack_folder) == ["was not refused"]
 
@@ -125,9 +125,7 @@ def forgetful_work(words):
 
 
 @pytest.mark.parametrize(("command", "is_right"), [(work, True), (forgetful_work, False)])
-def test_work_that_does_not_survive_a_kill_is_noticed(
-    attack_folder, monkeypatch, command, is_right
-):
+def test_work_lost_after_a_kill_is_detected(attack_folder, monkeypatch, command, is_right):
     monkeypatch.setattr("drgs.render.main", command)
     found = []
     for at in range(14):
@@ -139,7 +137,7 @@ def test_work_that_does_not_survive_a_kill_is_noticed(
     assert (stale == []) is is_right, found
 
 
-def test_the_workshop_is_put_back(attack_folder):
+def test_attack_folder_is_restored(attack_folder):
     before = contents(attack_folder.folder)
     (attack_folder.folder / "sky.png").unlink()
     (attack_folder.folder / "mine" / "notes.txt").write_text("changed")

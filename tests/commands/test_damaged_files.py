@@ -182,7 +182,7 @@ def test_damaged_masks_are_read_or_refused(photographs, layout):
     assert_both_happen(refused)
 
 
-def test_strange_names_are_found_or_said(photographs):
+def test_strange_names_are_found_or_reported(photographs):
     """Names of photographs, masks, clouds and lists: only files are read, and none twice."""
     path, refused = photographs / "transforms.json", []
     meta = json.loads(path.read_text())

@@ -149,7 +149,7 @@ def moments_of(config, tmp_path, *budget):
 BUDGET = ("--budget", "60s")
 
 
-def test_a_fit_with_a_budget_that_is_killed_around_its_revised_plans_goes_on(config, tmp_path):
+def test_fit_with_budget_killed_around_revised_plans_resumes(config, tmp_path):
     """Between the two files of a revision, and behind the last file."""
     names = moments_of(config, tmp_path, *BUDGET)
     saved = [moment for moment, name in enumerate(names) if name == "checkpoint.npz"]
@@ -163,7 +163,7 @@ def test_a_fit_with_a_budget_that_is_killed_around_its_revised_plans_goes_on(con
 @pytest.mark.slow
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("budget", [(), BUDGET], ids=["plain", "budget"])
-def test_a_fit_that_is_killed_at_any_file_goes_on(config, tmp_path, budget, behind):
+def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
     count = len(moments_of(config, tmp_path, *budget))
     for moment in range(count):
         out = assert_goes_on(config, tmp_path, moment, behind, *budget)
@@ -171,7 +171,7 @@ def test_a_fit_that_is_killed_at_any_file_goes_on(config, tmp_path, budget, behi
     assert not assert_goes_on(config, tmp_path, count, behind, *budget)
 
 
-def test_a_fit_that_is_killed_while_it_writes_results_repeats_no_iteration(config, tmp_path):
+def test_fit_killed_while_writing_results_repeats_no_iteration(config, tmp_path):
     names = moments_of(config, tmp_path)
     assert crashed(names.index("history.csv"), True, config, "--out", tmp_path / "out")[0]
     outcome = assert_fits("--resume", tmp_path / "out")
@@ -181,7 +181,7 @@ def test_a_fit_that_is_killed_while_it_writes_results_repeats_no_iteration(confi
         assert (tmp_path / "out" / name).read_bytes() == expected, name
 
 
-def test_a_run_that_is_half_removed_is_not_finished(config, tmp_path):
+def test_half_removed_run_is_not_finished(config, tmp_path):
     out = tmp_path / "out"
     assert_fits(config, "--out", out)
     unlink, removed = os.unlink, []

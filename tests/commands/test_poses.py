@@ -29,7 +29,7 @@ def run(tmp_path, monkeypatch, capsys):
     return command
 
 
-def test_what_was_found_is_said(run, tmp_path):
+def test_result_is_printed(run, tmp_path):
     asked, lines = run(FOUND)
     assert asked == (tmp_path, Search(), False)
     *progress, found, camera, written, following = lines
@@ -51,7 +51,7 @@ def test_photographs_without_a_camera_are_named(run):
     assert "so may --share one or --camera-model SIMPLE_RADIAL" in text
 
 
-def test_options_say_how_to_search(run):
+def test_options_set_the_search(run):
     options = ["--camera-model", "RADIAL", "--share", "one", "--compare", "neighbours"]
     asked, _ = run(FOUND, *options, "--overwrite")
     assert asked[1:] == (Search("RADIAL", "neighbours", "one"), True)

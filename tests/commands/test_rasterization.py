@@ -132,7 +132,7 @@ def test_colors_of_any_number_of_channels_are_composited():
     np.testing.assert_allclose(twice[1] - missing, 2 * (images[1] - missing), atol=1e-12)
 
 
-def test_depths_are_sums_or_expectations_and_come_last():
+def test_depths_are_sums_or_expectations_in_the_last_channel():
     arrays = {**scene(), "colors": scene()["colors"][:, 0]}
     for name in INPUTS[:5]:
         arrays[name] = arrays[name][8:11]  # few, so that there are pixels without any
@@ -261,7 +261,7 @@ def check_gradients_are_the_transpose_of_the_tangents(arrays, tangents, name):
     [{}, {"order": "pixel"}, {"sh_direction": "pixel", "sh_degree": 1}],
     ids=["center", "pixel order", "pixel colors"],
 )
-def test_groups_of_channels_change_no_image(monkeypatch, options):
+def test_grouping_channels_leaves_images_unchanged(monkeypatch, options):
     """All channels in one kernel, and three at a time; tangents and gradients to rounding."""
     arrays = dict(scene())
     if not options.get("sh_degree"):
@@ -438,12 +438,12 @@ SKEWED[1, 0, 1] = 0.5
         ({"projektion": "ewa"}, TypeError, "no parameter projektion; did you mean projection"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_name(changes, error, message):
+def test_mismatched_arguments_are_refused_by_name(changes, error, message):
     with pytest.raises(error, match=rf"rasterization\(\): .*{message}"):
         drgs.rasterization(**{**scene(), **FILM, "sh_degree": 3, **changes})
 
 
-def test_directions_of_pixels_need_coefficients():
+def test_pixel_sh_direction_needs_coefficients():
     arrays = {**scene(), "colors": scene()["colors"][:, 0]}
     with pytest.raises(ValueError, match="sh_direction is of spherical harmonics; give sh_degree"):
         drgs.rasterization(**arrays, **FILM, sh_direction="pixel")

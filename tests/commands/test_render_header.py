@@ -35,7 +35,7 @@ def shown(files, out, *arguments):
     return rendered.read_bytes()
 
 
-def test_a_file_alone_is_shown_as_it_says(files, capsys):
+def test_single_file_is_rendered_with_its_header(files, capsys):
     said = shown(files, "a", files / "run" / "point_cloud.ply", *CAMERA)
     lines = capsys.readouterr().out.splitlines()
     assert set(LINES) <= set(lines)
@@ -43,7 +43,7 @@ def test_a_file_alone_is_shown_as_it_says(files, capsys):
     assert "set by the file" not in capsys.readouterr().out
 
 
-def test_the_file_has_the_word_before_a_configuration_and_set_before_the_file(files, capsys):
+def test_header_overrides_configuration_and_set_overrides_header(files, capsys):
     ply, config = files / "run" / "point_cloud.ply", files / "plain.yml"
     own = shown(files, "a", files / "run")
     assert shown(files, "b", ply, "--scene", config) == own
@@ -59,7 +59,7 @@ def test_the_file_has_the_word_before_a_configuration_and_set_before_the_file(fi
     assert "set by the file" not in capsys.readouterr().out
 
 
-def test_a_file_for_viewers_is_shown_as_they_show_it(files):
+def test_file_for_viewers_is_rendered_like_viewers(files):
     """Under the configuration of its run, which says otherwise."""
     usual = {"antialiased": False, "low_pass": 0.3}
     replace(blobs(), rendered_with=usual).save(files / "run" / "viewers.ply")
