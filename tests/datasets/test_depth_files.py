@@ -49,7 +49,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("make", "message"), WRONG.values(), ids=WRONG)
-def test_a_depth_that_is_none_is_refused_in_one_line(tmp_path, make, message):
+def test_invalid_depth_file_is_refused_in_one_line(tmp_path, make, message):
     make(tmp_path / "a.npy")
     with pytest.raises(UserError) as error:
         read_depth(tmp_path / "a.npy", 1.0, (6, 4))
@@ -58,7 +58,7 @@ def test_a_depth_that_is_none_is_refused_in_one_line(tmp_path, make, message):
 
 
 @pytest.mark.parametrize("kind", ["f2", "f4", "f8", ">f4", "u1", "i4"])
-def test_depth_of_any_real_numbers_is_read(tmp_path, kind):
+def test_depth_of_any_real_type_is_read(tmp_path, kind):
     values = np.arange(24).reshape(4, 6).astype(kind)
     for array in (values, values[:, :, None]):
         np.save(tmp_path / "a.npy", array)

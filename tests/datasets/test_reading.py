@@ -33,7 +33,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_images_of_others_are_not_read(folder):
+def test_images_of_other_ranks_are_not_read(folder):
     """Pixels are damaged behind the headers, so all but the images is known."""
     config = DataConfig(path=folder, image_size=6)
     every = load_dataset(config)
@@ -59,7 +59,7 @@ def test_images_of_others_are_not_read(folder):
                 np.asarray(rendered)
 
 
-def test_images_that_were_read_can_be_left_to_others(folder):
+def test_images_of_other_ranks_can_be_dropped(folder):
     view = load_dataset(DataConfig(path=folder, ignore_depth=True)).train[0]
     without = without_images(view)
     assert without.depth is None and without.mask.shape == view.mask.shape
