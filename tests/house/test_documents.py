@@ -59,14 +59,14 @@ def test_the_readme_is_short():
     assert len(text_of("README.md").split()) <= MOST_WORDS
 
 
-def test_the_readme_has_two_commands_each_alone_on_its_line():
+def test_readme_has_two_commands_each_on_its_own_line():
     assert [block.strip() for block in fenced("README.md", "sh")] == [
         "bash .ci/setup python -m drgs.fit scenes/lego.yml",
         "bash .ci/setup python -m pytest",
     ]
 
 
-def test_the_readme_leads_to_every_page():
+def test_readme_links_to_every_page():
     for page in PAGES:
         if page not in ("README.md", "docs/index.md"):
             assert f"]({page})" in text_of("README.md")
@@ -86,7 +86,7 @@ def anchors(path) -> set[str]:
 
 
 @each_page
-def test_links_lead_somewhere(page):
+def test_links_have_targets(page):
     path = REPOSITORY / page
     for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
         if "://" in target:
@@ -102,7 +102,7 @@ OF_WORKED_EXAMPLES = {"drgs/effects/fog.py"}
 
 
 @each_page
-def test_paths_in_the_text_exist(page):
+def test_mentioned_paths_exist(page):
     for code in inline_code(page):
         if code.startswith(tuple(f"{folder}/" for folder in FOLDERS)):
             for path in code.split()[:1]:
@@ -120,7 +120,7 @@ GONE = {"drgs.rendering"}  # of the changelog
 
 
 @each_page
-def test_names_of_modules_and_their_contents_exist(page):
+def test_mentioned_modules_and_names_exist(page):
     for code in inline_code(page):
         if re.fullmatch(r"drgs(\.\w+)+", code) and code not in GONE:
             assert _exists(code), code
@@ -140,7 +140,7 @@ def _exists(name) -> bool:
 
 
 @each_page
-def test_keys_of_the_configuration_exist(page):
+def test_mentioned_configuration_keys_exist(page):
     for code in inline_code(page):
         match = re.fullmatch(r"((\w+)(\.\w+)+)(=.*)?", code)
         if match and match[3] != ".json" and match[2] in FitConfig.model_fields:
@@ -185,7 +185,7 @@ def help_of(*command) -> str:
 
 
 @each_page
-def test_commands_and_their_options_exist(page):
+def test_mentioned_commands_and_options_exist(page):
     for name, *arguments in commands(page):
         assert name in MODULES, name
         command = (name, *arguments[:1]) if name == "bench" and arguments else (name,)
@@ -193,7 +193,7 @@ def test_commands_and_their_options_exist(page):
         assert options <= set(re.findall(r"--?[a-zA-Z][\w-]*", help_of(*command))), arguments
 
 
-def test_the_pages_show_every_command():
+def test_documents_show_every_command():
     shown = {command[0] for page in PAGES for command in commands(page)}
     benches = {tuple(c[1:2]) for page in PAGES for c in commands(page) if c[0] == "bench"}
     assert shown == set(MODULES)
@@ -235,7 +235,7 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-def test_the_programs_of_the_pages_run(folder, run_python):
+def test_programs_in_the_documents_run(folder, run_python):
     """Each page's one after the other, as if they were pasted, then its scenes in XML."""
     program = []
     for page in WITH_PROGRAMS:

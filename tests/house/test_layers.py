@@ -138,18 +138,18 @@ def test_effects_of_a_fit_know_no_trainer():
         assert "drgs.training.trainer" not in IMPORTS[module], module
 
 
-def test_no_circle_among_modules():
+def test_no_import_cycles_among_modules():
     assert circle_among({name: found - {"drgs"} for name, found in IMPORTS.items()}) is None
 
 
-def test_no_circle_among_packages():
+def test_no_import_cycles_among_packages():
     packages = {name: set() for name in MAY_IMPORT}
     for module, found in IMPORTS.items():
         packages[package_of(module)] |= {package_of(name) for name in found - {"drgs"}}
     assert circle_among(packages) is None
 
 
-def test_a_circle_is_found():
+def test_import_cycle_is_found():
     assert circle_among({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
     assert circle_among({"a": {"b", "c"}, "b": {"c"}, "c": set()}) is None
 
@@ -157,7 +157,7 @@ def test_a_circle_is_found():
 @pytest.mark.parametrize(
     "module", [name for name in MODULES if MODULES[name].name == "__init__.py" and name != "drgs"]
 )
-def test_a_package_says_what_lives_there_and_what_it_may_import(module):
+def test_package_docstrings_describe_contents_and_allowed_imports(module):
     documentation = ast.get_docstring(ast.parse(MODULES[module].read_text()))
     first, _, rest = documentation.partition("\n\n")
     assert first.endswith("."), "the first line says what lives there"

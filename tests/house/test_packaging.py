@@ -93,7 +93,7 @@ def test_an_editable_install_wins_over_a_clone_of_the_same_name(tmp_path):
     assert integrator == "SplatsIntegrator"
 
 
-def test_every_file_of_the_packages_is_installed(installed):
+def test_every_package_file_is_installed(installed):
     def files(folder):
         return {
             path.relative_to(folder).as_posix()
@@ -107,7 +107,7 @@ def test_every_file_of_the_packages_is_installed(installed):
     assert files(installed / "drgs") == expected
 
 
-def test_the_version_is_that_of_the_project_file():
+def test_version_matches_the_project_file():
     import drgs
 
     assert f'\nversion = "{drgs.__version__}"\n' in (REPOSITORY / "pyproject.toml").read_text()
