@@ -51,27 +51,27 @@ def test_photographs_are_fitted_at_half_their_size_first(photographs):
         assert stages(CONFIG, one) == [(350, 2)]
 
 
-def test_what_is_cut_out_is_not(photographs):
+def test_images_with_alpha_have_no_coarse_stage(photographs):
     assert stages(CONFIG, with_alpha(photographs, lambda index: left_of(60 + index))) == []
     many = photographs_of(120, 100, 100)
     for opaque in range(12):  # one that is not cut out does not make the others so
         assert stages(CONFIG, with_alpha(many, lambda i, k=opaque: i == k or left_of(60))) == []
 
 
-def test_neither_are_small_images_and_the_papers_recipe(photographs):
+def test_small_images_and_adc_have_no_coarse_stage(photographs):
     assert stages(CONFIG, photographs_of(120, 99)) == []
     assert stages(with_changes(CONFIG, {"iterations": 1}), photographs) == []
     assert stages(with_changes(CONFIG, {"densify.strategy": "adc"}), photographs) == []
 
 
-def test_what_is_given_stays(photographs):
+def test_explicit_stages_are_kept(photographs):
     none = with_changes(CONFIG, {"coarse": []})
     assert stages(none, photographs) == []
     quarter = with_changes(CONFIG, {"coarse": [{"until": 9, "factor": 4}]})
     assert stages(quarter, photographs) == [(9, 4)]
 
 
-def test_it_stays_open_until_there_is_a_dataset(photographs):
+def test_stages_stay_open_until_the_dataset_is_known(photographs):
     assert with_iterations(CONFIG, 200).coarse is None
     known = resolve_defaults(CONFIG, photographs)
     assert with_decisions(CONFIG, known) == known

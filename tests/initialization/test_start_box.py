@@ -34,13 +34,13 @@ def refusal(views, **init):
 
 
 # The layout's own box
-def test_the_references_box_is_taken_where_the_cameras_are_as_it_expects():
+def test_reference_box_is_used_for_cameras_of_the_reference_layout():
     box = box_to_start_in(InitConfig(), dataset_of(views_from(AROUND), 1.3))
     assert (box.center == 0).all() and box.half_extent == 1.3
 
 
 @pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
-def test_elsewhere_it_is_scaled_and_moved_to_where_the_cameras_look(scale, target):
+def test_box_is_scaled_and_moved_to_the_focus_of_other_cameras(scale, target):
     dataset = dataset_of(views_from(AROUND, target, scale), 1.3)
     box = box_to_start_in(InitConfig(), dataset)
     np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
@@ -51,7 +51,7 @@ def test_elsewhere_it_is_scaled_and_moved_to_where_the_cameras_look(scale, targe
 
 
 # A box that is given
-def test_a_box_that_most_cameras_do_not_look_into_is_refused():
+def test_box_outside_most_views_is_refused():
     views = views_from(AROUND, target=(50, 0, 0))
     message = refusal(views, half_extent=1.3)
     assert message == (
@@ -66,7 +66,7 @@ def test_a_box_at_the_edge_of_the_images_is_refused():
     assert "but only 0 of 4 have it in the middle of" in refusal(views, half_extent=0.4)
 
 
-def test_a_box_that_hardly_shows_in_the_images_is_refused():
+def test_box_that_is_tiny_in_the_images_is_refused():
     views = views_from(AROUND, scale=100)
     assert "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of an image (the " in (
         refusal(views, half_extent=1.3)
@@ -74,7 +74,7 @@ def test_a_box_that_hardly_shows_in_the_images_is_refused():
 
 
 @pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
-def test_a_box_that_the_cameras_look_into_or_that_surrounds_them_is_taken(half_extent):
+def test_box_in_view_or_around_the_cameras_is_accepted(half_extent):
     box = box_to_start_in(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
     assert box.half_extent == half_extent
 
@@ -87,7 +87,7 @@ def cloud(tmp_path):
     return tmp_path / "cloud.ply"
 
 
-def test_a_cloud_in_another_frame_of_reference_is_refused(cloud):
+def test_cloud_in_another_coordinate_system_is_refused(cloud):
     message = refusal(views_from(AROUND, target=(30, 30, 30)), point_cloud=cloud)
     assert message == (
         f"{cloud}: must hold what the cameras look at (around (30, 30, 30), from 4.03 away), in "
@@ -97,7 +97,7 @@ def test_a_cloud_in_another_frame_of_reference_is_refused(cloud):
     )
 
 
-def test_the_point_cloud_that_a_dataset_names_is_started_from(photographs, cloud):
+def test_point_cloud_of_the_dataset_is_the_start(photographs, cloud):
     from support.datasets import edit
 
     edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="cloud.ply"))
@@ -112,7 +112,7 @@ def test_the_point_cloud_that_a_dataset_names_is_started_from(photographs, cloud
     assert initial_gaussians(config(init=few), ignoring).num_gaussians == 30
 
 
-def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
+def test_missing_point_cloud_falls_back_to_random_points(photographs):
     from support.datasets import edit
 
     edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="gone.ply"))
@@ -121,7 +121,7 @@ def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
     assert note.endswith("not there: 1 of 1 point cloud (gone.ply); the fit starts without")
 
 
-def test_points_that_are_all_black_get_the_colours_of_the_images(tmp_path):
+def test_black_points_are_coloured_from_the_images(tmp_path):
     """Some pipelines write points without colours."""
     positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
@@ -157,7 +157,7 @@ def test_the_near_plane_follows_from_the_cameras(scale, near):
     assert given.model.near == 1e-9
 
 
-def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
+def test_near_plane_beyond_the_focus_is_refused():
     near = dataset_of(views_from(AROUND, scale=0.01))
     with pytest.raises(UserError) as error:
         resolve_defaults(config(model={"near": 0.2}), near)
@@ -167,7 +167,7 @@ def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
     )
 
 
-def test_what_is_decided_is_written_down():
+def test_resolved_defaults_are_stored_in_the_configuration():
     """So that it is the same when the configuration of a fit is used again."""
     dataset = dataset_of(views_from(AROUND), 1.3)
     decided = resolve_defaults(config(), dataset)
@@ -175,7 +175,7 @@ def test_what_is_decided_is_written_down():
     assert resolve_defaults(decided, dataset) == decided
 
 
-def test_photographs_are_scaled_down_to_the_references_width_unless_a_size_is_given(photographs):
+def test_photographs_are_downscaled_to_the_reference_width_by_default(photographs):
     from PIL import Image
     from support.datasets import edit
 
