@@ -75,7 +75,7 @@ AOV = {"type": "aov", "aovs": "far:depth"}
     [(SENSORS["perspective"], False), *((view, True) for view in SENSORS.values())],
     ids=["splats alone", *SENSORS],
 )
-def test_aov_shows_the_image_and_its_own_channels(view, surfaces):
+def test_aov_outputs_the_image_and_its_own_channels(view, surfaces):
     """Channels: colour, alpha and AOVs of the nested image, those AOVs again, and its own."""
     scene, shapes = Scene(view), {"wall": wall(view)} if surfaces else {}
     alone = image_of(load(scene, shapes=shapes, samples=3), seed=5)
@@ -115,7 +115,7 @@ def test_one_sample_is_at_the_pixel_centre_in_the_image_and_on_the_ray_in_aovs()
     assert np.abs(image[..., 6] - image[..., 4]).max() > 0.01
 
 
-def test_derivatives_of_the_image_are_those_without_aov():
+def test_image_derivatives_are_the_same_without_aov():
     """With the same seed; aov hands on what is asked of the first channels."""
     scene = Scene()
     weights = scene.weights()
@@ -163,7 +163,7 @@ def test_derivatives_with_own_aovs_are_refused():
     )
 
 
-def test_other_integrators_are_refused():
+def test_unsupported_integrators_are_refused():
     assert refusal(load(Scene(), {"type": "moment"})) == (
         "splats: this integrator renders whole images: of those that sample the rays of another "
         "one, such as 'moment', it can only be nested in 'aov'"

@@ -107,7 +107,7 @@ def gaussians_before(camera):
 @both_emitters
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
 @all_cameras
-def test_an_environment_is_seen_past_the_splats(camera, srgb_primitives, emitter):
+def test_environment_shows_behind_the_splats(camera, srgb_primitives, emitter):
     camera = CAMERAS[camera]
     gaussians = gaussians_before(camera)
     sensor = camera.dictionary()
@@ -120,7 +120,7 @@ def test_an_environment_is_seen_past_the_splats(camera, srgb_primitives, emitter
 
 
 @both_emitters
-def test_what_is_seen_past_the_splats_is_what_path_renders(emitter):
+def test_environment_behind_splats_matches_path(emitter):
     """With as many samples at the same points: Mitsuba's samplers give both the same."""
     sensor, scene = Camera().dictionary(), Scene()
     far = {**tensors(scene.gaussians), "logit_opacities": mi.Float(np.full(40, -20, np.float32))}
@@ -158,7 +158,7 @@ def test_the_background_is_black_beyond_the_lens_model(camera):
     assert (image[12, 18, :3] > 0).all()
 
 
-def test_hidden_emitters_leave_the_background():
+def test_hide_emitters_keeps_the_background_color():
     scene = Scene()
     for hide, expected_alpha in ((True, None), (False, 1)):
         settings = {"hide_emitters": hide, "background": [0.2, 0.4, 0.6]}
@@ -173,7 +173,7 @@ def test_hidden_emitters_leave_the_background():
             assert image[..., 3].min() < 0.1
 
 
-def test_only_environment_emitters_are_seen():
+def test_only_environment_emitters_are_visible():
     """A point light is no environment."""
     scene, sensor = Scene(), Camera().dictionary()
     light = {"type": "point", "intensity": 10.0}
@@ -181,7 +181,7 @@ def test_only_environment_emitters_are_seen():
     assert np.array_equal(image, image_of(load(sensor, integrator_of(scene.gaussians))))
 
 
-def test_without_an_environment_alpha_is_that_of_the_splats():
+def test_alpha_without_an_environment_is_that_of_the_splats():
     scene, sensor = Scene(), Camera().dictionary()
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels()), "raw": True}
     image = image_of(load(sensor, integrator_of(scene.gaussians, background=bitmap)))

@@ -75,7 +75,7 @@ all_kinds = pytest.mark.parametrize("kind", KINDS)
 
 @all_kinds
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
-def test_derivatives_of_the_radiance_are_differences(kind, srgb_primitives):
+def test_derivatives_of_the_radiance_equal_differences(kind, srgb_primitives):
     """Along random directions. In linear radiance the image is linear in it: any step is exact
     up to rounding; in display space a step of 1e-2 leaves its square.
     """
@@ -264,7 +264,7 @@ def test_forward_and_backward_derivatives_are_transposed(kind, srgb_primitives):
     assert min(terms) > 5e-4 * size
 
 
-def test_derivatives_of_a_sensor_see_the_environment_move():
+def test_derivatives_of_a_sensor_include_the_environment():
     """A smooth one, before splats that end nowhere: a quotient in single precision."""
     y, x = np.mgrid[:32, :64]
     waves = [np.sin(x / 32 * np.pi), np.cos(y / 32 * np.pi), np.cos(x / 16 * np.pi)]
@@ -338,7 +338,7 @@ def test_a_changed_environment_needs_no_new_frame_and_no_new_kernel():
     assert loaded.integrator().state.cache.kept["frames 0"] is frames
 
 
-def test_a_new_view_before_an_environment_needs_no_new_kernel():
+def test_new_view_with_an_environment_needs_no_new_kernel():
     loaded, _ = scene_with("envmap")
     poses = [replace(VIEW, to_world=VIEWS[k].to_world) for k in (1, 2, 3)]
     sensors = [mi.load_dict(Camera(view).dictionary()) for view in poses]

@@ -53,7 +53,7 @@ CHANGING = replace(OPENCV, close=CLOSE, shutter="rolling")
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_changed_parameter_is_followed(name):
+def test_changed_parameter_takes_effect(name):
     convert, value = CHANGES[name]
     given = transform(value) if name.startswith("to_world") else value
     expected = CHANGING.load(**{name: given})
@@ -75,7 +75,7 @@ def test_a_changed_parameter_is_followed(name):
     assert np.abs(image - before).max() > 0.01
 
 
-def test_where_the_lens_model_ends_follows_its_coefficients():
+def test_valid_region_of_the_lens_follows_its_coefficients():
     scene = splats_scene(BARREL, splats_before(FILM, 1, 40, 0))
     params = mi.traverse(scene)
     key = next(key for key in params.keys() if key.endswith("k1"))  # noqa: SIM118
@@ -87,7 +87,7 @@ def test_where_the_lens_model_ends_follows_its_coefficients():
     assert (weight == 1).all()
 
 
-def test_coefficients_that_are_not_given_are_not_exposed():
+def test_missing_coefficients_are_not_exposed():
     assert set(mi.traverse(PINHOLE.load()).keys()) >= {"to_world", "fx", "fy", "cx", "cy"}
     keys = set(mi.traverse(replace(OPENCV, lens=OpenCV(k1=0.125)).load()).keys())
     assert "k1" in keys and not keys & {"k2", "k3", "k4", "p1", "to_world_close"}
@@ -99,7 +99,7 @@ def test_coefficients_that_are_not_given_are_not_exposed():
     [(OPENCV, ("k1", "k2", "p1")), (FISHEYE, ("k1", "k4")), (THIN_PRISM, ("k1", "p1", "sx1"))],
     ids=["opencv", "fisheye", "thin prism"],
 )
-def test_coefficients_that_are_given_as_zero_can_be_optimised(sensor, names):
+def test_zero_coefficients_can_be_optimised(sensor, names):
     """Each has a derivative, that of a difference across 0, and stays when another is changed.
 
     Of splats on the film: without distortion, all places on a side of the film bound the slopes at
@@ -270,7 +270,7 @@ def test_an_unknown_property_is_refused():
         mi.load_dict({"type": "calibrated", "shutter_sample": 3})
 
 
-def test_defaults_are_those_of_the_description():
+def test_documented_defaults_are_used():
     sensor = mi.load_dict({"type": "calibrated", "film": {"type": "hdrfilm", "width": 30}})
     width, height = sensor.film().size()
     values = [float(v[0]) for v in (sensor.fx, sensor.fy, sensor.cx, sensor.cy)]
@@ -281,7 +281,7 @@ def test_defaults_are_those_of_the_description():
     assert not sensor.needs_aperture_sample()
 
 
-def test_a_sensor_describes_itself():
+def test_sensor_has_a_readable_repr():
     description = str(replace(OPENCV, lens=OpenCV(k1=0.125, p2=0.25)).load())
     assert description.startswith("CalibratedSensor[\n  fx = [40], fy = [44],\n  cx = [24]")
     assert "lens = RadialTangential, k1, p1, p2" in description
@@ -308,7 +308,7 @@ XML = """
 """
 
 
-def test_a_sensor_of_an_xml_file_is_that_of_a_dictionary():
+def test_sensor_from_xml_equals_sensor_from_a_dictionary():
     sensor = replace(OPENCV, lens=OpenCV(k1=-0.25, p2=0.015625), close=CLOSE, shutter="rolling")
     open, close = (
         " ".join(repr(float(value)) for row in matrix for value in row)

@@ -81,7 +81,7 @@ def test_the_table_has_all_parameters_and_routes():
         assert empty == ([] if case.is_seen_alone else [ALONE])
 
 
-def test_only_poses_with_light_of_splats_are_partly_differentiated():
+def test_only_poses_lit_by_splats_are_partly_differentiated():
     rows = {row for row, route in CELLS if TABLE[row][route] == IN_PART}
     assert rows == {"`to_world`, diffuse", "`to_world`, rough"}
 
@@ -95,7 +95,7 @@ def test_poses_seen_by_other_surfaces_are_differentiated():
     assert measure(case, "`splatpath`").error < 0.01
 
 
-def test_hair_is_rendered_though_one_of_its_parameters_has_no_value():
+def test_hair_is_rendered_despite_a_parameter_without_value():
     """Mitsuba cannot list its parameters with their values."""
     scene = load(Case("lamp.intensity.value", {"type": "hair"}, spp=16), "`splatpath`")
     assert dr.mean(mi.render(scene), axis=None) > 0

@@ -46,20 +46,20 @@ def variant():
 
 @pytest.mark.parametrize("srgb_primitives", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_gradients_equal_the_references(degree, srgb_primitives):
+def test_gradients_match_the_reference(degree, srgb_primitives):
     scene = clear(Held(degree=degree, srgb_primitives=srgb_primitives))
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
 
-def test_gradients_equal_the_references_for_a_mesh():
+def test_gradients_match_the_reference_for_a_mesh():
     scene = clear(Held(kind="ellipsoidsmesh"))
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
 
 @pytest.mark.parametrize("name", HELD)
-def test_only_what_is_enabled_receives_gradients(name):
+def test_only_enabled_parameters_receive_gradients(name):
     scene = Held()
     loaded = scene.load()
     params = mi.traverse(loaded)
@@ -71,7 +71,7 @@ def test_only_what_is_enabled_receives_gradients(name):
     assert not any(dr.grad_enabled(params[f"shape.{other}"]) for other in HELD if other != name)
 
 
-def test_gradients_reach_what_a_shapes_parameters_were_computed_from():
+def test_gradients_reach_the_inputs_of_shape_parameters():
     scene = clear(Held())
     loaded = scene.load()
     params = mi.traverse(loaded)
@@ -133,7 +133,7 @@ def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
     assert forward == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
 
 
-def test_the_gradient_tests_would_notice_one_percent():
+def test_gradient_tests_detect_one_percent_errors():
     scene = clear(Held())
     expected = apart(held_gradients(scene.held, scene.gradients(scene.weights())))
     for name, values in expected.items():
@@ -141,7 +141,7 @@ def test_the_gradient_tests_would_notice_one_percent():
             assert_arrays_agree({name: 1.01 * values}, {name: values}, GRADIENTS)
 
 
-def test_backward_passes_give_the_same_bytes_and_add_nothing_atomically():
+def test_backward_passes_give_the_same_bytes_without_float_atomics():
     scene = Merged()
     first = gradients_held(scene.load(), scene.weights(), "first")
     again = {}
@@ -201,7 +201,7 @@ def counted(monkeypatch):
     return frames, conversions
 
 
-def test_a_backward_pass_reuses_the_frame_and_converts_once_more(counted):
+def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
     scene = Held()
     loaded = scene.load()
     gradients_held(loaded, scene.weights())
@@ -223,7 +223,7 @@ def test_a_changed_parameter_is_rendered_again(name, counted):
     np.testing.assert_array_equal(after, image_of(scene.load(shape=shape_of(halved))))
 
 
-def test_a_shape_may_be_given_other_gaussians(counted):
+def test_gaussians_of_a_shape_may_be_replaced(counted):
     scene, other = Held(), Held(count=60, seed=9)
     loaded = scene.load()
     image_of(loaded)
@@ -234,7 +234,7 @@ def test_a_shape_may_be_given_other_gaussians(counted):
     np.testing.assert_array_equal(image_of(loaded), image_of(other.load()))
 
 
-def test_a_changed_parameter_of_the_integrators_own_is_rendered_again():
+def test_changed_integrator_parameter_is_rendered_again():
     scene = Merged()
     loaded = scene.load()
     image_of(loaded)
@@ -246,7 +246,7 @@ def test_a_changed_parameter_of_the_integrators_own_is_rendered_again():
     np.testing.assert_array_equal(image_of(loaded), expected)
 
 
-def test_an_integrator_shows_the_shapes_of_the_scene_that_it_renders():
+def test_integrator_renders_the_shapes_of_the_current_scene():
     first, second = Held(), Held(seed=9)
     scenes = [scene.load() for scene in (first, second)]
     expected = [image_of(loaded) for loaded in scenes]
@@ -296,7 +296,7 @@ MODULES = (
 )
 
 
-def test_scenes_without_shapes_or_to_world_import_no_gathering_and_keep_their_kernels(
+def test_scenes_without_shapes_or_to_world_skip_merging_modules(
     run_python,
 ):
     results = [

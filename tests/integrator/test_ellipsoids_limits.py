@@ -97,7 +97,7 @@ def test_the_sign_of_a_standard_deviation_is_ignored():
     assert plain[4] != 0
 
 
-def test_a_to_world_that_mirrors_makes_the_mirror_image(tmp_path):
+def test_mirroring_to_world_gives_the_mirror_image(tmp_path):
     """Before a camera that is mirrored with it: of degree 0, the same image."""
     path = write_model(tmp_path / "model.ply", Scene(degree=0).gaussians)
     shape = {"type": "ellipsoids", "filename": path}
@@ -110,7 +110,7 @@ def test_a_to_world_that_mirrors_makes_the_mirror_image(tmp_path):
     assert_images_agree(mirrored, image)
 
 
-def test_the_derivative_at_an_opacity_of_one_is_that_of_the_inside():
+def test_derivative_at_opacity_one_is_the_one_sided_limit():
     """A splat behind all others, its peak beside the film: images are linear in its opacity."""
     settings = {"alpha_cut": 0.0, "transmittance_stop": 0.0, "extent": 3.0}
     scene = Held(degree=0)
@@ -194,7 +194,7 @@ def test_a_degree_above_that_of_the_shapes_is_refused():
     )
 
 
-def test_a_degree_that_only_shapes_have_may_be_asked_for():
+def test_degree_of_shapes_may_be_chosen():
     """When loaded, later, and still after a parameter of the integrator's own has changed."""
     scene = clear(Merged(own_degree=0, degrees=(0, 3), sh_degree=2))
     loaded = scene.load()
@@ -209,7 +209,7 @@ def test_a_degree_that_only_shapes_have_may_be_asked_for():
     assert_images_agree(image_of(loaded), expected)
 
 
-def test_own_coefficients_may_be_fewer_than_those_of_shapes_were():
+def test_own_coefficients_may_be_of_lower_degree_than_those_of_shapes():
     """The highest degree is still that of a shape."""
     loaded = Merged().load()
     before = image_of(loaded)

@@ -60,7 +60,7 @@ def of_three(probes="floor", **others):
     return *own, rendered("rays", **others)
 
 
-def test_a_mirror_shows_what_the_mirrored_camera_sees(monkeypatch):
+def test_mirror_matches_the_mirrored_camera(monkeypatch):
     """40 dB of the float64 reference, of which much is the noise of 64 paths: rays have 43."""
     monkeypatch.syspath_prepend(REPOSITORY / "scenes")
     import flat_mirror
@@ -134,14 +134,14 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_flat_mirror_shows_what_rays_show(kind):
+def test_flat_mirror_matches_traced_rays(kind):
     """46 dB, between texels; without light there are less than 24."""
     none, probe, rays = of_three(**KINDS[kind]())
     assert metrics.psnr(probe, rays) > 46
     assert metrics.psnr(none, rays) < 24
 
 
-def test_rough_mirrors_and_mirrors_in_mirrors_are_seen_from_the_mirrored_camera():
+def test_rough_and_nested_mirrors_use_the_mirrored_camera():
     """Both are approximate; from the middles of the objects, there are 25 and 29 dB."""
     rough = {"floor": floor(bsdf={"type": "roughconductor", "alpha": 0.1})}
     for probes, objects, least in (("floor", rough, 29), ("floor, wall", {"wall": wall()}, 34)):
@@ -176,7 +176,7 @@ def test_images_are_kept_until_something_changes(monkeypatch):
         counts.pop()
 
 
-def test_a_camera_that_goes_on_needs_no_new_kernels():
+def test_camera_motion_needs_no_new_kernels():
     found, kernels = scene(), []
     for _ in range(3):
         params = mi.traverse(found)

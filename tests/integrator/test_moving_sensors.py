@@ -71,7 +71,7 @@ class PluginCase(MovingCase):
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{s.name}, {s.shutter}")
-def test_a_calibrated_sensors_image_is_that_of_the_reference(variant, sensor):
+def test_calibrated_sensor_image_matches_the_reference(variant, sensor):
     gaussians, rendered = clear_gaussians(
         sensor, lambda gaussians: image_by_reference(sensor, gaussians)
     )
@@ -111,7 +111,7 @@ def test_gradients_add_up_over_the_times(variant, sensor):
         assert abs(1.01 * terms.sum() - expected) > 2e-5 * np.abs(terms).sum(), parameter
 
 
-def test_poses_that_kernels_share_change_no_byte(variant, monkeypatch):
+def test_sharing_kernels_among_poses_changes_no_byte(variant, monkeypatch):
     """More poses than :data:`PASSES_PER_KERNEL` are compiled in parts."""
     gaussians, _ = clear_gaussians(
         SENSORS[0], lambda gaussians: image_by_reference(SENSORS[0], gaussians)

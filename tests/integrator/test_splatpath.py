@@ -62,7 +62,7 @@ def room():
 
 
 @pytest.mark.parametrize("max_depth", [1, 2, 3, 8])
-def test_surfaces_alone_look_as_by_path(max_depth):
+def test_image_without_splats_matches_path(max_depth):
     """Within five standard errors everywhere, and within one and a bit on average."""
     found = []
     for nested, light in (("splatpath", "rays"), ("path", "none")):
@@ -103,7 +103,7 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     assert expected.max() > 0.3
 
 
-def test_a_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
+def test_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
     """The pixel shows one point of the wall, from which the lamp is seen through every Gaussian."""
     rng = np.random.default_rng(1)
     lamp, count = np.array([0.5, 0.3, 3.0]), 30
@@ -137,7 +137,7 @@ def test_a_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
     np.testing.assert_allclose(ratio[clear], seen.transmittances[clear], atol=0.02)
 
 
-def test_in_a_white_furnace_everything_is_white():
+def test_white_furnace_is_white():
     """White splats before a white sky around a white ball: none can be told from the others."""
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(300, 3))
@@ -259,7 +259,7 @@ def test_bounces_in_a_furnace_of_fog_converge_to_its_radiance(furnace):
 
 
 @pytest.mark.parametrize("color", [0.02, 0.5, (0.9, 0.3, 0.1)])
-def test_drawn_splats_have_the_colour_of_all_on_average(color):
+def test_sampled_splats_have_the_mean_colour_of_all_splats(color):
     """Splats of several colours overlap: their mean is decoded, not each of them."""
     rng = np.random.default_rng(3)
     colors = np.clip(np.asarray(color) * rng.uniform(0, 2, (40, 3)), 0, 1)
@@ -288,7 +288,7 @@ def test_the_sum_of_powers_decodes_within_its_error():
     assert np.abs(found - linear(color)).max() < 2e-3
 
 
-def test_glass_that_does_not_refract_changes_nothing():
+def test_glass_without_refraction_is_invisible():
     splats = gaussians([[0, 0, -1], [0.3, 0.2, -2]], 0.4, 0.8, [[0.9, 0.2, 0.1], [0.1, 0.3, 0.8]])
     slab = {
         "slab": {
@@ -305,7 +305,7 @@ def test_glass_that_does_not_refract_changes_nothing():
     assert rendered.max() > 0.3
 
 
-def test_materials_and_lamps_are_differentiated_among_splats():
+def test_materials_and_lamps_have_derivatives_among_splats():
     """Central differences use images with many paths."""
     splats = gaussians([[0.3, 1.2, 0.5], [-0.8, 0.6, 0.4]], 0.4, 0.7, 0.8)
     objects = room()
@@ -329,7 +329,7 @@ def test_materials_and_lamps_are_differentiated_among_splats():
         assert gradient == pytest.approx((means[1] - means[0]) / (2 * step), rel=0.05), key
 
 
-def test_what_would_be_wrong_is_refused():
+def test_unsupported_derivatives_and_settings_are_refused():
     splats = gaussians([[0, 0, -1]])
     scene = scene_of(splats, **room())
     params = mi.traverse(scene)

@@ -46,7 +46,7 @@ def scene_of(view, **objects):
 
 
 @pytest.mark.parametrize("shared", [True, False], ids=["one scene", "two scenes"])
-def test_two_threads_get_the_images_that_one_gets(shared):
+def test_two_threads_render_the_same_images_as_one(shared):
     """From sensors in turn, so that no frame is that of the image before."""
     first = scene_of(VIEWS[1])
     scenes = [first, first if shared else scene_of(VIEWS[3])]
@@ -61,7 +61,7 @@ def test_two_threads_get_the_images_that_one_gets(shared):
             np.testing.assert_array_equal(rendered, expected[number][sensor])
 
 
-def test_one_integrator_makes_one_image_at_a_time():
+def test_integrator_renders_one_image_at_a_time():
     """Its frames, its film and the nested integrator's recordings are not those of two."""
     active, most = [], []
 

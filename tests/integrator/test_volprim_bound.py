@@ -100,7 +100,7 @@ WRONG = (
 
 
 @pytest.mark.parametrize("splats, wrong", WRONG, ids=[wrong.__name__ for _, wrong in WRONG])
-def test_the_bound_refuses_splats(splats, wrong):
+def test_bound_rejects_wrong_splats(splats, wrong):
     gaussians, view = splats.gaussians, splats.view
     covariance = widened(gaussians, view.camera)
     expected = volprim_image(gaussians, view, *axes_of(covariance))
@@ -109,7 +109,7 @@ def test_the_bound_refuses_splats(splats, wrong):
         assert_within(difference, bound(gaussians, view.camera, covariance))
 
 
-def test_the_bound_refuses_splats_without_the_low_pass():
+def test_bound_rejects_splats_without_the_low_pass():
     gaussians, view = SMALL.gaussians, SMALL.view
     covariance = covariances(gaussians)
     difference = volprim_image(gaussians, view, *axes_of(covariance)) - drgs_image(gaussians, view)
