@@ -359,7 +359,7 @@ def sample_mutants(source):
     return results
 
 
-def test_mutants_are_what_they_say():
+def test_mutants_compute_their_described_change():
     expected = {
         ("x < y", AT_EQUALITY): [15, -9],
         ("x < y", ALWAYS): [15, -9],
@@ -378,7 +378,7 @@ def test_mutants_are_what_they_say():
     assert sample_mutants(SAMPLE) == {key: pytest.approx(value) for key, value in expected.items()}
 
 
-def test_a_partial_that_is_added_has_mutants():
+def test_added_partial_has_mutants():
     added = SAMPLE.replace("1 - g * x]", "dr.fma(g, -x, 2 - x / x)]")
     texts = {text for text, _ in set(sample_mutants(added)) - set(sample_mutants(SAMPLE))}
     assert texts == {
@@ -388,7 +388,7 @@ def test_a_partial_that_is_added_has_mutants():
     }
 
 
-def test_a_mutant_compiles_no_kernel():
+def test_mutants_compile_no_kernel():
     board = Switchboard()
     adjoint = Instrumented(board, SAMPLE, ["adjoint"], ["forward"])["adjoint"]
     arguments = [dr.opaque(Float64, value, 4) for value in (2, 3, 5)]

@@ -105,7 +105,7 @@ CENTER = at_pixel(8, 6)
 
 
 @both_precisions
-def test_a_clamped_alpha_has_no_derivative_and_its_colour_has(precision):
+def test_clamped_alpha_has_no_derivative_but_its_colour_has(precision):
     gaussians = splat(logit_opacities=[6.0])
     gradients = gradients_of(gaussians, precision, CENTER)
     for name in ("logit_opacities", "log_scales", "quats"):
@@ -228,7 +228,7 @@ def test_a_gaussian_nearer_than_the_near_plane_has_no_gradient(precision, z, is_
 
 
 @both_precisions
-def test_what_lies_behind_the_stop_has_no_gradient(precision):
+def test_splats_behind_the_stop_have_no_gradient(precision):
     """Two clamped splats leave just less than the stop: the second and all behind have none."""
     layers = [
         splat(means=[[0.0, 0.0, z]], logit_opacities=[logit])

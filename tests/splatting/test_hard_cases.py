@@ -58,7 +58,7 @@ def test_image_and_gradients_are_within_the_bound(precision, name):
     assert max(ratios.values()) <= 1, ratios
 
 
-def test_the_bounds_are_tight():
+def test_error_bounds_are_tight():
     """A bound that allows anything proves nothing: most families have five digits or more."""
     relative = []
     for name in FAMILIES:
@@ -67,7 +67,7 @@ def test_the_bounds_are_tight():
     assert np.median(relative) < 2e-5 and max(relative) < 1e-2, sorted(relative)
 
 
-def test_textbook_formulas_exceed_the_bound_where_the_stable_ones_do_not():
+def test_bound_distinguishes_textbook_from_stable_formulas():
     """The conic by xx yy - xy^2 in float32 loses needles: the bound tells the two apart."""
     case = FAMILIES["needles of ratio 1e6"]
     affine = reference._local_affine(case.gaussians, case.camera)
