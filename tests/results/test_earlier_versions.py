@@ -55,6 +55,6 @@ def test_a_configuration_keeps_its_values(fitted):
     assert config == values
 
 
-def test_a_scene_and_the_settings_in_a_ply_header_render_the_same_image():
+def test_scene_and_ply_header_render_the_same_image():
     image = mi.render(mi.load_file(str(EARLIER / "scene.xml")), seed=0)
     np.testing.assert_allclose(image, read_exr(EARLIER / "scene.exr"), ROUNDING, ROUNDING)

@@ -131,14 +131,14 @@ def assert_shown_as_fitted(rendered, camera, gaussians) -> None:
         assert decibels(rendered, image) <= OTHERWISE, name
 
 
-def test_it_opens_from_disk_without_a_request_or_an_error(page, path):
+def test_page_opens_from_disk_without_requests_or_errors(page, path):
     assert page.troubles() == []
     own, *others = page.requests()
     assert own == path.as_uri() + "?noui"
     assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
 
 
-def test_the_first_view_is_that_of_the_training_camera(page, gaussians, initial_view):
+def test_first_view_is_the_training_camera(page, gaussians, initial_view):
     camera = shown_camera(page, initial_view)
     np.testing.assert_allclose(
         camera.camera_to_world, initial_view.camera.camera_to_world, atol=1e-5 * RADIUS
@@ -146,7 +146,7 @@ def test_the_first_view_is_that_of_the_training_camera(page, gaussians, initial_
     assert_shown_as_fitted(page.rendered(), initial_view.camera, gaussians)
 
 
-def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, initial_view):
+def test_dragging_orbits_the_focus_at_the_same_height(page, gaussians, initial_view):
     before, first = shown_camera(page, initial_view), page.rendered()
     page.drag((30, 90), (210, 90))
     settle(page)
@@ -164,7 +164,7 @@ def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, ini
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_with_its_controls_it_fits_the_window_and_turns(path, size):
+def test_page_with_controls_fits_the_window_and_orbits(path, size):
     width, height = SIZES[size]
     with browsers.a_page(width, height) as page:
         page.cut_off()
@@ -189,7 +189,7 @@ def test_a_title_is_text(page):
     assert page.evaluate("typeof window.intruder") == "undefined"
 
 
-def test_without_webgl_the_page_says_what_it_needs(path):
+def test_page_without_webgl_explains_what_it_needs(path):
     with browsers.Browser(*browsers.NO_WEBGL) as browser:
         page = browsers.Page(browser, WIDTH, HEIGHT)
         page.cut_off()
