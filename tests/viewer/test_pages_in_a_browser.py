@@ -109,7 +109,7 @@ def expected_view(run: Path, width: int, height: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_gaussians_are_seen_as_they_are_and_turn_under_the_mouse(fit, size, tmp_path):
+def test_page_shows_gaussians_and_orbits_with_the_mouse(fit, size, tmp_path):
     width, height = SIZES[size]
     with (
         command("drgs.view", fit, log=tmp_path / "log") as (process, address),
@@ -131,7 +131,7 @@ def test_gaussians_are_seen_as_they_are_and_turn_under_the_mouse(fit, size, tmp_
         assert process.wait(30) == 0
 
 
-def test_a_fit_is_seen_paused_and_ended(tmp_path):
+def test_page_of_a_fit_shows_pauses_and_ends_it(tmp_path):
     config = write_scene(tmp_path, iterations=ENDLESS, densify={"start": 1, "stop": 2})
     out, log = tmp_path / "out", tmp_path / "log"
     words = ("drgs.fit", config, "--out", out, "--view", "--set", "output.report=false")
