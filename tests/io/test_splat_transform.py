@@ -77,7 +77,7 @@ def convert(*arguments) -> None:
 
 
 @pytest.mark.parametrize("suffix", READ)
-def test_it_reads_what_is_written_here(tmp_path, suffix):
+def test_our_files_are_read_by_it(tmp_path, suffix):
     rotation, precision = READ[suffix]
     path = tmp_path / f"ours{suffix}"
     gaussians_within_ranges().save(path)
@@ -87,7 +87,7 @@ def test_it_reads_what_is_written_here(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("case", WRITTEN)
-def test_what_it_writes_is_read_here(tmp_path, case):
+def test_its_files_are_read_here(tmp_path, case):
     if "4" in case:
         pytest.importorskip("zstandard")
     options, rotation, precision = WRITTEN[case]
