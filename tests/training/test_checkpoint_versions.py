@@ -58,7 +58,7 @@ def without_what_is_new(values):
     values["densify"] = {name: densify[name] for name in kept}
 
 
-def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
+def test_checkpoint_of_an_earlier_version_is_continued(folder, config):
     saved_as(folder, config, without_what_is_new)
     assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
 
@@ -67,7 +67,7 @@ def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
     ("section", "key", "value"),
     [("model", "near", 0.1), ("data", "background", "black"), ("densify", "stop", 15_000)],
 )
-def test_one_of_other_values_does_not(folder, config, section, key, value):
+def test_checkpoint_with_different_values_is_refused(folder, config, section, key, value):
     def change(values):
         without_what_is_new(values)
         values[section][key] = value

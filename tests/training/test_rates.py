@@ -27,7 +27,7 @@ def rates_of(trainer):
     }
 
 
-def test_rates_fall_to_a_part_of_themselves_behind_a_share_of_the_fit():
+def test_rates_decay_to_a_fraction_after_a_share_of_the_fit():
     trainer = make_trainer(optimizer={"decay": 0.1, "decay_from": 0.4}, densify=STILL)
     rates = []
     for _ in range(50):
@@ -46,7 +46,7 @@ def test_rates_fall_to_a_part_of_themselves_behind_a_share_of_the_fit():
     )
 
 
-def test_rates_stay_without_a_decay():
+def test_rates_are_constant_without_a_decay():
     trainer = make_trainer(densify=STILL, optimizer={"decay": 1.0})
     before = rates_of(trainer)
     for _ in range(50):
@@ -57,7 +57,7 @@ def test_rates_stay_without_a_decay():
     }
 
 
-def test_a_revised_plan_keeps_the_rates_of_the_past():
+def test_revised_plan_keeps_past_rates():
     changes = {"optimizer": {"decay": 0.1, "decay_from": 0.2}, "densify": STILL}
     trainer = make_trainer(**changes)
     past = []
@@ -75,7 +75,7 @@ def test_a_revised_plan_keeps_the_rates_of_the_past():
 LATE = {"views": 3, "views_from": 0.5, "decay": 1.0}
 
 
-def test_a_step_of_several_views_is_one_of_their_mean_gradient():
+def test_step_of_several_views_uses_their_mean_gradient():
     """Iterations 27, 28, 29 -> a step at 30: Adam by hand, from gradients of single views."""
     trainer = make_trainer(optimizer=LATE, densify=STILL)
     while trainer.iteration < 27:
@@ -111,7 +111,7 @@ def test_a_step_of_several_views_is_one_of_their_mean_gradient():
 
 
 @pytest.mark.parametrize("stopped", [26, 27, 28, 29])
-def test_a_fit_that_is_resumed_within_a_step_continues_to_the_same_bytes(stopped):
+def test_fit_resumed_within_a_step_continues_to_the_same_bytes(stopped):
     uninterrupted, first = (make_trainer(optimizer=LATE, densify=STILL) for _ in range(2))
     for _ in range(stopped):
         uninterrupted.step()
@@ -126,7 +126,7 @@ def test_a_fit_that_is_resumed_within_a_step_continues_to_the_same_bytes(stopped
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
 
 
-def test_views_are_put_together_only_when_the_population_is_what_it_will_be():
+def test_views_are_averaged_only_after_the_last_density_change():
     trainer = make_trainer(optimizer={"views": 4, "views_from": 0.2}, densify={"stop": 30})
     counts = []
     for iteration in range(1, 51):

@@ -85,7 +85,7 @@ def in_units_of_one(case: str):
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 @pytest.mark.parametrize("case", CASES)
-def test_a_fit_is_the_same_in_other_units(case, unit):
+def test_fit_is_invariant_to_units(case, unit):
     expected, gaussians = in_units_of_one(case)
     images, found = images_and_result(case, scaled(unit))
     assert found.num_gaussians == gaussians.num_gaussians
@@ -96,7 +96,7 @@ def test_a_fit_is_the_same_in_other_units(case, unit):
 
 
 @pytest.mark.parametrize("case", ["budget", "refined cameras", "visual hull"])
-def test_a_fit_is_the_same_far_from_the_origin(case, tmp_path):
+def test_fit_is_invariant_to_the_origin(case, tmp_path):
     """From files, whose cameras are in Earth-centred coordinates."""
     place = np.array([4.2e6, 1.7e5, -4.78e6])
     dataset = photographed()
@@ -131,7 +131,7 @@ def write_and_load(folder, dataset: Dataset) -> Dataset:
     return loaded
 
 
-def test_the_extent_of_one_training_camera_is_that_of_all():
+def test_extent_with_one_training_camera_uses_all_cameras():
     dataset = photographed()
     one = replace(dataset, train=dataset.train[:1])
     centers = np.stack([v.center for v in (*one.train, *one.test)])

@@ -26,7 +26,7 @@ def made(trainer):
     ]
 
 
-def test_nothing_is_made_before_it_is_needed():
+def test_targets_are_created_on_demand():
     trainer = make_trainer()
     assert made(trainer) == [set()]
     view = fits.steps(trainer, 1).last_step.views[-1].view
@@ -35,7 +35,7 @@ def test_nothing_is_made_before_it_is_needed():
     assert view.photograph is target is view.target
 
 
-def test_targets_stay_while_there_is_room(monkeypatch):
+def test_targets_are_cached_within_the_memory_limit(monkeypatch):
     monkeypatch.setattr(trainer_module, "KEPT_BYTES", 2 * PIXELS * TARGET_BYTES + 7)
     trainer, seen = make_trainer(), []
     for _ in range(8):  # two rounds of four views
@@ -45,7 +45,7 @@ def test_targets_stay_while_there_is_room(monkeypatch):
 
 
 @pytest.mark.parametrize("effects", [{}, {"data__random_background": True, "colors__lr": 0.02}])
-def test_a_fit_does_not_depend_on_what_stays(monkeypatch, effects):
+def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
     """Nor on effects that upload something of a view."""
 
     def result():
@@ -60,7 +60,7 @@ def test_a_fit_does_not_depend_on_what_stays(monkeypatch, effects):
     assert made_again == kept
 
 
-def test_what_a_view_takes_is_counted():
+def test_device_memory_of_a_view_is_counted():
     """Effects say what they upload of a pixel."""
     changes = {"loss__depth_weight": 0.2, "data__random_background": True, "colors__lr": 0.02}
     trainer = fits.make_trainer(fits.true_dataset(), **changes)
@@ -72,7 +72,7 @@ def test_what_a_view_takes_is_counted():
     assert count == view.width * view.height * training_steps.bytes_on_device(trainer.effects)
 
 
-def test_a_stage_that_ends_leaves_nothing_on_the_device():
+def test_finished_stage_leaves_no_arrays_on_the_device():
     trainer = make_trainer(coarse=[{"until": 3, "factor": 2}])
     fits.steps(trainer, 3)
     coarse, full = made(trainer)

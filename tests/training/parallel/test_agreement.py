@@ -62,7 +62,7 @@ def fitted(copies, out, size=2):
     return parallel_processes.run(size, words, cwd=copies[0], on_second=f"cd {copies[1]}")
 
 
-def test_another_photograph_of_one_process_is_refused(copies, tmp_path):
+def test_differing_photograph_of_one_process_is_refused(copies, tmp_path):
     shutil.copy(copies[1] / "train" / "r_0.png", copies[1] / "train" / "r_1.png")
     status, _, errors = fitted(copies, tmp_path / "out")
     assert (status, errors.count("error: ")) == (2, 1), errors
@@ -106,7 +106,7 @@ def test_views_are_compared_with_those_of_the_first_process(
         check()
 
 
-def test_images_of_other_files_are_refused(tmp_path):
+def test_images_of_different_files_are_refused(tmp_path):
     """A different background is refused; then a different model with the same background."""
     here, there, out = (tmp_path / name for name in ("first", "second", "out"))
     knot = Gaussians.load(parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply")
