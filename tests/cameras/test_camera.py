@@ -54,7 +54,7 @@ def test_a_camera_far_from_the_origin_keeps_its_centre():
 
 
 @pytest.mark.parametrize("near, near_clip", [(0.25, 0.5), (0.5, 0.25)])
-def test_the_larger_near_plane_wins(near, near_clip):
+def test_larger_of_two_near_planes_is_used(near, near_clip):
     sensor = mi.load_dict(replace(VIEWS[1], near_clip=near_clip).sensor())
     assert numbers(camera_of(sensor, near))["near"] == 0.5
 

@@ -262,7 +262,7 @@ def test_fit_opens_depths_if_its_loss_uses_them(scene, capsys, weight, first):
 
 
 @pytest.mark.parametrize("size", [10**6, 2**31 - 1])
-def test_an_image_that_claims_to_be_huge_takes_no_memory(scene, size):
+def test_image_header_of_huge_size_allocates_no_memory(scene, size):
     path = scene / "train" / "1.png"
     content = bytearray(path.read_bytes())
     content[16:24] = struct.pack(">II", size, size)

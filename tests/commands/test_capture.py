@@ -200,7 +200,7 @@ def test_alpha_is_the_coverage_of_a_disc(captured):
         assert alpha.sum() == pytest.approx(math.pi * radius**2, rel=0.02)
 
 
-def test_color_of_covered_pixels_is_encoded_radiance_not_premultiplied(captured):
+def test_color_of_covered_pixels_is_encoded_unpremultiplied_radiance(captured):
     expected = 255 * encode_srgb(ALBEDO)
     for path in captured.glob("*/r_*.png"):
         rgba = iio.imread(path).astype(float)

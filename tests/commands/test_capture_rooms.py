@@ -147,7 +147,7 @@ def test_sensors_of_the_scene_are_used_if_requested(cornell, tmp_path):
 
 
 @pytest.mark.parametrize("nested", [False, True])
-def test_splats_are_not_left_out_silently(tmp_path, nested):
+def test_splats_in_a_captured_scene_are_refused(tmp_path, nested):
     path = write_scene(tmp_path)
     if nested:
         text = path.read_text().replace("</integrator>", "</integrator></integrator>")

@@ -53,7 +53,7 @@ def fit(tmp_path):
 
 
 @pytest.mark.parametrize("each", readable_formats(), ids=lambda each: each.name)
-def test_each_format_is_written_beside_what_is_exported(model, each):
+def test_each_format_is_written_beside_its_source(model, each):
     if each.name == "ply":
         outcome = run(model, "--format", "ply", "--out", model.with_name("out.ply"))
         out = model.with_name("out.ply")

@@ -293,7 +293,7 @@ def test_grouping_channels_leaves_images_unchanged(monkeypatch, options):
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_derivatives(name):
+def test_tangents_equal_differences_and_gradients_match_tangents(name):
     """Forward against differences, reverse against forward; one test, as they share kernels."""
     arrays = arguments(name)
     tangents = direction(arrays)
@@ -369,7 +369,7 @@ def test_image_and_gradients_agree_with_gsplat():
         assert np.linalg.norm(found - theirs) <= 1e-3 * norm, name
 
 
-def test_torch_differentiates_it():
+def test_torch_computes_gradients():
     """The example of the docstring, against Dr.Jit's own gradients."""
     torch = pytest.importorskip("torch")
 

@@ -70,7 +70,7 @@ def fails(capsys, *arguments):
         ("", ["-D", "model=x.ply"], "--define: is not used with Gaussians"),
     ],
 )
-def test_user_errors_are_one_line_and_write_nothing(
+def test_user_errors_are_one_line_and_write_no_files(
     fit, tmp_path, capsys, what, arguments, message
 ):
     assert message in fails(capsys, fit / what, *arguments, "--out", tmp_path / "out")

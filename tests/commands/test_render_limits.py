@@ -78,7 +78,7 @@ def test_a_background_that_mitsuba_cannot_read_is_refused(model, tmp_path, suffi
     assert "must be a PNG, JPEG, BMP, PPM or TGA image, got " in line
 
 
-def test_a_background_for_print_is_refused(model, tmp_path):
+def test_cmyk_background_is_refused(model, tmp_path):
     Image.new("CMYK", (16, 16)).save(tmp_path / "a.tif")
     background = ("--background", tmp_path / "a.tif")
     assert "mode CMYK" in refused(render.main, tmp_path / "out", model, *CAMERA, *background)

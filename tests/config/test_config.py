@@ -309,7 +309,7 @@ def test_paths_are_relative_to_the_file_and_in_overrides_to_the_current_folder(l
     assert config.output.dir == tmp_path.resolve() / "there"
 
 
-def test_an_overriding_path_need_not_be_valid_yaml(load):
+def test_overriding_path_need_not_be_valid_yaml(load):
     assert load(MINIMAL, "data.path=a: [b").data.path.name == "a: [b"
     assert load(MINIMAL, "data.path=2024").data.path.name == "2024"
 

@@ -31,7 +31,7 @@ def table(count, length=5) -> np.ndarray:
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 9, 12, 45, 64])
-def test_columns_become_rows(precision, count):
+def test_columns_are_transposed_to_rows(precision, count):
     flat = np.array(interleave(numbered(precision, count))).reshape(-1, count)
     np.testing.assert_array_equal(flat, table(count))
     order = UInt32(4, 0, 3, 1, 2)

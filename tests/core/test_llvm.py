@@ -58,7 +58,7 @@ def test_the_version_is_read_from_the_file_name(path, version):
     assert version_from_name(path) == version
 
 
-def test_the_version_of_an_unversioned_link_is_its_targets(tmp_path):
+def test_unversioned_link_has_the_version_of_its_target(tmp_path):
     (tmp_path / "libLLVM.so.21.1").touch()
     (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.21.1")
     assert version_from_name(tmp_path / "libLLVM.so") == (21, 1)

@@ -68,7 +68,7 @@ def test_missing_photograph_is_not_reported_as_unknown_name(photographs):
     assert len(notes) == 1 and "not there: 1 of 10 photographs (images/08.png)" in notes[0]
 
 
-def test_a_photograph_in_both_splits_is_refused(photographs):
+def test_photograph_in_both_splits_is_refused(photographs):
     give(photographs, train_filenames=IMAGES, test_filenames=IMAGES[3:5])
     assert refusal(photographs) == (
         f"{photographs / 'transforms.json'}: a photograph must be either to train or to measure "

@@ -75,7 +75,7 @@ def test_an_orbit_looks_at_the_focus_from_the_cameras_distance_and_height():
         assert frame.fx == pytest.approx(20 / np.tan(FIELD_OF_VIEW / 2))
 
 
-def test_an_orbit_goes_all_the_way_round_in_equal_steps():
+def test_orbit_is_a_full_circle_in_equal_steps():
     views = views_at(np.arange(9) * 2 * np.pi / 9, np.full(9, 0.4))
     frames = orbit_of_views(views, blobs()).viewpoints(8, 40, 40, 40)
     offsets = np.stack([frame.camera_to_world[:3, 3] for frame in frames]) - FOCUS

@@ -29,7 +29,7 @@ def directions(count=64) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_number_of_coefficients(degree):
+def test_number_of_sh_coefficients(degree):
     assert sh.num_coefficients(degree) == len(reference.sh_basis(np.eye(3), degree).T)
 
 

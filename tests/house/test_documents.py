@@ -55,7 +55,7 @@ def inline_code(page) -> list[str]:
 MOST_WORDS = 900
 
 
-def test_the_readme_is_short():
+def test_readme_is_short():
     assert len(text_of("README.md").split()) <= MOST_WORDS
 
 

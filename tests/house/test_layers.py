@@ -131,7 +131,7 @@ def circle_among(imports):
     return next((circle for circle in map(visit, imports) if circle), None)
 
 
-def test_effects_of_a_fit_know_no_trainer():
+def test_training_effects_do_not_import_the_trainer():
     effects = [name for name in MODULES if name.startswith("drgs.training.effects.")]
     assert effects
     for module in effects:

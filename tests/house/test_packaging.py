@@ -59,7 +59,7 @@ def test_plugins_are_found_from_another_folder(run_python, tmp_path):
     assert result.stdout.strip() == str(REPOSITORY / "plugins" / "__init__.py"), result.stderr
 
 
-def test_an_installed_package_holds_its_plugins(run_python, tmp_path, installed):
+def test_installed_package_contains_its_plugins(run_python, tmp_path, installed):
     result = run_python(SHOW, cwd=tmp_path, PYTHONPATH=str(installed))
     expected = installed / "drgs" / "plugins" / "__init__.py"
     assert result.stdout.strip() == str(expected), result.stderr

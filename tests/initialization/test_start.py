@@ -278,7 +278,7 @@ def test_cameras_that_determine_no_box_are_refused(views, reason):
     )
 
 
-def test_one_camera_determines_no_box():
+def test_single_camera_does_not_determine_a_box():
     """It is parallel to nothing."""
     with pytest.raises(UserError) as error:
         initial_gaussians(config(), dataset_of([view_at((4, 0, 0), (0, 0, 0))]))

@@ -174,7 +174,7 @@ MOVING = (*LENS, ("shutter_close", 1.0))
 
 
 @pytest.mark.parametrize("case", ["border", "moving", "batch"])
-def test_rays_that_do_not_cover_a_film_are_refused(case):
+def test_rays_not_covering_the_film_are_refused(case):
     view, film = VIEWS[1], {}
     if case == "border":
         film = {"sample_border": True, "rfilter": "gaussian"}

@@ -68,7 +68,7 @@ def test_cells_equal_the_measured_errors(row, route):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row, route", [cell for cell in CELLS if cell not in CORE])
-def test_all_other_cells_equal_the_measured_errors(row, route):
+def test_other_cells_equal_the_measured_errors(row, route):
     check(row, route)
 
 
@@ -86,7 +86,7 @@ def test_only_poses_lit_by_splats_are_partly_differentiated():
     assert rows == {"`to_world`, diffuse", "`to_world`, rough"}
 
 
-def test_poses_seen_by_other_surfaces_are_differentiated():
+def test_poses_lit_by_other_surfaces_are_differentiated():
     """Along the rays that find it, which see it in the same solid angle."""
     to_world = identity().translate([0, 3, -3]).rotate([1, 0, 0], 45).scale(30)
     bsdf = {"type": "diffuse", "reflectance": rgb(0.7)}  # or Mitsuba would merge it with the panel

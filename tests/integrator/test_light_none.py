@@ -84,7 +84,7 @@ def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
 
 
 @pytest.mark.parametrize("objects", [dict, surfaces], ids=["splats alone", "splats and surfaces"])
-def test_light_is_none_by_default(objects):
+def test_light_defaults_to_none(objects):
     """The same kernels and bytes, also after another scene had light."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, objects())

@@ -150,7 +150,7 @@ def test_rough_and_nested_mirrors_use_the_mirrored_camera():
         assert metrics.psnr(none, rays) < 24
 
 
-def test_images_are_kept_until_something_changes(monkeypatch):
+def test_mirror_images_are_cached_until_the_scene_changes(monkeypatch):
     counts, render = [], Mirrors.render
     monkeypatch.setattr(Mirrors, "render", lambda *values: counts.append(1) or render(*values))
     ball = {"type": "sphere", "radius": 0.3, "to_world": at(0.1, 0.9, 0)}

@@ -342,7 +342,7 @@ def test_gaussians_that_overflow_float32_are_refused():
         loaded.integrator().render(loaded)
 
 
-def test_nan_gaussians_add_nothing_to_derivatives():
+def test_nan_gaussians_do_not_contribute_to_derivatives():
     scene, model = scene_and_object()
     means, shN = model.means.copy(), model.shN.copy()
     means[5], shN[6] = np.nan, np.inf

@@ -92,7 +92,7 @@ def test_rays_unknown_to_a_probe_are_empty_or_traced():
     np.testing.assert_array_equal(found["none"], nothing)
 
 
-def test_probes_are_kept_until_something_changes(monkeypatch):
+def test_probes_are_cached_until_the_scene_changes(monkeypatch):
     counts, render = [], Probes.render
     monkeypatch.setattr(Probes, "render", lambda *values: counts.append(1) or render(*values))
     scene = scene_of(around(20), light="probe", probes="ball", spp=1, **mirror_ball())
@@ -150,7 +150,7 @@ def test_objects_too_close_to_splats_give_one_warning():
         logger.remove_appender(appender)
 
 
-def test_objects_that_cannot_have_a_probe_are_refused():
+def test_invalid_probe_settings_are_refused():
     def scene(**settings):
         return scene_of(around(4), light="probe", **settings, **mirror_ball(sky=SKY))
 

@@ -222,7 +222,7 @@ def test_scene_may_contain_few_gaussians(count):
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
 
 
-def test_a_scenes_parameters_are_copies_under_the_integrators_name():
+def test_scene_parameters_are_copies_named_after_the_integrator():
     gaussians = make_gaussians(make_view()).to(mi.TensorXf)
     scene = make_scene(gaussians, ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     params = mi.traverse(scene)

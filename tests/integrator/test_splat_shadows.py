@@ -110,7 +110,7 @@ def test_unlisted_objects_cast_no_shadow():
     np.testing.assert_array_equal(factor, 1)  # it is behind the lid
 
 
-def test_shadows_are_kept_until_something_changes():
+def test_shadows_are_cached_until_the_scene_changes():
     scene = scene_of(
         discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY, floor=disc(-0.05, 50.0)
     )

@@ -282,7 +282,7 @@ def test_sampled_splats_have_the_mean_colour_of_all_splats(color):
     np.testing.assert_allclose(mean.mean((0, 1)), exact, atol=2e-3 + 5 * error.max())
 
 
-def test_the_sum_of_powers_decodes_within_its_error():
+def test_sum_of_powers_decodes_within_its_error_bound():
     color = np.linspace(0, 1, 1001)
     found = sum(factor * color**k for k, factor in enumerate(DECODING, 1))
     assert np.abs(found - linear(color)).max() < 2e-3

@@ -158,7 +158,7 @@ def test_a_background_may_be_given_as_any_rgb(background):
     assert np.array_equal(np.array(integrator.state.background).ravel(), [0.5, 0.5, 0.5])
 
 
-def test_a_scenes_parameters_are_not_the_callers_arrays():
+def test_scene_parameters_are_copies_of_the_arguments():
     """Mitsuba assigns to parameters in place: two scenes of one dictionary would share them."""
     scene = Scene()
     values = tensors(scene.gaussians)
@@ -212,7 +212,7 @@ for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
     ["import drgs; mi.set_variant('llvm_ad_rgb')", "mi.set_variant('llvm_ad_rgb'); import drgs"],
     ids=["drgs first", "variant first"],
 )
-def test_variants_may_be_switched_and_others_refuse_in_one_line(order, run_python):
+def test_variants_can_be_switched_and_unsupported_ones_are_refused(order, run_python):
     result = run_python(SWITCHING.format(order=order))
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines() == [
@@ -374,7 +374,7 @@ def test_isolated_splats_match_volprim_rf_basic():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_border_of_the_film_does_not_change_the_image():
+def test_film_border_does_not_change_the_image():
     scene = Scene(VIEWS[-1])
     image = fresh_image(scene, rfilter="box", samples=1, sample_border=True)
     assert np.array_equal(image, fresh_image(scene, rfilter="box", samples=1))
@@ -391,7 +391,7 @@ def test_formats_of_the_film():
     assert np.allclose(luminance[..., 0], expected, rtol=1e-3)
 
 
-def test_the_film_holds_the_image(tmp_path):
+def test_film_contains_the_image(tmp_path):
     scene = Scene()
     loaded = scene.load(component_format="float16")
     image = image_of(loaded)

@@ -233,7 +233,7 @@ def test_numpy_arrays_are_refused_with_a_remedy():
 
 
 @pytest.mark.parametrize("degree", [4, -1, 0.0, True])
-def test_the_degree_in_use_is_checked(degree):
+def test_sh_degree_in_use_is_checked(degree):
     integrator = mi.load_dict({"type": "splats", **valid()})
     with pytest.raises(ValueError, match=rf"integer from 0 to 3, got {degree}"):
         integrator.sh_degree = degree

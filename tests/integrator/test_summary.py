@@ -327,7 +327,7 @@ def test_all_effects_work_in_one_fit():
     fits.assert_resumes_to_the_same_bytes(lambda: fits.make_trainer(dataset, **changes), 3, 4)
 
 
-def test_a_checkpoint_file_holds_the_state_of_effects(tmp_path):
+def test_checkpoint_contains_the_state_of_effects(tmp_path):
     changes = {key: value for key, value in EVERYTHING.items() if key != "model__antialiased"}
     dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
     trainer = fits.steps(fits.make_trainer(dataset, **changes), 3)

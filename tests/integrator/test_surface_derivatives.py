@@ -156,7 +156,7 @@ def test_camera_derivatives_with_surfaces_are_refused_by_name(nested, mode):
 
 
 @pytest.mark.parametrize("kind", SENSORS)
-def test_parameters_of_all_cameras_are_refused(kind):
+def test_camera_derivatives_with_surfaces_are_refused_for_every_sensor(kind):
     check_refused(kind, SENSORS[kind][1], {}, "backward")
 
 

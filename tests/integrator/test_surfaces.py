@@ -139,7 +139,7 @@ def test_other_film_formats_show_the_same_image(pixel_format):
     np.testing.assert_allclose(image, colors, rtol=0, atol=IMAGE * image.max())
 
 
-def test_the_film_holds_the_image_when_it_is_not_developed():
+def test_film_contains_the_image_with_develop_false():
     scene = load(apart(SCENE), sky=True)
     image = image_of(scene)
     nothing = scene.integrator().render(scene, develop=False)
@@ -274,7 +274,7 @@ def test_splats_between_windows_and_a_wall_are_visible(srgb_primitives, nested):
     np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=8e-4)
 
 
-def test_edges_are_the_same_at_the_border_of_a_crop_window():
+def test_surface_edges_match_at_the_border_of_a_crop_window():
     scene, (x, y, width, height) = apart(SCENE), (9, 4, 17, 9)
     wall = Wall(half=0.5)
     planes = covered_by(wall, scene.camera)[y : y + height, x : x + width]

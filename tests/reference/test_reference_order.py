@@ -93,7 +93,7 @@ def test_pixel_order_of_two_discs_changes_where_their_planes_cross(projection):
 
 
 @pytest.mark.parametrize("low_pass", [0.0, 0.3])
-def test_entry_lies_on_the_ellipsoid(low_pass):
+def test_entry_point_is_on_the_ellipsoid(low_pass):
     gaussians, camera = rotated_splats(), straight_camera()
     model = ImageModel("exact", "entry", extent=1.7, low_pass=low_pass, alpha_cut=0.0)
     splats = rays._splats(gaussians, camera, model)

@@ -136,7 +136,7 @@ def test_folder_without_permission_is_refused(tmp_path, config, monkeypatch, fun
     )
 
 
-def test_a_removed_run_makes_room_for_another(finished, config):
+def test_folder_of_a_removed_run_can_be_reused(finished, config):
     remove_run(finished)
     assert os.listdir(finished) == []
     claim_output_folder(finished, config)

@@ -263,7 +263,7 @@ def test_psnr_is_plotted_over_time():
 
 
 @pytest.mark.parametrize("count", [1, 7, 50, 333])
-def test_the_running_mean_is_the_mean_of_the_rows_around(count):
+def test_running_mean_averages_neighbouring_rows(count):
     values = np.random.default_rng(0).normal(size=count)
     reach = count // 100
     expected = [values[max(0, i - reach) : i + reach + 1].mean() for i in range(count)]
@@ -370,7 +370,7 @@ def test_images_of_the_page_are_complete(page, out, tmp_path):
     assert len(page.source) < 3_000_000
 
 
-def test_the_page_states_the_metrics(page):
+def test_page_contains_the_metrics(page):
     text = " ".join(" ".join(page.text).split())
     for stated in (
         "blobs", "noise <small>", "31.23 dB", "mean of 4 test views", "0.9000", "12,345",

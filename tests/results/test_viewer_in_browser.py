@@ -184,7 +184,7 @@ def test_page_with_controls_fits_the_window_and_orbits(path, size):
         assert own == path.as_uri() and all(a.startswith(("blob:", "data:")) for a in others)
 
 
-def test_a_title_is_text(page):
+def test_title_is_escaped(page):
     assert page.evaluate("document.title") == f"{TITLE}: Gaussian splats"
     assert page.evaluate("typeof window.intruder") == "undefined"
 

@@ -140,7 +140,7 @@ def test_an_alpha_below_the_cut_has_no_gradient_at_all(precision, factor, is_see
 
 
 @both_precisions
-def test_a_pixel_outside_the_ellipse_has_no_gradient_where_others_have(precision):
+def test_pixel_outside_the_ellipse_has_no_gradient(precision):
     gaussians = splat(log_scales=np.log([[0.02, 0.02, 0.02]]))
     assert not gradients_of(gaussians, precision, at_pixel(14, 6))["means"].any()
     assert gradients_of(gaussians, precision, at_pixel(9, 6))["means"].any()
@@ -246,7 +246,7 @@ def test_splats_behind_the_stop_have_no_gradient(precision):
 
 
 @both_precisions
-def test_a_splat_far_below_a_pixel_moves_but_its_size_does_not_matter(precision):
+def test_subpixel_splat_has_position_gradients_but_no_scale_gradients(precision):
     """The low-pass is added, not clamped: the gradient of the size fades with the size squared."""
     off_center = at_pixel(9, 6)
 

@@ -212,7 +212,7 @@ def test_zero_quaternion_is_the_identity_and_has_no_gradient(precision):
 
 
 @both_precisions
-def test_a_mean_on_the_near_plane_is_visible_and_one_before_it_is_not(precision):
+def test_mean_on_the_near_plane_is_visible_and_one_before_it_is_not(precision):
     camera = reference.Camera(np.eye(3), np.zeros(3), 10, 10, 8, 8, 16, 16, near=0.5)
     z = [0.5, 0.5 * (1 - 1e-6), 0.0, -0.5]
     gaussians = reference.Gaussians(

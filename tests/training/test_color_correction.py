@@ -64,7 +64,7 @@ STILL = {
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_identity_gives_the_plain_loss_and_gradients_to_the_last_bit():
+def test_identity_transform_gives_the_same_loss_and_gradient_bits():
     plain, corrected = fits.make_trainer(fits.plain_dataset()), make_trainer()
     for trainer in (plain, corrected):
         trainer.iteration = 1
@@ -85,7 +85,7 @@ def test_every_transform_starts_as_the_identity():
     np.testing.assert_array_equal(matrices_of(make_trainer()), np.tile(IDENTITY, (6, 1, 1)))
 
 
-def test_without_a_rate_there_is_no_effect():
+def test_colour_correction_is_off_by_default():
     assert training_effects(fits.config_of(), fits.plain_dataset()) == []
 
 
@@ -133,7 +133,7 @@ def test_loss_and_derivatives_of_a_transform_match_numpy():
     assert np.abs(penalty).max() > 0.01 * np.abs(expected).max()
 
 
-def test_the_penalty_pulls_to_the_identity():
+def test_penalty_pulls_towards_the_identity():
     """Adam's steps by the penalty alone end there, and have its sign from the start."""
     trainer = with_matrices(make_trainer(colors__lr=0.01, **STILL), random_matrices())
     (effect,) = trainer.effects
@@ -308,7 +308,7 @@ def test_transforms_improve_fits_with_varying_exposure():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_transforms_are_written_by_name(tmp_path):
+def test_transforms_are_written_by_view_name(tmp_path):
     trainer = fits.steps(make_trainer(), 9)
     (effect,) = trainer.effects
     dataset = fits.plain_dataset()

@@ -359,7 +359,7 @@ def test_derivatives_use_no_float_atomics(name, precision):
     assert results and not found and count >= 1
 
 
-def test_the_matrix_is_not_compiled_into_the_kernels():
+def test_matrix_is_no_kernel_literal():
     """Each step of its optimizer would compile its own."""
     operation = transform_operation()
 

@@ -279,7 +279,7 @@ def test_later_edits_of_other_sizes_compile_no_kernel():
     assert kernels(70, 41, 22) == first
 
 
-def test_taken_rows_are_detached_copies():
+def test_take_rows_returns_detached_copies():
     values = parameters(5)
     optimizer = make_optimizer(values, RATES, PREFIX)
     rows = take_rows(optimizer, UInt32(4, 4, 1), PREFIX)

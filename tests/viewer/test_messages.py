@@ -107,7 +107,7 @@ def test_camera_message_must_be_finite_with_a_direction():
     assert not valid(CAMERA, type="ShareUrlRequest")
 
 
-def test_a_thousand_invalid_messages_change_nothing_and_print_nothing(server, capfd):
+def test_invalid_messages_have_no_effect_and_print_nothing(server, capfd):
     TrainingPage(
         server, RenderRequests(), StartView.from_views(true_dataset().train), Approximations()
     )

@@ -82,7 +82,7 @@ def test_start_view_is_the_first_training_camera_at_the_common_focus():
     assert alone.camera.distance > 0
 
 
-def test_a_browsers_camera_becomes_a_request(page):
+def test_browser_camera_becomes_a_request(page):
     request = asked(page)
     assert request.camera.camera_to_world == pytest.approx(pose_around(0.7, 0.2))
     assert request.camera.fov == pytest.approx(50) and request.camera.distance == pytest.approx(2.5)

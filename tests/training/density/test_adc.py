@@ -243,7 +243,7 @@ def test_cap_counts_a_clone_as_one_and_a_split_as_its_samples_less_the_parent():
     assert report == DensityReport(num_added=3, cloned=1, split=1, refused=1, num_gaussians=8)
 
 
-def test_pruned_rows_make_room():
+def test_pruned_rows_can_be_reused():
     optimizer = make([SMALL] * 5, [0.001, 0.001, 0.5, 0.5, 0.5])
     assert run(optimizer, [0, 0, HIGH, HIGH, HIGH], max_gaussians=5).num_gaussians == 5
 

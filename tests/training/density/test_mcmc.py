@@ -92,7 +92,7 @@ def test_transparent_gaussians_become_copies_of_opaque_ones():
         np.testing.assert_array_equal(moment[: len(untouched)], former[untouched])
 
 
-def test_the_image_before_and_after_is_nearly_the_same():
+def test_relocation_nearly_preserves_the_image():
     # Seen from far away, whatever the direction: a splat and its copies.
     camera = reference.Camera(np.eye(3), np.array([0.0, 0, -4]), 40.0, 40.0, 12.0, 12.0, 24, 24)
     optimizer = make([0.3, 0.3], [DEAD, 0.8], tensor_type=TensorXf64, seed=3)
@@ -150,7 +150,7 @@ def test_population_grows_by_a_fraction_up_to_its_cap():
     assert sizes == [105, 110, 115, 117, 117]
 
 
-def test_a_small_population_grows_as_well():
+def test_small_population_grows():
     """5 % of 6 are less than one."""
     optimizer = make([SIZE] * 6, 0.5)
     sizes = [act(optimizer, 100 * i, gaussians=8).num_gaussians for i in range(6, 9)]

@@ -91,9 +91,7 @@ def test_photographs_that_another_process_reads_may_differ(copies, tmp_path):
         (lambda frames: frames.reverse(), "training views are in another order"),
     ],
 )
-def test_views_are_compared_with_those_of_the_first_process(
-    agreement, copies, monkeypatch, change, message
-):
+def test_views_are_compared_with_rank_0(agreement, copies, monkeypatch, change, message):
     monkeypatch.chdir(copies[0])
     first = fingerprint_of(load(copies[0])).model_copy(update={"test": []})
     comm = SimpleNamespace(broadcast_text=lambda text: first.to_bytes().decode())

@@ -124,7 +124,7 @@ def test_failure_of_one_process_is_reported_once_and_ends_all(config, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unexpected_error_of_one_process_is_traced_once_and_ends_all(config, tmp_path):
+def test_unexpected_error_of_one_process_prints_one_traceback_and_ends_all(config, tmp_path):
     failing = parallel_processes.failing_import(
         tmp_path, "drgs.training.parallel.exchange", "RuntimeError('a bug')"
     )
