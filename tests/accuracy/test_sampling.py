@@ -259,7 +259,7 @@ def test_reconstruction_filter_weights_samples_around_a_pixel(name, samples):
                 np.add.at(weights, target_inside, weight[inside][:, None])
                 np.add.at(total, target_inside, (weight[..., None] * values[s])[inside])
     # Mitsuba reads its filters from tables of 32 entries a radius, linearly: 1e-3 of a weight.
-    # Where negative lobes leave little weight, a pixel is a quotient of small numbers.
+    # Negative lobes may leave little weight: a pixel is then a quotient of small numbers.
     expected = total / weights
     kept = weights[..., 0] > 0.2 * weights.max()
     assert kept.mean() > 0.8

@@ -52,7 +52,7 @@ def test_each_rung_comes_closer_to_the_most_accurate_image(subject):
     ]
     errors = [np.abs(image_of(subject, **step) - accurate).mean() for step in steps]
     assert all(after < before for before, after in pairwise(errors))
-    # Of single precision, of alphas below a millionth, and of order among faint splats.
+    # Left: single precision, alphas below a millionth, and the order among faint splats.
     assert errors[-1] < 1e-4 < errors[0]
 
 
@@ -157,7 +157,7 @@ def test_measurement_includes_the_smoothing_filter(tmp_path, subject):
     accurate = accuracy.most_accurate(found, found.cameras[0], accuracy.MIN_ALPHA)
     without = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
     image = image_of(found, projection="exact", order="pixel", order_window=16, **accuracy.UNCUT)
-    # What the ladder's last step leaves; the filter is as wide as the splats, and changes far more.
+    # The error of the last rung; the filter is as wide as the splats and changes far more.
     assert np.abs(image - accurate).mean() < 1e-4 < 0.01 < np.abs(accurate - without).mean()
 
 

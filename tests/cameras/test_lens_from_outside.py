@@ -59,7 +59,7 @@ def test_jacobian_is_the_derivative_of_the_projection():
     rows = camera.lens.projection_jacobian(camera, position)
     step = 1e-6
     for axis in range(3):
-        # Of a step in the world: that of the camera's axes, turned.
+        # A step along a camera axis, in world coordinates.
         moved = camera.rotation @ llvm.Array3f64([step if k == axis else 0 for k in range(3)])
         after, before = (
             camera.lens.project_point(camera, position + sign * moved) for sign in (1, -1)

@@ -40,7 +40,7 @@ from drgs.splatting import rendering
 from drgs.splatting.projection import ewa
 
 # ----------------------------------------------------------------------------------------------
-# What is left out
+# Missing coefficients
 # ----------------------------------------------------------------------------------------------
 
 
@@ -115,7 +115,7 @@ def test_valid_region_matches_the_reference(name):
     ("lens", "ends"),
     [
         (OpenCV(p1=0.125, p2=-0.0625), True),
-        # By what the radial part grows along the slope, and by what it is across it.
+        # Limited by the radial factor's derivative along the slope, then by the factor across it.
         (OpenCV(k1=-0.25, k2=0.03125, k4=0.0625, p1=-0.03125, p2=0.015625), True),
         (OpenCV(k1=0.0625, k4=0.03125, k5=-0.015625, p1=0.125, p2=0.125), True),
         # Nowhere; and not before the pole.
@@ -137,7 +137,7 @@ def test_valid_region_with_tangential_terms_matches_the_reference(lens, ends):
         (ThinPrismFisheye(p1=0.125, p2=-0.0625), True),
         (ThinPrismFisheye(sx1=-0.25, sy1=0.125), True),
         (ThinPrismFisheye(-0.0625, 0.03125, p1=0.125, p2=0.0625, sx1=0.25, sy1=-0.125), True),
-        # What one does, the other undoes; and what it does is less than the radial terms do.
+        # Terms that cancel, and terms smaller than the radial ones.
         (ThinPrismFisheye(p1=0.0625, p2=-0.03125, sx1=0.09375, sy1=-0.1875), False),
         (ThinPrismFisheye(0.25, p1=0.03125, sx1=0.03125), False),
     ],
@@ -161,7 +161,7 @@ def kernels_of(lens, camera_seed=0) -> dict[str, list]:
     dr.eval(gaussians, ones)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
-        # That of the other tests, for the same kernels.
+        # The pipeline of the other tests, for the same kernels.
         frame = rendering.render(gaussians, camera, case.pipeline)
         dr.eval(frame.planes())
         forward = drain_kernels()

@@ -34,11 +34,11 @@ every_opencv = pytest.mark.parametrize(
 
 
 # ----------------------------------------------------------------------------------------------
-# What is seen
+# Visibility
 # ----------------------------------------------------------------------------------------------
 
 
-# Of positions up to thousands of px and of covariances: J by differences, 1e-13; and float32.
+# Positions up to thousands of px, and covariances: J by differences, 1e-13; and float32.
 SPLATS = {FLOAT64: 1e-11, FLOAT32: 1e-5}
 
 
@@ -115,7 +115,7 @@ def test_points_beyond_the_lens_model_do_not_fold_back(precision, lens):
     assert not np.array(splats.visible).any()
     for name in ("means2d", "conic_factor", "depths", "variances"):
         assert np.isfinite(rows(getattr(splats, name))).all()
-    # As near as single precision can tell, what lies within is seen.
+    # Points within the limit are visible, up to single precision.
     limit = 1 - 1e-5
     within = limit * points[0] * [1 / 1.001, 1 / 1.001, 1 / limit]
     if isinstance(lens, Fisheye):

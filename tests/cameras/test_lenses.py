@@ -103,7 +103,7 @@ def test_a_lens_changes_the_image(name):
 DIFFERENCES = 1e-6
 
 
-# Those of test_rendering.
+# Tolerances of test_rendering.
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 

@@ -41,7 +41,7 @@ from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 from drgs.splatting.projection import load_rows
 
-# Those of test_lenses.
+# Tolerances of test_lenses.
 IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 
 
@@ -264,7 +264,7 @@ def test_times_are_found_for_fast_rotations(turn):
 # ----------------------------------------------------------------------------------------------
 
 
-# As in test_lenses; brentq finds times to 1e-15, which over the step is 1e-9.
+# Tolerance of test_lenses; brentq finds times to 1e-15, which over the step is 1e-9.
 DIFFERENCES = 1e-6
 
 

@@ -24,7 +24,7 @@ def loaded(**parts):
 TWO_SIDED = {"type": "twosided", "bsdf": {"type": "diffuse"}}
 
 ROOM = {"type": "cube", "bsdf": TWO_SIDED}
-"""Of side 2; the outer sides of its walls are the fronts."""
+"""Cube of side 2; the outer sides of its walls are the fronts."""
 
 LAMP = {
     "type": "sphere",
@@ -152,8 +152,8 @@ def test_many_sensors_are_used_as_cameras():
     integrator = mi.load_dict({"type": "path", "hide_emitters": True})
     for view, number in zip(views, order, strict=True):
         assert math.degrees(view.fov) == pytest.approx(40 + number, abs=1e-4)
-        # By Mitsuba, through the sensor itself. At an edge, 64 samples in 8x8 strata err by 1/8 of
-        # the largest channel, 0.6, at most.
+        # Rendered by Mitsuba through the sensor itself. At an edge, 64 samples in
+        # 8x8 strata err by 1/8 of the largest channel, 0.6, at most.
         own = scene.sensors()[number]
         shown = np.array(mi.render(scene, sensor=own, integrator=integrator, spp=64))
         np.testing.assert_allclose(camera.linear(view)[:, :, :3], shown[:, :, :3], atol=0.075)
@@ -182,7 +182,7 @@ def test_contradictory_settings_are_refused():
         camera_placement.views_of(scene, outside)
 
 
-# Where exactly
+# Exact positions
 
 
 def test_cameras_inside_stand_between_target_and_walls():

@@ -233,7 +233,7 @@ def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
     display = encode_srgb(np.array(seen_sky).clip(0, 1))
     expected = display.reshape(size, finer, size, finer, 3).mean(axis=(1, 3))
 
-    # Of the 64 small pixels of one at the edge, about 10 are cut by the edge themselves, and there
+    # About 10 of the 64 small pixels of one at the edge are cut by the edge themselves, and there
     # the order of mixing and encoding matters: up to 0.25 x 10/64. Rounding and noise are smaller.
     assert abs(composited - expected).max() < 0.05
     assert abs(composited - expected).mean() < 0.004

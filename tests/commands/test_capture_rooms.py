@@ -59,7 +59,7 @@ def test_room_is_captured_from_inside_without_dark_images(inside):
     parts = lit_parts(out)
     assert len(parts) == 12
     assert min(parts) > 0.7
-    # Of its lamp, too: white, as a photograph would have it.
+    # Including its lamp: white, as in a photograph.
     images = [iio.imread(path) for path in out.glob("*/*.png")]
     assert any((rendered[:, :, :3] == 255).all(axis=2).any() for rendered in images)
 

@@ -33,7 +33,7 @@ COUNT = 600
 """Mutations of each format."""
 
 MAX_SECONDS = 5.0
-"""Of a single file. They take about 5 ms; the rest is for a machine that is busy."""
+"""Time limit of a single file. Files take about 5 ms; the rest is for a machine that is busy."""
 
 
 # Valid files

@@ -33,7 +33,7 @@ from drgs.results.refined_cameras import write_views
 
 PLACE = np.array([4.2e6, 1.7e5, -4.78e6])
 ORIGIN = (4200001.0, 169999.0, -4779998.0)
-"""Of the Gaussians; another one than the dataset gets from its cameras."""
+"""Origin of the Gaussians, which differs from that of the dataset."""
 
 
 @pytest.fixture(scope="module")

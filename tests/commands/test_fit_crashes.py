@@ -21,7 +21,7 @@ from drgs.config.load import load_config
 from drgs.training import session
 
 PLANS = {2: 10, 3: 9, 5: 8}
-"""By iteration: how many there will be, as the plan is revised to; the clock ends it after 7."""
+"""Total number of iterations of the plan revised at each iteration; the clock ends it after 7."""
 
 LAST = 7
 

@@ -199,9 +199,9 @@ def results(arrays, name):
 
 
 STEP = 1e-5
-"""Of 0.01: 1e-7 in a mean, which changes an alpha by 1e-5 at most: no pixel of a clear scene is so
-near to a threshold. Rounding, 1e-16 / 1e-5, and the third derivative, 1e-10 of the first, matter
-less than 1e-7."""
+"""Fraction of 0.01: 1e-7 in a mean, which changes an alpha by 1e-5 at most: no pixel of a clear
+scene is so near to a threshold. Rounding, 1e-16 / 1e-5, and the third derivative, 1e-10 of the
+first, matter less than 1e-7."""
 
 
 def tangents_of(arrays, tangents, name, fixed=()):
@@ -401,7 +401,7 @@ def test_torch_computes_gradients():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is refused
+# Errors
 # ----------------------------------------------------------------------------------------------
 
 

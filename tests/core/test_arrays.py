@@ -49,7 +49,7 @@ def test_stored_rows_are_loaded_unchanged(precision, count):
     np.testing.assert_array_equal(loaded, table(count)[[4, 4, 0, 2]] * [[1], [0], [1], [1]])
 
 
-# Of one to five rows of 9, 11 and 45 numbers, arrays end anywhere in a packet.
+# Arrays of one to five rows of 9, 11 and 45 numbers end anywhere in a packet.
 @both_precisions
 @pytest.mark.parametrize("num_rows", [1, 2, 3, 4, 5])
 @pytest.mark.parametrize("width", [1, 3, 4, 6, 9, 11, 24, 45])

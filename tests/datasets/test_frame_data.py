@@ -16,7 +16,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.images import smaller_view
 
 
-# What a frame may have besides its photograph
+# Data of a frame besides its photograph
 def frame_of(meta, name="01.png"):
     """The frame of a photograph; frames are in another order than names."""
     return next(f for f in meta["frames"] if f["file_path"].endswith(name))

@@ -57,7 +57,7 @@ SCENES = {
 }
 all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 
-# Those of test_lenses.
+# Tolerances of test_lenses.
 IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 DIFFERENCES = 1e-6
@@ -185,7 +185,7 @@ def separate_scene() -> tuple[reference.Gaussians, reference.Camera]:
     return replace(gaussians, sh0=rng.uniform(-1, 1.7, (12, 1, 3))), camera
 
 
-# By aperture: PSNR (dB) of the blurred image and of the one in focus. Measured: 73.8 and 52.6,
+# PSNR (dB) of the blurred and the focused image, by aperture. Measured: 73.8 and 52.6,
 # 63.5 and 41.7, 51.6 and 33.1, 45.5 and 27.7.
 SAMPLED = {0.03125: (73, 53), 0.0625: (63, 42), 0.125: (51, 34), 0.25: (45, 28)}
 
@@ -266,7 +266,7 @@ def test_defocused_wall_matches_the_reference(precision):
     gaussians, camera = wall()
     expected = effects.render(gaussians, camera, defocus=FAR)
     found = planes_of_wall(precision)
-    # Of 5000 splats at each pixel some hundreds end there within a rounding of its centre.
+    # Some hundreds of 5000 splats at each pixel end within a rounding of its centre.
     np.testing.assert_allclose(found[0], expected.transmittance.ravel(), rtol=0, atol=1e-5)
     np.testing.assert_allclose(found[1:].T, expected.image.reshape(-1, 3), rtol=0, atol=1e-5)
 

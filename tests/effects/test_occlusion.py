@@ -32,7 +32,7 @@ from drgs.splatting import feature_groups, rendering
 from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.grid import TileGrid
 
-# As in test_rendering.
+# Tolerances of test_rendering.
 IMAGE = {name: limit for name, limit in (("Float64", 1e-12), ("Float", 2e-5))}
 GRADIENTS = {name: limit for name, limit in (("Float64", 1e-7), ("Float", 1e-4))}
 

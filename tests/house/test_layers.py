@@ -49,7 +49,7 @@ MAY_IMPORT = {
         *TRAINING,
     },
 }
-"""By package: the others that it may import. ``drgs`` itself may be imported for its version."""
+"""Packages that a package may import. ``drgs`` itself may be imported for its version."""
 
 COMMANDS = {"__main__", "fit", "poses", "render", "export", "view", "capture"}
 

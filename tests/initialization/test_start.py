@@ -237,7 +237,7 @@ def test_half_of_the_points_in_view_are_uniform_in_inverse_distance():
     behind = nearness[nearness < 1]
     assert 0.45 < len(behind) / len(points) < 0.65  # parts of the cube are too near to a camera
     assert behind.min() >= 0.1
-    # Of 2,000, a share of 4/9 varies by 0.011 (one sigma).
+    # A fraction of 4/9 of 2,000 varies by 0.011 (one sigma).
     assert np.mean(behind < 0.5) == pytest.approx((0.5 - 0.1) / (1 - 0.1), abs=0.05)
 
 

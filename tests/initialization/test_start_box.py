@@ -132,7 +132,7 @@ def test_black_points_are_coloured_from_the_images(tmp_path):
     assert not initial_gaussians(given, dataset_of([])).sh0.any()  # grey: colour is SH + 0.5
 
 
-# What else follows from the data
+# Other defaults derived from the data
 @pytest.mark.parametrize(("mode", "background"), [("RGB", "black"), ("RGBA", "white")])
 def test_the_background_follows_from_the_images(photographs, mode, background):
     from PIL import Image

@@ -13,7 +13,7 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
-# As in test_splats: single precision, relative to the largest value of an array.
+# Tolerances of test_splats: single precision, relative to the largest value of an array.
 IMAGE, GRADIENTS = 1e-5, 1e-4
 
 STEP = 1e-7
@@ -252,7 +252,7 @@ def test_several_samples_average_the_channels():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is refused
+# Errors
 # ----------------------------------------------------------------------------------------------
 
 

@@ -91,7 +91,7 @@ def test_defocused_environment_matches_path():
 def test_defocused_environment_has_derivatives(name):
     """Against differences, in single precision."""
     scene = load(thin_lens().dictionary(), hidden_splats(), sky=smooth_sky())
-    # What is lost by blurring: a loss that all of them change.
+    # The change by blurring: a loss that all parameters affect.
     in_focus = load(thin_lens().dictionary(), hidden_splats() | SHARP, sky=smooth_sky())
     weights = image_of(in_focus) - image_of(scene)
     params = mi.traverse(scene)
@@ -109,8 +109,8 @@ def test_defocused_environment_has_derivatives(name):
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
     actual = np.sum(direction * np.array(dr.grad(leaves[name])))
     expected = (losses[0] - losses[1]) / (2 * step)
-    # Where a ray crosses from one texel to the next within a step, the slope changes by some
-    # percent: of one ray in 20, of either sign. Measured: 1e-3.
+    # Rays that cross into another texel within a step, one in 20, have slopes that are off by
+    # some percent, of either sign. Measured: 1e-3.
     assert actual == pytest.approx(expected, rel=4e-3)
     assert abs(actual) > 1
 

@@ -121,7 +121,7 @@ FLOOR = "floor.bsdf.reflectance.value"
 
 
 TWICE = "two images", "two losses", "two losses of one graph"
-"""What a factor reaches the backdrop through, more than once."""
+"""Cases in which a factor reaches the backdrop more than once."""
 
 
 def factored(way, kind):
@@ -231,7 +231,7 @@ def test_derivatives_of_gaussians_include_the_background(kind):
     )
     for name in PARAMETER_NAMES:
         actual = np.array(dr.grad(params[f"integrator.{name}"])).astype(np.float64)
-        # As in test_splats.
+        # Tolerance of test_splats.
         np.testing.assert_allclose(
             actual, expected[name], atol=1e-4 * np.abs(expected[name]).max(), err_msg=name
         )
@@ -296,7 +296,7 @@ def test_derivatives_of_a_sensor_include_the_environment():
         both.append(np.sum(weights * image_of(scene)))
     difference = (both[0] - both[1]) / (2 * step)
     assert dr.grad(turn)[0] == pytest.approx(difference, rel=0.01)
-    # Of a constant behind the splats it would be another.
+    # A constant background would have another derivative.
     plain = load(Camera().dictionary(), integrator_of(Scene().gaussians, **settings))
     turn = mi.Float(0)
     dr.enable_grad(turn)

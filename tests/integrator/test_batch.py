@@ -13,7 +13,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 SCENE = Scene(VIEWS[1])
 SENSORS = (VIEWS[1], VIEWS[2], VIEWS[10])
 
-# As in test_splats.
+# Tolerance of test_splats.
 GRADIENTS = 1e-4
 
 

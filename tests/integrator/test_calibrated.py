@@ -319,6 +319,6 @@ def test_splats_through_the_sensor_match_the_reference(sensor):
     )
     image = image_of(splats_scene(sensor, gaussians))
     expected = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
-    # As in test_rendering, float32; Mitsuba's numbers are float32 too.
+    # Tolerance of test_rendering in float32; Mitsuba's numbers are float32 too.
     np.testing.assert_allclose(image, expected[sensor.view.window], rtol=0, atol=5e-5)
     assert image[..., 3].max() > 0.8

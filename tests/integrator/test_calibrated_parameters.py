@@ -180,7 +180,8 @@ def test_gradients_of_an_image_reach_the_calibration(sensor):
         dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
         actual = float(dr.grad(params[keys[0]])[0])
         params[keys[0]] = dr.detach(params[keys[0]])
-        # Of the differences: 1e-6 of 4000 numbers of either sign, over the step, and its square.
+        # Error of the differences: 1e-6 of 4000 numbers of either sign, over the step, and its
+        # square.
         assert actual == pytest.approx(expected, rel=2e-3, abs=1e-4 / step), name
 
 

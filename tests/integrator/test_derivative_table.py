@@ -44,7 +44,7 @@ CORE = [
     ("`to_world`, rough", "`splatpath`"),
     ("`to_world`, mirror or glass", "`rays`"),
 ]
-"""Of the cells, those that are tested always."""
+"""Cells that are not marked slow."""
 
 MODES = 1e-3
 """Difference of forward from reverse mode: both add up the same numbers, in another order."""

@@ -18,7 +18,7 @@ MODULES = (
     "drgs.integrator.splat_transport",
     "drgs.integrator.shadows",
 )
-"""Of light between splats and surfaces, and of nothing else; and so is this package:"""
+"""Modules used only for light between splats and surfaces, like all of ``PACKAGE``."""
 
 PACKAGE = ["drgs", "light"]
 

@@ -171,7 +171,7 @@ def test_a_scene_renders_the_views_image_in_display_space(antialiased, near):
     scene = make_scene(gaussians, model, BACKGROUND)
     image = image_of(scene, sensor=make_sensors([view])[0])
     expected = expected_image(gaussians, view, near, antialiased)
-    # As for the integrator: see test_splats.
+    # Tolerance of test_splats.
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
 
 

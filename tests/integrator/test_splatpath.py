@@ -235,10 +235,10 @@ FURNACES = {
 }
 
 DEPTHS = [1, 2, 3, 4, 5, -1]
-"""Of paths. The last has no limit, and Russian roulette ends it from 5 on."""
+"""Maximum path depths. -1 is unlimited, and Russian roulette begins at 5."""
 
 ROUNDING = 1e-5
-"""Of means of 64 samples, of 3 at most, that are added up in single precision: 64 * 3 * 6e-8."""
+"""Error of means of 64 samples up to 3, summed in single precision: 64 * 3 * 6e-8."""
 
 
 @pytest.mark.parametrize("furnace", FURNACES.values(), ids=FURNACES.keys())

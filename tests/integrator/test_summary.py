@@ -42,7 +42,7 @@ MODULES = (
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
     "training.effects.view_parameters",
 )  # fmt: skip
-"""Of effects, and of nothing else."""
+"""Modules used only by effects."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -284,7 +284,7 @@ def test_plan_of_a_fit_matches_its_effects():
 
 
 # ----------------------------------------------------------------------------------------------
-# What takes part in a fit
+# Effects of a fit
 # ----------------------------------------------------------------------------------------------
 
 

@@ -19,8 +19,8 @@ ROUNDING = {
     "glb": 0,
     "splat": 1 / 255,
 }
-"""By name of a format: the largest error of a coefficient, which is more than any other error of a
-colour; of ``splat``, which has none, of a base colour."""
+"""Largest error of an SH coefficient by format, which exceeds any other error of a colour; for
+``splat``, which has none, of a base colour."""
 
 
 def asymmetric_scene() -> Gaussians:

@@ -125,7 +125,7 @@ def test_an_exr_is_written_with_one_thread(tmp_path):
     np.testing.assert_array_equal(np.array(read_exr(tmp_path / "new" / "a.exr")), pixels)
 
 
-# What is read, and what is said not to be
+# Reading, and notes on ignored content
 
 
 def write_tiff16(path, pixels):

@@ -44,7 +44,7 @@ def random_rays(count, seed=1) -> Rays:
     axes = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1, 1], (count, 1))
     targets[along] = (origins + axes)[along]
     found = Rays.towards(origins, targets, far)
-    # Of unit length in double precision: else distances along rays are not in world units.
+    # Unit length in double precision: else distances along rays are not in world units.
     directions = found.directions / np.linalg.norm(found.directions, axis=1, keepdims=True)
     return Rays(found.origins, np.where(np.abs(directions) < 1e-6, 0, directions), found.far)
 
@@ -56,8 +56,9 @@ def passed(splats, rays, precision):
 
 
 TOLERANCE = {np.float64: 1e-11, np.float32: 2e-4}
-"""Of a transmittance. An offset of 30 from a needle 1e-3 thick is 3e4 standard deviations, whose
-rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours up to 3, three times as much."""
+"""Tolerance of a transmittance. An offset of 30 from a needle 1e-3 thick is 3e4 standard
+deviations, whose rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours up to 3, three
+times as much."""
 
 
 @both_precisions

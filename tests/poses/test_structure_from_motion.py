@@ -164,7 +164,7 @@ def test_colmap_errors_are_reported_in_one_line(tmp_path, monkeypatch):
 
 
 # ----------------------------------------------------------------------------------------------
-# What is replaced, and what is left behind
+# Replaced and leftover files
 # ----------------------------------------------------------------------------------------------
 
 
@@ -328,7 +328,7 @@ def test_temporary_files_are_on_the_same_disk_as_the_model(search, tmp_path):
 
 
 # ----------------------------------------------------------------------------------------------
-# What is compared, and what shares a camera
+# Matched pairs and shared cameras
 # ----------------------------------------------------------------------------------------------
 
 

@@ -174,7 +174,7 @@ def test_splats_with_their_peak_behind_the_camera_are_invisible():
         model = replace(UNCUT, projection=projection, order=order, low_pass=0.0)
         alpha = rays.render(gaussians, camera, model=model).alpha[4]
         assert not alpha[behind].any() and alpha[~behind].all(), (projection, order)
-    # By its center, EWA does not ask for depths.
+    # EWA does not need depths when sorted by center.
     model = replace(UNCUT, low_pass=0.0)
     assert rays.render(gaussians, camera, model=model).alpha[4].all()
 

@@ -67,7 +67,7 @@ CHANGES = [
     DensityRow(iteration=40, num_gaussians=1400, pruned=100, refused=3),
     DensityRow(iteration=60, num_gaussians=2400, num_added=1010, cloned=10, split=1000, pruned=10),
 ]
-"""Of a fit that began with 1000."""
+"""Changes of a fit that began with 1000 Gaussians."""
 
 
 def metrics(**data):

@@ -34,10 +34,10 @@ BUTTONS = """
 [...document.querySelectorAll("button")].map((b) => b.getBoundingClientRect())
   .filter((r) => r.width && r.height).map((r) => [r.left, r.top, r.right, r.bottom])
 """
-"""Those that are shown: the left, upper, right and lower edge of each, px."""
+"""Left, top, right and bottom edge of each visible button, px."""
 
 TURN = Rotation.from_euler("xyz", [40, -70, 25], degrees=True).as_matrix()
-"""Of the world, in which up is thus none of the axes."""
+"""Rotation of the world, so that up is none of its axes."""
 
 UP = TURN[:, 2]
 

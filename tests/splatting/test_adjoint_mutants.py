@@ -137,7 +137,7 @@ def _loss_and_gradient(height, width, weight):
 def _check_loss_and_gradient():
     x, y, expected_loss, expected_gradient = _loss_and_gradient(9, 3, 0.2)
     loss, gradient = loss_checks.value_and_gradient(x, y, 0.2)
-    # As in test_losses.
+    # Tolerances of test_losses.
     assert loss == pytest.approx(expected_loss, rel=1e-12)
     np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-5, atol=2e-11)
 

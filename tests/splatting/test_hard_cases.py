@@ -132,7 +132,7 @@ def test_reference_gradient_is_the_slope_of_the_reference(name):
     fields, fields_before = moved(1), moved(-1)
     after, before = loss(fields), loss(fields_before)
     slope = np.sum(after - before) / (2 * step)
-    # What the parameters did move by: far from the origin, means cannot move by any amount.
+    # The actual changes of the parameters: far from the origin, means move in coarse steps.
     terms = [gradients[key] * (fields[key] - fields_before[key]) / (2 * step) for key in direction]
     analytic = sum(term.sum() for term in terms)
     size = np.sqrt(sum((term**2).sum() for term in terms))

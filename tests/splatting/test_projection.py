@@ -24,9 +24,9 @@ from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.reference import splatting as reference
 from drgs.splatting.projection import compensated_opacity, load_rows, plain_opacity, project
 
-# Of the largest number of each array. Chains of some hundred roundings, 1e-14 in float64 and 1e-5
-# in float32 (2^29 times as much), and factors of a few where the terms of a quaternion's or a
-# mean's gradient cancel. Measured: 1e-14 and 5e-6.
+# Relative to the largest number of each array. Chains of some hundred roundings, 1e-14 in float64
+# and 1e-5 in float32 (2^29 times as much), and factors of a few where the terms of a quaternion's
+# or a mean's gradient cancel. Measured: 1e-14 and 5e-6.
 TOLERANCE = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 CASES = [

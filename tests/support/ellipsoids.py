@@ -15,8 +15,8 @@ from drgs.reference import splatting as reference
 from support.helpers import assert_arrays_agree, single
 from support.views import Scene, gradient, tensors
 
-# As in test_splats: single precision, relative to the largest value of an array. Scales and
-# opacities are converted with a relative error of 1e-7 each.
+# Tolerances of test_splats: single precision, relative to the largest value of an array. Scales
+# and opacities are converted with a relative error of 1e-7 each.
 IMAGE, GRADIENTS = 1e-5, 1e-4
 
 

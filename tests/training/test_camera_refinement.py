@@ -259,10 +259,10 @@ def test_camera_derivatives_are_not_computed_before_the_start():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is found
+# Recovered cameras
 # ----------------------------------------------------------------------------------------------
 
-# What a fit leaves as it is when only cameras are to be found.
+# Rates of a fit that optimises cameras only.
 STILL = {
     "optimizer__means_lr": 1e-20,
     "optimizer__means_lr_final": 1e-20,

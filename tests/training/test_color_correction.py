@@ -51,7 +51,7 @@ def random_matrices(count=6, seed=1) -> np.ndarray:
     return IDENTITY + changes - changes.mean(axis=0)
 
 
-# What a fit leaves as it is when only colours are to be found.
+# Rates of a fit that optimises colours only.
 STILL = {
     "optimizer__means_lr": 1e-20,
     "optimizer__means_lr_final": 1e-20,
@@ -243,7 +243,7 @@ def test_background_is_untransformed_in_transparent_pixels():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is found
+# Recovered transforms
 # ----------------------------------------------------------------------------------------------
 
 WARM = np.array([[1.2, 0.05, 0.0, 0.02], [0.0, 0.9, 0.1, -0.03], [0.05, 0.0, 0.7, 0.05]])

@@ -253,7 +253,7 @@ peaks, estimate = [], memory.estimate
 memory.estimate = lambda *a, **k: peaks.append(estimate(*a, **k)) or peaks[-1]
 fit.main(sys.argv[1:])
 expected = peaks[0].required_bytes + min(peaks[0].targets, KEPT_BYTES)
-# What getrusage says may be the peak of the process that started this one.
+# getrusage may report the peak of the parent process.
 status = dict(line.split(":") for line in open("/proc/self/status"))
 print("peak", expected, 1024 * int(status["VmHWM"].split()[0]))
 """

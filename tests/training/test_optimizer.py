@@ -229,7 +229,7 @@ def test_edit_keeps_step_counts_rates_order_and_gradients():
         assert t[0] == 2
         assert promoted is False
         assert dr.grad_enabled(value)
-    # What does not start with the prefix is not a row of anything.
+    # Parameters without the prefix have no rows.
     np.testing.assert_array_equal(optimizer["exposure"].numpy(), [1, 2, 3])
 
 

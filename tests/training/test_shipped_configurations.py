@@ -29,7 +29,7 @@ FASTER_OR_BETTER = {
     "lego_fast": (NUMBER,),
     "lego_best": (NUMBER, "optimizer.shN_lr", "optimizer.decay"),
 }
-"""What else differs in these."""
+"""Further keys in which these configurations differ."""
 
 WIDTH, ITERATIONS = 60, 600
 

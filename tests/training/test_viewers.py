@@ -51,7 +51,7 @@ def test_iterations_improve_images_of_viewers(monkeypatch):
         shown_by_viewers(g, dataset) for g in (gaussians, closed, found.gaussians)
     )
     assert tuned > max(as_it_is, in_closed_form) + 0.2
-    # What the fit itself has found is shown as before.
+    # The fit itself renders the same images as before.
     for image, again in zip(before, trainer.images(dataset.test), strict=True):
         np.testing.assert_array_equal(image, again)
     pairs = zip(found.images(dataset.test), dataset.test, strict=True)

@@ -85,7 +85,7 @@ def test_step_is_adam_on_the_mean_gradient_with_scaled_rates_and_decays():
             change = m[name] / (1 - b1**t) / (np.sqrt(v[name] / (1 - b2**t)) + 1e-15)
             rate = np.sqrt(views_per_step) * expected_rates[name]
             rate *= 1 if name == "means" else falls
-            # Where a gradient is rounding noise, a step of Adam is as long as any.
+            # Gradients that are rounding noise still make full steps of Adam.
             is_sure = np.abs(g) > 1e-4 * np.abs(g).max()
             got, expected = (after[name] - value)[is_sure], -(rate * change)[is_sure]
             # Sums of float32 are off by some 1e-6 of the largest gradient: by 1e-2 of a small one.

@@ -36,7 +36,7 @@ ENDLESS = 100_000
 """Iterations."""
 
 FADE_SECONDS = 3
-"""That a page takes to appear, and to say where a fit is."""
+"""Time until a page appears and shows the progress of a fit."""
 
 
 @contextmanager
@@ -101,7 +101,7 @@ def expected_view(run: Path, width: int, height: int) -> np.ndarray:
     args = argparse.Namespace(what=run, up=None)
     model = load_model(run)
     (camera,) = view.cameras_of(args, model)
-    # As wide as high, at least: on a phone the window is narrower than the camera's image.
+    # The field of view spans the smaller side: a phone's window is narrower than high.
     focal = 0.5 * min(width, height) / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     size = {"cx": width / 2, "cy": height / 2, "width": width, "height": height}
     (rendered,) = render_views(model.scene(), [replace(camera, fx=focal, fy=focal, **size)])

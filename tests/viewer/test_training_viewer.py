@@ -39,7 +39,7 @@ EVERYTHING = {
     "densify__adc__grad_threshold": 1e-7,
     "densify__every": 2,
 }
-"""What a fit can have: effects, a population that changes, harmonics that grow."""
+"""Settings of a fit with effects, density control and a growing SH degree."""
 
 
 @pytest.fixture(scope="module", autouse=True)

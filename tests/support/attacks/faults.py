@@ -55,7 +55,7 @@ WORKS = {
         ("points3d.ply", "transforms_train.json", "train/r_0.png", "test/r_0.png", "capture.json"),
     ),
 }
-"""By name. What a fit draws takes seconds, and is sketched."""
+"""Commands by name. Images of a fit take seconds, and are replaced by stubs."""
 
 
 def count_changes(work: Work, attack_folder: AttackFolder) -> int:

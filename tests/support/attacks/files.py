@@ -52,7 +52,7 @@ READERS = {
         ("ball.xml", *CAPTURE, *capture_size(6), "--out", "captured"),
     ),
 }
-"""By file: a command that reads it, and its words."""
+"""Command that reads a file, with its arguments."""
 
 REWRITTEN = ("captured/capture.json",)
 """Files without which a command begins anew."""
@@ -124,7 +124,7 @@ OTHERS = {
     "itself twice": lambda path: path.write_bytes(path.read_bytes() * 2),
     "itself and a line": lambda path: path.write_bytes(path.read_bytes() + b"\nmore"),
 }
-"""By name: what is put in the place of a file."""
+"""Replacements of a file, by name."""
 
 HARMLESS = (
     "itself and a line",
@@ -299,7 +299,7 @@ MUTATIONS = {
     "splats.xml": {"bytes": mutate_bytes, "values": _xml_numbers},
     "ball.xml": {"bytes": mutate_bytes, "values": _xml_numbers},
 }
-"""By file: kinds of damage, functions of a generator of random numbers and the content."""
+"""Kinds of damage by file: functions of a random generator and the content."""
 
 
 def damage_attacks(count: int) -> Iterator[Attack]:
@@ -441,7 +441,7 @@ SPECIAL = {
     "photos/mask.png": {"bomb": _png_bomb, "animated": _animated},
     "photos/depth.png": {"bomb": _png_bomb},
 }
-"""By file: what it is replaced with."""
+"""Special replacements, by file."""
 
 FORMATS = {
     "JPEG": "RGB",

@@ -34,7 +34,7 @@ OTHERS = {
     "spectrum": ("0.5", "400:1, 700:0"),
     "point": ("0, 0, 0", "nan, 0, 0"),
 }
-"""By tag of a property, values."""
+"""Property values, by XML tag."""
 
 OWN = (
     "filename",

@@ -26,7 +26,7 @@ KILLED = 137
 INTERRUPTED = 130
 
 PIPE_BYTES = 1 << 20
-"""Of what a command prints."""
+"""Limit of a command's output."""
 
 CACHES = re.compile(
     r"/(\.drjit|\.cache|__pycache__|\.nv|\.config/matplotlib)(/|$)|^/dev/(null|tty)$|^/proc/self/"
@@ -47,7 +47,7 @@ MAY_CHANGE = {
     "render": {"out"},
     "capture": {"out", "captured"},
 }
-"""By command, folders in which files that were there before may be its own."""
+"""Folders in which a command may change existing files."""
 
 
 class TooLong(BaseException):
@@ -108,7 +108,7 @@ def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outc
 
 
 # ----------------------------------------------------------------------------------------------
-# What is wrong
+# Violations
 # ----------------------------------------------------------------------------------------------
 
 

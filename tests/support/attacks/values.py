@@ -46,7 +46,7 @@ NUMBERS = {
     "2^63": "9223372036854775808",
     "10^400": "1" + "0" * 400,
 }
-"""By name, in YAML."""
+"""Numbers in YAML, by name."""
 
 THINGS = {
     "true": "true",
@@ -87,7 +87,7 @@ LONG_WORK = {
     "init.num_points": (),
     "densify.adc.split_count": (),
 }
-"""By key, values that are right and mean work without end."""
+"""Valid values that mean endless work, by key."""
 
 NEEDED = {
     "init.num_points": ("init.point_cloud=null", "densify.max_gaussians=100000000"),
@@ -97,7 +97,7 @@ NEEDED = {
     "colors": ("colors.lr=0.01",),
     "coarse": (),
 }
-"""By key or section: other values with which it has an effect."""
+"""Further values that make a key or section take effect."""
 
 
 def leaves() -> list[str]:
@@ -211,14 +211,14 @@ WORDS = {
     "dash": "-",
     "dashes": "--",
 }
-"""By name, what stands after an option."""
+"""Option arguments, by name."""
 
 BASES = {
     "fit": ("fit.yml",),
     "render": ("gaussians.ply", "--origin", "3", "0", "1", "--size", "8", "6"),
     "capture": ("ball.xml", *CAPTURE, *capture_size(4)),
 }
-"""By command, words that are right; ``--out out`` is added."""
+"""Valid arguments by command; ``--out out`` is added."""
 
 OTHER_BASES = {
     "split": ("run", "--split", "test"),
@@ -226,7 +226,7 @@ OTHER_BASES = {
     "camera": ("gaussians.ply", "--camera", "camera.json"),
     "scene": ("splats.xml",),
 }
-"""Of ``render``."""
+"""Further valid arguments of ``render``, by name."""
 
 COSTLY = {
     ("fit", ""): ("photographs",),
@@ -241,7 +241,7 @@ COSTLY = {
     ("fit", "--threads"): ("10^4", "10^5"),
     ("render", "--threads"): ("10^4", "10^5"),
 }
-"""By command and option, values that are right and mean a lot of work."""
+"""Valid values that mean a lot of work, by command and option."""
 
 
 def options_of(command: str) -> list[argparse.Action]:

@@ -82,7 +82,7 @@ def test_normals_are_independent_standard_normal_numbers(float_type):
     for column in columns.T:
         # Kolmogorov and Smirnov; one in 10,000 would fail.
         assert stats.kstest(column, "norm").pvalue > 1e-4
-    # Of independent numbers, a correlation has the standard deviation 1 / sqrt(count).
+    # Correlations of independent numbers have the standard deviation 1 / sqrt(count).
     correlations = np.corrcoef(columns.T) - np.eye(9)
     assert np.abs(correlations).max() < 5 / np.sqrt(count)
     lagged = [np.corrcoef(column[1:], column[:-1])[0, 1] for column in columns.T]

@@ -104,7 +104,7 @@ def test_relocation_nearly_preserves_the_image():
 
     before = rendered()
     assert act(optimizer, growth=0.0).relocated == 1
-    # As much light in all along lines through the centre; the profile itself is not Gaussian.
+    # The same integral along lines through the centre; the profile itself is not Gaussian.
     assert np.abs(before - 1).max() > 0.3
     assert np.abs(rendered() - before).max() < 0.06 * np.abs(before - 1).max()
 
