@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fits import SCENES as SCENES_FOLDER
-from fits import add_only, fit, make_parser
+from fits import add_case_option, fit, make_parser
 
 from drgs.bench.output import machine, markdown_table
 from drgs.config.changes import with_changes
@@ -403,7 +403,7 @@ def main() -> None:
     parser = make_parser(__doc__, "recipes")
     parser.add_argument("--data", type=Path, metavar="DIR", help="the photographs of the fox")
     parser.add_argument("--batches", action="store_true", help="steps of several views instead")
-    add_only(parser, [case.name for case in CASES])
+    add_case_option(parser, [case.name for case in CASES])
     args = parser.parse_args()
     cases = BATCH_CASES if args.batches else [CASES[k - 1] for k in args.only]
     points: dict[str, dict[str, Point]] = {}

@@ -28,7 +28,7 @@ from support.lens_scenes import (
     camera_behind,
     gaussians_at_points,
     points_at,
-    points_near_the_end,
+    points_near_lens_limit,
 )
 from support.reference_scenes import numeric_gradients
 
@@ -57,7 +57,7 @@ def large_scene(case, rng):
     film = rng.uniform(-0.4, 1.4, (case.count, 2)) * size
     distances = rng.uniform(1, 3, case.count)
     points = points_at(case.lens, camera, film, distances)
-    near_the_end = points_near_the_end(case.lens, camera, film, distances)
+    near_the_end = points_near_lens_limit(case.lens, camera, film, distances)
     points = np.where(np.isnan(points), near_the_end, points)
     sizes = rng.uniform(0.1, 0.8, (case.count, 3)) * max(size)
     logits = rng.normal(-1.0, 1.0, case.count)

@@ -28,7 +28,7 @@ def variant():
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_left_behind():
+def settings_are_restored():
     before = dr.flag(DEBUG), dr.thread_count(), sys.gettrace(), sys.stderr
     yield
     assert (dr.flag(DEBUG), dr.thread_count(), sys.gettrace(), sys.stderr) == before
@@ -166,7 +166,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.fixture
-def in_every_step(monkeypatch):
+def step_callbacks(monkeypatch):
     """Calls of ``Trainer.step`` call these, with the trainer, when they are done."""
     acts, step = [], Trainer.step
 
@@ -188,10 +188,10 @@ def fails(capsys, command, *arguments):
     return capsys.readouterr().err
 
 
-def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, in_every_step, capsys):
+def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, step_callbacks, capsys):
     """Across a change of the population, of the SH degree, and an opacity reset."""
     flags = []
-    in_every_step.append(lambda trainer: flags.append(dr.flag(DEBUG)))
+    step_callbacks.append(lambda trainer: flags.append(dr.flag(DEBUG)))
     for name, options in (("plain", []), ("checked", ["--debug", "--threads", "1"])):
         fit.main([str(scene / "a.yml"), "--out", str(tmp_path / name), *options])
     assert flags == [False] * 3 + [True] * 3
@@ -203,9 +203,9 @@ def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, in_every_st
 
 
 def test_fit_stops_at_out_of_range_access_and_keeps_the_last_checkpoint(
-    scene, tmp_path, in_every_step, capsys
+    scene, tmp_path, step_callbacks, capsys
 ):
-    in_every_step.append(lambda trainer: trainer.iteration == 2 and read_beyond_the_end())
+    step_callbacks.append(lambda trainer: trainer.iteration == 2 and read_beyond_the_end())
     out = tmp_path / "out"
     message = fails(capsys, fit, scene / "a.yml", "--out", out, "--debug").splitlines()[-1]
     assert message.startswith("error: --debug: drjit.gather(): out-of-bounds read from position 7")

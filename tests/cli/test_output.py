@@ -133,7 +133,7 @@ def test_invalid_command_line_is_reported_in_one_line(words, message):
 
 
 @pytest.fixture
-def interrupt_is_given_back():
+def sigint_handler_is_restored():
     before = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, before)
@@ -143,7 +143,7 @@ def interrupted():
     signal.raise_signal(signal.SIGINT)
 
 
-def interrupted_in_a_callback():
+def raise_interrupt_in_a_callback():
     """Raise as Dr.Jit does, whose own error hides the exception raised within it."""
     try:
         interrupted()
@@ -151,15 +151,15 @@ def interrupted_in_a_callback():
         raise RuntimeError("drjit.backward(): failed (see above)") from cause
 
 
-@pytest.mark.usefixtures("interrupt_is_given_back")
-@pytest.mark.parametrize("act", [interrupted, interrupted_in_a_callback])
+@pytest.mark.usefixtures("sigint_handler_is_restored")
+@pytest.mark.parametrize("act", [interrupted, raise_interrupt_in_a_callback])
 def test_an_interrupt_ends_a_command_without_a_traceback(act):
     outcome = run_in_process(command(act))
     assert (outcome.returncode, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")
     assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL  # what comes now ends it at once
 
 
-@pytest.mark.usefixtures("interrupt_is_given_back")
+@pytest.mark.usefixtures("sigint_handler_is_restored")
 def test_sigterm_ends_a_command_as_ctrl_c_does(tmp_path):
     """Files that it was writing are removed. Afterwards the signal is what it was."""
     before = signal.getsignal(signal.SIGTERM)

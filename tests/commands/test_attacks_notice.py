@@ -63,7 +63,7 @@ def leave_a_temporary_file():
     open("out/.a.7.tmp.txt", "w").close()
 
 
-def print_what_no_terminal_can():
+def print_unencodable_text():
     print("\u00e4")
 
 
@@ -76,14 +76,14 @@ BREACHES = {
     "long line": (lambda: refuse("error: " + "x" * 3000), "a line of 3007 characters"),
     "warning": (warn, "standard error: UserWarning: of what?"),
     "memory": (take_memory, "MB more"),
-    "time": (wait, "TooLong"),
+    "time": (wait, "TimeLimitExceeded"),
     "file of the user's": (lambda: write("mine/notes.txt"), "changed mine/notes.txt"),
     "removed": (lambda: os.unlink("sky.png"), "removed sky.png"),
     "beside the output": (lambda: write("new/a"), "made new/a"),
     "refused too late": (lambda: write_and_refuse("out/a"), "made out/a"),
     "elsewhere": (write_elsewhere, "wrote outside"),
     "temporary": (leave_a_temporary_file, "left out/.a.7.tmp.txt"),
-    "encoding": (print_what_no_terminal_can, "UnicodeEncodeError"),
+    "encoding": (print_unencodable_text, "UnicodeEncodeError"),
 }
 
 
@@ -145,5 +145,5 @@ def test_attack_folder_is_restored(attack_folder):
     (attack_folder.folder / "new").mkdir()
     os.mkfifo(attack_folder.folder / "new" / "pipe")
     assert contents(attack_folder.folder) != before
-    attack_folder.put_back()
+    attack_folder.restore_files()
     assert contents(attack_folder.folder) == before

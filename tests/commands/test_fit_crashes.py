@@ -81,7 +81,7 @@ def config(tmp_path_factory):
     return write_project(tmp_path_factory.mktemp("project"))
 
 
-def crashed(moment, behind, *arguments):
+def run_crashing_fit(moment, behind, *arguments):
     """Run a fit that is ended at the replacement of a file, before or behind it.
 
     moment: which, by number; None: none. Returns whether it got so far, and the names of what was
@@ -125,7 +125,7 @@ def assert_same_again(out, again):
 def assert_goes_on(config, tmp_path, moment, behind, *budget):
     """The folder; None where the fit ends before that moment."""
     out = tmp_path / f"{moment}{behind}"
-    was_killed, names = crashed(moment, behind, config, "--out", out, *budget)
+    was_killed, names = run_crashing_fit(moment, behind, config, "--out", out, *budget)
     if not was_killed:
         assert len(names) == moment
         return None
@@ -140,7 +140,7 @@ def assert_goes_on(config, tmp_path, moment, behind, *budget):
 
 
 def moments_of(config, tmp_path, *budget):
-    was_killed, names = crashed(None, False, config, "--out", tmp_path / "whole", *budget)
+    was_killed, names = run_crashing_fit(None, False, config, "--out", tmp_path / "whole", *budget)
     assert not was_killed
     assert_done(tmp_path / "whole")
     return names
@@ -173,7 +173,7 @@ def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
 
 def test_fit_killed_while_writing_results_repeats_no_iteration(config, tmp_path):
     names = moments_of(config, tmp_path)
-    assert crashed(names.index("history.csv"), True, config, "--out", tmp_path / "out")[0]
+    assert run_crashing_fit(names.index("history.csv"), True, config, "--out", tmp_path / "out")[0]
     outcome = assert_fits("--resume", tmp_path / "out")
     assert f"continues at iteration {ITERATIONS}\n" in outcome.stdout
     for name in RESULTS - {"history.csv", "metrics.json", "config.yml"}:  # times, and a folder

@@ -179,7 +179,7 @@ def another_image(folder, split="train"):
     shutil.copy(folder / split / "r_0.png", folder / split / "r_1.png")
 
 
-def other_sizes(folder):
+def resize_training_images(folder):
     """Return other sizes for all training images."""
     from PIL import Image
 
@@ -208,7 +208,7 @@ CHANGES = {
     "the training views are in another order": lambda data: edit(data, list.reverse),
     "the image of training view r_1": another_image,
     "the size (32x24, now 16x12) of training view r_0, the image of training view r_0, the size "
-    "(32x24, now 16x12) of training view r_1 and 3 more": other_sizes,
+    "(32x24, now 16x12) of training view r_1 and 3 more": resize_training_images,
     "the camera of training view r_2": lambda data: edit(data, moved_camera),
     "the mask of training view r_0": masked,
     "the image of test view r_1": lambda data: another_image(data, "test"),

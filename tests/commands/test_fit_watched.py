@@ -49,7 +49,7 @@ class Screen:
 
 
 @pytest.fixture
-def looked_on(monkeypatch):
+def viewer_page(monkeypatch):
     """Makes ``--view`` a page for the screen above, without a server."""
 
     @contextmanager
@@ -62,7 +62,7 @@ def looked_on(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
     monkeypatch.setattr("drgs.viewer.training_viewer.PROGRESS_SECONDS", 0.0)
 
-    def look_on(end_at=None):
+    def attach_viewer(end_at=None):
         screens = []
 
         def watch(server, trainer, dataset, length):
@@ -76,7 +76,7 @@ def looked_on(monkeypatch):
         return screens
 
     without_images(monkeypatch)
-    return look_on
+    return attach_viewer
 
 
 def files_of(out):
@@ -85,8 +85,8 @@ def files_of(out):
     return {path.relative_to(out): path.read_bytes() for path in paths}
 
 
-def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, looked_on):
-    config, screens = write_project(tmp_path), looked_on()
+def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, viewer_page):
+    config, screens = write_project(tmp_path), viewer_page()
     outcome = assert_fits(config, "--out", tmp_path / "watched", "--view")
     assert "look on at http://here" in outcome.stdout
     assert screens[0].shown == screens[0].iterations == 8
@@ -96,9 +96,9 @@ def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, looked_
     assert first.replace("watched", "alone") == second
 
 
-def test_ending_early_leaves_a_finished_fit(tmp_path, looked_on):
+def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page):
     config, out = write_project(tmp_path), tmp_path / "out"
-    looked_on(end_at=4)
+    viewer_page(end_at=4)
     outcome = assert_fits(config, "--out", out, "--view")
     assert "5 iterations in" in outcome.stdout
     metrics = json.loads((out / "metrics.json").read_text())
@@ -110,9 +110,11 @@ def test_ending_early_leaves_a_finished_fit(tmp_path, looked_on):
     assert files_of(tmp_path / "again") == files_of(out)
 
 
-def test_fit_ended_early_and_killed_writes_its_results_on_resume(tmp_path, looked_on, monkeypatch):
+def test_fit_ended_early_and_killed_writes_its_results_on_resume(
+    tmp_path, viewer_page, monkeypatch
+):
     config, out = write_project(tmp_path), tmp_path / "out"
-    looked_on(end_at=4)
+    viewer_page(end_at=4)
     with monkeypatch.context() as patch:
         patch.setattr(
             fit_folder, "write_images", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)

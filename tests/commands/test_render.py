@@ -209,7 +209,7 @@ def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path, samples):
     # In the middle of equal times, each by the reference.
     count = samples or 8
     times = [(k + 0.5) / count for k in range(count)]
-    cameras = [small_view("", between(begin, end, time), None) for time in times]
+    cameras = [small_view("", pose_between(begin, end, time), None) for time in times]
     parts = [photograph(blobs(), camera, WHITE) for camera in cameras]
     clear = ~np.any([part.near_threshold for part in parts], axis=0)
     expected = np.clip(np.mean([part.image for part in parts], axis=0), 0, 1)
@@ -245,7 +245,7 @@ def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys
         assert "  lens: RadialTangential (k1) (1 of 2 sensors)\n" in of_scene
 
 
-def between(begin, end, time):
+def pose_between(begin, end, time):
     """The pose at a time: the centre on a line, turning at a constant rate."""
     turn = Rotation.from_matrix(end[:3, :3] @ begin[:3, :3].T).as_rotvec()
     pose = np.eye(4)

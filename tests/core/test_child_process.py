@@ -37,7 +37,7 @@ def is_running(process):
         return False
 
 
-def ends(process):
+def has_ended(process):
     """Whether it is gone within a while."""
     for _ in range(200):
         if not is_running(process):
@@ -96,7 +96,7 @@ def test_a_child_ends_with_a_parent_that_is_killed():
         child = int(parent.stdout.readline())
         assert is_running(child)
         parent.kill()
-    assert ends(child)
+    assert has_ended(child)
 
 
 def test_interrupt_is_deferred_to_the_end_of_the_block():

@@ -18,7 +18,7 @@ def header(shape, kind="<f8"):
     return stream.getvalue()
 
 
-def of_several(path):
+def write_several_arrays(path):
     with path.open("wb") as file:
         np.savez(file, a=np.ones(3))
 
@@ -39,7 +39,7 @@ WRONG = {
     ),
     "of objects": (lambda p: np.save(p, np.full((4, 6), None)), "cannot read the depth"),
     "of several arrays": (
-        of_several,
+        write_several_arrays,
         "depth must be (height, width)",
     ),
     "no numbers": (lambda p: p.write_bytes(b"hello"), "cannot read the depth"),

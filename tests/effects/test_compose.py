@@ -62,7 +62,7 @@ def test_adjoint_and_tangent_replay_the_composed_pipeline(scene):
     assert rendering.render(gaussians, camera, pipeline).pipeline is pipeline
 
 
-def asking(source):
+def reads_camera_effects(source):
     """Whether ``source`` reads an attribute ``aperture`` or ``shutter``."""
     nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute))
     return any(node.attr in ("aperture", "shutter") for node in nodes)
@@ -72,8 +72,10 @@ def asking(source):
 def test_packages_do_not_query_effects_of_a_camera(package):
     paths = sorted((REPOSITORY / "drgs" / package).glob("*.py"))
     assert len(paths) > 5
-    assert [path.name for path in paths if asking(path.read_text())] == []
+    assert [path.name for path in paths if reads_camera_effects(path.read_text())] == []
 
 
 def test_query_of_a_camera_effect_is_found():
-    assert asking("x = camera.aperture is None") and not asking("aperture = 1")
+    assert reads_camera_effects("x = camera.aperture is None") and not reads_camera_effects(
+        "aperture = 1"
+    )

@@ -125,7 +125,7 @@ def test_filter_matches_sampling_rates_of_the_reference(precision, count):
     np.testing.assert_allclose(actual, np.sqrt(0.2) / rates, rtol=tolerance)
 
 
-def seen_by(camera, means) -> np.ndarray:
+def visible_means(camera, means) -> np.ndarray:
     """(N,) bool, as a loop over the means says it."""
     seen = []
     for mean in means:
@@ -139,7 +139,7 @@ def seen_by(camera, means) -> np.ndarray:
 
 def test_unseen_means_get_the_widest_filter_of_seen_ones():
     cameras, means = cameras_and_means(1)
-    seen = np.any([seen_by(camera, means) for camera in cameras], axis=0)
+    seen = np.any([visible_means(camera, means) for camera in cameras], axis=0)
     assert 50 < seen.sum() < 350
     tensor = FLOAT64.TensorXf(FLOAT64.array(means), means.shape)
     actual = rows(smoothing_of(tensor, [device_camera(c, FLOAT64) for c in cameras]))

@@ -111,7 +111,7 @@ def test_imports_point_down(module):
         assert allowed, f"{module} imports {imported}"
 
 
-def circle_among(imports):
+def find_cycle(imports):
     """A circle of modules each of which imports the next one; None: there is none."""
     finished, trail = set(), []
 
@@ -139,19 +139,19 @@ def test_training_effects_do_not_import_the_trainer():
 
 
 def test_no_import_cycles_among_modules():
-    assert circle_among({name: found - {"drgs"} for name, found in IMPORTS.items()}) is None
+    assert find_cycle({name: found - {"drgs"} for name, found in IMPORTS.items()}) is None
 
 
 def test_no_import_cycles_among_packages():
     packages = {name: set() for name in MAY_IMPORT}
     for module, found in IMPORTS.items():
         packages[package_of(module)] |= {package_of(name) for name in found - {"drgs"}}
-    assert circle_among(packages) is None
+    assert find_cycle(packages) is None
 
 
 def test_import_cycle_is_found():
-    assert circle_among({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
-    assert circle_among({"a": {"b", "c"}, "b": {"c"}, "c": set()}) is None
+    assert find_cycle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
+    assert find_cycle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) is None
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def variant():
 
 
 @dataclass(frozen=True)
-class Seen(View):
+class SensorView(View):
     """The view through a sensor of another type; its lens need not see the same part."""
 
     others: tuple = ()  # (name, value) of the sensor's parameters
@@ -41,10 +41,10 @@ LENS = (("type", "calibrated"), ("fx", 40.0), ("lens", "opencv"), ("k1", -0.1))
 SENSORS = {
     "perspective": VIEWS[1],
     "crop window": VIEWS[12],
-    "thinlens": Seen("", others=THIN),
-    "orthographic": Seen("", others=(("type", "orthographic"),)),
-    "calibrated": Seen("", others=LENS),
-    "fisheye": Seen("", others=(*LENS[:2], ("lens", "fisheye"), ("k1", -0.02))),
+    "thinlens": SensorView("", others=THIN),
+    "orthographic": SensorView("", others=(("type", "orthographic"),)),
+    "calibrated": SensorView("", others=LENS),
+    "fisheye": SensorView("", others=(*LENS[:2], ("lens", "fisheye"), ("k1", -0.02))),
 }
 
 
@@ -180,7 +180,7 @@ def test_rays_not_covering_the_film_are_refused(case):
         film = {"sample_border": True, "rfilter": "gaussian"}
     if case == "moving":
         close = mi.ScalarTransform4f().translate([0.1, 0, 0])
-        view = Seen("", others=(*MOVING, ("to_world_close", close)))
+        view = SensorView("", others=(*MOVING, ("to_world_close", close)))
     loaded = load(Scene(view), AOV, **film)
     arguments = {}
     if case == "batch":

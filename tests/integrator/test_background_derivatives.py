@@ -58,7 +58,7 @@ def gradient_of(loaded, key, weights) -> np.ndarray:
     return np.array(dr.grad(leaves[key])).astype(np.float64)
 
 
-def like(parameter, values):
+def value_like(parameter, values):
     """Numbers as a value of a parameter: of a colour, of a flat array, of a tensor."""
     values = np.asarray(values, np.float32)
     if isinstance(parameter, mi.Color3f):
@@ -89,7 +89,7 @@ def test_derivatives_of_the_radiance_equal_differences(kind, srgb_primitives):
         both = []
         for sign in (1, -1):
             params = mi.traverse(loaded)
-            params[key] = like(params[key], start + np.float32(sign * step) * direction)
+            params[key] = value_like(params[key], start + np.float32(sign * step) * direction)
             params.update()
             both.append(np.sum(weights * image_of(loaded)))
         difference = (both[0] - both[1]) / (2 * step)
@@ -164,7 +164,7 @@ def test_gradients_reach_the_inputs_of_the_radiance(way, kind):
     def loss(factor, **seeds):
         params = mi.traverse(loaded)
         for key, values in start.items():
-            params[key] = like(params[key], values) * factor
+            params[key] = value_like(params[key], values) * factor
         params.update()
         renders = [mi.render(loaded, params, **seeds) for _ in range(count)]
         return [dr.sum(image * tensor(weights), axis=None) for image in renders]
@@ -256,7 +256,7 @@ def test_forward_and_backward_derivatives_are_transposed(kind, srgb_primitives):
         k: single(np.sign(g) * np.abs(rng.normal(size=g.shape))) for k, g in gradients.items()
     }
     for k, direction in directions.items():
-        dr.set_grad(leaves[k], like(leaves[k], direction))
+        dr.set_grad(leaves[k], value_like(leaves[k], direction))
     tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
     terms = [np.sum(directions[k] * gradients[k]) for k in keys]
     size = np.abs(weights * tangent).sum()

@@ -19,7 +19,7 @@ from support.ellipsoids import (
     ROTATION,
     SCALE,
     TRANSLATION,
-    Held,
+    EllipsoidsCase,
     assert_images_agree,
     gradients_held,
     joined,
@@ -54,7 +54,7 @@ def variant():
 @both_kinds
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_shape_matches_the_reference(kind, degree):
-    scene = clear(Held(degree=degree, kind=kind))
+    scene = clear(EllipsoidsCase(degree=degree, kind=kind))
     loaded = scene.load()
     assert_images_agree(image_of(loaded), scene.image())
     assert loaded.integrator().sh_degree == degree
@@ -67,7 +67,7 @@ def test_file_renders_the_same_through_a_shape(kind, degree, tmp_path):
     """To what float32 makes of exp, log and the sigmoid."""
     scene = Scene(degree=degree)
     path = write_model(tmp_path / "model.ply", scene.gaussians)
-    loaded = Held().load(shape={"type": kind, "filename": path})
+    loaded = EllipsoidsCase().load(shape={"type": kind, "filename": path})
     assert_images_agree(image_of(loaded), image_of(scene.load()))
 
 
@@ -87,7 +87,7 @@ AS_VOLPRIM = {
 
 @both_kinds
 def test_shapes_match_volprim_rf_basic(kind):
-    scene = Held(degree=2, count=60)
+    scene = EllipsoidsCase(degree=2, count=60)
     held = scene.held
     held["data"][:, 6:] /= np.linalg.norm(held["data"][:, 6:], axis=1, keepdims=True)
 

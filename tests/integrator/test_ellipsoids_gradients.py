@@ -13,7 +13,7 @@ from support.ellipsoids import (
     GRADIENTS,
     HELD,
     MERGED,
-    Held,
+    EllipsoidsCase,
     Merged,
     apart,
     assert_held_agree,
@@ -47,20 +47,20 @@ def variant():
 @pytest.mark.parametrize("srgb_primitives", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_gradients_match_the_reference(degree, srgb_primitives):
-    scene = clear(Held(degree=degree, srgb_primitives=srgb_primitives))
+    scene = clear(EllipsoidsCase(degree=degree, srgb_primitives=srgb_primitives))
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
 
 def test_gradients_match_the_reference_for_a_mesh():
-    scene = clear(Held(kind="ellipsoidsmesh"))
+    scene = clear(EllipsoidsCase(kind="ellipsoidsmesh"))
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
 
 @pytest.mark.parametrize("name", HELD)
 def test_only_enabled_parameters_receive_gradients(name):
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
     params = mi.traverse(loaded)
     dr.enable_grad(params[f"shape.{name}"])
@@ -72,7 +72,7 @@ def test_only_enabled_parameters_receive_gradients(name):
 
 
 def test_gradients_reach_the_inputs_of_shape_parameters():
-    scene = clear(Held())
+    scene = clear(EllipsoidsCase())
     loaded = scene.load()
     params = mi.traverse(loaded)
     factor = mi.Float(1.0)
@@ -109,7 +109,7 @@ def forward_image(loaded, directions, prefix="shape") -> np.ndarray:
 @pytest.mark.parametrize("names", [*((name,) for name in HELD), HELD], ids="+".join)
 def test_forward_mode_equals_central_differences(names):
     """STEP: as in test_splats."""
-    scene = clear(Held(degree=2))
+    scene = clear(EllipsoidsCase(degree=2))
     directions = {name: directions_of(scene.held)[name] for name in names}
 
     def moved(step):
@@ -134,7 +134,7 @@ def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
 
 
 def test_gradient_tests_detect_one_percent_errors():
-    scene = clear(Held())
+    scene = clear(EllipsoidsCase())
     expected = apart(held_gradients(scene.held, scene.gradients(scene.weights())))
     for name, values in expected.items():
         with pytest.raises(AssertionError):
@@ -158,7 +158,7 @@ def test_backward_passes_give_the_same_bytes_without_float_atomics():
 
 def test_adam_reduces_the_loss():
     """Every parameter starts somewhat off; the image it had is the target."""
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
     target = mi.TensorXf(image_of(loaded).astype(np.float32))
     params = mi.traverse(loaded)
@@ -202,7 +202,7 @@ def counted(monkeypatch):
 
 
 def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
     gradients_held(loaded, scene.weights())
     image_of(loaded)
@@ -211,7 +211,7 @@ def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
 
 @pytest.mark.parametrize("name", HELD)
 def test_a_changed_parameter_is_rendered_again(name, counted):
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
     before = image_of(loaded)
     params = mi.traverse(loaded)
@@ -224,7 +224,7 @@ def test_a_changed_parameter_is_rendered_again(name, counted):
 
 
 def test_gaussians_of_a_shape_may_be_replaced(counted):
-    scene, other = Held(), Held(count=60, seed=9)
+    scene, other = EllipsoidsCase(), EllipsoidsCase(count=60, seed=9)
     loaded = scene.load()
     image_of(loaded)
     params = mi.traverse(loaded)
@@ -247,7 +247,7 @@ def test_changed_integrator_parameter_is_rendered_again():
 
 
 def test_integrator_renders_the_shapes_of_the_current_scene():
-    first, second = Held(), Held(seed=9)
+    first, second = EllipsoidsCase(), EllipsoidsCase(seed=9)
     scenes = [scene.load() for scene in (first, second)]
     expected = [image_of(loaded) for loaded in scenes]
     integrator = mi.load_dict(first.settings)

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.ellipsoids import (
-    Held,
+    EllipsoidsCase,
     Merged,
     assert_images_agree,
     gradients_held,
@@ -53,7 +53,7 @@ SEEN = 3
 
 
 def test_an_opacity_of_one_is_the_largest_below_one():
-    scene = Held()
+    scene = EllipsoidsCase()
     largest = rendered_of(scene, opacities=(SEEN, 0, 1 - 2.0**-24))
     for value in (1.0, 1.5, np.inf):
         np.testing.assert_array_equal(rendered_of(scene, opacities=(SEEN, 0, value)), largest)
@@ -70,7 +70,7 @@ def test_an_opacity_of_one_is_the_largest_below_one():
 )
 def test_invisible_gaussians_leave_the_image_unchanged(changes):
     """With any least alpha."""
-    scene = Held()
+    scene = EllipsoidsCase()
     others = {name: np.delete(values, SEEN, axis=0) for name, values in scene.held.items()}
     for settings in ({}, {"alpha_cut": 0.0}):
         loaded = scene.load(settings, shape=shape_of(changed(scene.held, **changes)))
@@ -84,7 +84,7 @@ def test_invisible_gaussians_leave_the_image_unchanged(changes):
 
 def test_the_sign_of_a_standard_deviation_is_ignored():
     """Derivatives change theirs."""
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
     width = scene.held["data"][SEEN, 4]
     other = scene.load(shape=shape_of(changed(scene.held, data=(SEEN, 4, -width))))
@@ -113,7 +113,7 @@ def test_mirroring_to_world_gives_the_mirror_image(tmp_path):
 def test_derivative_at_opacity_one_is_the_one_sided_limit():
     """A splat behind all others, its peak beside the film: images are linear in its opacity."""
     settings = {"alpha_cut": 0.0, "transmittance_stop": 0.0, "extent": 3.0}
-    scene = Held(degree=0)
+    scene = EllipsoidsCase(degree=0)
     camera = scene.camera
     held = {name: values.copy() for name, values in scene.held.items()}
     held["data"][SEEN, :3] = camera.center + [7, 0, 9] @ camera.rotation
@@ -174,7 +174,7 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_shapes_with_missing_attributes_are_refused(case):
     make, expected = REFUSED[case]
-    scene = Held()
+    scene = EllipsoidsCase()
     assert expected in refusal(scene.load(shape=shape_of(make(scene.held))))
 
 
@@ -190,7 +190,7 @@ def test_a_scene_without_gaussians_is_refused():
 
 def test_a_degree_above_that_of_the_shapes_is_refused():
     assert "integer from 0 to 1, the degree of the Gaussians, got 2" in refusal(
-        Held(degree=1).load({"sh_degree": 2})
+        EllipsoidsCase(degree=1).load({"sh_degree": 2})
     )
 
 
@@ -222,7 +222,7 @@ def test_own_coefficients_may_be_of_lower_degree_than_those_of_shapes():
 
 def test_a_to_world_for_an_unknown_shape_is_refused():
     settings = {"shapes_to_world_chair": transform()}
-    assert refusal(Held().load(settings)) == (
+    assert refusal(EllipsoidsCase().load(settings)) == (
         "splats: shapes_to_world_chair must end with the id of a shape of type ellipsoids or "
         "ellipsoidsmesh, ids are: 'shape'"
     )
@@ -266,7 +266,7 @@ def test_wrong_properties_are_refused(case):
 
 def instanced(kind="ellipsoids", group="shapegroup", **settings) -> mi.Scene:
     """A scene whose Gaussians are in a group, beside a ball that stands alone."""
-    scene = Held(kind=kind)
+    scene = EllipsoidsCase(kind=kind)
     return mi.load_dict(
         {
             "type": "scene",

@@ -54,7 +54,7 @@ def rendered(*arguments, **others):
     return np.array(mi.render(scene(*arguments, **others), seed=3), np.float64)
 
 
-def of_three(probes="floor", **others):
+def images_by_light(probes="floor", **others):
     """Images without light, with probes, and with rays."""
     own = rendered(None, **others), rendered(probes=probes, **others)
     return *own, rendered("rays", **others)
@@ -136,7 +136,7 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_flat_mirror_matches_traced_rays(kind):
     """46 dB, between texels; without light there are less than 24."""
-    none, probe, rays = of_three(**KINDS[kind]())
+    none, probe, rays = images_by_light(**KINDS[kind]())
     assert metrics.psnr(probe, rays) > 46
     assert metrics.psnr(none, rays) < 24
 
@@ -145,7 +145,7 @@ def test_rough_and_nested_mirrors_use_the_mirrored_camera():
     """Both are approximate; from the middles of the objects, there are 25 and 29 dB."""
     rough = {"floor": floor(bsdf={"type": "roughconductor", "alpha": 0.1})}
     for probes, objects, least in (("floor", rough, 29), ("floor, wall", {"wall": wall()}, 34)):
-        none, probe, rays = of_three(probes, **objects)
+        none, probe, rays = images_by_light(probes, **objects)
         assert metrics.psnr(probe, rays) > least
         assert metrics.psnr(none, rays) < 24
 

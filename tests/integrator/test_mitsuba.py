@@ -57,7 +57,7 @@ TIMES = 3
 
 
 @dataclass(frozen=True)
-class Seen:
+class SensorCase:
     """A sensor, and what the reference makes of it."""
 
     sensor: Callable[[], dict]
@@ -93,21 +93,21 @@ class Seen:
 
 
 SENSORS = {
-    "perspective": Seen(VIEW.sensor, VIEW.camera),
-    "thinlens": Seen(lambda: own_sensor("thinlens", VIEW), VIEW.camera),
+    "perspective": SensorCase(VIEW.sensor, VIEW.camera),
+    "thinlens": SensorCase(lambda: own_sensor("thinlens", VIEW), VIEW.camera),
     **{
-        f"orthographic, {name}": Seen(
+        f"orthographic, {name}": SensorCase(
             lambda view=view: own_sensor("orthographic", view), own_camera(view), Orthographic()
         )
         for name, view in OWN.items()
     },
-    "calibrated": Seen(PINHOLE.dictionary, PINHOLE.camera),
-    "calibrated, opencv": Seen(OPENCV.dictionary, OPENCV.camera, OPENCV.lens),
-    "calibrated, fisheye": Seen(FISHEYE.dictionary, FISHEYE.camera, FISHEYE.lens),
-    "calibrated, rolling shutter": Seen(
+    "calibrated": SensorCase(PINHOLE.dictionary, PINHOLE.camera),
+    "calibrated, opencv": SensorCase(OPENCV.dictionary, OPENCV.camera, OPENCV.lens),
+    "calibrated, fisheye": SensorCase(FISHEYE.dictionary, FISHEYE.camera, FISHEYE.lens),
+    "calibrated, rolling shutter": SensorCase(
         ROLLING.dictionary, OPENCV.camera, OPENCV.lens, ROLLING.close_camera, rolling=True
     ),
-    "calibrated, blurred": Seen(
+    "calibrated, blurred": SensorCase(
         lambda: BLURRED.dictionary(shutter_samples=TIMES),
         OPENCV.camera,
         OPENCV.lens,

@@ -180,7 +180,7 @@ class Furnace:
     """On the axis along which the camera looks."""
 
     @property
-    def let_through(self) -> float:
+    def path_transmittance(self) -> float:
         return (1 - self.alpha) ** 2
 
     def radiances(self, most_depth) -> list[float]:
@@ -190,12 +190,12 @@ class Furnace:
         with cos cos / (pi d^2) = 1 / 4 pi, whichever they are, and what a bounce brings is the mean
         over the sphere. That of the lamp's irradiance is its intensity, pi, without fog.
         """
-        fog = (1 - self.let_through) * self.exposure * linear(np.array(self.color))
-        of_lamp = self.albedo * (1 + self.let_through) / 2
-        of_lamp_there = self.albedo * self.let_through / (1 - self.LAMP) ** 2
+        fog = (1 - self.path_transmittance) * self.exposure * linear(np.array(self.color))
+        of_lamp = self.albedo * (1 + self.path_transmittance) / 2
+        of_lamp_there = self.albedo * self.path_transmittance / (1 - self.LAMP) ** 2
         seen, mean = [1.0], 1.0
         for _ in range(most_depth - 1):
-            bounced = self.albedo * (fog + self.let_through * mean)
+            bounced = self.albedo * (fog + self.path_transmittance * mean)
             seen, mean = [*seen, 1 + of_lamp_there + bounced], 1 + of_lamp + bounced
         return seen
 

@@ -391,7 +391,7 @@ print(json.dumps(found))
 """
 
 
-def in_a_new_process(run_python, blocked=(), **changes) -> dict:
+def run_in_new_process(run_python, blocked=(), **changes) -> dict:
     """Raises RuntimeError with the process's last line of error."""
     modules = [f"drgs.{name}" for name in MODULES]
     program = PLAIN.format(
@@ -408,8 +408,8 @@ def in_a_new_process(run_python, blocked=(), **changes) -> dict:
 
 def test_kernels_are_the_same_without_effect_modules(run_python):
     """Hashes and operations of an image with its derivatives, and of a fit's iterations."""
-    whole = in_a_new_process(run_python)
-    reduced = in_a_new_process(run_python, blocked=MODULES)
+    whole = run_in_new_process(run_python)
+    reduced = run_in_new_process(run_python, blocked=MODULES)
     assert whole == reduced
     assert whole["imported"] == []
     assert all(len(kernels) > 30 for name, kernels in whole.items() if name != "imported")
@@ -425,7 +425,7 @@ def test_kernels_are_the_same_without_effect_modules(run_python):
 )
 def test_missing_module_fails_only_when_its_effect_is_used(run_python, changes, module):
     with pytest.raises(RuntimeError, match=f"drgs.{module} is not there"):
-        in_a_new_process(run_python, blocked=[module], **changes)
+        run_in_new_process(run_python, blocked=[module], **changes)
 
 
 IMPORTS = """

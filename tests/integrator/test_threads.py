@@ -17,7 +17,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def in_two_threads(work):
+def run_in_two_threads(work):
     """Return ``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
     results = [None, None]
 
@@ -56,7 +56,7 @@ def test_two_threads_render_the_same_images_as_one(shared):
         turns = [n % 2 for n in range(10)]
         return [(s, image_of(scenes[number], sensor=2 * number + s)) for s in turns]
 
-    for number, images in enumerate(in_two_threads(work)):
+    for number, images in enumerate(run_in_two_threads(work)):
         for sensor, rendered in images:
             np.testing.assert_array_equal(rendered, expected[number][sensor])
 
@@ -82,5 +82,5 @@ def test_integrator_renders_one_image_at_a_time():
     sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(2)}
     floor = {"type": "rectangle"}
     loaded = mi.load_dict({"type": "scene", "integrator": integrator, "floor": floor, **sensors})
-    in_two_threads(lambda number: [image_of(loaded, sensor=number) for _ in range(3)])
+    run_in_two_threads(lambda number: [image_of(loaded, sensor=number) for _ in range(3)])
     assert most == [1] * 6

@@ -87,7 +87,7 @@ def rays_of_sensor(view) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(rows(ray.o), directions.shape), directions
 
 
-def pass_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
+def composite_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
     """Transmittance and colour (H, W, 4) of what rays pass on their whole length."""
     device = load_rows(device_gaussians(gaussians, precision), gaussians.sh_degree)
     splats = RaySplats.from_gaussians(device, gaussians.sh_degree, cutoffs or Cutoffs())
@@ -144,7 +144,7 @@ def test_primary_rays_match_the_exact_image(precision, view):
     problem = Problem.of(view)
     expected, kept = problem.planes_of_reference(MARKED[precision])
     rays = rays_of(problem.camera)
-    actual = {"kernels": pass_all(problem.gaussians, rays, precision, view)}
+    actual = {"kernels": composite_all(problem.gaussians, rays, precision, view)}
     if precision is FLOAT64:
         far = np.full(len(rays[0]), np.inf)
         passed = reference_light.composite_segments(problem.gaussians, *rays, far)
@@ -176,7 +176,7 @@ def test_plugin_image_matches_rays_of_the_sensor(view):
         mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view.sensor()})
     )
     rendered = np.concatenate([1 - image[..., 3:], image[..., :3]], axis=-1)
-    passed = pass_all(problem.gaussians, rays_of_sensor(view), FLOAT32, view)
+    passed = composite_all(problem.gaussians, rays_of_sensor(view), FLOAT32, view)
     assert_arrays_agree(
         {"image": rendered[kept], "rays": passed[kept]},
         dict.fromkeys(("image", "rays"), expected[kept]),
@@ -195,7 +195,7 @@ def test_primary_rays_match_volprim(splats):
     gaussians, view = splats.gaussians, splats.view
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     expected = volprim_image(gaussians, view, np.exp(gaussians.log_scales), quats[:, [1, 2, 3, 0]])
-    passed = pass_all(gaussians, rays_of_sensor(view), FLOAT32, view, OF_VOLPRIM)
+    passed = composite_all(gaussians, rays_of_sensor(view), FLOAT32, view, OF_VOLPRIM)
     on_film = footprints(gaussians, view.camera, covariances(gaussians))
     allowed = propagated(on_film, on_film.alpha_rounding, on_film.color_rounding)
     assert expected.max() > 1000 * allowed.max()

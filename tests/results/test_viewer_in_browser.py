@@ -132,7 +132,7 @@ def assert_shown_as_fitted(rendered, camera, gaussians) -> None:
 
 
 def test_page_opens_from_disk_without_requests_or_errors(page, path):
-    assert page.troubles() == []
+    assert page.console_errors() == []
     own, *others = page.requests()
     assert own == path.as_uri() + "?noui"
     assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
@@ -166,7 +166,7 @@ def test_dragging_orbits_the_focus_at_the_same_height(page, gaussians, initial_v
 @pytest.mark.parametrize("size", SIZES)
 def test_page_with_controls_fits_the_window_and_orbits(path, size):
     width, height = SIZES[size]
-    with browsers.a_page(width, height) as page:
+    with browsers.browser_page(width, height) as page:
         page.cut_off()
         page.open(path.as_uri())
         page.wait_for("window.viewer?.state.loaded")
@@ -179,7 +179,7 @@ def test_page_with_controls_fits_the_window_and_orbits(path, size):
         settle(page)
         shown = np.s_[height // 3 : height // 2, width // 4 : 3 * width // 4]
         assert decibels(page.rendered()[shown], before[shown]) < OTHERWISE
-        assert page.troubles() == []
+        assert page.console_errors() == []
         own, *others = page.requests()
         assert own == path.as_uri() and all(a.startswith(("blob:", "data:")) for a in others)
 

@@ -261,13 +261,13 @@ def outcome():
             patch.setattr(module, "render", cache(helpers.render))
         for name in ("kernel_gradients", "kernel_tangent"):
             function = getattr(rendering_checks, name)
-            patch.setattr(rendering_checks, name, _remembered(board, function))
+            patch.setattr(rendering_checks, name, _memoized(board, function))
         general, special = _detectors(at_thresholds)
         result = find_noticed(board, general, special)
     return result
 
 
-def _remembered(board, function):
+def _memoized(board, function):
     """``function(case, precision, weights)``, whose results without a mutant are remembered for
     the mutants that it does not read.
     """

@@ -146,7 +146,7 @@ class Page:
         """Until it is true."""
         end = time.monotonic() + PATIENCE
         while not self.evaluate(expression):
-            assert time.monotonic() < end, f"{expression} is not true; {self.troubles()}"
+            assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
             time.sleep(0.05)
 
     def rendered(self) -> np.ndarray:
@@ -183,7 +183,7 @@ class Page:
         """The addresses of all that it has asked for."""
         return [p["request"]["url"] for p in self._events("Network.requestWillBeSent")]
 
-    def troubles(self, levels: Sequence[str] = ("error", "warning")) -> list[str]:
+    def console_errors(self, levels: Sequence[str] = ("error", "warning")) -> list[str]:
         """Exceptions, and what stands in the console at these levels."""
         logged = [p["entry"] for p in self._events("Log.entryAdded")]
         said = self._events("Runtime.consoleAPICalled")
@@ -204,7 +204,7 @@ class Page:
 
 
 @contextmanager
-def a_page(width: int, height: int) -> Iterator[Page]:
+def browser_page(width: int, height: int) -> Iterator[Page]:
     """Yield a page of a new browser, whose images are made by software."""
     with Browser(*SOFTWARE_WEBGL) as browser:
         yield Page(browser, width, height)

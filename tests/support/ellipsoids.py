@@ -23,7 +23,7 @@ IMAGE, GRADIENTS = 1e-5, 1e-4
 HELD = ("data", "opacities", "sh_coeffs")
 
 
-def held_by(gaussians) -> dict[str, np.ndarray]:
+def float32_attributes(gaussians) -> dict[str, np.ndarray]:
     """Attributes of a shape, (N, ...), float32 values."""
     held = {
         "data": np.concatenate(
@@ -58,14 +58,14 @@ def shape_of(held, kind="ellipsoids", **others) -> dict:
 
 
 @dataclass(frozen=True)
-class Held(Scene):
+class EllipsoidsCase(Scene):
     """A scene whose Gaussians a shape holds; their numbers are what float32 makes of them there."""
 
     kind: str = "ellipsoids"
 
     @property
     def held(self) -> dict[str, np.ndarray]:
-        return held_by(super().gaussians)
+        return float32_attributes(super().gaussians)
 
     @property
     def gaussians(self) -> reference.Gaussians:
@@ -163,9 +163,9 @@ class Merged(Scene):
         return replace(self._plain, degree=self.own_degree).gaussians
 
     @property
-    def shapes(self) -> list[Held]:
+    def shapes(self) -> list[EllipsoidsCase]:
         return [
-            Held(self.view, degree=degree, count=count, seed=self.seed + 1000 * (i + 1))
+            EllipsoidsCase(self.view, degree=degree, count=count, seed=self.seed + 1000 * (i + 1))
             for i, (degree, count) in enumerate(zip(self.degrees, (12, 23), strict=True))
         ]
 

@@ -214,7 +214,7 @@ def clock(monkeypatch):
 LINEAR = Curve((100, 200), (100.0, 200.0), (20.0, 21.0))
 
 
-def until_the_end(trainer, seconds):
+def run_to_end(trainer, seconds):
     deadline = Deadline(trainer, trainer.clock.now + seconds, LINEAR)
     while deadline.should_continue(trainer):
         trainer.step()
@@ -227,7 +227,7 @@ def test_fit_ends_in_time_for_any_iteration_cost(clock, second):
 
     An iteration or two more or less: the clock is read between them.
     """
-    trainer = until_the_end(FakeTrainer(clock, second), 100)
+    trainer = run_to_end(FakeTrainer(clock, second), 100)
     assert 200 <= clock.now < 200 + 2 * second
     n = trainer.iteration
     assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
@@ -263,7 +263,7 @@ def test_the_expected_end_follows_the_clock(clock):
 
 def test_density_changes_never_end_before_they_start(clock):
     trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
-    assert until_the_end(trainer, 100).config.densify.stop == 591
+    assert run_to_end(trainer, 100).config.densify.stop == 591
 
 
 def test_rescheduling_past_iterations_is_refused():

@@ -49,7 +49,7 @@ def saved_as(folder, config, change):
     np.savez(folder / "checkpoint.npz", **arrays)
 
 
-def without_what_is_new(values):
+def remove_new_keys(values):
     del values["data"]["ignore_points"], values["init"]["start"], values["init"]["scale"]
     for name in ("decay", "decay_from", "views", "views_from"):
         del values["optimizer"][name]
@@ -59,7 +59,7 @@ def without_what_is_new(values):
 
 
 def test_checkpoint_of_an_earlier_version_is_continued(folder, config):
-    saved_as(folder, config, without_what_is_new)
+    saved_as(folder, config, remove_new_keys)
     assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
 
 
@@ -69,7 +69,7 @@ def test_checkpoint_of_an_earlier_version_is_continued(folder, config):
 )
 def test_checkpoint_with_different_values_is_refused(folder, config, section, key, value):
     def change(values):
-        without_what_is_new(values)
+        remove_new_keys(values)
         values[section][key] = value
 
     saved_as(folder, config, change)

@@ -79,14 +79,14 @@ def images_and_result(case: str, dataset: Dataset):
 
 
 @cache
-def in_units_of_one(case: str):
+def fit_at_unit_scale(case: str):
     return images_and_result(case, photographed())
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 @pytest.mark.parametrize("case", CASES)
 def test_fit_is_invariant_to_units(case, unit):
-    expected, gaussians = in_units_of_one(case)
+    expected, gaussians = fit_at_unit_scale(case)
     images, found = images_and_result(case, scaled(unit))
     assert found.num_gaussians == gaussians.num_gaussians
     assert capture.decibels(images, expected) > SAME_DB

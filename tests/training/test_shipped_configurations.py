@@ -92,7 +92,7 @@ def instant_ngp(folder):
     return SHARED_DATA / "fox"
 
 
-def cameras_of_their_own(folder):
+def cameras_in_colmap_frame(folder):
     """Return cameras as COLMAP finds them: the origin between them, and another unit of length."""
     return moved(SHARED_DATA / "fox", folder / "fox", scale=5)
 
@@ -105,7 +105,7 @@ def colmap_with_points(folder):
     return SHARED_DATA / "colmap_robothead"
 
 
-KINDS = (nerf_synthetic, instant_ngp, cameras_of_their_own, far_smaller, colmap_with_points)
+KINDS = (nerf_synthetic, instant_ngp, cameras_in_colmap_frame, far_smaller, colmap_with_points)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def made(trainer):
+def indices_on_device(trainer):
     """Indices of the views whose targets are on the device, by stage."""
     return [
         {view.index for view in stage.views if "photograph" in vars(view)}
@@ -28,9 +28,9 @@ def made(trainer):
 
 def test_targets_are_created_on_demand():
     trainer = make_trainer()
-    assert made(trainer) == [set()]
+    assert indices_on_device(trainer) == [set()]
     view = fits.steps(trainer, 1).last_step.views[-1].view
-    assert made(trainer) == [{view.index}]
+    assert indices_on_device(trainer) == [{view.index}]
     target = view.photograph
     assert view.photograph is target is view.target
 
@@ -41,7 +41,7 @@ def test_targets_are_cached_within_the_memory_limit(monkeypatch):
     for _ in range(8):  # two rounds of four views
         trainer.step()
         seen += [trainer.last_step.views[-1].view.index]
-        assert made(trainer) == [set(seen[:2])]
+        assert indices_on_device(trainer) == [set(seen[:2])]
 
 
 @pytest.mark.parametrize("effects", [{}, {"data__random_background": True, "colors__lr": 0.02}])
@@ -55,7 +55,7 @@ def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
     _, kept = result()
     monkeypatch.setattr(trainer_module, "KEPT_BYTES", 0)
     trainer, made_again = result()
-    assert made(trainer) == [set()]
+    assert indices_on_device(trainer) == [set()]
     assert not any(view.uploads for view in trainer.views)
     assert made_again == kept
 
@@ -75,9 +75,9 @@ def test_device_memory_of_a_view_is_counted():
 def test_finished_stage_leaves_no_arrays_on_the_device():
     trainer = make_trainer(coarse=[{"until": 3, "factor": 2}])
     fits.steps(trainer, 3)
-    coarse, full = made(trainer)
+    coarse, full = indices_on_device(trainer)
     assert len(coarse) == 3 and not full
     fits.steps(trainer, 1)
-    coarse, full = made(trainer)
+    coarse, full = indices_on_device(trainer)
     assert not coarse and len(full) == 1
     assert np.shape(trainer.last_step.views[-1].view.photograph.image) == (16, 20, 3)

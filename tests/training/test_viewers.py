@@ -33,7 +33,7 @@ def ended_fit(iterations=20, **changes):
     return trainer, dataset, trainer.gaussians()
 
 
-def shown_by_viewers(gaussians, dataset):
+def psnr_in_viewers(gaussians, dataset):
     scene = make_scene(gaussians, ModelConfig(near=0.2, **VIEWER_RENDERING), dataset.background)
     pairs = zip(render_views(scene, dataset.test), dataset.test, strict=True)
     return np.mean([decibels(image, view.image) for image, view in pairs])
@@ -48,7 +48,7 @@ def test_iterations_improve_images_of_viewers(monkeypatch):
     found = for_viewers(trainer, gaussians, counted.append)
     assert counted == list(range(1, 21))
     as_it_is, in_closed_form, tuned = (
-        shown_by_viewers(g, dataset) for g in (gaussians, closed, found.gaussians)
+        psnr_in_viewers(g, dataset) for g in (gaussians, closed, found.gaussians)
     )
     assert tuned > max(as_it_is, in_closed_form) + 0.2
     # The fit itself renders the same images as before.

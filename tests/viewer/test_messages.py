@@ -65,7 +65,7 @@ def controls_of(server):
     return server.gui._gui_input_handle_from_uuid
 
 
-def uuids_that_stop_nothing(server):
+def uuids_of_harmless_controls(server):
     controls = controls_of(server).items()
     return [uuid for uuid, control in controls if getattr(control, "label", "") not in STOPPING]
 
@@ -111,7 +111,7 @@ def test_invalid_messages_have_no_effect_and_print_nothing(server, capfd):
     TrainingPage(
         server, RenderRequests(), StartView.from_views(true_dataset().train), Approximations()
     )
-    uuids = uuids_that_stop_nothing(server)
+    uuids = uuids_of_harmless_controls(server)
     before = {uuid: control.value for uuid, control in controls_of(server).items()}
     callbacks = {uuid: len(c._impl.update_cb) for uuid, c in controls_of(server).items()}
     send_all(server.get_port(), hostile_messages(1, 1000, uuids))
@@ -232,7 +232,7 @@ def test_fit_with_hostile_clients_has_the_same_bytes(server, capfd):
     served, history = [], History()
     show = watching._scheduler.show
     watching._scheduler.show = lambda *frame: (served.append(frame), show(*frame))
-    uuids, is_over = uuids_that_stop_nothing(server), threading.Event()
+    uuids, is_over = uuids_of_harmless_controls(server), threading.Event()
 
     def attack():
         seed = 0

@@ -60,7 +60,7 @@ def client(width=1600, height=900, pose=None):
     return SimpleNamespace(client_id=7, camera=camera)
 
 
-def asked(page, **camera):
+def pending_request(page, **camera):
     page.controls._angle.value = 50
     page._follow(client(**camera))
     return page.requests.pending[7].request
@@ -83,20 +83,20 @@ def test_start_view_is_the_first_training_camera_at_the_common_focus():
 
 
 def test_browser_camera_becomes_a_request(page):
-    request = asked(page)
+    request = pending_request(page)
     assert request.camera.camera_to_world == pytest.approx(pose_around(0.7, 0.2))
     assert request.camera.fov == pytest.approx(50) and request.camera.distance == pytest.approx(2.5)
     assert (request.width, request.height) == (1280, 720)  # of 1600 x 900, at most 1280
     assert request.content == "color" and request.lens == "pinhole"
     assert request.approximations == FITTED
-    request = asked(page, width=300, height=200)
+    request = pending_request(page, width=300, height=200)
     assert (request.width, request.height) == (300, 200)
 
 
 def test_every_control_is_in_the_request(page):
     controls = page.controls
     controls._content.value, controls._side.value = "depth", "640"
-    request = asked(page)
+    request = pending_request(page)
     assert request.content == "depth" and (request.width, request.height) == (640, 360)
     controls._lens_sliders["k1"].value = -0.2
     lenses = {
@@ -109,7 +109,7 @@ def test_every_control_is_in_the_request(page):
     assert lenses.keys() == VIEWER_LENSES.keys()
     for name, numbers in lenses.items():
         controls._lens.value = name
-        request = asked(page)
+        request = pending_request(page)
         assert (request.lens, request.lens_parameters) == (name, numbers)
         assert request.camera.fov == pytest.approx(90 if name == "fisheye" else 50)
     for name in ADJUSTABLE_APPROXIMATIONS:
@@ -118,8 +118,8 @@ def test_every_control_is_in_the_request(page):
         other = next((word for word in declared.words if word != value), other)
         other = 0.5 if name in ("alpha_cut", "transmittance_stop") else other
         controls._values[name].value = other
-        assert getattr(asked(page).approximations, name) == other, name
-    assert asked(page).approximations.extent == 3.5  # has no control
+        assert getattr(pending_request(page).approximations, name) == other, name
+    assert pending_request(page).approximations.extent == 3.5  # has no control
 
 
 def test_frame_times_are_compared_with_the_fitted_settings(page):
@@ -128,7 +128,7 @@ def test_frame_times_are_compared_with_the_fitted_settings(page):
     frames = [
         ViewerFrame(np.zeros((2, 2, 3), np.uint8), s, note) for s, note in ((0.02, ""), (0.05, "x"))
     ]
-    request = asked(page)
+    request = pending_request(page)
     other = replace(request, approximations=switched)
     assert page._describe(7, request, frames[0]) == "**20 ms** for 1280×720"
     assert page._describe(7, other, frames[1]).startswith("**50 ms** for 1280×720; as fitted 20 ms")

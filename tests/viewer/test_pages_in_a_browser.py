@@ -80,17 +80,17 @@ def seen(page) -> np.ndarray:
 def wait_for_an_image(page) -> np.ndarray:
     """Splats on white, once the page has ceased to fade in."""
 
-    def is_there() -> bool:
+    def has_appeared() -> bool:
         rendered = 255 * page.rendered()
         return rendered[-20:, :20].min() > 250 and np.ptp(shown(rendered)) > 100
 
-    browsers.wait_until(is_there, "an image")
+    browsers.wait_until(has_appeared, "an image")
     return seen(page)
 
 
 def assert_clean(page, address: str) -> None:
     """No error, and nothing from anywhere else."""
-    assert page.troubles(["error"]) == []
+    assert page.console_errors(["error"]) == []
     hosts = {urlsplit(request).netloc for request in page.requests() if request[:4] == "http"}
     assert hosts == {urlsplit(address).netloc}
 
@@ -113,7 +113,7 @@ def test_page_shows_gaussians_and_orbits_with_the_mouse(fit, size, tmp_path):
     width, height = SIZES[size]
     with (
         command("drgs.view", fit, log=tmp_path / "log") as (process, address),
-        browsers.a_page(width, height) as page,
+        browsers.browser_page(width, height) as page,
     ):
         page.open(address)
         wait_for_an_image(page)
@@ -135,7 +135,10 @@ def test_page_of_a_fit_shows_pauses_and_ends_it(tmp_path):
     config = write_scene(tmp_path, iterations=ENDLESS, densify={"start": 1, "stop": 2})
     out, log = tmp_path / "out", tmp_path / "log"
     words = ("drgs.fit", config, "--out", out, "--view", "--set", "output.report=false")
-    with command(*words, log=log) as (process, address), browsers.a_page(*SIZES["desktop"]) as page:
+    with (
+        command(*words, log=log) as (process, address),
+        browsers.browser_page(*SIZES["desktop"]) as page,
+    ):
 
         def iteration() -> int:
             text = page.evaluate("document.body.innerText")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from support.attacks.attack import Attack
-from support.attacks.attack_folder import CAPTURE, AttackFolder, capture_size, standing_in
+from support.attacks.attack_folder import CAPTURE, AttackFolder, capture_size, current_folder
 from support.attacks.observer import KINDS, SMALL_FILES, Fault
 from support.attacks.trial import run
 
@@ -61,9 +61,9 @@ WORKS = {
 def count_changes(work: Work, attack_folder: AttackFolder) -> int:
     """How often the command changes a file, when nothing happens."""
     attack = Attack("rehearsal", work.command, work.words)
-    with standing_in(attack_folder.folder):
+    with current_folder(attack_folder.folder):
         outcome = run(attack, work.words)
-    attack_folder.put_back()
+    attack_folder.restore_files()
     assert outcome.status == 0, outcome.err
     return len(outcome.changes.inside)
 

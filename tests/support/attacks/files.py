@@ -359,7 +359,7 @@ def _gzip_bomb(path: Path) -> None:
     path.write_bytes(gzip.compress(bytes(content) + bytes(1 << 30), 1))
 
 
-def _honest_gzip_bomb(path: Path) -> None:
+def _valid_gzip_bomb(path: Path) -> None:
     """1 GB of zeros, which are as many Gaussians as the header says."""
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, (1 << 30) // 20, 0, 12, 0, 0)
     path.write_bytes(gzip.compress(header + bytes((1 << 30) // 20 * 20), 1))
@@ -424,7 +424,7 @@ SPECIAL = {
         "far": _far_points,
     },
     "gaussians.ply": {"lists": _ply_of_lists, "elements": _ply_of_elements},
-    "gaussians.spz": {"bomb": _gzip_bomb, "larger bomb": _honest_gzip_bomb},
+    "gaussians.spz": {"bomb": _gzip_bomb, "larger bomb": _valid_gzip_bomb},
     "gaussians.glb": {"deep": _deep_glb},
     "lego/transforms_train.json": {"deep": _deep, "object": _deep_object},
     "photos/transforms.json": {"deep": _deep, "object": _deep_object},

@@ -19,7 +19,7 @@ def settings(views_per_step=4, **changes):
 def assert_the_same(changes, sizes, steps=8, data="plain"):
     dataset = parallel_processes.DATASETS[data]()
     alone = fits.Trainer(fits.config_of(**changes), dataset, fits.disturbed_blobs())
-    expected = parallel_processes.found_by(alone, steps)
+    expected = parallel_processes.hashes_and_reports(alone, steps)
     for size in sizes:
         state, reports = parallel_processes.fitted(size, steps, changes, data)
         assert reports == expected[1], size
