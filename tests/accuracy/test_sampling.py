@@ -362,24 +362,24 @@ def test_more_samples_converge_to_the_pixel_area():
 # Several samples a pass
 # ----------------------------------------------------------------------------------------------
 
-FEW = Scene(count=12, degree=1)
+SMALL_SCENE = Scene(count=12, degree=1)
 
 
 def scene_with(settings=(), sensor=None, **objects):
-    integrator = FEW.settings | tensors(FEW.gaussians) | dict(settings)
-    sensor = FEW.view.sensor() if sensor is None else sensor
+    integrator = SMALL_SCENE.settings | tensors(SMALL_SCENE.gaussians) | dict(settings)
+    sensor = SMALL_SCENE.view.sensor() if sensor is None else sensor
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
 
 
 def batch_of_two():
-    whole = FEW.view.sensor()
+    whole = SMALL_SCENE.view.sensor()
     whole["film"]["width"] *= 2
-    children = {"a": FEW.view.sensor(), "b": VIEWS[2].sensor()}
+    children = {"a": SMALL_SCENE.view.sensor(), "b": VIEWS[2].sensor()}
     return {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **children}
 
 
 def thin_lens():
-    common = {name: FEW.view.sensor()[name] for name in ("film", "sampler", "to_world")}
+    common = {name: SMALL_SCENE.view.sensor()[name] for name in ("film", "sampler", "to_world")}
     return {
         "type": "thinlens",
         "fov": 50.0,
@@ -389,7 +389,7 @@ def thin_lens():
 
 
 def moving():
-    common = {name: FEW.view.sensor()[name] for name in ("film", "sampler", "to_world")}
+    common = {name: SMALL_SCENE.view.sensor()[name] for name in ("film", "sampler", "to_world")}
     lens = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5, "shutter": "global"}
     close = mi.ScalarTransform4f(CLOSE)
     moves = {"to_world_close": close, "shutter_samples": 2}
@@ -398,7 +398,7 @@ def moving():
 
 def feature_tensor(channels):
     rng = np.random.default_rng(3)
-    return mi.TensorXf(rng.normal(0, 1, (FEW.count, channels)).astype(np.float32))
+    return mi.TensorXf(rng.normal(0, 1, (SMALL_SCENE.count, channels)).astype(np.float32))
 
 
 SCENES = {
@@ -413,7 +413,9 @@ SCENES = {
     ),
     "texture": lambda: scene_with({"background": rendered(texels())}),
     "environment, thin lens": lambda: scene_with(sensor=thin_lens(), sky=EMITTERS["envmap"]()),
-    "surface, environment": lambda: load_wall(FEW, sky=True, wall=Wall(half=0.5), aovs="z:depth"),
+    "surface, environment": lambda: load_wall(
+        SMALL_SCENE, sky=True, wall=Wall(half=0.5), aovs="z:depth"
+    ),
     "batch": lambda: scene_with({"aovs": "z:depth"}, batch_of_two()),
     "motion": lambda: scene_with(sensor=moving()),
 }
@@ -467,10 +469,10 @@ def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch)
 
 def test_a_pass_of_a_large_film_has_one_sample():
     film = {"width": 512, "height": PIXELS_PER_PASS // 512 + 1}
-    large = scene_with(sensor=FEW.view.sensor(**film)).sensors()[0]
+    large = scene_with(sensor=SMALL_SCENE.view.sensor(**film)).sensors()[0]
     assert [p.samples for p in DrawnSamples(large, 0, 3, {}).positions] == [1, 1, 1]
     small = scene_with().sensors()[0]
-    at_once = PIXELS_PER_PASS // (FEW.view.width * FEW.view.height)
+    at_once = PIXELS_PER_PASS // (SMALL_SCENE.view.width * SMALL_SCENE.view.height)
     passes = DrawnSamples(small, 0, 2 * at_once + 1, {}).positions
     assert [p.samples for p in passes] == [at_once, at_once, 1]
 
@@ -495,7 +497,7 @@ def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):
         dr.enable_grad(params["integrator.sh0"])
         params.update()
         dr.backward(dr.sum(mi.render(loaded, params, spp=3).array))
-        plane = dr.arange(mi.Float, FEW.view.width * FEW.view.height)
+        plane = dr.arange(mi.Float, SMALL_SCENE.view.width * SMALL_SCENE.view.height)
         return np.array(loaded.integrator().last.weighted_sums(plane))
 
     found = weights()

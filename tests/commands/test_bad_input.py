@@ -333,7 +333,7 @@ def test_an_output_folder_that_is_a_file_is_refused(scene):
 # Permissions
 
 
-NOBODY = 65534
+NOBODY_UID = 65534
 """The user without rights, by Linux's convention."""
 
 
@@ -345,8 +345,8 @@ def as_ordinary_user():
     was_root = os.geteuid() == 0
     if was_root:
         for path in (folder, *folder.rglob("*")):
-            os.chown(path, NOBODY, NOBODY)
-        os.seteuid(NOBODY)
+            os.chown(path, NOBODY_UID, NOBODY_UID)
+        os.seteuid(NOBODY_UID)
     yield folder
     if was_root:
         os.seteuid(0)

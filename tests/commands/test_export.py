@@ -24,7 +24,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import read_gaussians, readable_formats
 from drgs.results.refined_cameras import write_views
 
-OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 VIEWER_RENDERING = {"antialiased": False, "low_pass": 0.3}
 
 
@@ -45,7 +45,7 @@ def fit(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.yml").write_text("")
-    replace(gaussians_within_ranges(20), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
+    replace(gaussians_within_ranges(20), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
     viewers = replace(gaussians_within_ranges(30), rendered_with=VIEWER_RENDERING)
     viewers.save(folder / "point_cloud_viewers.ply")
     write_views(folder / "views.json", make_dataset(6, 1))
@@ -89,7 +89,7 @@ def test_export_without_the_file_for_viewers_uses_the_own_file(fit):
 def test_file_with_drgs_approximations_is_exported_with_a_hint(fit):
     outcome = run(fit / "point_cloud.ply", "--out", fit.with_name("a.glb"))
     assert f"export {fit}/point_cloud_viewers.ply instead" in outcome.stdout
-    assert Gaussians.load(fit.with_name("a.glb")).rendered_with == OTHERWISE
+    assert Gaussians.load(fit.with_name("a.glb")).rendered_with == FITTED_WITH
 
 
 @pytest.mark.parametrize(("low_pass", "is_nearer"), [(0.1, True), (0.18, True), (0.2, False)])

@@ -16,7 +16,7 @@ from drgs import export
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.refined_cameras import write_views
 
-OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 
 
 @pytest.fixture
@@ -24,8 +24,8 @@ def fit(tmp_path):
     """A folder as a fit leaves it: more Gaussians of its own than for viewers."""
     folder = tmp_path / "run"
     folder.mkdir()
-    configure(folder, OTHERWISE)
-    replace(blobs(30), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
+    configure(folder, FITTED_WITH)
+    replace(blobs(30), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
     blobs(20).save(folder / "point_cloud_viewers.ply")
     write_views(folder / "views.json", make_dataset())
     return folder
@@ -56,7 +56,7 @@ def test_page_of_a_fit_shows_its_own_gaussians(fit, tmp_path):
 
 
 def test_page_of_an_unsupported_fit_shows_gaussians_for_viewers(fit, tmp_path):
-    configure(fit, {**OTHERWISE, "order": "pixel"})
+    configure(fit, {**FITTED_WITH, "order": "pixel"})
     said, _, scene, gaussians = exported(fit, tmp_path / "a.html")
     assert said.splitlines()[0] == f"{fit}/point_cloud_viewers.ply: 20 Gaussians"
     assert gaussians.num_gaussians == 20

@@ -25,14 +25,14 @@ from drgs.results.folder import remove_run
 from drgs.training import session
 from drgs.training.fit_folder import gaussians_on_page
 
-OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """The folder of a fit whose approximations are not those of viewers."""
     folder = tmp_path_factory.mktemp("viewers")
-    config = write_project(folder, model={**VALUES["model"], **OTHERWISE})
+    config = write_project(folder, model={**VALUES["model"], **FITTED_WITH})
     with pytest.MonkeyPatch.context() as patch:
         without_images(patch)
         outcome = assert_fits(config, "--out", folder / "out", "--threads", 1)
@@ -41,7 +41,7 @@ def fitted(tmp_path_factory):
 
 def test_both_files_record_their_approximations(fitted):
     out, _ = fitted
-    assert Gaussians.load(out / GAUSSIANS).rendered_with == OTHERWISE
+    assert Gaussians.load(out / GAUSSIANS).rendered_with == FITTED_WITH
     usual = {"antialiased": False, "low_pass": 0.3}
     assert Gaussians.load(out / GAUSSIANS_FOR_VIEWERS).rendered_with == usual
     native, other = (Gaussians.load(out / name) for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS))
@@ -91,7 +91,7 @@ def test_plugin_renders_the_file_like_the_fit(fitted):
 def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     """Stopped when its iterations are done, with what is for viewers still to come."""
     out, _ = fitted
-    config = write_project(tmp_path, model={**VALUES["model"], **OTHERWISE})
+    config = write_project(tmp_path, model={**VALUES["model"], **FITTED_WITH})
     without_images(monkeypatch)
     with monkeypatch.context() as broken:
         broken.setattr(session.FitSession, "_fit_for_viewers", lambda *_: sys.exit(7))
@@ -132,7 +132,7 @@ def test_foreign_file_is_not_replaced(tmp_path, monkeypatch):
     ("approximations", "shown"),
     [
         (Approximations(), "the fit's own"),
-        (Approximations(**OTHERWISE), "the fit's own"),
+        (Approximations(**FITTED_WITH), "the fit's own"),
         (Approximations(order="pixel", low_pass=0.1), "those for viewers"),
     ],
 )

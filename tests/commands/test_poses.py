@@ -5,7 +5,7 @@ import pytest
 from drgs.poses import __main__ as poses
 from drgs.poses.structure_from_motion import Placed, Search
 
-FOUND = Placed(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
+PLACED = Placed(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def run(tmp_path, monkeypatch, capsys):
 
 
 def test_result_is_printed(run, tmp_path):
-    asked, lines = run(FOUND)
+    asked, lines = run(PLACED)
     assert asked == (tmp_path, Search(), False)
     *progress, found, camera, written, following = lines
     assert progress == ["camera 2/2  left 0:00"]
@@ -53,12 +53,12 @@ def test_photographs_without_a_camera_are_named(run):
 
 def test_options_set_the_search(run):
     options = ["--camera-model", "RADIAL", "--share", "one", "--compare", "neighbours"]
-    asked, _ = run(FOUND, *options, "--overwrite")
+    asked, _ = run(PLACED, *options, "--overwrite")
     assert asked[1:] == (Search("RADIAL", "neighbours", "one"), True)
 
 
 def test_a_wrong_option_is_refused(run, capsys):
     with pytest.raises(SystemExit) as end:
-        run(FOUND, "--camera-model", "FOV")
+        run(PLACED, "--camera-model", "FOV")
     assert end.value.code == 2
     assert "invalid choice: 'FOV'" in capsys.readouterr().err

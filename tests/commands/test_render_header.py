@@ -7,7 +7,7 @@ import yaml
 from support.render_command import run
 from support.small_capture import blobs, make_dataset, write_dataset
 
-SAID = {"antialiased": True, "low_pass": 0.02}
+HEADER_VALUES = {"antialiased": True, "low_pass": 0.02}
 CAMERA = ["--origin", 0, -4, 1, "--size", 24, 16]
 LINES = [
     "  antialiasing: opacities compensated for the low-pass filter (set by the file)",
@@ -17,15 +17,15 @@ LINES = [
 
 @pytest.fixture
 def files(tmp_path):
-    """A run whose file says SAID, as its configuration does, and a file that says nothing."""
+    """A run whose file and configuration have HEADER_VALUES, and a file without a header."""
     run_folder = tmp_path / "run"
     run_folder.mkdir()
-    replace(blobs(), rendered_with=SAID).save(run_folder / "point_cloud.ply")
+    replace(blobs(), rendered_with=HEADER_VALUES).save(run_folder / "point_cloud.ply")
     blobs().save(tmp_path / "plain.ply")
     write_dataset(tmp_path / "data", make_dataset(1, 1))
     config = {"data": {"path": str(tmp_path / "data")}}
     (tmp_path / "plain.yml").write_text(yaml.safe_dump(config))
-    (run_folder / "config.yml").write_text(yaml.safe_dump({**config, "model": SAID}))
+    (run_folder / "config.yml").write_text(yaml.safe_dump({**config, "model": HEADER_VALUES}))
     return tmp_path
 
 
@@ -48,7 +48,7 @@ def test_header_overrides_configuration_and_set_overrides_header(files, capsys):
     own = shown(files, "a", files / "run")
     assert shown(files, "b", ply, "--scene", config) == own
     capsys.readouterr()
-    values = [f"model.{name}={str(value).lower()}" for name, value in SAID.items()]
+    values = [f"model.{name}={str(value).lower()}" for name, value in HEADER_VALUES.items()]
     assert shown(files, "c", files / "plain.ply", "--scene", config, "--set", *values[:1]) != own
     given = [word for value in values for word in ("--set", value)]
     assert shown(files, "d", files / "plain.ply", "--scene", config, *given) == own

@@ -29,7 +29,7 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import _read_cloud, start_of
 from drgs.io.colmap import MODELS
 
-REAL = SHARED_DATA / "colmap_robothead"
+REAL_MODEL = SHARED_DATA / "colmap_robothead"
 
 
 def intrinsics(view):
@@ -126,12 +126,12 @@ def test_points_project_like_in_colmap(tmp_path, name):
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-11)
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the shared data folder is not here")
+@pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
 def test_real_points_project_to_their_observations():
     """Within the mean error that the model says of itself, through the reader of datasets."""
     pycolmap = pytest.importorskip("pycolmap")
-    theirs = pycolmap.Reconstruction(str(REAL / "sparse" / "0"))
-    dataset = load(REAL, downscale=2)
+    theirs = pycolmap.Reconstruction(str(REAL_MODEL / "sparse" / "0"))
+    dataset = load(REAL_MODEL, downscale=2)
     errors = {number: [] for number in theirs.points3D}
     for view in (*dataset.train, *dataset.test):
         image = theirs.find_image_with_name(view.files["image"].name)

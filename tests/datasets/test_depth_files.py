@@ -23,7 +23,7 @@ def write_several_arrays(path):
         np.savez(file, a=np.ones(3))
 
 
-WRONG = {
+INVALID_DEPTHS = {
     "of 8 TB": (lambda p: p.write_bytes(header((10**6, 10**6))), "cannot read the depth"),
     "of more than there is": (lambda p: p.write_bytes(header((2**40, 2**40))), "cannot read the"),
     "cut off": (lambda p: p.write_bytes(header((4, 6)) + bytes(80)), "cannot read the depth"),
@@ -48,7 +48,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("make", "message"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("make", "message"), INVALID_DEPTHS.values(), ids=INVALID_DEPTHS)
 def test_invalid_depth_file_is_refused_in_one_line(tmp_path, make, message):
     make(tmp_path / "a.npy")
     with pytest.raises(UserError) as error:

@@ -52,11 +52,11 @@ def inline_code(page) -> list[str]:
 # The README
 # ----------------------------------------------------------------------------------------------
 
-MOST_WORDS = 900
+MAX_README_WORDS = 900
 
 
 def test_readme_is_short():
-    assert len(text_of("README.md").split()) <= MOST_WORDS
+    assert len(text_of("README.md").split()) <= MAX_README_WORDS
 
 
 def test_readme_has_two_commands_each_on_its_own_line():
@@ -98,7 +98,7 @@ def test_links_have_targets(page):
 
 
 FOLDERS = ("drgs", "plugins", "scenes", "tests", "docs")
-OF_WORKED_EXAMPLES = {"drgs/effects/fog.py"}
+WORKED_EXAMPLE_FILES = {"drgs/effects/fog.py"}
 
 
 @each_page
@@ -106,7 +106,7 @@ def test_mentioned_paths_exist(page):
     for code in inline_code(page):
         if code.startswith(tuple(f"{folder}/" for folder in FOLDERS)):
             for path in code.split()[:1]:
-                assert path in OF_WORKED_EXAMPLES or (REPOSITORY / path).exists(), path
+                assert path in WORKED_EXAMPLE_FILES or (REPOSITORY / path).exists(), path
 
 
 def test_the_layout_lists_every_package():
@@ -116,13 +116,13 @@ def test_the_layout_lists_every_package():
         assert folder == Path() or f"`{folder.as_posix()}/`" in table, folder
 
 
-GONE = {"drgs.rendering"}  # of the changelog
+REMOVED_MODULES = {"drgs.rendering"}  # of the changelog
 
 
 @each_page
 def test_mentioned_modules_and_names_exist(page):
     for code in inline_code(page):
-        if re.fullmatch(r"drgs(\.\w+)+", code) and code not in GONE:
+        if re.fullmatch(r"drgs(\.\w+)+", code) and code not in REMOVED_MODULES:
             assert _exists(code), code
 
 
@@ -204,7 +204,7 @@ def test_documents_show_every_command():
 # Programs
 # ----------------------------------------------------------------------------------------------
 
-WITH_PROGRAMS = tuple(page for page in PAGES if fenced(page, "python"))
+PAGES_WITH_PROGRAMS = tuple(page for page in PAGES if fenced(page, "python"))
 
 SMALL_FIT = """
 data: {path: lego}
@@ -238,7 +238,7 @@ def folder(tmp_path) -> Path:
 def test_programs_in_the_documents_run(folder, run_python):
     """Each page's one after the other, as if they were pasted, then its scenes in XML."""
     program = []
-    for page in WITH_PROGRAMS:
+    for page in PAGES_WITH_PROGRAMS:
         name = f"page_{Path(page).stem}"
         (folder / f"{name}.py").write_text(python_of(page))
         program.append(f"exec(compile(open('{name}.py').read(), {page!r}, 'exec'), {{}})")
@@ -249,4 +249,4 @@ def test_programs_in_the_documents_run(folder, run_python):
             program.append(f"assert mi.render(mi.load_file('{name}_{k}.xml')).shape")
     result = run_python("\n".join(program), cwd=folder, PYTHONPATH=str(REPOSITORY))
     assert result.returncode == 0, result.stderr
-    assert result.stdout.count("ran ") >= len(WITH_PROGRAMS) == 4, result.stdout
+    assert result.stdout.count("ran ") >= len(PAGES_WITH_PROGRAMS) == 4, result.stdout

@@ -12,10 +12,10 @@ from drgs.initialization.start_box import Box
 from drgs.initialization.visual_hull import are_masks, hull_points, silhouettes_of
 from drgs.reference import effects as reference
 
-WHOLE = Box(np.zeros(3), 1.3)
+START_BOX = Box(np.zeros(3), 1.3)
 
 
-def carved(views, count=1500, seed=0, within=WHOLE):
+def carved(views, count=1500, seed=0, within=START_BOX):
     return hull_points(silhouettes_of(views), within, count, seed)
 
 
@@ -93,7 +93,7 @@ def test_carving_uses_little_memory(ball):
     """The limit is a chunk of cubes, and some numbers of each cube."""
     silhouettes = silhouettes_of(ball)
     tracemalloc.start()
-    hull_points(silhouettes, WHOLE, 3000, 0)
+    hull_points(silhouettes, START_BOX, 3000, 0)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 20e6
@@ -104,7 +104,7 @@ def test_noisy_silhouettes_use_little_memory(ball):
     rng = np.random.default_rng(2)
     noisy = [replace(v, alpha=rng.uniform(0, 1, v.alpha.shape).astype(np.float32)) for v in ball]
     tracemalloc.start()
-    hull_points(silhouettes_of(noisy), WHOLE, 3000, 0)
+    hull_points(silhouettes_of(noisy), START_BOX, 3000, 0)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 60e6

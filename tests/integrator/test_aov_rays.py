@@ -14,9 +14,9 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 # Both evaluate the same splats at the same points, which one of them finds by looking back at the
 # rays: single precision, on films of 40 pixels with colours and depths up to 4, so that a place is
 # off by 1e-5 px and a colour by the same times its slope. Measured 3e-6.
-SAME = 3e-5
+TOLERANCE = 3e-5
 
-OWN = "t:depth, a:alpha"
+OWN_AOVS = "t:depth, a:alpha"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -59,7 +59,7 @@ def wall(view) -> dict:
     }
 
 
-def load(scene, outer=None, own=OWN, shapes=None, **film):
+def load(scene, outer=None, own=OWN_AOVS, shapes=None, **film):
     """A Mitsuba scene; outer: what the integrator is nested in."""
     integrator = scene.settings | tensors(scene.gaussians) | ({"aovs": own} if own else {})
     integrator = integrator if outer is None else outer | {"img": integrator}
@@ -84,13 +84,15 @@ def test_aov_outputs_the_image_and_its_own_channels(view, surfaces):
     film = np.array(nested.sensors()[0].film().develop())
     assert image.shape[-1] == 9 and np.ptp(alone[..., 0]) > 0.1
     assert np.array_equal(image[..., :6], alone)
-    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=SAME)
+    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=TOLERANCE)
     direct = mi.load_dict(AOV | {"img": {"type": "direct"}})
     expected = image_of(nested, integrator=direct, seed=5)[..., -1]
     assert (expected.max() > 0) == surfaces
     assert np.array_equal(image[..., -1], expected)
     for first in (0, 4):  # the film's own colours, and those that it has under the nested name
-        np.testing.assert_allclose(film[..., first:][..., :3], alone[..., :3], rtol=0, atol=SAME)
+        np.testing.assert_allclose(
+            film[..., first:][..., :3], alone[..., :3], rtol=0, atol=TOLERANCE
+        )
 
 
 @pytest.mark.parametrize("srgb_primitives", [False, True])
@@ -104,8 +106,8 @@ def test_any_filter_and_sampler_may_be_used(srgb_primitives, rfilter, samples, s
     alone = image_of(load(scene, **film), seed=2)
     image = image_of(load(scene, AOV, **film), seed=2)
     # Filters other than a box are added up in an order that varies.
-    np.testing.assert_allclose(image[..., :6], alone, rtol=0, atol=SAME)
-    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=SAME)
+    np.testing.assert_allclose(image[..., :6], alone, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=TOLERANCE)
 
 
 def test_one_sample_is_at_the_pixel_centre_in_the_image_and_on_the_ray_in_aovs():

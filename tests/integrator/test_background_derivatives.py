@@ -120,7 +120,7 @@ def floor() -> dict:
 FLOOR = "floor.bsdf.reflectance.value"
 
 
-TWICE = "two images", "two losses", "two losses of one graph"
+TWO_PATHS = "two images", "two losses", "two losses of one graph"
 """Cases in which a factor reaches the backdrop more than once."""
 
 
@@ -152,13 +152,13 @@ BACKGROUND = "integrator.background.data"
 
 @all_kinds
 @pytest.mark.parametrize(
-    "way", [*TWICE, "batch", "surface", "surface of the same", "splats of the same"]
+    "way", [*TWO_PATHS, "batch", "surface", "surface of the same", "splats of the same"]
 )
 def test_gradients_reach_the_inputs_of_the_radiance(way, kind):
     """A factor of all of it, by central differences, from the same points of the emitters."""
     loaded, keys = factored(way, kind)
     start = {key: np.array(mi.traverse(loaded)[key]) for key in keys}
-    count = 2 if way in TWICE else 1
+    count = 2 if way in TWO_PATHS else 1
     weights = single(np.random.default_rng(1).uniform(0.5, 1.5, image_of(loaded).shape))
 
     def loss(factor, **seeds):

@@ -19,7 +19,7 @@ from support.calibrated_sensors import (
     FISHEYE,
     OPENCV,
     PINHOLE,
-    STILL,
+    STATIC_SENSORS,
     THIN_PRISM,
     Calibrated,
     by_name,
@@ -86,7 +86,7 @@ def test_pinhole_rays_match_perspective(view):
     np.testing.assert_array_equal(np.array(ray.time), np.array(expected.time))
 
 
-@pytest.mark.parametrize("sensor", STILL, **by_name)
+@pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
 def test_points_on_rays_project_to_their_pixels(sensor):
     ray, weight, sample = sampled_rays(sensor.load())
     assert (weight == 1).all()
@@ -149,7 +149,7 @@ def test_rays_outside_the_lens_have_zero_weight(sensor):
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("sensor", [*STILL, MOVING[3], BARREL], **by_name)
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, MOVING[3], BARREL], **by_name)
 def test_ray_differentials_are_rays_of_neighbouring_pixels(sensor):
     loaded = sensor.load()
     sample = np.random.default_rng(0).uniform(0.1, 0.8, (2, 50)).astype(np.float32)
@@ -171,7 +171,7 @@ def test_ray_differentials_are_rays_of_neighbouring_pixels(sensor):
         assert turned[shown].min() > 0.3 / 44
 
 
-@pytest.mark.parametrize("sensor", [*STILL, MOVING[3]], **by_name)
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, MOVING[3]], **by_name)
 def test_rays_end_at_the_far_plane(sensor):
     """From depth ``near_clip`` to ``far_clip``: z, with a fisheye the distance."""
     near_view = replace(sensor.view, near_clip=0.5)
@@ -308,7 +308,7 @@ def test_moving_camera_blurs_a_path_traced_image():
     np.testing.assert_allclose(found, path.mean(axis=0), atol=0.05)
 
 
-@pytest.mark.parametrize("sensor", [*STILL, BARREL], **by_name)
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, BARREL], **by_name)
 def test_splats_through_the_sensor_match_the_reference(sensor):
     camera = replace(sensor.camera, near=0.01)
     gaussians, rendered = clear_gaussians(

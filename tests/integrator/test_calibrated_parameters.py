@@ -15,7 +15,7 @@ from support.calibrated_sensors import (
     FISHEYE,
     OPENCV,
     PINHOLE,
-    STILL,
+    STATIC_SENSORS,
     THIN_PRISM,
     by_name,
     sampled_rays,
@@ -49,16 +49,16 @@ CHANGES = {
 }
 
 
-CHANGING = replace(OPENCV, close=CLOSE, shutter="rolling")
+MOVING_SENSOR = replace(OPENCV, close=CLOSE, shutter="rolling")
 
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_changed_parameter_takes_effect(name):
     convert, value = CHANGES[name]
     given = transform(value) if name.startswith("to_world") else value
-    expected = CHANGING.load(**{name: given})
-    gaussians = splats_before(CHANGING.view, 1, 40, 0)
-    scene = splats_scene(CHANGING, gaussians)
+    expected = MOVING_SENSOR.load(**{name: given})
+    gaussians = splats_before(MOVING_SENSOR.view, 1, 40, 0)
+    scene = splats_scene(MOVING_SENSOR, gaussians)
     before = image_of(scene)
     sensor = scene.sensors()[0]
     params = mi.traverse(scene)
@@ -91,7 +91,7 @@ def test_missing_coefficients_are_not_exposed():
     assert set(mi.traverse(PINHOLE.load()).keys()) >= {"to_world", "fx", "fy", "cx", "cy"}
     keys = set(mi.traverse(replace(OPENCV, lens=OpenCV(k1=0.125)).load()).keys())
     assert "k1" in keys and not keys & {"k2", "k3", "k4", "p1", "to_world_close"}
-    assert "to_world_close" in mi.traverse(CHANGING.load()).keys()  # noqa: SIM118
+    assert "to_world_close" in mi.traverse(MOVING_SENSOR.load()).keys()  # noqa: SIM118
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_an_opencv_lens_without_coefficients_is_a_pinhole():
     np.testing.assert_allclose(np.array(ray.d), np.array(expected.d), rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize("sensor", STILL, **by_name)
+@pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
 def test_gradients_of_an_image_reach_the_calibration(sensor):
     """Against central differences in single precision; some slopes are clamped."""
     gaussians = splats_before(FILM, 1, 40, 0)

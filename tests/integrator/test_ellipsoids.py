@@ -79,7 +79,7 @@ def test_file_renders_the_same_through_a_shape(kind, degree, tmp_path):
 VOLPRIM = 0.04
 
 
-AS_VOLPRIM = {
+VOLPRIM_APPROXIMATIONS = {
     "projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0,
     "extent": 3.0, "alpha_max": 0.9999, "alpha_cut": 0.0, "transmittance_stop": 0.01,
 }  # fmt: skip
@@ -105,7 +105,7 @@ def test_shapes_match_volprim_rf_basic(kind):
     expected = rendered(held, "volprim_rf_basic", max_depth=256)
 
     def error(**changes):
-        actual = rendered(held | changes, "splats", **AS_VOLPRIM)
+        actual = rendered(held | changes, "splats", **VOLPRIM_APPROXIMATIONS)
         return np.abs(actual - expected).mean() / expected.mean()
 
     assert error() < VOLPRIM

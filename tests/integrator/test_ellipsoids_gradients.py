@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from support.ellipsoids import (
     GRADIENTS,
-    HELD,
     MERGED,
+    SHAPE_ATTRIBUTES,
     EllipsoidsCase,
     Merged,
     apart,
@@ -58,7 +58,7 @@ def test_gradients_match_the_reference_for_a_mesh():
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
 
-@pytest.mark.parametrize("name", HELD)
+@pytest.mark.parametrize("name", SHAPE_ATTRIBUTES)
 def test_only_enabled_parameters_receive_gradients(name):
     scene = EllipsoidsCase()
     loaded = scene.load()
@@ -68,7 +68,9 @@ def test_only_enabled_parameters_receive_gradients(name):
     dr.backward(dr.sum(image * mi.TensorXf(scene.weights().astype(np.float32)), axis=None))
     everything = gradients_held(scene.load(), scene.weights())
     np.testing.assert_array_equal(gradient(params[f"shape.{name}"]), everything[name])
-    assert not any(dr.grad_enabled(params[f"shape.{other}"]) for other in HELD if other != name)
+    assert not any(
+        dr.grad_enabled(params[f"shape.{other}"]) for other in SHAPE_ATTRIBUTES if other != name
+    )
 
 
 def test_gradients_reach_the_inputs_of_shape_parameters():
@@ -106,7 +108,9 @@ def forward_image(loaded, directions, prefix="shape") -> np.ndarray:
     return np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
 
 
-@pytest.mark.parametrize("names", [*((name,) for name in HELD), HELD], ids="+".join)
+@pytest.mark.parametrize(
+    "names", [*((name,) for name in SHAPE_ATTRIBUTES), SHAPE_ATTRIBUTES], ids="+".join
+)
 def test_forward_mode_equals_central_differences(names):
     """STEP: as in test_splats."""
     scene = clear(EllipsoidsCase(degree=2))
@@ -128,7 +132,7 @@ def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
     directions = directions_of(scene.shapes[0].held)
     image = forward_image(scene.load(**settings), directions, "first")
     gradients = gradients_held(scene.load(**settings), scene.weights(), "first")
-    terms = [np.sum(directions[name].ravel() * gradients[name]) for name in HELD]
+    terms = [np.sum(directions[name].ravel() * gradients[name]) for name in SHAPE_ATTRIBUTES]
     forward = np.sum(image * scene.weights())
     assert forward == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
 
@@ -153,7 +157,7 @@ def test_backward_passes_give_the_same_bytes_without_float_atomics():
     found, count = float_reductions(turned)
     assert not found and count > 5
     again = gradients_held(scene.load(), scene.weights(), "first")
-    assert all(first[name].tobytes() == again[name].tobytes() for name in HELD)
+    assert all(first[name].tobytes() == again[name].tobytes() for name in SHAPE_ATTRIBUTES)
 
 
 def test_adam_reduces_the_loss():
@@ -164,7 +168,7 @@ def test_adam_reduces_the_loss():
     params = mi.traverse(loaded)
     rng = np.random.default_rng(4)
     optimizer = mi.ad.Adam(lr=0.003)
-    for name in HELD:
+    for name in SHAPE_ATTRIBUTES:
         factors = rng.uniform(0.9, 1.1, scene.held[name].size).astype(np.float32)
         optimizer[f"shape.{name}"] = params[f"shape.{name}"] * mi.Float(factors)
     losses = []
@@ -209,7 +213,7 @@ def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
     assert [len(calls) for calls in counted] == [1, 2]
 
 
-@pytest.mark.parametrize("name", HELD)
+@pytest.mark.parametrize("name", SHAPE_ATTRIBUTES)
 def test_a_changed_parameter_is_rendered_again(name, counted):
     scene = EllipsoidsCase()
     loaded = scene.load()

@@ -48,30 +48,34 @@ def changed(held, **changes):
     return held
 
 
-SEEN = 3
+LARGE_SPLAT_ROW = 3
 """The large splat of ``views.splats_before``."""
 
 
 def test_an_opacity_of_one_is_the_largest_below_one():
     scene = EllipsoidsCase()
-    largest = rendered_of(scene, opacities=(SEEN, 0, 1 - 2.0**-24))
+    largest = rendered_of(scene, opacities=(LARGE_SPLAT_ROW, 0, 1 - 2.0**-24))
     for value in (1.0, 1.5, np.inf):
-        np.testing.assert_array_equal(rendered_of(scene, opacities=(SEEN, 0, value)), largest)
-    assert np.abs(largest - rendered_of(scene, opacities=(SEEN, 0, 0.9))).max() > 0.01
+        np.testing.assert_array_equal(
+            rendered_of(scene, opacities=(LARGE_SPLAT_ROW, 0, value)), largest
+        )
+    assert np.abs(largest - rendered_of(scene, opacities=(LARGE_SPLAT_ROW, 0, 0.9))).max() > 0.01
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"opacities": (SEEN, 0, value)} for value in (0.0, -0.5, np.nan)),
-        *({"data": (SEEN, 4, value)} for value in (0.0, -0.0, np.nan)),
+        *({"opacities": (LARGE_SPLAT_ROW, 0, value)} for value in (0.0, -0.5, np.nan)),
+        *({"data": (LARGE_SPLAT_ROW, 4, value)} for value in (0.0, -0.0, np.nan)),
     ],
     ids=str,
 )
 def test_invisible_gaussians_leave_the_image_unchanged(changes):
     """With any least alpha."""
     scene = EllipsoidsCase()
-    others = {name: np.delete(values, SEEN, axis=0) for name, values in scene.held.items()}
+    others = {
+        name: np.delete(values, LARGE_SPLAT_ROW, axis=0) for name, values in scene.held.items()
+    }
     for settings in ({}, {"alpha_cut": 0.0}):
         loaded = scene.load(settings, shape=shape_of(changed(scene.held, **changes)))
         expected = scene.load(settings, shape=shape_of(others))
@@ -79,18 +83,18 @@ def test_invisible_gaussians_leave_the_image_unchanged(changes):
         derivatives = gradients_held(loaded, scene.weights())
         for name, width in (("data", 10), ("opacities", 1), ("sh_coeffs", 12)):
             rows = derivatives[name].reshape(40, width)
-            assert np.isfinite(rows).all() and (rows[SEEN] == 0).all() and rows.any()
+            assert np.isfinite(rows).all() and (rows[LARGE_SPLAT_ROW] == 0).all() and rows.any()
 
 
 def test_the_sign_of_a_standard_deviation_is_ignored():
     """Derivatives change theirs."""
     scene = EllipsoidsCase()
     loaded = scene.load()
-    width = scene.held["data"][SEEN, 4]
-    other = scene.load(shape=shape_of(changed(scene.held, data=(SEEN, 4, -width))))
+    width = scene.held["data"][LARGE_SPLAT_ROW, 4]
+    other = scene.load(shape=shape_of(changed(scene.held, data=(LARGE_SPLAT_ROW, 4, -width))))
     np.testing.assert_array_equal(image_of(other), image_of(loaded))
     plain, negated = (
-        gradients_held(each, scene.weights())["data"].reshape(-1, 10)[SEEN]
+        gradients_held(each, scene.weights())["data"].reshape(-1, 10)[LARGE_SPLAT_ROW]
         for each in (loaded, other)
     )
     np.testing.assert_array_equal(negated, plain * np.repeat([1, -1, 1], [4, 1, 5]))
@@ -116,12 +120,14 @@ def test_derivative_at_opacity_one_is_the_one_sided_limit():
     scene = EllipsoidsCase(degree=0)
     camera = scene.camera
     held = {name: values.copy() for name, values in scene.held.items()}
-    held["data"][SEEN, :3] = camera.center + [7, 0, 9] @ camera.rotation
-    held["data"][SEEN, 3:6] = 2.5
+    held["data"][LARGE_SPLAT_ROW, :3] = camera.center + [7, 0, 9] @ camera.rotation
+    held["data"][LARGE_SPLAT_ROW, 3:6] = 2.5
 
     def derivative(opacity):
-        loaded = scene.load(settings, shape=shape_of(changed(held, opacities=(SEEN, 0, opacity))))
-        return gradients_held(loaded, scene.weights())["opacities"][SEEN]
+        loaded = scene.load(
+            settings, shape=shape_of(changed(held, opacities=(LARGE_SPLAT_ROW, 0, opacity)))
+        )
+        return gradients_held(loaded, scene.weights())["opacities"][LARGE_SPLAT_ROW]
 
     expected = derivative(0.9)
     assert derivative(1.0) == pytest.approx(expected, rel=1e-4) and abs(expected) > 0.1

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.ellipsoids import (
     GRADIENTS,
-    HELD,
     MERGED,
+    SHAPE_ATTRIBUTES,
     Merged,
     assert_held_agree,
     assert_images_agree,
@@ -54,7 +54,7 @@ def test_gradients_of_merged_gaussians_reach_their_sources():
     weights = scene.weights()
     loaded = scene.load()
     params = mi.traverse(loaded)
-    keys = [f"{shape}.{name}" for shape in ("first", "second") for name in HELD]
+    keys = [f"{shape}.{name}" for shape in ("first", "second") for name in SHAPE_ATTRIBUTES]
     for key in keys:
         dr.enable_grad(params[key])
     own = gradients_of(loaded, weights)
@@ -66,7 +66,7 @@ def test_gradients_of_merged_gaussians_reach_their_sources():
     for prefix, shape, part in zip(("first", "second"), scene.shapes, rows[1:], strict=True):
         of_gaussians = {name: expected[name][part] for name in PARAMETER_NAMES}
         of_gaussians["shN"] = of_gaussians["shN"][:, : shape.gaussians.shN.shape[1]]
-        actual = {name: gradient(params[f"{prefix}.{name}"]) for name in HELD}
+        actual = {name: gradient(params[f"{prefix}.{name}"]) for name in SHAPE_ATTRIBUTES}
         assert_held_agree(actual, held_gradients(shape.held, of_gaussians))
 
 

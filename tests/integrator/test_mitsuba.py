@@ -51,7 +51,7 @@ def load(scene, sensor, **others):
 # ----------------------------------------------------------------------------------------------
 
 VIEW = View("", 53, 41, crop=WINDOW)
-OWN = {name: replace(VIEW, to_world=to_world) for name, to_world in (POSES | SCALED).items()}
+OWN_VIEWS = {name: replace(VIEW, to_world=to_world) for name, to_world in (POSES | SCALED).items()}
 ROLLING, BLURRED = (replace(OPENCV, close=CLOSE, shutter=s) for s in ("rolling", "global"))
 TIMES = 3
 
@@ -99,7 +99,7 @@ SENSORS = {
         f"orthographic, {name}": SensorCase(
             lambda view=view: own_sensor("orthographic", view), own_camera(view), Orthographic()
         )
-        for name, view in OWN.items()
+        for name, view in OWN_VIEWS.items()
     },
     "calibrated": SensorCase(PINHOLE.dictionary, PINHOLE.camera),
     "calibrated, opencv": SensorCase(OPENCV.dictionary, OPENCV.camera, OPENCV.lens),

@@ -174,18 +174,18 @@ print(np.array(mi.render(mi.load_dict({{"type": "scene", "i": splats, "s": senso
 """
 
 
-MOVES = '"to_world_close": T().translate([0, 0.1, -2])'
+CLOSING_POSE = '"to_world_close": T().translate([0, 0.1, -2])'
 
 
-CALLED_FOR = {
+SENSOR_MODULES = {
     "lens": ('{"type": "calibrated", "lens": "opencv"}', "cameras.radial_tangential"),
     "orthographic": ('{"type": "orthographic"}', "cameras.orthographic"),
     "thin lens": ('{"type": "thinlens", "aperture_radius": 0.1}', "effects.defocus"),
-    "moving": (f'{{"type": "calibrated", {MOVES}}}', "cameras.motion"),
+    "moving": (f'{{"type": "calibrated", {CLOSING_POSE}}}', "cameras.motion"),
 }
 
 
-@pytest.mark.parametrize(("sensor", "module"), CALLED_FOR.values(), ids=CALLED_FOR)
+@pytest.mark.parametrize(("sensor", "module"), SENSOR_MODULES.values(), ids=SENSOR_MODULES)
 def test_a_sensor_requires_its_module(run_python, sensor, module):
     """test_summary covers other sensors, and kernels without these modules."""
     result = run_python(RENDERING.format(blocked=module, sensor=sensor))

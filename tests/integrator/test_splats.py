@@ -181,7 +181,7 @@ def test_scene_parameters_are_copies_of_the_arguments():
 # ----------------------------------------------------------------------------------------------
 
 
-SWITCHING = """
+SWITCHING_PROGRAM = """
 import mitsuba as mi
 {order}
 import sys
@@ -213,7 +213,7 @@ for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
     ids=["drgs first", "variant first"],
 )
 def test_variants_can_be_switched_and_unsupported_ones_are_refused(order, run_python):
-    result = run_python(SWITCHING.format(order=order))
+    result = run_python(SWITCHING_PROGRAM.format(order=order))
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines() == [
         f"PluginError: {plugin}: the variant '{variant}' is not supported, "

@@ -169,7 +169,7 @@ def test_render_backward_may_be_called_directly(suspended):
         assert np.array_equal(gradient(params[f"integrator.{name}"]), expected[name]), name
 
 
-ASIDE = View("aside", 31, 27, to_world=pose([0.3, -1.0, 0.5], 16, (0.6, -0.9, 0.9)))
+ASIDE_VIEW = View("aside", 31, 27, to_world=pose([0.3, -1.0, 0.5], 16, (0.6, -0.9, 0.9)))
 """Sees 26 of the 40 Gaussians before ``VIEWS[1]``."""
 
 
@@ -187,7 +187,7 @@ def reference_gradients_from(view, scene, weights) -> dict[str, np.ndarray]:
 
 def test_two_views_before_one_backward_pass():
     """The second replaces the first's frame, which the backward pass has to render again."""
-    scene, aside = clear(Scene()), mi.load_dict(ASIDE.sensor())
+    scene, aside = clear(Scene()), mi.load_dict(ASIDE_VIEW.sensor())
     loaded = scene.load()
     params = mi.traverse(loaded)
     for name in ALL_PARAMETERS:
@@ -200,7 +200,7 @@ def test_two_views_before_one_backward_pass():
         loss += dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None).array
     dr.backward(loss)
     from_first = scene.gradients(first + third)
-    from_aside = reference_gradients_from(ASIDE, scene, second)
+    from_aside = reference_gradients_from(ASIDE_VIEW, scene, second)
     actual = {name: gradient(params[f"integrator.{name}"]) for name in ALL_PARAMETERS}
     assert_gradients_agree(actual, {name: from_first[name] + from_aside[name] for name in actual})
 
@@ -227,7 +227,7 @@ def test_last_provides_inputs_of_density_control():
         {
             "type": "scene",
             "integrator": scene.settings | tensors(scene.gaussians),
-            "sensor": ASIDE.sensor(),
+            "sensor": ASIDE_VIEW.sensor(),
         }
     )
     assert loaded.integrator().last is None
@@ -235,10 +235,10 @@ def test_last_provides_inputs_of_density_control():
     gradients_of(loaded, weights, ["means"])
     last = loaded.integrator().last
     actual = {"means2d": np.array(last.means2d_grad).astype(np.float64)}
-    assert_gradients_agree(actual, reference_gradients_from(ASIDE, scene, weights))
+    assert_gradients_agree(actual, reference_gradients_from(ASIDE_VIEW, scene, weights))
 
     # Visible: the box around the ellipse alpha = 1/255 holds a pixel's centre.
-    splats = reference.project(scene.gaussians, ASIDE.camera)
+    splats = reference.project(scene.gaussians, ASIDE_VIEW.camera)
     k = 2 * np.log(np.maximum(splats.opacities / reference.ALPHA_CUT, 1))
     radius = np.sqrt(k[:, None] * np.diagonal(splats.cov2d, axis1=1, axis2=2))
     first = np.maximum(np.ceil(splats.means2d - radius - 0.5), 0)

@@ -85,7 +85,7 @@ def with_coefficients_in_another_order(gaussians, camera):
     return replace(gaussians, shN=gaussians.shN.transpose(0, 2, 1).reshape(gaussians.shN.shape))
 
 
-WRONG = (
+WRONG_SPLATS = (
     (SMALL, conjugated),
     (SMALL, with_quats_read_as_xyzw),
     (SMALL, with_axes_exchanged),
@@ -99,7 +99,9 @@ WRONG = (
 )
 
 
-@pytest.mark.parametrize("splats, wrong", WRONG, ids=[wrong.__name__ for _, wrong in WRONG])
+@pytest.mark.parametrize(
+    "splats, wrong", WRONG_SPLATS, ids=[wrong.__name__ for _, wrong in WRONG_SPLATS]
+)
 def test_bound_rejects_wrong_splats(splats, wrong):
     gaussians, view = splats.gaussians, splats.view
     covariance = widened(gaussians, view.camera)

@@ -13,7 +13,7 @@ from drgs.io.colmap import MODELS, model_files, read_model, read_points3d
 
 MUTATIONS = 500  # of each format
 
-REAL = SHARED_DATA / "colmap_robothead" / "sparse" / "0"
+REAL_MODEL = SHARED_DATA / "colmap_robothead" / "sparse" / "0"
 
 each_format = pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 
@@ -111,10 +111,10 @@ def test_every_model_is_read_like_colmap(tmp_path, pycolmap):
             assert_as_colmap_reads(pycolmap, write(tmp_path / name / kind, model))
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the shared data folder is not here")
+@pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
 def test_real_model_is_read_like_colmap(tmp_path, pycolmap):
-    assert_as_colmap_reads(pycolmap, REAL)
-    reconstruction = pycolmap.Reconstruction(str(REAL))
+    assert_as_colmap_reads(pycolmap, REAL_MODEL)
+    reconstruction = pycolmap.Reconstruction(str(REAL_MODEL))
     for write in (reconstruction.write_text, reconstruction.write_binary):
         write(str(tmp_path))
         assert_as_colmap_reads(pycolmap, tmp_path)

@@ -12,7 +12,7 @@ from drgs.config.approximations import Approximations, from_ply_header
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
 
-SAID = {"antialiased": True, "low_pass": 0.1, "order_window": 8, "projection": "exact"}
+HEADER_VALUES = {"antialiased": True, "low_pass": 0.1, "order_window": 8, "projection": "exact"}
 
 
 def with_lines(path, *lines):
@@ -26,7 +26,7 @@ def with_lines(path, *lines):
 
 
 def test_values_are_read_back_with_their_types(tmp_path):
-    expected = SAID | {"alpha_cut": Approximations().alpha_cut, "extent": np.inf}
+    expected = HEADER_VALUES | {"alpha_cut": Approximations().alpha_cut, "extent": np.inf}
     replace(blobs(10), rendered_with=expected).save(tmp_path / "a.ply")
     found = Gaussians.load(tmp_path / "a.ply")
     assert found.rendered_with == expected
@@ -36,7 +36,7 @@ def test_values_are_read_back_with_their_types(tmp_path):
 
 
 def test_each_value_is_a_comment_after_the_format_line(tmp_path):
-    replace(blobs(10), rendered_with=SAID).save(tmp_path / "a.ply")
+    replace(blobs(10), rendered_with=HEADER_VALUES).save(tmp_path / "a.ply")
     lines = (tmp_path / "a.ply").read_bytes().split(b"\n")[1:7]
     assert lines[1:5] == [
         b"comment drgs antialiased true",

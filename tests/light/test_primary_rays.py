@@ -50,13 +50,18 @@ from drgs.reference import splatting as reference
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import load_rows
 
-AS_RAYS = {"projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0}
+RAY_APPROXIMATIONS = {
+    "projection": "exact",
+    "order": "pixel",
+    "sh_direction": "pixel",
+    "low_pass": 0.0,
+}
 """The approximations of an image that shows what rays pass."""
 
-MOST_ON_A_RAY = 64
+MAX_SPLATS_PER_RAY = 64
 """Splats that a pixel may put in order, at most; fewer are on any ray of these scenes."""
 
-OF_VOLPRIM = Cutoffs(alpha_max=0.9999, alpha_cut=0.0, transmittance_stop=0.0)
+VOLPRIM_CUTOFFS = Cutoffs(alpha_max=0.9999, alpha_cut=0.0, transmittance_stop=0.0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -124,7 +129,7 @@ class Problem:
         rendered = reference_rays.render(
             self.gaussians,
             self.camera,
-            model=reference_rays.ImageModel(**AS_RAYS),
+            model=reference_rays.ImageModel(**RAY_APPROXIMATIONS),
             threshold_width=marked,
         )
         planes = np.concatenate([rendered.transmittance[..., None], rendered.image], axis=-1)
@@ -151,7 +156,7 @@ def test_primary_rays_match_the_exact_image(precision, view):
         planes = np.column_stack([passed.transmittances, passed.colors])
         actual["reference of rays"] = planes.reshape(expected.shape)
         # Many on a ray; and the image with a window puts all of them in order.
-        assert 20 < passed.counts.max() < MOST_ON_A_RAY
+        assert 20 < passed.counts.max() < MAX_SPLATS_PER_RAY
     assert kept.mean() > 0.9 and expected[..., 0].min() < 0.01 and expected[..., 1:].max() > 0.9
     assert_arrays_agree(
         {name: planes[kept] for name, planes in actual.items()},
@@ -168,8 +173,8 @@ def test_plugin_image_matches_rays_of_the_sensor(view):
     integrator = {
         "type": "splats",
         "srgb_primitives": False,
-        "order_window": MOST_ON_A_RAY,
-        **AS_RAYS,
+        "order_window": MAX_SPLATS_PER_RAY,
+        **RAY_APPROXIMATIONS,
         **tensors(problem.gaussians),
     }
     image = image_of(
@@ -195,7 +200,7 @@ def test_primary_rays_match_volprim(splats):
     gaussians, view = splats.gaussians, splats.view
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     expected = volprim_image(gaussians, view, np.exp(gaussians.log_scales), quats[:, [1, 2, 3, 0]])
-    passed = composite_all(gaussians, rays_of_sensor(view), FLOAT32, view, OF_VOLPRIM)
+    passed = composite_all(gaussians, rays_of_sensor(view), FLOAT32, view, VOLPRIM_CUTOFFS)
     on_film = footprints(gaussians, view.camera, covariances(gaussians))
     allowed = propagated(on_film, on_film.alpha_rounding, on_film.color_rounding)
     assert expected.max() > 1000 * allowed.max()

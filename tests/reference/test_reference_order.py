@@ -197,14 +197,14 @@ def test_ties_are_composited_by_index():
 # ----------------------------------------------------------------------------------------------
 
 
-ON_BOTH_SIDES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
+MARKED_DISTANCES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
 """(relative distance, whether a width of 1e-6 marks it)"""
 
 
 def test_pixels_near_the_extent_are_marked():
     """At (1, 0) px from the mean of a splat of 1 px^2: rho = 1."""
     gaussians, camera = scene_of([[0, 0, 1.0]], np.log(0.1)), straight_camera(focal=10.0)
-    for relative, marked in ON_BOTH_SIDES:
+    for relative, marked in MARKED_DISTANCES:
         model = ImageModel(extent=math.sqrt(1 / (1 + relative)), low_pass=0.0)
         rendered = rays.render(gaussians, camera, model=model)
         assert rendered.near_threshold[4, 5] == marked, relative
@@ -214,7 +214,7 @@ def test_pixels_near_the_extent_are_marked():
 
 def test_pixels_with_ambiguous_order_are_marked():
     camera = straight_camera()
-    for relative, marked in ON_BOTH_SIDES:
+    for relative, marked in MARKED_DISTANCES:
         gaussians = scene_of([[0, 0, 2.0], [0, 0, 2.0 * (1 + relative)]], np.log(0.1))
         for order in ("center", "pixel"):
             model = ImageModel("exact", order)
@@ -245,7 +245,7 @@ def test_splats_behind_the_stop_mark_no_pixels():
 
 def test_pixels_whose_ray_enters_a_splat_near_the_camera_are_marked():
     camera = straight_camera()
-    for relative, marked in ON_BOTH_SIDES:
+    for relative, marked in MARKED_DISTANCES:
         gaussians = scene_of([[0, 0, 1.0]], np.log(0.5 * (1 + relative)))
         model = ImageModel("exact", "entry", extent=2.0, low_pass=0.0)
         rendered = rays.render(gaussians, camera, model=model)

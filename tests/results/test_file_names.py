@@ -9,7 +9,7 @@ from drgs.results import files
 
 NAMES = {files.CONFIG, *files.RESULTS}
 
-KNOWN = {
+ALLOWED_NAMES = {
     "drgs/fit.py": {files.TENSORBOARD},
 }
 """Modules below ``results`` recognise a fit's folder by names that they write out themselves; the
@@ -34,7 +34,7 @@ def test_file_names_are_unique():
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_file_names_are_written_in_one_module_only(path):
-    known = KNOWN.get(path.relative_to(REPOSITORY).as_posix(), set())
+    known = ALLOWED_NAMES.get(path.relative_to(REPOSITORY).as_posix(), set())
     assert NAMES & strings(path.read_text()) == known
 
 

@@ -28,7 +28,7 @@ from drgs.results.viewer import DisplaySettings, InitialView, viewer_page
 SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
 MANIFEST = json.loads(SHIPPED.joinpath("MANIFEST.json").read_text())
 
-OWN = Approximations(low_pass=0.1, antialiased=True)
+FITTED = Approximations(low_pass=0.1, antialiased=True)
 TITLE = '<i>"ü" & </script>'
 
 
@@ -51,7 +51,7 @@ class Page(HTMLParser):
 
 
 def page_of(gaussians, initial_view, title="title", background=(0.1, 0.2, 0.3)):
-    return viewer_page(title, DisplaySettings(gaussians, OWN), initial_view, background)
+    return viewer_page(title, DisplaySettings(gaussians, FITTED), initial_view, background)
 
 
 @pytest.fixture(scope="module")
@@ -205,24 +205,24 @@ def test_view_without_cameras_shows_all_gaussians():
 
 
 def test_supported_approximations_are_recognised():
-    assert viewer.shows_as_fitted(Approximations()) and viewer.shows_as_fitted(OWN)
-    assert not viewer.shows_as_fitted(replace(OWN, order="pixel"))
+    assert viewer.shows_as_fitted(Approximations()) and viewer.shows_as_fitted(FITTED)
+    assert not viewer.shows_as_fitted(replace(FITTED, order="pixel"))
 
 
 def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
     folder, dataset = tmp_path / "blobs", make_dataset()
     folder.mkdir()
-    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
+    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
     size = (folder / "viewer.html").stat().st_size
     (folder / "viewer.html").unlink()
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size - 1)
     with pytest.warns(
         UserNote, match=r"blobs/viewer\.html: not written, .*export .* --format html"
     ):
-        viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
+        viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
     assert list(folder.iterdir()) == []
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size)
-    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
+    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
     assert (folder / "viewer.html").stat().st_size == size
 
 
@@ -230,7 +230,7 @@ def test_page_too_large_by_gaussian_count_is_not_built(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "viewer_page", None)
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.min_page_bytes(30, blobs().sh_degree) - 1)
     with pytest.warns(UserNote, match=r"not written, as it would have at least 0 MB"):
-        viewer.write_viewer(tmp_path, make_dataset(), DisplaySettings(blobs(), OWN))
+        viewer.write_viewer(tmp_path, make_dataset(), DisplaySettings(blobs(), FITTED))
     assert list(tmp_path.iterdir()) == []
     assert viewer.seconds_of_page(30, 1) == 0 < viewer.seconds_of_page(29, 0)
 
@@ -249,7 +249,7 @@ def test_page_size_is_within_the_estimated_bounds(initial_view, sh_degree):
 def test_a_page_in_the_current_folder_is_named_after_it(tmp_path, monkeypatch):
     (tmp_path / "blobs").mkdir()
     monkeypatch.chdir(tmp_path / "blobs")
-    viewer.write_viewer(Path(), make_dataset(), DisplaySettings(blobs(), OWN))
+    viewer.write_viewer(Path(), make_dataset(), DisplaySettings(blobs(), FITTED))
     assert Page(Path("viewer.html").read_bytes()).texts["title"].strip() == "blobs: Gaussian splats"
 
 
@@ -262,7 +262,7 @@ def test_first_view_uses_refined_cameras(tmp_path):
         config = {"data": {"path": "data"}, "cameras": {"optimise": folder == "refined"}}
         (tmp_path / folder / "config.yml").write_text(yaml.safe_dump(config))
         write_views(tmp_path / folder / "cameras.json", replace(dataset, train=far))
-        viewer.write_viewer(tmp_path / folder, dataset, DisplaySettings(blobs(), OWN))
+        viewer.write_viewer(tmp_path / folder, dataset, DisplaySettings(blobs(), FITTED))
         splats = Page((tmp_path / folder / "viewer.html").read_bytes()).texts["splats"]
         (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(splats)))
         sizes.append(np.ptp(Gaussians.load(tmp_path / "a.ply").means, axis=0))

@@ -61,12 +61,12 @@ for module, name in [{names}]:
 """
 
 
-NOT_CALLED_FOR_BY_DEGREE_1 = """
+UNUSED_AT_DEGREE_1 = """
     (projection, "compensated_opacity"), (rendering, "depth_feature"), (sh, "C2"), (sh, "C3"),
 """
 
 
-NOT_CALLED_FOR_BY_DEGREE_0 = NOT_CALLED_FOR_BY_DEGREE_1 + '(sh, "C1"),'
+UNUSED_AT_DEGREE_0 = UNUSED_AT_DEGREE_1 + '(sh, "C1"),'
 
 
 def kernels_in_a_new_process(run_python, degree, rule, features, forbidden=None):
@@ -89,7 +89,7 @@ PLAIN = {"rule": "projection.plain_opacity", "features": "(rendering.color_featu
 
 @pytest.mark.parametrize(
     ("degree", "forbidden"),
-    [(0, NOT_CALLED_FOR_BY_DEGREE_0), (1, NOT_CALLED_FOR_BY_DEGREE_1)],
+    [(0, UNUSED_AT_DEGREE_0), (1, UNUSED_AT_DEGREE_1)],
     ids=["degree 0", "degree 1"],
 )
 def test_kernels_are_the_same_without_unused_modules(run_python, degree, forbidden):
@@ -111,7 +111,7 @@ def test_kernels_are_the_same_without_unused_modules(run_python, degree, forbidd
 def test_missing_module_fails_only_when_its_feature_is_used(run_python, degree, change, used):
     with pytest.raises(RuntimeError, match=used):
         kernels_in_a_new_process(
-            run_python, degree, **{**PLAIN, **change}, forbidden=NOT_CALLED_FOR_BY_DEGREE_1
+            run_python, degree, **{**PLAIN, **change}, forbidden=UNUSED_AT_DEGREE_1
         )
 
 

@@ -73,7 +73,7 @@ def test_ten_thousand_gaussians_match_the_reference_in_float32(case):
 NOT_FINITE = Case("not finite", 21, 18, 1, count=30)
 
 
-INFINITE_BUT_MEANINGFUL = {
+MEANINGFUL_INFINITIES = {
     ("log_scales", -np.inf): "a scale of 0: a point, which the low-pass makes a pixel wide",
     ("logit_opacities", np.inf): "an opacity of 1",
     ("sh0", -np.inf): "a colour of 0",
@@ -105,7 +105,7 @@ def test_nonfinite_value_affects_no_other_row(precision, antialiased, value, nam
     planes, gradients = planes_and_gradients(reference.Gaussians(**spoiled), case, precision)
     assert all(np.isfinite(plane).all() for plane in planes)
     assert all(np.isfinite(gradient).all() for gradient in gradients.values())
-    if (name, value) in INFINITE_BUT_MEANINGFUL:
+    if (name, value) in MEANINGFUL_INFINITIES:
         return
     without = {key: np.delete(array, row, 0) for key, array in vars(case.gaussians).items()}
     expected_planes, expected_gradients = planes_and_gradients(

@@ -297,18 +297,18 @@ def test_tangent_equals_central_differences_of_the_reference(precision, case):
 # ----------------------------------------------------------------------------------------------
 
 
-OF_CAMERA = [
+CAMERA_CASES = [
     Case("of the camera", 37, 29, 1),
     Case("of the camera, antialiased", 33, 17, 0, antialiased=True),
 ]
 
 
-@pytest.mark.parametrize("case", OF_CAMERA, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", CAMERA_CASES, ids=lambda case: case.name)
 def test_camera_gradients_of_two_frames_equal_differences_of_the_reference(case):
     check_camera_gradients_of_two_frames_equal_differences_of_the_reference(case)
 
 
-@pytest.mark.parametrize("case", OF_CAMERA, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", CAMERA_CASES, ids=lambda case: case.name)
 def test_camera_tangents_of_two_frames_equal_differences_of_the_reference(case):
     check_camera_tangents_of_two_frames_equal_differences_of_the_reference(case)
 

@@ -43,7 +43,7 @@ OPTIONS = (
 SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 NO_WEBGL = ("--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis")
 
-PATIENCE = 120.0
+TIMEOUT_SECONDS = 120.0
 """Timeout of an unresponsive browser, seconds, on one of two busy cores."""
 
 SECOND_TO_END = 5.0
@@ -92,7 +92,7 @@ class Browser:
         if session is not None:
             message["sessionId"] = session
         os.write(self._out, json.dumps(message).encode() + b"\0")
-        while (heard := self._heard.get(timeout=PATIENCE)).get("id") != self._count:
+        while (heard := self._heard.get(timeout=TIMEOUT_SECONDS)).get("id") != self._count:
             self.events.append(heard)
         assert "error" not in heard, f"{method}: {heard['error']}"
         return heard["result"]
@@ -144,7 +144,7 @@ class Page:
 
     def wait_for(self, expression: str) -> None:
         """Until it is true."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT_SECONDS
         while not self.evaluate(expression):
             assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
             time.sleep(0.05)
@@ -212,7 +212,7 @@ def browser_page(width: int, height: int) -> Iterator[Page]:
 
 def wait_until(happens: Callable[[], object], what: str) -> None:
     """Ask until it is true; what: it is that."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT_SECONDS
     while not happens():
         assert time.monotonic() < end, f"there never was {what}"
         time.sleep(0.05)

@@ -20,7 +20,7 @@ from support.views import Scene, gradient, tensors
 IMAGE, GRADIENTS = 1e-5, 1e-4
 
 
-HELD = ("data", "opacities", "sh_coeffs")
+SHAPE_ATTRIBUTES = ("data", "opacities", "sh_coeffs")
 
 
 def float32_attributes(gaussians) -> dict[str, np.ndarray]:
@@ -110,7 +110,7 @@ def held_gradients(held, of_gaussians) -> dict[str, np.ndarray]:
 def gradients_held(loaded, weights, prefix="shape") -> dict[str, np.ndarray]:
     """Gradients of sum(weights * image) for what a shape holds, flat."""
     params = mi.traverse(loaded)
-    keys = {name: f"{prefix}.{name}" for name in HELD}
+    keys = {name: f"{prefix}.{name}" for name in SHAPE_ATTRIBUTES}
     for key in keys.values():
         dr.enable_grad(params[key])
     image = mi.render(loaded, params)
@@ -122,7 +122,7 @@ def apart(arrays) -> dict[str, np.ndarray]:
     """With ``data`` in its parts, which differ in size: each has a largest value of its own."""
     data = arrays["data"].reshape(-1, 10)
     parts = {"means": data[:, :3], "scales": data[:, 3:6], "quats": data[:, 6:]}
-    return parts | {name: arrays[name].ravel() for name in HELD if name != "data"}
+    return parts | {name: arrays[name].ravel() for name in SHAPE_ATTRIBUTES if name != "data"}
 
 
 def assert_held_agree(actual, expected):

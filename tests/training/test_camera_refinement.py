@@ -263,7 +263,7 @@ def test_camera_derivatives_are_not_computed_before_the_start():
 # ----------------------------------------------------------------------------------------------
 
 # Rates of a fit that optimises cameras only.
-STILL = {
+FROZEN_GAUSSIANS = {
     "optimizer__means_lr": 1e-20,
     "optimizer__means_lr_final": 1e-20,
     **{f"optimizer__{name}_lr": 0.0 for name in ("quats", "scales", "opacities", "sh0", "shN")},
@@ -287,7 +287,7 @@ def test_disturbed_camera_is_recovered_with_true_gaussians():
         fits.true_blobs(),
         cameras__rotation_lr=3e-3,
         cameras__translation_lr=1e-2 / dataset.extent,
-        **STILL,
+        **FROZEN_GAUSSIANS,
     )
     start = trainer.step().loss
     end = fits.steps(trainer, 150).step().loss
@@ -307,7 +307,7 @@ def test_wrong_focal_length_and_principal_point_are_recovered():
         cameras__translation_lr=0.0,
         cameras__focal_lr=2e-3,
         cameras__principal_lr=1e-3,
-        **STILL,
+        **FROZEN_GAUSSIANS,
     )
     fits.steps(trainer, 100)
     (found,) = effect_of(trainer).refined_views([disturbed])

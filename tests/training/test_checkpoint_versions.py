@@ -14,7 +14,7 @@ from drgs.datasets.fingerprint import fingerprint_of
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from drgs.training.loop import History
 
-DECIDED = {"data.background": "white", "model.near": 0.2}
+RESOLVED_DEFAULTS = {"data.background": "white", "model.near": 0.2}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,7 +31,8 @@ def folder(tmp_path):
 @pytest.fixture
 def config(tmp_path):
     return with_changes(
-        FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000), DECIDED
+        FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000),
+        RESOLVED_DEFAULTS,
     )
 
 

@@ -52,7 +52,7 @@ def random_matrices(count=6, seed=1) -> np.ndarray:
 
 
 # Rates of a fit that optimises colours only.
-STILL = {
+FROZEN_GAUSSIANS = {
     "optimizer__means_lr": 1e-20,
     "optimizer__means_lr_final": 1e-20,
     **{f"optimizer__{name}_lr": 0.0 for name in ("quats", "scales", "opacities", "sh0", "shN")},
@@ -135,7 +135,7 @@ def test_loss_and_derivatives_of_a_transform_match_numpy():
 
 def test_penalty_pulls_towards_the_identity():
     """Adam's steps by the penalty alone end there, and have its sign from the start."""
-    trainer = with_matrices(make_trainer(colors__lr=0.01, **STILL), random_matrices())
+    trainer = with_matrices(make_trainer(colors__lr=0.01, **FROZEN_GAUSSIANS), random_matrices())
     (effect,) = trainer.effects
     view, start = trainer.views[1], random_matrices()[1]
     for iteration in range(60):
@@ -270,7 +270,7 @@ def test_color_change_of_a_photograph_is_recovered():
         fits.true_blobs(),
         colors__lr=6e-3,
         colors__identity_weight=0.0,
-        **STILL,
+        **FROZEN_GAUSSIANS,
     )
     fits.steps(trainer, 500)
     for photo, target, matrix in zip(photos, changed, matrices_of(trainer), strict=True):

@@ -15,7 +15,7 @@ from drgs.training import viewers
 from drgs.training.trainer import Trainer
 from drgs.training.viewers import for_viewers, num_iterations, tuning
 
-OTHERWISE = {"model.antialiased": True, "model.low_pass": 0.02}
+NON_VIEWER_SETTINGS = {"model.antialiased": True, "model.low_pass": 0.02}
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +26,7 @@ def variant():
 def ended_fit(iterations=20, **changes):
     """A trainer that has done all of its iterations, its dataset, and its Gaussians."""
     dataset = fits.plain_dataset()
-    config = with_changes(fits.config_of(iterations=iterations), {**OTHERWISE, **changes})
+    config = with_changes(fits.config_of(iterations=iterations), {**NON_VIEWER_SETTINGS, **changes})
     trainer = Trainer(config, dataset, fits.disturbed_blobs())
     for _ in range(iterations):
         trainer.step()
@@ -103,7 +103,9 @@ def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
 
 
 def test_population_and_schedule_are_unchanged():
-    config = with_changes(fits.config_of(iterations=400), {**OTHERWISE, "model.order": "pixel"})
+    config = with_changes(
+        fits.config_of(iterations=400), {**NON_VIEWER_SETTINGS, "model.order": "pixel"}
+    )
     further = tuning(config)
     assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
     assert further.model.approximations.is_default and not config.model.approximations.is_default

@@ -94,7 +94,7 @@ def _grown(size: int, path: Path) -> None:
         file.truncate(size)
 
 
-OTHERS = {
+REPLACEMENTS = {
     "nothing": lambda path: path.unlink(),
     "an empty file": lambda path: path.write_bytes(b""),
     "a null byte": lambda path: path.write_bytes(b"\0"),
@@ -156,7 +156,7 @@ LEFT_OUT = [
 ]
 """One of several files that are named: the others are fitted."""
 
-MAY_BE_READ = [
+MAY_BE_ACCEPTED = [
     *MAY_BE_MISSING,
     *LEFT_OUT,
     ("gaussians.splat", "its first half"),
@@ -176,9 +176,9 @@ def _archive() -> bytes:
 def other_file_attacks() -> Iterator[Attack]:
     """Each of the files that commands read, with each of the above in its place."""
     for file in READERS:
-        for name, change in OTHERS.items():
+        for name, change in REPLACEMENTS.items():
             may_be_read = name in HARMLESS or file in REWRITTEN
-            may_be_read |= (file, name) in MAY_BE_READ
+            may_be_read |= (file, name) in MAY_BE_ACCEPTED
             yield _attack(f"instead/{file}/{name}", file, change, must_refuse=not may_be_read)
 
 

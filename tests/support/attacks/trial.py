@@ -22,8 +22,8 @@ from support.attacks.attack import Attack
 from support.attacks.attack_folder import AttackFolder, contents, current_folder, stub_results
 from support.attacks.observer import Changes, Killed, observed
 
-KILLED = 137
-INTERRUPTED = 130
+KILLED_STATUS = 137
+INTERRUPTED_STATUS = 130
 
 PIPE_BYTES = 1 << 20
 """Limit of a command's output."""
@@ -35,7 +35,7 @@ CACHES = re.compile(
 
 TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
 
-MOST_LINE = 2000
+MAX_REFUSAL_CHARS = 2000
 """Characters in a refusal, beside what the user wrote."""
 
 ADDRESS_SPACE = 4 << 30
@@ -98,7 +98,7 @@ def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outc
         except SystemExit as end:
             outcome.status = end.code if isinstance(end.code, int) else 0 if not end.code else 1
         except Killed:
-            outcome.status = KILLED
+            outcome.status = KILLED_STATUS
         except TimeLimitExceeded:
             print(f"did not end within {attack.seconds:g} s", file=sys.stderr)
             traceback.print_exc()
@@ -117,7 +117,7 @@ def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
     wrong = []
     expected = {0, 2}
     if attack.fault is not None:
-        own = {"kill": KILLED, "interrupt": INTERRUPTED}.get(attack.fault.kind, 2)
+        own = {"kill": KILLED_STATUS, "interrupt": INTERRUPTED_STATUS}.get(attack.fault.kind, 2)
         expected = {0, own}
     if outcome.status not in expected:
         reached = "an exception" if outcome.status is None else f"status {outcome.status}"
@@ -149,7 +149,7 @@ def _wrong_refusal(attack: Attack, err: str) -> list[str]:
         wrong.append(f"a refusal of {len(lines)} lines: {_last_lines(err)}")
     elif "error: " not in lines[0]:
         wrong.append(f"a refusal that is none: {lines[0]}")
-    if max(map(len, lines), default=0) > MOST_LINE + sum(map(len, attack.words)):
+    if max(map(len, lines), default=0) > MAX_REFUSAL_CHARS + sum(map(len, attack.words)):
         wrong.append(f"a line of {max(map(len, lines))} characters")
     if attack.named and attack.named not in err:
         wrong.append(f"does not name {attack.named}: {_last_lines(err)}")

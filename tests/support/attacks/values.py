@@ -48,7 +48,7 @@ NUMBERS = {
 }
 """Numbers in YAML, by name."""
 
-THINGS = {
+OTHER_VALUES = {
     "true": "true",
     "null": "null",
     "nothing": "",
@@ -78,7 +78,7 @@ THINGS = {
     "aims": "[{after: 0, end: 1}, {after: 1, end: 2147483647}]",
 }
 
-SELDOM_RIGHT = ("nan", "inf", "-inf", "-1", "2^63", "10^400")
+RARELY_VALID = ("nan", "inf", "-inf", "-1", "2^63", "10^400")
 """Numbers that hardly any value may be: the others often begin a fit."""
 
 LONG_WORK = {
@@ -89,7 +89,7 @@ LONG_WORK = {
 }
 """Valid values that mean endless work, by key."""
 
-NEEDED = {
+ENABLING_SETTINGS = {
     "init.num_points": ("init.point_cloud=null", "densify.max_gaussians=100000000"),
     "init.half_extent": ("init.point_cloud=null", "init.num_points=20"),
     "densify": ("densify.start=0", "densify.every=1", "densify.stop=9"),
@@ -121,9 +121,9 @@ def schema_attacks() -> Iterator[Attack]:
     for key in leaves():
         of_data = key.partition(".")[0] in ("data", "cameras", "loss")
         config = "photos.yml" if of_data else "fit.yml"
-        others = NEEDED.get(key, NEEDED.get(key.partition(".")[0], ()))
+        others = ENABLING_SETTINGS.get(key, ENABLING_SETTINGS.get(key.partition(".")[0], ()))
         others = [word for word in others if not word.startswith(f"{key}=")]
-        for name, text in (NUMBERS | THINGS).items():
+        for name, text in (NUMBERS | OTHER_VALUES).items():
             if name in LONG_WORK.get(key, ()):
                 continue
             sets = [word for other in (*others, f"{key}={text}") for word in ("--set", other)]
@@ -133,7 +133,7 @@ def schema_attacks() -> Iterator[Attack]:
                 "fit",
                 (config, *out, *sets),
                 out=_out(key, text),
-                is_long=name in NUMBERS and name not in SELDOM_RIGHT,
+                is_long=name in NUMBERS and name not in RARELY_VALID,
             )
 
 

@@ -201,7 +201,7 @@ def test_death_of_a_process_ends_all_and_the_fit_resumes(config, tmp_path, seed)
     assert (out / "metrics.json").exists()
 
 
-ON_A_SMALL_DISK = """
+SMALL_DISK_SCRIPT = """
 disk=$1 kept=$2
 shift 2
 mount -t tmpfs -o size=600k none "$disk" || exit 77
@@ -227,7 +227,7 @@ def test_full_disk_ends_all_processes_and_the_fit_resumes(config, tmp_path):
         *command(path, "--out", disk / "out"),
     ]
     done = subprocess.run(
-        ["unshare", "--mount", "sh", "-c", ON_A_SMALL_DISK, "-", disk, kept, *words],
+        ["unshare", "--mount", "sh", "-c", SMALL_DISK_SCRIPT, "-", disk, kept, *words],
         cwd=parallel_processes.REPOSITORY,
         env=parallel_processes.environment(),
         capture_output=True,

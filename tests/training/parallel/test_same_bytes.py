@@ -26,18 +26,18 @@ def assert_the_same(changes, sizes, steps=8, data="plain"):
         assert state == expected[0], size
 
 
-CHANGING = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
+DENSITY_SCHEDULE = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
 
 STRATEGIES = {
-    "adc": {**CHANGING, "densify__strategy": "adc", "densify__adc__grad_threshold": 1e-6},
+    "adc": {**DENSITY_SCHEDULE, "densify__strategy": "adc", "densify__adc__grad_threshold": 1e-6},
     "budget": {
-        **CHANGING,
+        **DENSITY_SCHEDULE,
         "densify__strategy": "budget",
         "densify__budget__gaussians": 60,
         "densify__budget__error_every": 3,
     },
     "mcmc": {
-        **CHANGING,
+        **DENSITY_SCHEDULE,
         "densify__strategy": "mcmc",
         "densify__mcmc__gaussians": 60,
         "densify__mcmc__min_opacity": 0.3,
