@@ -17,7 +17,7 @@ import numpy as np
 from bricks import PLATE, STUD_HEIGHT, Builder, rotation
 
 SCALE = 0.068  # world units per stud: the model lies within [-1.2, 1.2]^3
-MIDDLE = 4.6  # studs: this height is z = 0 in the world
+MIDDLE_STUDS = 4.6  # studs: this height is z = 0 in the world
 BOOM_PITCH, BOOM_LENGTH = 42, 18  # degrees, studs
 LOAD_HEIGHT = 2.0  # studs above the deck
 STEPS = np.linspace(0, 1, 16)  # along a hose
@@ -320,5 +320,5 @@ def scene() -> dict[str, Any]:
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.58, 0.62, 0.68]}},
         "key": lamp([0.6, -3.6, 4.6], 2.4, [17, 15.6, 13.4]),
         "fill": lamp([3.6, 4.2, 3.2], 2.6, [6.0, 6.4, 7.0]),
-        **build().meshes(SCALE, MIDDLE),
+        **build().meshes(SCALE, MIDDLE_STUDS),
     }

@@ -100,7 +100,7 @@ class Unknowns:
 
 
 @dataclass(frozen=True)
-class OfObjects(Unknowns):
+class ObjectUnknowns(Unknowns):
     """Unknowns of the case ``objects``."""
 
     shift: list[float]  # of the model, in its radii
@@ -121,7 +121,7 @@ class OfObjects(Unknowns):
 
 
 @dataclass(frozen=True)
-class OfMirror(Unknowns):
+class MirrorUnknowns(Unknowns):
     """Unknowns of the case ``mirror``."""
 
     normal: list[float]  # of the sheet; of any length
@@ -364,14 +364,16 @@ class Case:
 CASES = {
     "objects": Case(
         Objects,
-        OfObjects([0.05, 0.05, 0], [0, 0, -12], [10, -20, 30], [0.75, 0.2, 0.1], [1, 0.9, 0.7]),
-        OfObjects([-0.15, 0.2, 0.1], [5, -8, 3], [-10, 5, 0], [0.4] * 3, [0.6] * 3),
+        ObjectUnknowns(
+            [0.05, 0.05, 0], [0, 0, -12], [10, -20, 30], [0.75, 0.2, 0.1], [1, 0.9, 0.7]
+        ),
+        ObjectUnknowns([-0.15, 0.2, 0.1], [5, -8, 3], [-10, 5, 0], [0.4] * 3, [0.6] * 3),
         spp=8,
     ),
     "mirror": Case(
         Mirror,
-        OfMirror([0.8, -0.5916, 0.1], [0.06], [0.95, 0.8, 0.5]),
-        OfMirror([0.7, -0.7, -0.05], [0.3], [0.6] * 3),
+        MirrorUnknowns([0.8, -0.5916, 0.1], [0.06], [0.95, 0.8, 0.5]),
+        MirrorUnknowns([0.7, -0.7, -0.05], [0.3], [0.6] * 3),
         spp=2,
     ),
 }

@@ -18,7 +18,7 @@ pytest.register_assert_rewrite("support")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = str(REPOSITORY / "tests")
-"""Where programs of the tests find ``support``."""
+"""Folder that contains ``support``, for programs that tests run."""
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 

@@ -112,7 +112,7 @@ def is_correct(scene, weights, entries=3, report=print):
     return correct
 
 
-def test_image_and_gradients_are_those_of_the_reference():
+def test_image_and_gradients_match_the_reference():
     assert is_correct(*random_scene(), entries=8)
 
 

@@ -101,7 +101,7 @@ def fit_case(case: Case, config: FitConfig) -> tuple[Trainer, Dataset, Dataset]:
 # ----------------------------------------------------------------------------------------------
 
 
-def _each_train(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
+def _map_training_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
     return replace(dataset, train=tuple(change(view) for view in dataset.train))
 
 
@@ -112,14 +112,14 @@ def darken(dataset: Dataset, rng: np.random.Generator) -> Dataset:
     def dark(view: View) -> View:
         return _with_image(view, DARKENING_FACTOR * np.asarray(view.image))
 
-    return replace(_each_train(dataset, dark), test=tuple(map(dark, dataset.test)))
+    return replace(_map_training_views(dataset, dark), test=tuple(map(dark, dataset.test)))
 
 
 def spoil_exposure(dataset: Dataset, rng: np.random.Generator) -> Dataset:
     """Multiply each training image by random gains per channel with mean 1."""
     gains = rng.uniform(0.6, 1.4, (len(dataset.train), 3))
     gains = iter(gains / gains.mean(axis=0))
-    return _each_train(
+    return _map_training_views(
         darken(dataset, rng), lambda v: _with_image(v, np.asarray(v.image) * next(gains))
     )
 
@@ -135,7 +135,7 @@ def spoil_parts(dataset: Dataset, rng: np.random.Generator) -> Dataset:
         image = np.where(mask[:, :, None] > 0, view.image, red)
         return replace(_with_image(view, image), mask=mask)
 
-    return _each_train(dataset, hidden)
+    return _map_training_views(dataset, hidden)
 
 
 def few_views(dataset: Dataset, rng: np.random.Generator) -> Dataset:
@@ -169,13 +169,15 @@ def move_cameras(dataset: Dataset, rng: np.random.Generator) -> Dataset:
         pose[:3, 3] += rng.normal(0, 0.025, 3)
         return replace(view, camera_to_world=pose)
 
-    return _each_train(dataset, moved)
+    return _map_training_views(dataset, moved)
 
 
 def stretch_lenses(dataset: Dataset, rng: np.random.Generator) -> Dataset:
     """Increase focal lengths by 4 %."""
     del rng
-    return _each_train(dataset, lambda view: replace(view, fx=1.04 * view.fx, fy=1.04 * view.fy))
+    return _map_training_views(
+        dataset, lambda view: replace(view, fx=1.04 * view.fx, fy=1.04 * view.fy)
+    )
 
 
 def _with_image(view: View, image: np.ndarray) -> View:
@@ -193,7 +195,9 @@ def quality(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, f
     return {"PSNR, dB": _psnr(trainer, dataset.test)}
 
 
-def quality_as_exposed(trainer: Trainer, dataset: Dataset, spoiled: Dataset) -> dict[str, float]:
+def psnr_at_training_exposure(
+    trainer: Trainer, dataset: Dataset, spoiled: Dataset
+) -> dict[str, float]:
     """Return the PSNR of test views as dark as the training views are on average.
 
     Also with each image's colours fitted to the photograph's by an affine transform: what is lost
@@ -231,7 +235,7 @@ def views_at_sizes(config: FitConfig) -> dict[str, list[View]]:
     }
 
 
-def seen_at_sizes(trainer: Trainer) -> list[np.ndarray]:
+def render_at_sizes(trainer: Trainer) -> list[np.ndarray]:
     """Render the first test view at all sizes."""
     views = views_at_sizes(trainer.config).values()
     return [next(iter(render_views(trainer.scene, of_size[:1]))) for of_size in views]
@@ -314,9 +318,11 @@ FAST = (("cameras.rotation_lr", 5e-3), ("cameras.translation_lr", 5e-3))
 """Rates for short fits: of 3,000 iterations, each of 100 cameras gets 30."""
 
 CASES = (
-    Case(EXPOSURE, "all alike", darken, BLACK, quality_as_exposed),
-    Case(EXPOSURE, "without", spoil_exposure, BLACK, quality_as_exposed),
-    Case(EXPOSURE, "with", spoil_exposure, (*BLACK, ("colors.lr", 0.02)), quality_as_exposed),
+    Case(EXPOSURE, "all alike", darken, BLACK, psnr_at_training_exposure),
+    Case(EXPOSURE, "without", spoil_exposure, BLACK, psnr_at_training_exposure),
+    Case(
+        EXPOSURE, "with", spoil_exposure, (*BLACK, ("colors.lr", 0.02)), psnr_at_training_exposure
+    ),
     Case("masks", "without", lambda data, rng: without(spoil_parts(data, rng), "mask")),
     Case("masks", "with", spoil_parts),
     Case("depth", "without", few_views, (("loss.depth_weight", 0.0),)),
@@ -345,7 +351,7 @@ CASES = (
 
 def without(dataset: Dataset, name: str) -> Dataset:
     """Remove masks or depths of the training views."""
-    return _each_train(dataset, lambda view: replace(view, **{name: None}))
+    return _map_training_views(dataset, lambda view: replace(view, **{name: None}))
 
 
 def table(results: Sequence[Result]) -> str:
@@ -387,7 +393,7 @@ def main() -> None:
         trainer, dataset, spoiled = fit_case(case, config)
         found = (case.measure or quality)(trainer, dataset, spoiled)
         if case.measure is at_sizes:
-            shown[case.name] = seen_at_sizes(trainer)
+            shown[case.name] = render_at_sizes(trainer)
         results += [Result(case.effect, case.name, k, v) for k, v in found.items()]
         print(f"{case.effect}, {case.name}", flush=True)
     print(f"\n{machine()}\n\n{table(results)}")

@@ -34,7 +34,7 @@ def make_parser(description: str, name: str) -> argparse.ArgumentParser:
     return parser
 
 
-def add_only(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
+def add_case_option(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
     """Add ``--only``, which chooses cases by their numbers."""
     text = "; ".join(f"{k}: {name}" for k, name in enumerate(names, 1)).replace("%", "%%")
     numbers = range(1, len(names) + 1)

@@ -268,20 +268,22 @@ def count_operations(code: list[str], text: str = "") -> Operations:
     return Operations(**counts)
 
 
-ONLY_COMPARES = r"cmp|test|bt[bwlq]?\s|vptest|vucomis|vcomis|ucomis|comis"
+COMPARE_INSTRUCTIONS = r"cmp|test|bt[bwlq]?\s|vptest|vucomis|vcomis|ucomis|comis"
 """Instructions whose last operand is read, not written."""
 
-ONLY_MOVES = r"v?mov|v?pmov|vextract|v?pextr|vscatter|vpscatter|vcompress|vpcompress|set|vcvtps2ph"
+MOVE_INSTRUCTIONS = (
+    r"v?mov|v?pmov|vextract|v?pextr|vscatter|vpscatter|vcompress|vpcompress|set|vcvtps2ph"
+)
 """Instructions whose last operand is written, not read."""
 
 
 def _writes_memory(line: str) -> bool:
     """Return whether the last operand, the destination in AT&T's syntax, lies in memory."""
-    return _last_is_memory(line) and re.match(ONLY_COMPARES, line) is None
+    return _last_is_memory(line) and re.match(COMPARE_INSTRUCTIONS, line) is None
 
 
 def _reads_memory(line: str) -> bool:
-    return not _last_is_memory(line) or re.match(ONLY_MOVES, line) is None
+    return not _last_is_memory(line) or re.match(MOVE_INSTRUCTIONS, line) is None
 
 
 def _last_is_memory(line: str) -> bool:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
-from fits import add_only, fit_words, make_parser
+from fits import add_case_option, fit_words, make_parser
 
 import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
@@ -114,7 +114,7 @@ CASES = (
 # ----------------------------------------------------------------------------------------------
 
 
-def psnr_as_taken(fitted: Path, config: FitConfig) -> float:
+def psnr_of_test_views(fitted: Path, config: FitConfig) -> float:
     """Return the PSNR of a fit's Gaussians on the dataset's test views."""
     run_config = load_run_config(fitted)
     gaussians = Gaussians.load(fitted / GAUSSIANS)
@@ -134,7 +134,7 @@ def main() -> None:
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="override a value of the configuration; repeatable",
     )  # fmt: skip
-    add_only(parser, [case.name for case in CASES])
+    add_case_option(parser, [case.name for case in CASES])
     args = parser.parse_args()
     config, reasons = config_for(args.data, args.overrides)
     print(reasons)
@@ -154,7 +154,7 @@ def main() -> None:
         if case.has_own_world:
             name += f" ({len(read_model(require_model(data)[1]).images)} placed)"
         else:
-            as_taken = f"{psnr_as_taken(folder / 'fit', config):.2f} dB"
+            as_taken = f"{psnr_of_test_views(folder / 'fit', config):.2f} dB"
         quality = f"{metrics['test']['psnr']:.2f} dB", f"{metrics['test']['ssim']:.4f}"
         peak = 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss  # of all so far
         cost = f"{metrics['num_gaussians']:,}", f"{metrics['wall_s']:.0f} s", f"{peak / 1e9:.2f} GB"

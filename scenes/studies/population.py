@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
-from fits import SCENES, add_only, make_parser, read_metrics, write_curves
+from fits import SCENES, add_case_option, make_parser, read_metrics, write_curves
 from scipy.special import expit
 
 from drgs import fit
@@ -47,7 +47,7 @@ SMALL, MEDIUM, LARGE = 200, 400, 800
 
 
 @contextmanager
-def prune_added_rows_at_once() -> Iterator[None]:
+def prune_added_rows_immediately() -> Iterator[None]:
     """Apply a step's prune also to rows that the step has added, as in the reference code."""
 
     def densify_and_prune(
@@ -121,7 +121,7 @@ CASES = (
         overrides=lambda config, extent: {"densify.adc.white_background_reset": "null"},
     ),
     Case("gradient threshold in pixels", overrides=threshold_in_pixels),
-    Case("just added rows pruned at once", rules=prune_added_rows_at_once),
+    Case("just added rows pruned at once", rules=prune_added_rows_immediately),
     Case("opacity resets until the end", rules=reset_until_the_end),
 )
 
@@ -170,7 +170,7 @@ def main() -> None:
     parser = make_parser(__doc__, "population")
     parser.add_argument("--data", type=Path, metavar="DIR", help="NeRF-synthetic's Lego")
     parser.add_argument("--case", type=int, help=argparse.SUPPRESS)  # fitted in this process
-    add_only(parser, [case.name for case in CASES])
+    add_case_option(parser, [case.name for case in CASES])
     args = parser.parse_args()
     if args.case is not None:
         fit_case(args.case, args)

@@ -151,7 +151,7 @@ class Task:
 
 CORE_TASKS = Task(100_000, 1, 400), Task(1_000_000, 1, 1265)
 MACHINE_TASKS = Task(100_000, 1, 400), Task(3_000_000, 5, 1600, views=4)
-QUICK = Task(2000, 1, 64, views=2)
+QUICK_TASK = Task(2000, 1, 64, views=2)
 
 
 @dataclass(frozen=True)
@@ -332,10 +332,10 @@ def main() -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
     print(machine())
-    for task in (QUICK,) if args.quick else CORE_TASKS:
+    for task in (QUICK_TASK,) if args.quick else CORE_TASKS:
         scene = Scene("bench", make_boxes(task), bench_camera(task.size_px))
         print(f"\n{title(task)}: bounds of the speed-up\n\n{cores_table(scene)}", flush=True)
-    for task in (QUICK,) if args.quick else MACHINE_TASKS:
+    for task in (QUICK_TASK,) if args.quick else MACHINE_TASKS:
         costs = measure_costs(task)
         print(f"\n{title(task)}, of which a view sees 1 / {task.boxes}\n\n{costs_table(costs)}")
         print(f"\n{costs.splats:,.0f} splats of a view travel\n\n{machines_table(costs)}")

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fits import SCENES as SCENES_FOLDER
-from fits import add_only, fit, make_parser
+from fits import add_case_option, fit, make_parser
 
 from drgs.bench.output import machine, markdown_table
 from drgs.config.changes import with_changes
@@ -230,17 +230,22 @@ class Case:
 
 PAPERS = Case("the paper's", ())
 
-WHOLE = Case("the whole", INGREDIENTS, PAPERS.name)
+WHOLE_RECIPE = Case("the whole", INGREDIENTS, PAPERS.name)
 
 CASES = (
     PAPERS,
-    WHOLE,
+    WHOLE_RECIPE,
     *(Case(f"the paper's + {i.name}", (i,), PAPERS.name, i) for i in INGREDIENTS),
     *(
-        Case(f"the whole without {i.name}", tuple(k for k in INGREDIENTS if k != i), WHOLE.name, i)
+        Case(
+            f"the whole without {i.name}",
+            tuple(k for k in INGREDIENTS if k != i),
+            WHOLE_RECIPE.name,
+            i,
+        )
         for i in INGREDIENTS
     ),
-    *(Case(f"the whole + {i.name}", (*INGREDIENTS, i), WHOLE.name, i) for i in EXTRAS),
+    *(Case(f"the whole + {i.name}", (*INGREDIENTS, i), WHOLE_RECIPE.name, i) for i in EXTRAS),
 )
 
 
@@ -293,7 +298,7 @@ def batch_case(views: int, rule: Rule) -> Case:
     """Return the whole recipe with steps of several views."""
 
     def changes(scene: Scene) -> Values:
-        optimizer = config_of(WHOLE, scene).optimizer
+        optimizer = config_of(WHOLE_RECIPE, scene).optimizer
         rate, power = rule.rate(views) / math.sqrt(views), rule.power(views) / views
         return {
             "optimizer.views_per_step": views,
@@ -385,10 +390,10 @@ def write_plot(path: Path, points: dict[str, dict[str, Point]], quantity: str, l
         for number, case in enumerate(case for case in CASES if case.name in found):
             color, marker = f"C{number}", "o"
             if case.varied is None:
-                color, marker = "black" if case == WHOLE else "tab:gray", "*"
+                color, marker = "black" if case == WHOLE_RECIPE else "tab:gray", "*"
             elif case.varied in INGREDIENTS:
                 color = f"C{INGREDIENTS.index(case.varied)}"
-                marker = "v" if case.reference == WHOLE.name else "^"
+                marker = "v" if case.reference == WHOLE_RECIPE.name else "^"
             point = found[case.name]
             style = {"color": color, "marker": marker, "linestyle": "none"}
             panel.plot([getattr(point, quantity)], [point.psnr], label=case.name, **style)
@@ -403,7 +408,7 @@ def main() -> None:
     parser = make_parser(__doc__, "recipes")
     parser.add_argument("--data", type=Path, metavar="DIR", help="the photographs of the fox")
     parser.add_argument("--batches", action="store_true", help="steps of several views instead")
-    add_only(parser, [case.name for case in CASES])
+    add_case_option(parser, [case.name for case in CASES])
     args = parser.parse_args()
     cases = BATCH_CASES if args.batches else [CASES[k - 1] for k in args.only]
     points: dict[str, dict[str, Point]] = {}

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mitsuba as mi
-from fits import SCENES, add_only, fit, fit_words, make_parser, write_curves
+from fits import SCENES, add_case_option, fit, fit_words, make_parser, write_curves
 
 import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table, write_rows
@@ -132,7 +132,7 @@ def main() -> None:
     """Fit curves or budgets."""
     parser = make_parser(__doc__, "training")
     parser.add_argument("--times", action="store_true", help=f"fits for {', '.join(TIMES)}")
-    add_only(parser, list(CHOICES))
+    add_case_option(parser, list(CHOICES))
     args = parser.parse_args()
     if args.times:
         fit_times(args.out, args.threads)

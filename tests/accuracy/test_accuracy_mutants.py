@@ -85,7 +85,7 @@ class Copies:
             add_product=order["_add_product"],
         )
 
-    def used_by(self, frame: rendering.Frame) -> rendering.Frame:
+    def frame_with_copies(self, frame: rendering.Frame) -> rendering.Frame:
         """The frame, whose forward pass is that of the package, with derivatives of the copies."""
         model, order = frame.bins.model, frame.order
         features = model.features
@@ -106,7 +106,7 @@ def outcome():
 
     def render(problem, precision):
         gaussians, frame = problem_render(problem, precision)
-        return gaussians, copies.used_by(frame)
+        return gaussians, copies.frame_with_copies(frame)
 
     def with_copies(check):
         """For a test that uses the classes themselves."""
@@ -125,7 +125,9 @@ def outcome():
 
         def run():
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(rendering, "render", lambda *a: copies.used_by(package_render(*a)))
+                patch.setattr(
+                    rendering, "render", lambda *a: copies.frame_with_copies(package_render(*a))
+                )
                 check()
 
         return run

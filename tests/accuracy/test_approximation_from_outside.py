@@ -88,14 +88,14 @@ def compact_image(arrays):
     return [passed.ravel(), *image.reshape(3, -1)]
 
 
-def test_the_image_is_that_of_the_equation():
+def test_image_matches_the_equation():
     found, expected = planes_of(values(), falloff="compact"), compact_image(values())
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
     assert np.abs(np.array(found) - planes_of(values())).max() > 0.01
 
 
 @pytest.mark.parametrize("order", ["center", "pixel"])
-def test_the_gradients_are_those_of_the_image(order):
+def test_gradients_match_differences_of_the_image(order):
     """Against central differences, and the tangent against the adjoint."""
     rng, arrays = np.random.default_rng(4), values()
     weights = rng.normal(size=(4, WIDTH * HEIGHT))
@@ -118,7 +118,7 @@ def test_the_gradients_are_those_of_the_image(order):
     assert (loss(STEP) - loss(-STEP)) / (2 * STEP) == pytest.approx(along, rel=1e-5)
 
 
-def test_the_plugin_and_a_configuration_have_it_by_name():
+def test_falloff_is_found_by_name_in_plugin_and_configuration():
     mi.set_variant("llvm_ad_rgb")
     tensors = {name: mi.TensorXf(array) for name, array in values().items()}
     found = mi.load_dict({"type": "splats", "falloff": "compact", **tensors})
@@ -129,7 +129,7 @@ def test_the_plugin_and_a_configuration_have_it_by_name():
         ModelConfig(falloff="compcat")
 
 
-def test_a_projection_with_a_falloff_of_its_own_takes_no_other():
+def test_projection_with_its_own_falloff_rejects_another():
     with pytest.raises(UnsupportedError, match="projection 'exact' has a falloff of its own"):
         pipeline_of(Approximations(projection="exact", falloff="compact"), 0)
 
@@ -161,7 +161,7 @@ def others(monkeypatch):
 
 
 @pytest.mark.parametrize("order", ["center", "pixel"])
-def test_a_projection_is_found_by_name_under_both_orders(others, order):
+def test_projection_is_found_by_name_with_both_orders(others, order):
     doubled = values()
     doubled["log_scales"] = doubled["log_scales"] + math.log(2)
     found = planes_of(values(), projection="twofold", order=order)
@@ -180,7 +180,7 @@ def test_an_order_is_found_by_name(others):
     np.testing.assert_allclose(found, planes_of(arrays), rtol=0, atol=1e-12)
 
 
-def test_what_an_approximation_raises_has_its_name(monkeypatch):
+def test_errors_of_an_approximation_contain_its_name(monkeypatch):
     monkeypatch.setattr(PROJECTIONS, "_extensions", dict(PROJECTIONS._extensions))
 
     @PROJECTIONS.register("broken")
@@ -194,13 +194,13 @@ def test_what_an_approximation_raises_has_its_name(monkeypatch):
         planes_of(values(), projection="broken")
 
 
-def test_the_documents_have_the_example_as_it_is():
+def test_documented_example_is_the_file():
     example = (REPOSITORY / "tests" / "examples" / "compact_falloff.py").read_text()
     assert example in (REPOSITORY / "docs" / "developing.md").read_text()
     assert 20 <= len(example.splitlines()) <= 60
 
 
-def test_a_fit_says_that_it_is_simulated():
+def test_fit_summary_lists_the_falloff():
     config = config_from({"data": {"path": "."}, "model": {"falloff": "compact"}}, "x")
     (line,) = [e for e in summary_of_fit(config, plain_dataset()) if e.name == "approximations"]
     assert (line.what, line.why) == ("compact", "model.falloff")

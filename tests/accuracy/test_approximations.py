@@ -136,11 +136,11 @@ def test_same_bytes_in_every_run(name):
     assert [a.tobytes() for a in first] == [a.tobytes() for a in second]
 
 
-def test_behind_hundreds_of_layers_gradients_keep_their_accuracy():
+def test_gradients_stay_accurate_behind_hundreds_of_layers():
     check_behind_hundreds_of_layers_gradients_keep_their_accuracy()
 
 
-def test_what_the_order_of_faint_splats_is_worth():
+def test_unordered_faint_splats_change_the_image_within_bounds():
     """A splat before 200 that are fainter than what is put in order: it loses at most their sum of
     its light, and they gain at most as much.
     """
@@ -172,7 +172,7 @@ def test_what_the_order_of_faint_splats_is_worth():
     np.testing.assert_allclose(T, expected.transmittance.ravel(), rtol=0, atol=1e-12)
 
 
-def test_no_stop_leaves_gradients_behind_any_number_of_opaque_layers():
+def test_without_transmittance_stop_gradients_exist_behind_opaque_layers():
     """Transmittance is 1e-60 there, which float32 has not: it ends before."""
     count = 30
     camera = reference.Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 8.0, 8.0, 16, 16)
@@ -202,11 +202,11 @@ def test_sums_of_products_are_exact_to_twice_the_precision():
     check_sums_of_products_are_exact_to_twice_the_precision()
 
 
-def test_twins_are_composited_in_one_order_by_image_and_derivative():
+def test_equal_splats_have_one_order_in_image_and_derivative():
     check_twins_are_composited_in_one_order_by_image_and_derivative()
 
 
-def test_a_peak_in_the_plane_of_the_camera_shows_nothing():
+def test_splat_whose_peak_is_in_the_camera_plane_is_invisible():
     check_a_peak_in_the_plane_of_the_camera_shows_nothing()
 
 
@@ -241,7 +241,7 @@ def test_a_colour_at_its_minimum_keeps_its_derivative():
         ({"low_pass": math.inf}, "low_pass must be finite and not negative, got inf"),
     ],
 )
-def test_what_is_no_approximation_is_refused(values, message):
+def test_invalid_approximations_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         Approximations(**values)
 
@@ -279,7 +279,7 @@ def kernels_in_a_new_process(run_python, blocked, **approximations):
     return run_python(program)
 
 
-def test_an_approximation_that_is_not_taken_costs_nothing(run_python):
+def test_unused_approximation_costs_nothing(run_python):
     """Hash and operation count of the default's kernels, with all other modules out of reach."""
     import json
 
@@ -298,12 +298,14 @@ def test_an_approximation_that_is_not_taken_costs_nothing(run_python):
         ("ray_colors", {"sh_direction": "pixel"}),
     ],
 )
-def test_a_module_out_of_reach_is_missed_when_it_is_chosen(run_python, module, approximations):
+def test_missing_module_fails_only_when_its_approximation_is_chosen(
+    run_python, module, approximations
+):
     result = kernels_in_a_new_process(run_python, (module,), **approximations)
     assert result.returncode != 0 and f"drgs.accuracy.{module}" in result.stderr
 
 
-def test_approximations_take_effect_at_their_stage_alone():
+def test_approximations_change_only_kernels_of_their_stage():
     """Kernels in front of an approximation's stage are those of the default."""
     from support import kernels
 
@@ -328,7 +330,7 @@ def test_no_kernel_of_an_approximation_reduces_floats_in_memory():
         assert not found and count > 3
 
 
-def test_no_gaussians_on_the_film():
+def test_image_without_gaussians_is_transparent():
     """Empty lists."""
     problem = Problem("exact, pixel order", "random")
     gaussians = replace(problem.inputs[0], means=problem.inputs[0].means * 0 + 1e3)

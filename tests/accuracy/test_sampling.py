@@ -192,7 +192,7 @@ def test_a_box_filter_averages_the_samples(sampler):
     assert np.abs(image - image_of(SCENE.load())).max() > 0.01
 
 
-def test_points_are_those_of_the_sampler():
+def test_sample_points_come_from_the_sampler():
     points = exposure_of(SCENE.load(samples=16, sampler="stratified"), 16)
     cells = np.floor(points * 4).astype(int)
     number = cells[..., 1] * 4 + cells[..., 0]
@@ -203,7 +203,7 @@ def test_points_are_those_of_the_sampler():
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
-def test_a_seed_that_was_changed_in_place_gives_other_points():
+def test_seed_changed_in_place_gives_other_points():
     loaded = SCENE.load(samples=4)
     integrator, sensor = loaded.integrator(), loaded.sensors()[0]
     seed = mi.UInt32(0)
@@ -223,7 +223,7 @@ def test_a_seed_that_was_changed_in_place_gives_other_points():
     np.testing.assert_array_equal(rendered(seed), rendered(2))
 
 
-def test_samples_of_one_call_replace_those_of_the_sampler():
+def test_spp_of_a_call_overrides_the_sampler():
     few, many = SCENE.load(samples=1), SCENE.load(samples=4)
     assert np.array_equal(image_of(few, spp=4), image_of(many))
     assert np.array_equal(image_of(many, spp=1), image_of(few))
@@ -231,7 +231,7 @@ def test_samples_of_one_call_replace_those_of_the_sampler():
 
 @pytest.mark.parametrize("name", ["gaussian", "tent", "mitchell", "lanczos"])
 @pytest.mark.parametrize("samples", [1, 3])
-def test_a_filter_weighs_the_samples_around_a_pixel(name, samples):
+def test_reconstruction_filter_weights_samples_around_a_pixel(name, samples):
     """image = sum f(x - center) value / sum f, over the samples within the filter's radius."""
     loaded = SCENE.load(samples=samples, rfilter=name)
     image = image_of(loaded)
@@ -259,7 +259,7 @@ def test_a_filter_weighs_the_samples_around_a_pixel(name, samples):
                 np.add.at(weights, target_inside, weight[inside][:, None])
                 np.add.at(total, target_inside, (weight[..., None] * values[s])[inside])
     # Mitsuba reads its filters from tables of 32 entries a radius, linearly: 1e-3 of a weight.
-    # Where negative lobes leave little weight, a pixel is a quotient of small numbers.
+    # Negative lobes may leave little weight: a pixel is then a quotient of small numbers.
     expected = total / weights
     kept = weights[..., 0] > 0.2 * weights.max()
     assert kept.mean() > 0.8
@@ -290,7 +290,7 @@ def test_gradients_are_the_transpose_of_the_tangents(samples, rfilter):
         assert size > 0 and abs(left - right) < 1e-5 * size, name
 
 
-def test_no_samples_are_taken_beyond_the_film():
+def test_no_samples_outside_the_film():
     """Whether or not it has a border for them."""
     loaded = SCENE.load(samples=2)
     images = [
@@ -303,7 +303,7 @@ def test_no_samples_are_taken_beyond_the_film():
 
 
 @pytest.mark.parametrize("action", ["develop", "adjoint"])
-def test_more_samples_need_no_longer_kernels_for_a_filter(action):
+def test_kernels_with_a_filter_do_not_grow_with_samples(action):
     """Compilers take longer than proportionally to a kernel's length."""
     sensor = SCENE.load(rfilter="gaussian").sensors()[0]
     width, height = sensor.film().crop_size()
@@ -335,7 +335,7 @@ def test_a_box_filter_gives_the_same_bytes_in_every_run():
     assert all(a.tobytes() == b.tobytes() for a, b in zip(*results, strict=True))
 
 
-def test_more_samples_come_closer_to_the_area_of_a_pixel():
+def test_more_samples_converge_to_the_pixel_area():
     """Splats smaller than a pixel, no low-pass: a pixel is the mean over its area. Errors of
     stratified samples fall at least as 1 / sqrt(n).
     """
@@ -362,24 +362,24 @@ def test_more_samples_come_closer_to_the_area_of_a_pixel():
 # Several samples a pass
 # ----------------------------------------------------------------------------------------------
 
-FEW = Scene(count=12, degree=1)
+SMALL_SCENE = Scene(count=12, degree=1)
 
 
 def scene_with(settings=(), sensor=None, **objects):
-    integrator = FEW.settings | tensors(FEW.gaussians) | dict(settings)
-    sensor = FEW.view.sensor() if sensor is None else sensor
+    integrator = SMALL_SCENE.settings | tensors(SMALL_SCENE.gaussians) | dict(settings)
+    sensor = SMALL_SCENE.view.sensor() if sensor is None else sensor
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
 
 
 def batch_of_two():
-    whole = FEW.view.sensor()
+    whole = SMALL_SCENE.view.sensor()
     whole["film"]["width"] *= 2
-    children = {"a": FEW.view.sensor(), "b": VIEWS[2].sensor()}
+    children = {"a": SMALL_SCENE.view.sensor(), "b": VIEWS[2].sensor()}
     return {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **children}
 
 
 def thin_lens():
-    common = {name: FEW.view.sensor()[name] for name in ("film", "sampler", "to_world")}
+    common = {name: SMALL_SCENE.view.sensor()[name] for name in ("film", "sampler", "to_world")}
     return {
         "type": "thinlens",
         "fov": 50.0,
@@ -389,7 +389,7 @@ def thin_lens():
 
 
 def moving():
-    common = {name: FEW.view.sensor()[name] for name in ("film", "sampler", "to_world")}
+    common = {name: SMALL_SCENE.view.sensor()[name] for name in ("film", "sampler", "to_world")}
     lens = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5, "shutter": "global"}
     close = mi.ScalarTransform4f(CLOSE)
     moves = {"to_world_close": close, "shutter_samples": 2}
@@ -398,7 +398,7 @@ def moving():
 
 def feature_tensor(channels):
     rng = np.random.default_rng(3)
-    return mi.TensorXf(rng.normal(0, 1, (FEW.count, channels)).astype(np.float32))
+    return mi.TensorXf(rng.normal(0, 1, (SMALL_SCENE.count, channels)).astype(np.float32))
 
 
 SCENES = {
@@ -413,7 +413,9 @@ SCENES = {
     ),
     "texture": lambda: scene_with({"background": rendered(texels())}),
     "environment, thin lens": lambda: scene_with(sensor=thin_lens(), sky=EMITTERS["envmap"]()),
-    "surface, environment": lambda: load_wall(FEW, sky=True, wall=Wall(half=0.5), aovs="z:depth"),
+    "surface, environment": lambda: load_wall(
+        SMALL_SCENE, sky=True, wall=Wall(half=0.5), aovs="z:depth"
+    ),
     "batch": lambda: scene_with({"aovs": "z:depth"}, batch_of_two()),
     "motion": lambda: scene_with(sensor=moving()),
 }
@@ -441,7 +443,7 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypatch):
+def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch):
     monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
     monkeypatch.setattr("drgs.integrator.film.PIXELS_PER_PASS", 1)
     expected, passes = outcome(name)
@@ -467,15 +469,15 @@ def test_passes_of_several_samples_give_the_bytes_of_single_ones(name, monkeypat
 
 def test_a_pass_of_a_large_film_has_one_sample():
     film = {"width": 512, "height": PIXELS_PER_PASS // 512 + 1}
-    large = scene_with(sensor=FEW.view.sensor(**film)).sensors()[0]
+    large = scene_with(sensor=SMALL_SCENE.view.sensor(**film)).sensors()[0]
     assert [p.samples for p in DrawnSamples(large, 0, 3, {}).positions] == [1, 1, 1]
     small = scene_with().sensors()[0]
-    at_once = PIXELS_PER_PASS // (FEW.view.width * FEW.view.height)
+    at_once = PIXELS_PER_PASS // (SMALL_SCENE.view.width * SMALL_SCENE.view.height)
     passes = DrawnSamples(small, 0, 2 * at_once + 1, {}).positions
     assert [p.samples for p in passes] == [at_once, at_once, 1]
 
 
-def test_more_samples_of_a_small_film_need_no_more_kernels():
+def test_samples_of_a_small_film_share_kernels():
     """But for their sums over samples, of 16 at a time."""
 
     def launches(samples) -> int:
@@ -495,7 +497,7 @@ def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):
         dr.enable_grad(params["integrator.sh0"])
         params.update()
         dr.backward(dr.sum(mi.render(loaded, params, spp=3).array))
-        plane = dr.arange(mi.Float, FEW.view.width * FEW.view.height)
+        plane = dr.arange(mi.Float, SMALL_SCENE.view.width * SMALL_SCENE.view.height)
         return np.array(loaded.integrator().last.weighted_sums(plane))
 
     found = weights()

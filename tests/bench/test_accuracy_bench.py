@@ -41,7 +41,7 @@ def image_of(subject, **approximations):
     ).image()
 
 
-def test_the_ladder_leads_to_the_most_accurate_form(subject):
+def test_each_rung_comes_closer_to_the_most_accurate_image(subject):
     """The most accurate kernels agree with it; each step on the way comes closer."""
     accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
     steps = [
@@ -52,11 +52,11 @@ def test_the_ladder_leads_to_the_most_accurate_form(subject):
     ]
     errors = [np.abs(image_of(subject, **step) - accurate).mean() for step in steps]
     assert all(after < before for before, after in pairwise(errors))
-    # Of single precision, of alphas below a millionth, and of order among faint splats.
+    # Left: single precision, alphas below a millionth, and the order among faint splats.
     assert errors[-1] < 1e-4 < errors[0]
 
 
-def test_the_most_accurate_form_is_close_to_one_without_any_cut(subject):
+def test_most_accurate_image_is_close_to_one_without_cuts(subject):
     accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
     # Three hundred alphas of less than a millionth.
     assert 0 < accuracy.check_on_crops(subject, accurate) < 3e-4
@@ -64,7 +64,7 @@ def test_the_most_accurate_form_is_close_to_one_without_any_cut(subject):
     assert accuracy.check_on_crops(subject, rough) > 1e-3
 
 
-def test_a_measurement_is_what_its_columns_say(subject):
+def test_measurement_matches_its_columns(subject):
     accurate = [accuracy.most_accurate(subject, c, accuracy.MIN_ALPHA) for c in subject.cameras]
     rungs = [accuracy.RUNGS[0], accuracy.Rung("4 samples", {"low_pass": 0.0}, False, samples=4)]
     default, sampled = accuracy.measure(subject, accurate, rungs, 1)
@@ -89,7 +89,7 @@ def measurement(name, milliseconds, psnr, is_approximation=True):
     )
 
 
-def test_the_front_holds_what_none_is_both_faster_and_closer_than():
+def test_pareto_front_contains_undominated_measurements():
     a, b, c = measurement("a", 1, 30), measurement("b", 2, 40), measurement("c", 3, 35)
     d, other = measurement("d", 4, 50), measurement("other", 0.5, 90, is_approximation=False)
     assert accuracy.pareto_front([d, c, other, b, a]) == [a, b, d]
@@ -98,7 +98,7 @@ def test_the_front_holds_what_none_is_both_faster_and_closer_than():
     assert "| c | 3 ms" in text and "| (other) | 0 ms" in text
 
 
-def test_the_stress_scene_is_what_it_says():
+def test_stress_scene_has_crossing_layers_and_large_near_splats():
     """Its layers cross in the middle of the image, and splats are large and near."""
     gaussians, (camera,) = stress_scene(64)
     assert 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) == pytest.approx(110, abs=1e-3)
@@ -134,7 +134,7 @@ def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monke
     assert Image.open(tmp_path / "accuracy.png").size[0] > 800
 
 
-def test_pixels_that_do_not_count_are_left_out(subject):
+def test_masked_pixels_are_left_out(subject):
     """The mask is the photograph's."""
     accurate = [accuracy.most_accurate(subject, c, accuracy.MIN_ALPHA) for c in subject.cameras]
     (view,), mask = subject.photographs, np.ones((24, 24), np.float32)
@@ -146,7 +146,7 @@ def test_pixels_that_do_not_count_are_left_out(subject):
     assert abs(expected - metrics.psnr(image_of(subject), view.image)) > 0.1
 
 
-def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
+def test_measurement_includes_the_smoothing_filter(tmp_path, subject):
     """Without the filter, the most accurate form and all rungs agree."""
     gaussians = subject.gaussians
     smoothing = np.full(gaussians.num_gaussians, 0.1, np.float32)
@@ -157,12 +157,12 @@ def test_a_smoothing_filter_is_part_of_what_is_measured(tmp_path, subject):
     accurate = accuracy.most_accurate(found, found.cameras[0], accuracy.MIN_ALPHA)
     without = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
     image = image_of(found, projection="exact", order="pixel", order_window=16, **accuracy.UNCUT)
-    # What the ladder's last step leaves; the filter is as wide as the splats, and changes far more.
+    # The error of the last rung; the filter is as wide as the splats and changes far more.
     assert np.abs(image - accurate).mean() < 1e-4 < 0.01 < np.abs(accurate - without).mean()
 
 
 @pytest.mark.parametrize("has", ["lens distortion", "motion"])
-def test_views_that_are_not_of_pinholes_at_rest_are_refused(tmp_path, capsys, has):
+def test_views_other_than_static_pinholes_are_refused(tmp_path, capsys, has):
     """A fit's folder is refused; its Gaussians can be measured alone."""
     dataset = small_capture.make_dataset(2, 1)
     small_capture.write_dataset(tmp_path / "data", dataset)

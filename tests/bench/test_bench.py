@@ -47,7 +47,7 @@ def test_stability_finds_no_error_beyond_the_conditioning(stability_run):
             assert float(row["left_out"]) < 0.1
 
 
-def test_noise_is_that_of_single_precision():
+def test_noise_matches_single_precision():
     """Rounding the scene to float32 changes the image by about as much as the noise says."""
     sweep = next(s for s in stability.sweeps() if s.name == "Anisotropy")
     found = stability.measure(sweep, 100.0, samples=4)
@@ -59,7 +59,7 @@ def test_noise_is_that_of_single_precision():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_useful_pairs_are_those_that_the_reference_composites():
+def test_useful_pairs_match_the_reference():
     case = clear(Case("pairs", 40, 35, 0, count=80))
     frame = rendering.render(
         device_gaussians(case.gaussians, SINGLE), device_camera(case.camera, SINGLE),
@@ -130,7 +130,7 @@ def test_renderers_do_not_reuse_a_frame(small_scene):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_exponents_are_those_of_a_power_law():
+def test_exponents_of_a_power_law_are_recovered():
     work = timing.Work(1, 1, 1, 1)
     found = [
         scaling.Result(scaling.Point("Gaussians", n, 400, 2), 3e-3 * n**1.5, 7 * n, 0, work)
@@ -140,7 +140,7 @@ def test_exponents_are_those_of_a_power_law():
     assert scaling.exponent(found, "device_bytes") == pytest.approx(1)
 
 
-def test_gaussians_keep_their_entries_as_their_number_grows():
+def test_entries_per_gaussian_stay_constant_as_their_number_grows():
     """In the first sweep the film grows and the Gaussians shrink."""
     points = [p for p in scaling.points(quick=True) if p.sweep.startswith("constant")]
     ratios = []

@@ -64,7 +64,7 @@ def test_effects_add_operations_and_lower_degrees_take_some_away(small):
         assert (count > plain) == adds and count != plain, (effect, name, count, plain)
 
 
-def test_every_case_is_another_image(small):
+def test_every_case_renders_a_different_image(small):
     """But for derivatives, which are no image's, and effects that a single sample cannot show."""
     gaussians = scenes.bench_gaussians(150)
     images = {}
@@ -78,7 +78,7 @@ def test_every_case_is_another_image(small):
         assert (np.abs(image - plain).max() < 1e-4) == same, key
 
 
-def test_an_image_is_never_reused(small):
+def test_images_are_never_reused(small):
     """Each is rendered: the second launches what the first did."""
     renderer = effects.CaseRenderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
     counts = [effects.operations(renderer) for _ in range(2)]
@@ -98,7 +98,7 @@ def test_derivatives_do_not_add_up_over_rounds(small):
     assert sum(first.any() for first in found[0]) >= 6
 
 
-def test_prices_are_medians_against_the_first_case(monkeypatch):
+def test_prices_are_medians_relative_to_the_first_case(monkeypatch):
     """With a clock of our own: an effect that takes twice as long has the ratio 2."""
 
     class Subject:

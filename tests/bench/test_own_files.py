@@ -30,7 +30,7 @@ def test_a_measurement_is_replaced_by_the_next(tmp_path):
 
 
 @pytest.mark.parametrize("written_before", [False, True], ids=["foreign", "edited"])
-def test_a_file_of_others_stays(tmp_path, written_before):
+def test_foreign_file_is_not_overwritten(tmp_path, written_before):
     if written_before:
         measurement("first")(tmp_path)
     (tmp_path / "it.csv").write_text("mine")
@@ -40,7 +40,7 @@ def test_a_file_of_others_stays(tmp_path, written_before):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_what_a_measurement_would_write_is_refused_before_it_begins(name, tmp_path):
+def test_existing_output_is_refused_before_measuring(name, tmp_path):
     module = importlib.import_module(f"drgs.bench.{name}")
     parser = CommandParser()
     module.add_arguments(parser)

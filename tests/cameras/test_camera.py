@@ -21,7 +21,7 @@ def variant():
 
 
 @all_views
-def test_points_on_a_sensors_rays_project_to_where_the_rays_start(view):
+def test_points_on_sensor_rays_project_to_their_pixels(view):
     sensor = mi.load_dict(view.sensor())
     points, expected = points_on_rays(sensor)
     camera = camera_of(sensor)
@@ -34,7 +34,7 @@ def test_points_on_a_sensors_rays_project_to_where_the_rays_start(view):
 
 
 @all_views
-def test_numbers_are_those_of_the_manuals_definitions(view):
+def test_camera_parameters_follow_mitsubas_definitions(view):
     """To float32 rounding; with the rays above, this checks the cameras of the other tests."""
     expected, (rows, columns) = view.camera, view.window
     actual = numbers(camera_of(mi.load_dict(view.sensor())))
@@ -54,7 +54,7 @@ def test_a_camera_far_from_the_origin_keeps_its_centre():
 
 
 @pytest.mark.parametrize("near, near_clip", [(0.25, 0.5), (0.5, 0.25)])
-def test_the_larger_near_plane_wins(near, near_clip):
+def test_larger_of_two_near_planes_is_used(near, near_clip):
     sensor = mi.load_dict(replace(VIEWS[1], near_clip=near_clip).sensor())
     assert numbers(camera_of(sensor, near))["near"] == 0.5
 
@@ -72,7 +72,7 @@ def test_a_camera_follows_its_sensor():
     assert np.abs(project(camera_of(sensor), points) - positions).max() < PIXELS
 
 
-def test_no_number_of_a_camera_is_a_literal():
+def test_camera_parameters_are_no_literals_in_kernels():
     """A literal would be compiled into the kernels, and each view would compile its own."""
     camera = camera_of(mi.load_dict(VIEWS[1].sensor()))
     scalars = [v for row in camera.rotation for v in row]
@@ -80,7 +80,7 @@ def test_no_number_of_a_camera_is_a_literal():
     assert {value.state for value in scalars} == {dr.VarState.Evaluated}
 
 
-def test_other_sensors_are_refused_by_name():
+def test_unsupported_sensors_are_refused_by_name():
     sensor = mi.load_dict({"type": "batch", "id": "mine", "first": VIEWS[0].sensor()})
     message = (
         r"^splats: the sensor must be of type perspective, thinlens, orthographic or calibrated, "
@@ -104,7 +104,7 @@ def test_create_uploads_a_camera():
     assert (camera.width, camera.height) == (19, 15)
 
 
-def test_films_of_all_sizes_share_their_kernels():
+def test_films_of_all_sizes_share_kernels():
     """No number of the film or the crop window is compiled into a kernel."""
 
     def kernels(**film):

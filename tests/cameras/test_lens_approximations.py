@@ -94,7 +94,7 @@ def test_unscented_splats_have_the_mean_and_covariance_of_projected_samples(name
 
 
 @every_lens
-def test_unscented_splats_that_are_tiny_are_the_affine_ones(name):
+def test_tiny_unscented_splats_match_affine_ones(name):
     gaussians, camera = unscented_scene(name, size=1e-4)
     affine, points = (
         splats_of(gaussians, camera, LENSES[name], FLOAT64, shape, low_pass=0.0)
@@ -131,7 +131,7 @@ def direction_of_pixels(case) -> np.ndarray:
     [*((name, FLOAT64) for name in FORMS), ("rational", FLOAT32)],
     ids=[*FORMS, "rational, float32"],
 )
-def test_colours_are_seen_in_the_directions_of_the_pixels_rays(precision, name):
+def test_colours_use_the_directions_of_pixel_rays(precision, name):
     """One reference image for each pixel, of that pixel."""
     case = clear(LensCase("small", 12, 9, 1, 20, lens=LENSES[name]))
     pipeline = pipeline_of(Approximations(sh_direction="pixel"), 1)
@@ -156,7 +156,7 @@ def test_colours_are_seen_in_the_directions_of_the_pixels_rays(precision, name):
 @pytest.mark.parametrize(
     "name", [name for name, lens in LENSES.items() if not isinstance(lens, Orthographic)]
 )
-def test_pixels_in_their_own_order_are_those_of_layers_in_the_centers_order(name):
+def test_pixel_order_equals_center_order_for_separate_layers(name):
     """Flat splats in layers far apart, so that no pixel's order is another one."""
     camera = camera_behind(case_of(name), np.random.default_rng(0))
     rng = np.random.default_rng(1)
@@ -214,7 +214,7 @@ def composited_along_parallel_rays(case, low_pass=0.3) -> tuple[np.ndarray, int]
 
 
 @pytest.mark.parametrize("projection", ["ewa", "unscented"])
-def test_an_order_of_each_pixel_along_parallel_rays(projection):
+def test_pixel_order_along_parallel_rays_matches_the_reference(projection):
     """Needles and discs in all directions that cross: some peaks are behind the camera."""
     case = LensCase("needles", 19, 14, 0, 12, lens=LENSES["orthographic"], recipe=needles)
     window = Approximations(projection=projection, order="pixel", order_window=12)
@@ -249,7 +249,7 @@ def needles(case, rng):
     ],
     ids=lambda value: value if isinstance(value, str) else ", ".join(value),
 )
-def test_gradients_equal_their_own_central_differences(name, approximations):
+def test_gradients_equal_central_differences(name, approximations):
     """The kernels' adjoint against the kernels' image. So small a step meets no jump, neither of
     a cut nor of the order of splats at a pixel.
     """

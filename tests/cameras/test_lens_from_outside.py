@@ -42,7 +42,7 @@ def points(number=64):
     return np.random.default_rng(1).normal(size=(3, number)) + np.array([[0], [0], [0.5]])
 
 
-def test_the_ray_through_a_points_place_meets_the_point():
+def test_ray_through_a_projected_point_meets_the_point():
     camera = camera_with(UnifiedCamera(XI))
     seen, position, _ = camera.lens.visibility(camera, llvm.Array3f64(points()))
     film = camera.lens.project_point(camera, position)
@@ -53,13 +53,13 @@ def test_the_ray_through_a_points_place_meets_the_point():
     assert 32 < dr.count(seen)[0] < 64
 
 
-def test_the_jacobian_is_the_derivative_of_the_place():
+def test_jacobian_is_the_derivative_of_the_projection():
     camera = camera_with(UnifiedCamera(XI))
     _, position, _ = camera.lens.visibility(camera, llvm.Array3f64(points()))
     rows = camera.lens.projection_jacobian(camera, position)
     step = 1e-6
     for axis in range(3):
-        # Of a step in the world: that of the camera's axes, turned.
+        # A step along a camera axis, in world coordinates.
         moved = camera.rotation @ llvm.Array3f64([step if k == axis else 0 for k in range(3)])
         after, before = (
             camera.lens.project_point(camera, position + sign * moved) for sign in (1, -1)
@@ -68,7 +68,7 @@ def test_the_jacobian_is_the_derivative_of_the_place():
             np.testing.assert_allclose(row[axis], difference, rtol=1e-6, atol=1e-6)
 
 
-def test_newtons_ray_has_the_derivatives_of_the_formula():
+def test_newton_ray_has_the_derivatives_of_the_closed_form():
     """In the place, and in the coefficient."""
     found = []
     for ray in (UnifiedCamera.ray, Lens.ray):
@@ -96,7 +96,7 @@ def scene_with(lens, **coefficients):
     return mi.load_dict({"type": "scene", "integrator": splats, "sensor": sensor})
 
 
-def test_a_sensor_has_the_lens_by_name_and_its_coefficients_as_parameters():
+def test_sensor_takes_lens_by_name_and_exposes_its_coefficients():
     mi.set_variant("llvm_ad_rgb")
     pinhole, plain = scene_with("pinhole"), scene_with("unified", xi=0.0)
     assert "sensor.xi" in mi.traverse(plain).keys()  # noqa: SIM118
@@ -112,7 +112,7 @@ def test_a_sensor_has_the_lens_by_name_and_its_coefficients_as_parameters():
     assert np.isfinite(dr.grad(params["sensor.xi"])[0]) and dr.grad(params["sensor.xi"])[0] != 0
 
 
-def test_a_file_has_the_lens_by_name_and_what_is_written_is_read_again(tmp_path):
+def test_lens_in_a_file_survives_a_round_trip(tmp_path):
     pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
     frames = [
         {"file_path": "a.png", "transform_matrix": pose},
@@ -141,7 +141,7 @@ def test_a_file_has_the_lens_by_name_and_what_is_written_is_read_again(tmp_path)
         ),
     ],
 )
-def test_a_file_that_is_wrong_is_refused_with_file_and_key(tmp_path, values, message):
+def test_invalid_file_is_refused_with_file_and_key(tmp_path, values, message):
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
     meta = {"camera_model": "unified", "fl_x": 30.0, "w": 40, "h": 30, "frames": [frame]}
     path = tmp_path / "transforms.json"
@@ -151,7 +151,7 @@ def test_a_file_that_is_wrong_is_refused_with_file_and_key(tmp_path, values, mes
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_start_points_are_seen_where_the_lens_shows_them(dtype):
+def test_start_points_are_projected_with_the_lens(dtype):
     view = view_at((0, -2, 0), (0, 0, 0))
     view = replace(view, lens=UnifiedCamera(XI))
     x, y, z = points().astype(dtype)
@@ -164,7 +164,7 @@ def test_start_points_are_seen_where_the_lens_shows_them(dtype):
     assert np.isfinite([u, v]).all()
 
 
-def test_what_a_lens_raises_has_its_name():
+def test_errors_of_a_lens_contain_its_name():
     @LENSES.register("broken")
     class Broken(Pinhole):
         def project_point(self, camera, position):
@@ -176,7 +176,7 @@ def test_what_a_lens_raises_has_its_name():
     del LENSES._extensions["broken"]
 
 
-def test_photographs_that_such_a_lens_took_are_loaded(tmp_path):
+def test_photographs_of_a_custom_lens_are_loaded(tmp_path):
     frames = []
     for k in range(3):
         iio.imwrite(tmp_path / f"{k}.png", np.full((30, 40, 3), 50 * k, np.uint8))
@@ -189,7 +189,7 @@ def test_photographs_that_such_a_lens_took_are_loaded(tmp_path):
     assert [view.lens for view in views] == [UnifiedCamera(XI)] * len(views)
 
 
-def test_the_documents_have_the_example_as_it_is():
+def test_documented_example_is_the_file():
     example = (REPOSITORY / "tests" / "examples" / "unified_camera.py").read_text()
     assert example in (REPOSITORY / "docs" / "developing.md").read_text()
     assert 20 <= len(example.splitlines()) <= 60

@@ -40,7 +40,7 @@ from drgs.splatting import rendering
 from drgs.splatting.projection import ewa
 
 # ----------------------------------------------------------------------------------------------
-# What is left out
+# Missing coefficients
 # ----------------------------------------------------------------------------------------------
 
 
@@ -59,7 +59,7 @@ from drgs.splatting.projection import ewa
         ),
     ],
 )
-def test_coefficients_that_are_not_given_are_left_out(given, named):
+def test_missing_coefficients_are_left_out(given, named):
     lens = RadialTangential.from_coefficients(**given)
     assert lens.coefficients() == named
     values = {name: -value for name, value in named.items()}
@@ -67,7 +67,7 @@ def test_coefficients_that_are_not_given_are_left_out(given, named):
     assert lens.with_coefficients(values).max_squared_radius == lens.max_squared_radius
 
 
-def test_a_fisheye_leaves_out_what_is_not_given():
+def test_fisheye_leaves_out_missing_coefficients():
     assert fisheye.Fisheye.from_coefficients().coefficients() == {}
     assert fisheye.Fisheye.from_coefficients(k2=0.5).coefficients() == {"k1": 0.0, "k2": 0.5}
     assert fisheye.Fisheye.from_coefficients(k1=0.0).coefficients() == {"k1": 0.0}
@@ -91,7 +91,7 @@ def test_a_fisheye_leaves_out_what_is_not_given():
         ),
     ],
 )
-def test_a_thin_prism_fisheye_leaves_out_what_is_not_given(given, named):
+def test_thin_prism_fisheye_leaves_out_missing_coefficients(given, named):
     lens = KernelThinPrism.from_coefficients(**given)
     assert lens.coefficients() == named
     values = {name: -value for name, value in named.items()}
@@ -100,7 +100,7 @@ def test_a_thin_prism_fisheye_leaves_out_what_is_not_given(given, named):
 
 
 @every_lens
-def test_where_the_model_ends_is_where_the_reference_ends(name):
+def test_valid_region_matches_the_reference(name):
     lens = LENSES[name]
     if isinstance(lens, OpenCV):
         expected, actual = lens.valid_radius**2, kernel_lens(lens).max_squared_radius
@@ -115,7 +115,7 @@ def test_where_the_model_ends_is_where_the_reference_ends(name):
     ("lens", "ends"),
     [
         (OpenCV(p1=0.125, p2=-0.0625), True),
-        # By what the radial part grows along the slope, and by what it is across it.
+        # Limited by the radial factor's derivative along the slope, then by the factor across it.
         (OpenCV(k1=-0.25, k2=0.03125, k4=0.0625, p1=-0.03125, p2=0.015625), True),
         (OpenCV(k1=0.0625, k4=0.03125, k5=-0.015625, p1=0.125, p2=0.125), True),
         # Nowhere; and not before the pole.
@@ -124,7 +124,7 @@ def test_where_the_model_ends_is_where_the_reference_ends(name):
     ],
     ids=str,
 )
-def test_tangential_terms_end_the_model_where_the_reference_does(lens, ends):
+def test_valid_region_with_tangential_terms_matches_the_reference(lens, ends):
     radius = math.sqrt(kernel_lens(lens).max_squared_radius)
     assert radius == pytest.approx(lens.valid_radius, rel=1e-9)
     plain = replace(lens, p1=0.0, p2=0.0).valid_radius
@@ -137,13 +137,13 @@ def test_tangential_terms_end_the_model_where_the_reference_does(lens, ends):
         (ThinPrismFisheye(p1=0.125, p2=-0.0625), True),
         (ThinPrismFisheye(sx1=-0.25, sy1=0.125), True),
         (ThinPrismFisheye(-0.0625, 0.03125, p1=0.125, p2=0.0625, sx1=0.25, sy1=-0.125), True),
-        # What one does, the other undoes; and what it does is less than the radial terms do.
+        # Terms that cancel, and terms smaller than the radial ones.
         (ThinPrismFisheye(p1=0.0625, p2=-0.03125, sx1=0.09375, sy1=-0.1875), False),
         (ThinPrismFisheye(0.25, p1=0.03125, sx1=0.03125), False),
     ],
     ids=str,
 )
-def test_prisms_end_the_model_where_the_reference_does(lens, ends):
+def test_valid_region_with_thin_prisms_matches_the_reference(lens, ends):
     angle = math.acos(kernel_lens(lens).min_cosine)
     assert angle == pytest.approx(lens.valid_angle, rel=1e-9)
     assert (angle < 0.99 * Fisheye(lens.k1, lens.k2, lens.k3, lens.k4).valid_angle) == ends
@@ -161,7 +161,7 @@ def kernels_of(lens, camera_seed=0) -> dict[str, list]:
     dr.eval(gaussians, ones)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
-        # That of the other tests, for the same kernels.
+        # The pipeline of the other tests, for the same kernels.
         frame = rendering.render(gaussians, camera, case.pipeline)
         dr.eval(frame.planes())
         forward = drain_kernels()
@@ -195,7 +195,7 @@ def test_kernels_do_not_depend_on_the_numbers_of_a_lens(lens, other):
     assert all(len(entries) >= 3 for entries in kernels.values())
 
 
-def test_each_coefficient_adds_operations_where_it_belongs():
+def test_each_coefficient_adds_operations_to_the_projection_only():
     """A lens without any has those of a pinhole with a bound; compositing never changes."""
     radial, rational = LENSES["radial"], LENSES["rational"]
     lenses_of = [effects.Pinhole(), OpenCV(), LENSES["barrel"], radial]
@@ -228,7 +228,7 @@ def test_each_coefficient_of_a_fisheye_adds_operations():
     + [("rational", unscented_shape, FLOAT32), ("fisheye", unscented_shape, FLOAT32)],
     ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
 )
-def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
+def test_nonfinite_positions_affect_no_other_gaussian(precision, name, shape):
     """The image and all other gradients are those of the same Gaussians far away."""
     case = clear(case_of(name, count=30))
     means = case.gaussians.means.copy()
@@ -263,7 +263,7 @@ def test_positions_that_are_no_numbers_poison_nothing(precision, name, shape):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_the_exact_projection_refuses_other_lenses_than_pinholes(name):
+def test_exact_projection_refuses_lenses_other_than_pinholes(name):
     case = LensCase("tiny", 13, 11, 0, 5, lens=LENSES[name])
     kind = type(kernel_lens(LENSES[name])).__name__
     pipeline = pipeline_of(Approximations(projection="exact"), 0)

@@ -34,17 +34,17 @@ every_opencv = pytest.mark.parametrize(
 
 
 # ----------------------------------------------------------------------------------------------
-# What is seen
+# Visibility
 # ----------------------------------------------------------------------------------------------
 
 
-# Of positions up to thousands of px and of covariances: J by differences, 1e-13; and float32.
+# Positions up to thousands of px, and covariances: J by differences, 1e-13; and float32.
 SPLATS = {FLOAT64: 1e-11, FLOAT32: 1e-5}
 
 
 @both_precisions
 @pytest.mark.parametrize("name", ["plain fisheye", "fisheye", "thin prism"])
-def test_a_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
+def test_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
     """On the axis, at angles from 1e-12 up, where the series end (17.5 degrees), beside, behind."""
     lens, camera = LENSES[name], camera_at_origin()
     at = np.arctan(np.sqrt(fisheye.NEAR_AXIS)) + np.array([-1e-3, -1e-6, 1e-6, 1e-3])
@@ -73,7 +73,7 @@ def test_a_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
 
 @pytest.mark.parametrize("lens", [RadialTangential, CameraFisheye, CameraThinPrismFisheye])
 @pytest.mark.parametrize("tiny", [5e-324, -1e-200, 1e-31])
-def test_coefficients_that_change_nothing_are_zero(lens, tiny):
+def test_negligible_coefficients_are_zero(lens, tiny):
     assert lens.from_coefficients(
         **dict.fromkeys(lens.coefficient_names(), tiny)
     ) == lens.from_coefficients(**dict.fromkeys(lens.coefficient_names(), 0.0))
@@ -105,7 +105,7 @@ FOLDING = {
 
 @both_precisions
 @pytest.mark.parametrize("lens", FOLDING.values(), ids=FOLDING)
-def test_what_lies_beyond_the_lens_model_does_not_fold_back(precision, lens):
+def test_points_beyond_the_lens_model_do_not_fold_back(precision, lens):
     camera = camera_at_origin(fx=60.0, fy=60.0)
     points = folded_points(lens)
     film = lens.film_points(camera, points)
@@ -115,7 +115,7 @@ def test_what_lies_beyond_the_lens_model_does_not_fold_back(precision, lens):
     assert not np.array(splats.visible).any()
     for name in ("means2d", "conic_factor", "depths", "variances"):
         assert np.isfinite(rows(getattr(splats, name))).all()
-    # As near as single precision can tell, what lies within is seen.
+    # Points within the limit are visible, up to single precision.
     limit = 1 - 1e-5
     within = limit * points[0] * [1 / 1.001, 1 / 1.001, 1 / limit]
     if isinstance(lens, Fisheye):
@@ -127,7 +127,7 @@ def test_what_lies_beyond_the_lens_model_does_not_fold_back(precision, lens):
 
 @both_precisions
 @every_lens
-def test_a_mean_on_the_near_plane_is_seen_and_one_before_it_is_not(precision, name):
+def test_mean_on_the_near_plane_is_visible_and_one_before_it_is_not(precision, name):
     camera = camera_at_origin(near=0.5)
     depths = np.array([0.5, 0.5 * (1 - 1e-6), 0.0, -0.5])
     points = np.column_stack([np.zeros((4, 2)), depths])
@@ -137,7 +137,7 @@ def test_a_mean_on_the_near_plane_is_seen_and_one_before_it_is_not(precision, na
 
 @both_precisions
 @every_opencv
-def test_a_lens_knows_the_slopes_on_its_films_border(precision, name):
+def test_slope_bounds_match_the_reference(precision, name):
     lens, camera = LENSES[name], camera_behind(case_of(name), np.random.default_rng(0))
     expected = lens.slope_bounds(camera)
     actual = lens_camera(camera, lens, precision).lens.on_film
@@ -149,7 +149,7 @@ def test_a_lens_knows_the_slopes_on_its_films_border(precision, name):
 
 @both_precisions
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.69, 0.7, 0.71, 0.81, 1.0, 1.5])
-def test_slopes_are_bounded_while_the_lens_reaches_the_whole_border(precision, part):
+def test_slopes_are_bounded_if_the_lens_covers_the_whole_border(precision, part):
     """Half a side is a part of the largest distorted radius; the corners are sqrt(2) as far."""
     lens = OpenCV(k1=-0.3125)
     half = part * (2 / 3) * lens.valid_radius
@@ -164,7 +164,7 @@ def test_slopes_are_bounded_while_the_lens_reaches_the_whole_border(precision, p
     np.testing.assert_allclose([rows(b)[0] for b in bounds], expected, rtol=tolerance)
 
 
-def test_a_crop_window_is_bounded_by_the_whole_film():
+def test_crop_window_has_the_slope_bounds_of_the_whole_film():
     lens, camera = LENSES["rational"], camera_at_origin()
     whole = lens_camera(camera, lens, FLOAT64)
     shift = FLOAT64.Array2f(37.0, 21.0)
@@ -196,7 +196,7 @@ def rays_of(camera, lens, film, precision) -> np.ndarray:
 
 @both_precisions
 @every_lens
-def test_a_ray_is_seen_where_it_starts(precision, name):
+def test_points_of_a_ray_project_to_its_pixel(precision, name):
     """The reference projects points of rays, wherever the lens shows anything."""
     lens, camera = LENSES[name], camera_behind(case_of(name), np.random.default_rng(0))
     y, x = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
@@ -218,7 +218,7 @@ def test_a_ray_is_seen_where_it_starts(precision, name):
 
 @both_precisions
 @pytest.mark.parametrize("kind", ["opencv", "fisheye", "thin prism"])
-def test_rays_of_any_lens_are_found_and_finite(precision, kind):
+def test_rays_of_extreme_lenses_are_found_and_finite(precision, kind):
     """Coefficients as large as they come, films far beyond what some of the lenses show.
 
     An unguarded Newton's method from the place on the film misses some and ends in NaN.

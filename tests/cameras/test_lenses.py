@@ -28,7 +28,7 @@ from support.lens_scenes import (
     camera_behind,
     gaussians_at_points,
     points_at,
-    points_near_the_end,
+    points_near_lens_limit,
 )
 from support.reference_scenes import numeric_gradients
 
@@ -57,7 +57,7 @@ def large_scene(case, rng):
     film = rng.uniform(-0.4, 1.4, (case.count, 2)) * size
     distances = rng.uniform(1, 3, case.count)
     points = points_at(case.lens, camera, film, distances)
-    near_the_end = points_near_the_end(case.lens, camera, film, distances)
+    near_the_end = points_near_lens_limit(case.lens, camera, film, distances)
     points = np.where(np.isnan(points), near_the_end, points)
     sizes = rng.uniform(0.1, 0.8, (case.count, 3)) * max(size)
     logits = rng.normal(-1.0, 1.0, case.count)
@@ -74,7 +74,7 @@ def test_image_equals_the_reference(precision, name, antialiased):
 
 @both_precisions
 @every_lens
-def test_tiles_hold_all_that_large_splats_reach(precision, name):
+def test_tiles_contain_every_pixel_of_large_splats(precision, name):
     """The reference evaluates every splat at every pixel."""
     case = clear(case_of(name, recipe=large_scene, count=20))
     _, frame = case.render(precision)
@@ -103,12 +103,12 @@ def test_a_lens_changes_the_image(name):
 DIFFERENCES = 1e-6
 
 
-# Those of test_rendering.
+# Tolerances of test_rendering.
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 
 @pytest.mark.parametrize("name", ["rational", "fisheye", "orthographic"])
-def test_each_number_of_the_gradients_equals_a_difference_of_the_reference(name, monkeypatch):
+def test_each_gradient_entry_equals_a_difference_of_the_reference(name, monkeypatch):
     """One splat is on the axis, one so far beside the film that its slopes may be clamped."""
     lens = LENSES[name]
     case = clear(LensCase("tiny", 13, 11, 1, 5, lens=lens, recipe=tiny_scene, threshold_width=5e-4))

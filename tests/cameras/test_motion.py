@@ -41,7 +41,7 @@ from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 from drgs.splatting.projection import load_rows
 
-# Those of test_lenses.
+# Tolerances of test_lenses.
 IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 
 
@@ -79,7 +79,7 @@ kinds_and_samples = pytest.mark.parametrize(
 
 @both_precisions
 @pytest.mark.parametrize("turn", [0.0, 1e-5, 0.06, 2.5])
-def test_poses_are_those_of_the_reference(precision, turn):
+def test_poses_match_the_reference(precision, turn):
     case = case_of("pinhole", turn=turn, travel=3.0)
     camera = case.device_camera(precision)
     for time in (0.0, 0.25, 1.0):
@@ -129,7 +129,7 @@ def test_motion_blur_equals_the_reference(precision, name):
 
 @both_precisions
 @pytest.mark.parametrize("samples", [0, 1, 4])
-def test_a_still_camera_takes_the_plain_image(precision, samples):
+def test_static_camera_renders_the_plain_image(precision, samples):
     """To the last bit: turns of zero are the identity."""
     case = clear(case_of("pinhole", samples=samples))
     zero = precision.Array3f(0, 0, 0)
@@ -156,7 +156,7 @@ def test_a_still_camera_takes_the_plain_image(precision, samples):
 
 @both_precisions
 @all_kinds
-def test_rolling_shutter_equals_splats_at_the_time_of_their_row(precision, name):
+def test_rolling_shutter_matches_splats_at_the_time_of_their_row(precision, name):
     """Found by bisection and secants in the reference. Some are never read: above, or below."""
     case = clear(case_of(name, samples=0))
     times = np.array([time_of(case, mean) for mean in case.gaussians.means])
@@ -192,7 +192,7 @@ def small_scene(case, rng):
     )
 
 
-def test_small_splats_look_as_if_each_row_had_an_image_of_its_own():
+def test_rolling_shutter_of_small_splats_matches_an_image_per_row():
     """While a row is read, splats move by up to V / H = 4.9 px / 40 = 0.12 px; d rows from its mean
     a splat is off by so much d. With a standard deviation of sigma = 0.74 px and more, low-pass
     included, and an opacity of 0.82, alpha is off by 0.12 d 0.82 exp(-1/2) / sigma exp(-d^2 / 2
@@ -217,7 +217,7 @@ def test_small_splats_look_as_if_each_row_had_an_image_of_its_own():
         assert np.abs(wrong.alpha - expected.alpha).max() > 0.5
 
 
-def test_motion_along_the_rows_is_exact_in_the_middle_of_each_row():
+def test_horizontal_motion_is_exact_at_row_centers():
     """A camera that moves to the right, and splats in the middle of rows: each is seen by its row
     at the time at which it is projected.
     """
@@ -244,7 +244,7 @@ def test_motion_along_the_rows_is_exact_in_the_middle_of_each_row():
 
 
 @pytest.mark.parametrize("turn", [0.03, 0.1, 0.3])
-def test_times_are_found_though_the_camera_turns_by_a_third_of_the_film(turn):
+def test_times_are_found_for_fast_rotations(turn):
     """Times are fractions of the turn at which a splat is seen. Measured: 3e-15."""
     case = case_of("pinhole", samples=0, turn=turn, travel=0.0)
     camera = case.device_camera(FLOAT64)
@@ -264,7 +264,7 @@ def test_times_are_found_though_the_camera_turns_by_a_third_of_the_film(turn):
 # ----------------------------------------------------------------------------------------------
 
 
-# As in test_lenses; brentq finds times to 1e-15, which over the step is 1e-9.
+# Tolerance of test_lenses; brentq finds times to 1e-15, which over the step is 1e-9.
 DIFFERENCES = 1e-6
 
 
@@ -312,7 +312,7 @@ def test_single_precision_gradients_equal_double_precision(samples):
     assert_arrays_agree(kernel_gradients(case, FLOAT32, cotangents), expected, GRADIENTS[FLOAT32])
 
 
-def test_gradients_with_respect_to_the_motion_equal_their_own_differences():
+def test_motion_gradients_equal_central_differences():
     """A calibration of the motion needs those of a rolling shutter's travel and turn."""
     case = clear(case_of("pinhole", samples=0, threshold_width=1e-3))
     weights = single(np.random.default_rng(1).normal(size=(5, case.height * case.width)))
@@ -348,7 +348,7 @@ def test_gradients_with_respect_to_the_motion_equal_their_own_differences():
     [("pinhole", FLOAT32), ("pinhole", FLOAT64), ("fisheye", FLOAT32)],
     ids=["pinhole, float32", "pinhole", "fisheye"],
 )
-def test_a_camera_that_moves_quickly_stays_finite(precision, samples, turn, travel, name):
+def test_fast_camera_motion_stays_finite(precision, samples, turn, travel, name):
     """Past the splats, through them, away from them; and positions that are no numbers."""
     case = case_of(name, samples=samples, turn=turn, travel=travel)
     means = case.gaussians.means.copy()

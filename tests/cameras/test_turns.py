@@ -43,7 +43,7 @@ def turns() -> np.ndarray:
 
 
 @both_precisions
-def test_a_turn_is_the_rotation_of_its_axis_and_angle(precision):
+def test_rotation_vector_gives_rotation_about_its_axis_by_its_length(precision):
     actual = np.moveaxis(np.array(rotation_matrix(precision.vectors(turns()))), -1, 0)
     expected = Rotation.from_rotvec(turns()).as_matrix()
     # Some roundings of numbers of size one. Measured: 4e-16 and 2e-7.
@@ -52,7 +52,7 @@ def test_a_turn_is_the_rotation_of_its_axis_and_angle(precision):
 
 
 @both_precisions
-def test_the_turn_of_a_rotation_is_found_again(precision):
+def test_rotation_vector_inverts_rotation_matrix(precision):
     rotations = Rotation.from_rotvec(turns()).as_matrix()
     actual = rows(rotation_vector(matrices(rotations, precision)))
     angles = np.linalg.norm(turns(), axis=1)
@@ -64,7 +64,7 @@ def test_the_turn_of_a_rotation_is_found_again(precision):
 
 
 @both_precisions
-def test_turns_are_found_again_from_their_own_rotations(precision):
+def test_rotation_vectors_survive_a_round_trip(precision):
     """Both ways, without another computation between them."""
     angles = np.linalg.norm(turns(), axis=1)
     kept = turns()[angles < 2.5]
@@ -73,7 +73,7 @@ def test_turns_are_found_again_from_their_own_rotations(precision):
     np.testing.assert_allclose(again, kept, rtol=0, atol=tolerance)
 
 
-def test_derivatives_at_no_turn_are_those_of_a_small_one():
+def test_derivatives_at_zero_rotation_match_small_rotations():
     """(a_x)' = e_x: nothing is divided by an angle of zero."""
     turn = FLOAT64.vectors(np.zeros((1, 3)))
     dr.enable_grad(turn)

@@ -24,7 +24,7 @@ def loaded(**parts):
 TWO_SIDED = {"type": "twosided", "bsdf": {"type": "diffuse"}}
 
 ROOM = {"type": "cube", "bsdf": TWO_SIDED}
-"""Of side 2; the outer sides of its walls are the fronts."""
+"""Cube of side 2; the outer sides of its walls are the fronts."""
 
 LAMP = {
     "type": "sphere",
@@ -53,7 +53,7 @@ def centers(scene, settings):
 # Which kind
 
 
-def test_cornells_box_is_photographed_from_inside():
+def test_cornell_box_is_captured_from_inside():
     scene = mi.load_dict(mi.cornell_box())
     settings = derived(scene, views=12, test_views=4, size=(16, 16), spp=4)
     assert (settings.cameras, settings.up) == ("inside", "y")
@@ -67,7 +67,7 @@ def test_cornells_box_is_photographed_from_inside():
         assert (rendered[:, :, 3] > 0).mean() > 0.15
 
 
-def test_a_room_of_two_sided_walls_is_photographed_from_inside():
+def test_room_of_two_sided_walls_is_captured_from_inside():
     """No light comes out: from around, all is black."""
     scene = loaded(room=ROOM, lamp=LAMP)
     settings = derived(scene)
@@ -75,7 +75,7 @@ def test_a_room_of_two_sided_walls_is_photographed_from_inside():
     assert (np.abs(centers(scene, settings)) < 1).all()
 
 
-def test_a_room_that_is_lit_outside_as_well_is_one_where_its_own_sensor_stands_inside():
+def test_room_lit_from_outside_is_captured_from_inside_if_its_sensor_is_inside():
     parts = {"room": ROOM, "lamp": LAMP, "sky": SKY}
     assert derived(loaded(**parts)).cameras == "around"
     inside = sensor((0.5, 0, 0), (-1, 0, 0))
@@ -83,13 +83,13 @@ def test_a_room_that_is_lit_outside_as_well_is_one_where_its_own_sensor_stands_i
 
 
 @pytest.mark.parametrize("bsdf", [{"type": "diffuse"}, TWO_SIDED], ids=["one side", "two"])
-def test_an_object_is_photographed_from_around(bsdf):
+def test_object_is_captured_from_around(bsdf):
     """It is closed as a room is, but dark inside."""
     settings = derived(loaded(ball={"type": "sphere", "bsdf": bsdf}, sky=SKY))
     assert settings == CaptureSettings()
 
 
-def test_a_place_around_the_scene_that_is_given_is_kept():
+def test_options_of_cameras_around_place_them_around():
     scene = mi.load_dict(mi.cornell_box())
     for given in ({"distance": 3.0}, {"azimuth": (-20.0, 20.0)}, {"elevation": (0.0, 20.0)}):
         assert derived(scene, **given).cameras == "around"
@@ -140,7 +140,7 @@ BALL = {
 }
 
 
-def test_many_sensors_take_the_images_themselves():
+def test_many_sensors_are_used_as_cameras():
     scene = loaded(ball=BALL, sky=SKY, **ring(17))
     settings = derived(scene, size=(8, 8), spp=64)
     assert (settings.cameras, settings.views, settings.test_views) == ("sensors", 14, 3)
@@ -152,8 +152,8 @@ def test_many_sensors_take_the_images_themselves():
     integrator = mi.load_dict({"type": "path", "hide_emitters": True})
     for view, number in zip(views, order, strict=True):
         assert math.degrees(view.fov) == pytest.approx(40 + number, abs=1e-4)
-        # By Mitsuba, through the sensor itself. At an edge, 64 samples in 8x8 strata err by 1/8 of
-        # the largest channel, 0.6, at most.
+        # Rendered by Mitsuba through the sensor itself. At an edge, 64 samples in
+        # 8x8 strata err by 1/8 of the largest channel, 0.6, at most.
         own = scene.sensors()[number]
         shown = np.array(mi.render(scene, sensor=own, integrator=integrator, spp=64))
         np.testing.assert_allclose(camera.linear(view)[:, :, :3], shown[:, :, :3], atol=0.075)
@@ -171,7 +171,7 @@ def test_placement_options_are_refused_with_sensors(name):
     assert str(error.value) == f"{option}: is not used with --cameras sensors; leave it out"
 
 
-def test_settings_that_do_not_go_together_are_refused():
+def test_contradictory_settings_are_refused():
     scene = loaded(ball=BALL, sky=SKY)
     with pytest.raises(UserError, match="--cameras sensors: the scene has no sensor of type"):
         derived(scene, cameras="sensors")
@@ -182,10 +182,10 @@ def test_settings_that_do_not_go_together_are_refused():
         camera_placement.views_of(scene, outside)
 
 
-# Where exactly
+# Exact positions
 
 
-def test_cameras_inside_stand_between_what_they_look_at_and_what_is_around():
+def test_cameras_inside_stand_between_target_and_walls():
     scene = loaded(room=ROOM)
     target = (0.4, -0.3, 0.1)
     settings = derived(scene, cameras="inside", target=target, views=40, test_views=0)
@@ -197,7 +197,7 @@ def test_cameras_inside_stand_between_what_they_look_at_and_what_is_around():
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-z"])
-def test_ranges_of_angles_are_kept_and_filled_evenly(up):
+def test_angles_fill_their_ranges_evenly(up):
     settings = CaptureSettings(
         test_views=200, up=up, azimuth=(-30.0, 60.0), elevation=(-10.0, 40.0)
     )
@@ -231,7 +231,7 @@ def test_wrong_ranges_are_refused(given, message):
         CaptureSettings(**given)
 
 
-def test_the_whole_hemisphere_needs_no_range():
+def test_default_range_is_the_whole_hemisphere():
     settings = CaptureSettings(views=7)
     same = replace(settings, elevation=(0.0, 90.0))
     for one, other in zip(

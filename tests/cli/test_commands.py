@@ -33,7 +33,7 @@ def test_help_shows_the_command_with_an_example(capsys, name):
 
 
 @pytest.mark.parametrize("command", [fit, render, capture, bench])
-def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
+def test_help_of_modules_shows_python_m(capsys, command):
     status, out, _ = ended(capsys, command.main, "--help")
     module = command.__name__.removesuffix(".__main__")
     assert status == 0 and out.startswith(f"usage: python -m {module} ")
@@ -64,13 +64,13 @@ def test_modules_are_commands_too_and_say_how_they_are_called(capsys, command):
         (["render", "a.ply"], "the following arguments are required: --out"),
     ],
 )
-def test_wrong_command_lines_end_with_2_and_say_why(capsys, words, message):
+def test_invalid_command_lines_exit_with_2_and_the_reason(capsys, words, message):
     status, out, error = ended(capsys, commands.main, *words)
     assert (status, out) == (2, "")
     assert message in error and "Traceback" not in error
 
 
-def test_the_list_of_commands_imports_none_of_them(run_python):
+def test_listing_commands_imports_none_of_them(run_python):
     program = (
         "import sys\n"
         "from drgs.__main__ import main\n"
@@ -84,7 +84,7 @@ def test_the_list_of_commands_imports_none_of_them(run_python):
     assert run_python(program).stdout.splitlines()[-1] == "[]"
 
 
-def test_a_command_is_run_with_its_arguments_and_knows_how_it_was_called():
+def test_command_receives_its_arguments_and_program_name():
     seen = []
 
     def add_arguments(parser):
@@ -95,7 +95,7 @@ def test_a_command_is_run_with_its_arguments_and_knows_how_it_was_called():
     assert (seen[0].count, seen[0].prog) == (3, "some command")
 
 
-def test_arguments_are_added_once():
+def test_parser_adds_arguments_of_a_command_once():
     parser = CommandParser(prog="drgs", module="drgs.__main__")
     for _ in range(2):
         args, _ = parser.parse_known_args(["fit", "a.yml"])
@@ -103,14 +103,14 @@ def test_arguments_are_added_once():
 
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "1.5", "two", "1e3"])
-def test_numbers_that_are_not_whole_or_too_small_are_refused(text):
+def test_non_integers_and_small_numbers_are_refused(text):
     with pytest.raises(argparse.ArgumentTypeError, match="must be a whole number >= 1, got"):
         bounded_int(1)(text)
     assert bounded_int(0)("0") == 0 and bounded_int(1)("+7") == 7
 
 
 @pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e999", "x"])
-def test_numbers_that_are_not_finite_are_refused(text):
+def test_nonfinite_numbers_are_refused(text):
     with pytest.raises(argparse.ArgumentTypeError, match="must be a finite number, got"):
         finite_number(text)
     assert finite_number("-1e3") == -1000.0

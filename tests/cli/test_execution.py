@@ -28,7 +28,7 @@ def variant():
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_left_behind():
+def settings_are_restored():
     before = dr.flag(DEBUG), dr.thread_count(), sys.gettrace(), sys.stderr
     yield
     assert (dr.flag(DEBUG), dr.thread_count(), sys.gettrace(), sys.stderr) == before
@@ -45,18 +45,18 @@ def write_beyond_the_end():
 
 
 # ----------------------------------------------------------------------------------------------
-# As a context
+# Context manager
 # ----------------------------------------------------------------------------------------------
 
 
-def test_range_checks_are_on_only_if_asked_for_and_only_within():
+def test_range_checks_are_on_only_within_the_block_and_if_enabled():
     for debug in (False, True):
         with execution_settings(threads=None, debug=debug):
             assert dr.flag(DEBUG) == debug
         assert not dr.flag(DEBUG)
 
 
-def test_debuggers_trace_function_is_given_back():
+def test_trace_function_of_a_debugger_is_restored():
     def trace(*_):
         return None
 
@@ -77,7 +77,7 @@ def test_debuggers_trace_function_is_given_back():
         (write_beyond_the_end, 2, "drjit.scatter(): out-of-bounds write to position 9 in an array"),
     ],
 )
-def test_access_out_of_range_is_an_error_that_names_it(capsys, access, line, report):
+def test_out_of_range_access_is_reported(capsys, access, line, report):
     with (
         pytest.raises(UserError) as error,
         execution_settings(threads=None, debug=True) as check_ranges,
@@ -97,7 +97,7 @@ def test_error_of_the_block_is_not_replaced_by_a_report():
         1 / 0  # noqa: B018
 
 
-def test_threads_are_as_many_as_asked_for_within():
+def test_number_of_threads_is_set_within_the_block():
     before = dr.thread_count()
     for count in (1, before + 1):
         with execution_settings(threads=count, debug=False):
@@ -116,7 +116,7 @@ def denormal_product(count):
     reason="the mode is only known there",
 )
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_denormal_numbers_are_zero_on_any_number_of_threads(count):
+def test_denormals_are_flushed_on_any_number_of_threads(count):
     with execution_settings(threads=count, debug=False):
         for size in (1, 64, 1_000_000):
             assert np.all(denormal_product(size) == 0)
@@ -124,7 +124,7 @@ def test_denormal_numbers_are_zero_on_any_number_of_threads(count):
     assert np.float32(1e-30) * np.float32(1e-10) > 0
 
 
-def test_number_of_threads_that_the_system_refuses_is_the_users_to_change(monkeypatch):
+def test_refused_number_of_threads_is_a_user_error(monkeypatch):
     set_thread_count = dr.set_thread_count
 
     def refuse(count):
@@ -166,7 +166,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.fixture
-def in_every_step(monkeypatch):
+def step_callbacks(monkeypatch):
     """Calls of ``Trainer.step`` call these, with the trainer, when they are done."""
     acts, step = [], Trainer.step
 
@@ -188,12 +188,10 @@ def fails(capsys, command, *arguments):
     return capsys.readouterr().err
 
 
-def test_fit_has_no_access_out_of_range_and_gives_the_same_bytes_with_range_checks(
-    scene, tmp_path, in_every_step, capsys
-):
+def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, step_callbacks, capsys):
     """Across a change of the population, of the SH degree, and an opacity reset."""
     flags = []
-    in_every_step.append(lambda trainer: flags.append(dr.flag(DEBUG)))
+    step_callbacks.append(lambda trainer: flags.append(dr.flag(DEBUG)))
     for name, options in (("plain", []), ("checked", ["--debug", "--threads", "1"])):
         fit.main([str(scene / "a.yml"), "--out", str(tmp_path / name), *options])
     assert flags == [False] * 3 + [True] * 3
@@ -204,10 +202,10 @@ def test_fit_has_no_access_out_of_range_and_gives_the_same_bytes_with_range_chec
         assert plain == checked, name
 
 
-def test_fit_stops_at_an_access_out_of_range_and_keeps_the_last_checkpoint(
-    scene, tmp_path, in_every_step, capsys
+def test_fit_stops_at_out_of_range_access_and_keeps_the_last_checkpoint(
+    scene, tmp_path, step_callbacks, capsys
 ):
-    in_every_step.append(lambda trainer: trainer.iteration == 2 and read_beyond_the_end())
+    step_callbacks.append(lambda trainer: trainer.iteration == 2 and read_beyond_the_end())
     out = tmp_path / "out"
     message = fails(capsys, fit, scene / "a.yml", "--out", out, "--debug").splitlines()[-1]
     assert message.startswith("error: --debug: drjit.gather(): out-of-bounds read from position 7")
@@ -233,7 +231,7 @@ def test_render_gives_the_same_bytes_with_range_checks(scene, tmp_path, monkeypa
     assert plain == checked
 
 
-def test_render_fails_after_an_access_out_of_range(scene, tmp_path, monkeypatch, capsys):
+def test_render_fails_after_out_of_range_access(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(render, "render_cameras", lambda *_: [read_beyond_the_end()])
     camera = ("--origin", "0", "-4", "1", "--out", tmp_path / "out")
     message = fails(capsys, render, scene / "blobs.ply", *camera, "--debug").splitlines()[-1]
@@ -253,7 +251,7 @@ def test_render_fails_after_an_access_out_of_range(scene, tmp_path, monkeypatch,
         ),
     ],
 )
-def test_wrong_numbers_of_threads_are_refused(scene, tmp_path, capsys, command, count, message):
+def test_invalid_numbers_of_threads_are_refused(scene, tmp_path, capsys, command, count, message):
     what = scene / ("a.yml" if command is fit else "blobs.ply")
     arguments = (what, "--out", tmp_path / "out", "--threads", count)
     errors = fails(capsys, command, *arguments)

@@ -58,13 +58,13 @@ def test_names_are_printed_in_any_encoding(name):
     assert out.errors == "strict"  # as before
 
 
-def test_a_closed_stream_is_left_alone():
+def test_closed_stream_is_left_alone():
     out, err = ascii_streams()
     with redirect_stdout(out), redirect_stderr(err), escape_unencodable():
         out.close()
 
 
-def test_a_note_is_a_line_of_the_output():
+def test_user_note_is_printed_as_a_line():
     def act():
         warnings.warn(UserNote("a.ply: clamped"), stacklevel=1)
 
@@ -73,7 +73,7 @@ def test_a_note_is_a_line_of_the_output():
     assert outcome.stderr == ""
 
 
-def test_pillow_notes_nothing(tmp_path, monkeypatch):
+def test_pillow_warnings_are_not_printed(tmp_path, monkeypatch):
     """Pillow warns of large images that are not too large for drgs."""
     write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
@@ -86,14 +86,14 @@ def test_pillow_notes_nothing(tmp_path, monkeypatch):
     assert (outcome.returncode, outcome.stderr, caught) == (0, "", [])
 
 
-def test_an_error_whose_names_hold_line_ends_is_one_line():
+def test_error_with_newlines_is_printed_on_one_line():
     def act():
         raise UserError("a\nb.yml: wrong")
 
     assert run_in_process(command(act)).stderr == "error: a b.yml: wrong\n"
 
 
-def test_of_a_long_error_both_ends_are_shown():
+def test_long_error_is_shortened_in_the_middle():
     def act():
         raise UserError(f"a.yml: {'x' * 5000}; remove it")
 
@@ -102,7 +102,7 @@ def test_of_a_long_error_both_ends_are_shown():
     assert " ... " in line and len(line) < 1000
 
 
-def test_folders_of_users_are_found_or_refused(monkeypatch):
+def test_home_folders_are_expanded_or_refused(monkeypatch):
     monkeypatch.setenv("HOME", "/home/somebody")
     assert file_or_folder("~/out") == Path("/home/somebody/out")
     with pytest.raises(argparse.ArgumentTypeError, match=r"home directory.*: ~no-such-user/out"):
@@ -121,7 +121,7 @@ def test_folders_of_users_are_found_or_refused(monkeypatch):
         (["--sise", "a\nb"], "unrecognized arguments: --sise a b"),
     ],
 )
-def test_a_wrong_command_line_is_answered_in_one_line(words, message):
+def test_invalid_command_line_is_reported_in_one_line(words, message):
     outcome = run_in_process(command(lambda: None), *words)
     assert outcome.returncode == 2 and outcome.stdout == ""
     assert outcome.stderr.startswith(f"error: {message}")
@@ -133,7 +133,7 @@ def test_a_wrong_command_line_is_answered_in_one_line(words, message):
 
 
 @pytest.fixture
-def interrupt_is_given_back():
+def sigint_handler_is_restored():
     before = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, before)
@@ -143,7 +143,7 @@ def interrupted():
     signal.raise_signal(signal.SIGINT)
 
 
-def interrupted_in_a_callback():
+def raise_interrupt_in_a_callback():
     """Raise as Dr.Jit does, whose own error hides the exception raised within it."""
     try:
         interrupted()
@@ -151,15 +151,15 @@ def interrupted_in_a_callback():
         raise RuntimeError("drjit.backward(): failed (see above)") from cause
 
 
-@pytest.mark.usefixtures("interrupt_is_given_back")
-@pytest.mark.parametrize("act", [interrupted, interrupted_in_a_callback])
+@pytest.mark.usefixtures("sigint_handler_is_restored")
+@pytest.mark.parametrize("act", [interrupted, raise_interrupt_in_a_callback])
 def test_an_interrupt_ends_a_command_without_a_traceback(act):
     outcome = run_in_process(command(act))
     assert (outcome.returncode, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")
     assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL  # what comes now ends it at once
 
 
-@pytest.mark.usefixtures("interrupt_is_given_back")
+@pytest.mark.usefixtures("sigint_handler_is_restored")
 def test_sigterm_ends_a_command_as_ctrl_c_does(tmp_path):
     """Files that it was writing are removed. Afterwards the signal is what it was."""
     before = signal.getsignal(signal.SIGTERM)
@@ -187,7 +187,7 @@ def ended_process(*lines):
     return ended.returncode, ended.stderr
 
 
-def test_an_interrupt_within_an_exec_ends_a_process_with_its_status():
+def test_interrupt_within_exec_ends_a_process_with_its_status():
     """CPython would end by SIGINT then; dataclasses are made so, while modules are imported."""
     act = "exec('signal.raise_signal(signal.SIGINT)')"
     assert ended_process(act) == (130, "interrupted\n")
@@ -196,13 +196,13 @@ def test_an_interrupt_within_an_exec_ends_a_process_with_its_status():
 @pytest.mark.parametrize(
     ("name", "expected"), [("SIGINT", (130, "interrupted\n")), ("SIGTERM", (143, "terminated\n"))]
 )
-def test_a_signal_within_an_import_ends_a_process_at_once(name, expected):
+def test_signal_during_an_import_ends_a_process_at_once(name, expected):
     """Modules may hide what is raised."""
     lines = "with interruptible_imports():", "  try:", f"    signal.raise_signal(signal.{name})"
     assert ended_process(*lines, "  except BaseException:", "    pass") == expected
 
 
-def test_other_errors_keep_their_tracebacks():
+def test_unexpected_errors_keep_their_tracebacks():
     with pytest.raises(ZeroDivisionError), exit_on_interrupt():
         print(1 / 0)
     with pytest.raises(SystemExit, match="3"), exit_on_interrupt():

@@ -21,7 +21,7 @@ def lines(capsys):
     return capsys.readouterr().out.splitlines()
 
 
-def test_a_log_file_gets_a_line_every_ten_seconds_and_the_last(clock, capsys):
+def test_log_file_gets_a_line_every_ten_seconds_and_the_last(clock, capsys):
     with RunProgress("image", 50) as shown:
         for done in range(1, 51):
             clock[0] += 1.0
@@ -35,7 +35,7 @@ def test_a_log_file_gets_a_line_every_ten_seconds_and_the_last(clock, capsys):
     ]
 
 
-def test_the_pace_is_that_since_the_first_update(clock, capsys):
+def test_pace_is_measured_since_the_first_update(clock, capsys):
     """Work done before the start takes no time, and compiling is no iteration."""
     with RunProgress("iteration", 1000, done=400) as shown:
         clock[0] += 60.0
@@ -48,7 +48,7 @@ def test_the_pace_is_that_since_the_first_update(clock, capsys):
     ]
 
 
-def test_the_total_may_change_on_the_way(clock, capsys):
+def test_total_may_change_during_a_run(clock, capsys):
     with RunProgress("iteration", 10) as shown:
         shown.update(1, 10)
         clock[0] += LOG_SECONDS

@@ -62,7 +62,7 @@ def check(found):
 
 
 @pytest.mark.parametrize("family", QUICK)
-def test_attacks_end_in_results_or_in_one_line(attack_folder, family):
+def test_attacks_end_in_results_or_a_one_line_error(attack_folder, family):
     found = [a for a in attacks(family, attack_folder) if not a.risky and not a.is_long]
     chosen = some(found, QUICK[family])
     check({attack.name: trial(attack, attack_folder) for attack in chosen})
@@ -70,7 +70,7 @@ def test_attacks_end_in_results_or_in_one_line(attack_folder, family):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
-def test_many_attacks_end_in_results_or_in_one_line(attack_folder, tmp_path, family):
+def test_many_attacks_end_in_results_or_a_one_line_error(attack_folder, tmp_path, family):
     with Server(tmp_path) as server:
         chosen = some(attacks(family, attack_folder), SLOW[family], seed=1)
         check({attack.name: server.trial(attack.name, attack.seconds) for attack in chosen})

@@ -63,7 +63,7 @@ def leave_a_temporary_file():
     open("out/.a.7.tmp.txt", "w").close()
 
 
-def print_what_no_terminal_can():
+def print_unencodable_text():
     print("\u00e4")
 
 
@@ -76,19 +76,19 @@ BREACHES = {
     "long line": (lambda: refuse("error: " + "x" * 3000), "a line of 3007 characters"),
     "warning": (warn, "standard error: UserWarning: of what?"),
     "memory": (take_memory, "MB more"),
-    "time": (wait, "TooLong"),
+    "time": (wait, "TimeLimitExceeded"),
     "file of the user's": (lambda: write("mine/notes.txt"), "changed mine/notes.txt"),
     "removed": (lambda: os.unlink("sky.png"), "removed sky.png"),
     "beside the output": (lambda: write("new/a"), "made new/a"),
     "refused too late": (lambda: write_and_refuse("out/a"), "made out/a"),
     "elsewhere": (write_elsewhere, "wrote outside"),
     "temporary": (leave_a_temporary_file, "left out/.a.7.tmp.txt"),
-    "encoding": (print_what_no_terminal_can, "UnicodeEncodeError"),
+    "encoding": (print_unencodable_text, "UnicodeEncodeError"),
 }
 
 
 @pytest.mark.parametrize(("command", "message"), BREACHES.values(), ids=BREACHES)
-def test_what_no_command_may_do_is_noticed(attack_folder, monkeypatch, command, message):
+def test_forbidden_behaviour_is_detected(attack_folder, monkeypatch, command, message):
     monkeypatch.setattr("drgs.render.main", lambda words: command())
     seconds = 0.5 if command is wait else 20
     wrong = trial(Attack("x", "render", (), encoding="ascii", seconds=seconds), attack_folder)
@@ -105,7 +105,7 @@ def test_a_refusal_names_the_file(attack_folder, monkeypatch, message, wrong):
     assert trial(Attack("x", "render", (), named="a.yml"), attack_folder) == wrong
 
 
-def test_what_must_be_refused_and_is_not_is_noticed(attack_folder, monkeypatch):
+def test_missing_refusal_is_detected(attack_folder, monkeypatch):
     monkeypatch.setattr("drgs.render.main", lambda words: None)
     assert trial(Attack("x", "render", (), must_refuse=True), attack_folder) == ["was not refused"]
 
@@ -125,9 +125,7 @@ def forgetful_work(words):
 
 
 @pytest.mark.parametrize(("command", "is_right"), [(work, True), (forgetful_work, False)])
-def test_work_that_does_not_survive_a_kill_is_noticed(
-    attack_folder, monkeypatch, command, is_right
-):
+def test_work_lost_after_a_kill_is_detected(attack_folder, monkeypatch, command, is_right):
     monkeypatch.setattr("drgs.render.main", command)
     found = []
     for at in range(14):
@@ -139,7 +137,7 @@ def test_work_that_does_not_survive_a_kill_is_noticed(
     assert (stale == []) is is_right, found
 
 
-def test_the_workshop_is_put_back(attack_folder):
+def test_attack_folder_is_restored(attack_folder):
     before = contents(attack_folder.folder)
     (attack_folder.folder / "sky.png").unlink()
     (attack_folder.folder / "mine" / "notes.txt").write_text("changed")
@@ -147,5 +145,5 @@ def test_the_workshop_is_put_back(attack_folder):
     (attack_folder.folder / "new").mkdir()
     os.mkfifo(attack_folder.folder / "new" / "pipe")
     assert contents(attack_folder.folder) != before
-    attack_folder.put_back()
+    attack_folder.restore_files()
     assert contents(attack_folder.folder) == before

@@ -252,7 +252,7 @@ def test_wrong_input_ends_with_status_2_and_one_line(scene, capsys, damage, mess
 
 
 @pytest.mark.parametrize(("weight", "first"), [(0.2, "there is no image"), (0, "points.ply")])
-def test_a_fit_opens_depths_if_its_loss_looks_at_them(scene, capsys, weight, first):
+def test_fit_opens_depths_if_its_loss_uses_them(scene, capsys, weight, first):
     """Which of two files that are missing is missed first."""
     edit_transforms(lambda m: m["frames"][1].update(depth_file_path="nowhere.png"))(scene)
     (scene / "points.ply").unlink()
@@ -262,7 +262,7 @@ def test_a_fit_opens_depths_if_its_loss_looks_at_them(scene, capsys, weight, fir
 
 
 @pytest.mark.parametrize("size", [10**6, 2**31 - 1])
-def test_an_image_that_claims_to_be_huge_takes_no_memory(scene, size):
+def test_image_header_of_huge_size_allocates_no_memory(scene, size):
     path = scene / "train" / "1.png"
     content = bytearray(path.read_bytes())
     content[16:24] = struct.pack(">II", size, size)
@@ -302,7 +302,7 @@ def test_the_command_itself_refuses_a_damaged_point_cloud(scene):
     assert not (scene / "out").exists()
 
 
-def test_an_earlier_result_stays_as_it_is(scene):
+def test_earlier_result_is_kept(scene):
     first = run_command(scene / "a.yml")
     assert first.returncode == 0, first.stderr
     before = contents(scene / "out")
@@ -333,7 +333,7 @@ def test_an_output_folder_that_is_a_file_is_refused(scene):
 # Permissions
 
 
-NOBODY = 65534
+NOBODY_UID = 65534
 """The user without rights, by Linux's convention."""
 
 
@@ -345,8 +345,8 @@ def as_ordinary_user():
     was_root = os.geteuid() == 0
     if was_root:
         for path in (folder, *folder.rglob("*")):
-            os.chown(path, NOBODY, NOBODY)
-        os.seteuid(NOBODY)
+            os.chown(path, NOBODY_UID, NOBODY_UID)
+        os.seteuid(NOBODY_UID)
     yield folder
     if was_root:
         os.seteuid(0)
@@ -365,7 +365,7 @@ def as_ordinary_user():
         ("points.ply", "points.ply: cannot read the file: Permission denied"),
     ],
 )
-def test_a_file_that_may_not_be_read_is_named(as_ordinary_user, name, message):
+def test_unreadable_file_is_named(as_ordinary_user, name, message):
     (as_ordinary_user / name).chmod(0)
     with pytest.raises(UserError) as error:
         config = load_config(as_ordinary_user / "a.yml")
@@ -374,14 +374,14 @@ def test_a_file_that_may_not_be_read_is_named(as_ordinary_user, name, message):
     assert message in str(error.value)
 
 
-def test_a_data_folder_that_may_not_be_opened_is_named(as_ordinary_user):
+def test_unreadable_data_folder_is_named(as_ordinary_user):
     config = load_config(as_ordinary_user / "a.yml")
     as_ordinary_user.chmod(0)
     with pytest.raises(UserError, match=r"data.path: cannot open the folder .*: Permission denied"):
         load_dataset(config.data)
 
 
-def test_a_folder_that_may_not_be_written_keeps_its_files(as_ordinary_user):
+def test_write_protected_folder_keeps_its_files(as_ordinary_user):
     folder = as_ordinary_user
     config = load_config(folder / "a.yml")
     before = contents(folder)
@@ -443,6 +443,6 @@ def test_a_full_disk_keeps_the_earlier_file(small_disk, name, write_large):
     assert os.listdir(small_disk) == [name]
 
 
-def test_what_fits_on_a_small_disk_is_written(small_disk):
+def test_file_that_fits_on_a_small_disk_is_written(small_disk):
     some_gaussians(9).save(small_disk / "a.ply")
     assert Gaussians.load(small_disk / "a.ply").num_gaussians == 9

@@ -102,7 +102,7 @@ def encode_srgb(linear):
 # Layout and cameras
 
 
-def test_layout_is_that_of_nerf_synthetic(captured):
+def test_layout_matches_nerf_synthetic(captured):
     assert set(contents(captured)) == {
         *("capture.json", "points3d.ply", "transforms_train.json", "transforms_test.json"),
         *(f"train/r_{i}.png" for i in range(6)),
@@ -154,7 +154,7 @@ def test_directions_are_spread_evenly_over_the_upper_hemisphere(jitter):
     assert np.degrees(np.arccos((probes @ directions.T).max(axis=1))).max() < 28
 
 
-def test_splits_and_seeds_have_cameras_of_their_own():
+def test_splits_and_seeds_have_different_cameras():
     settings = CaptureSettings(views=5, val_views=5, test_views=5)
     first = camera_placement.views_around(settings, np.zeros(3), 4.0)
     other = camera_placement.views_around(replace(settings, seed=1), np.zeros(3), 4.0)
@@ -200,7 +200,7 @@ def test_alpha_is_the_coverage_of_a_disc(captured):
         assert alpha.sum() == pytest.approx(math.pi * radius**2, rel=0.02)
 
 
-def test_color_of_covered_pixels_is_encoded_radiance_not_premultiplied(captured):
+def test_color_of_covered_pixels_is_encoded_unpremultiplied_radiance(captured):
     expected = 255 * encode_srgb(ALBEDO)
     for path in captured.glob("*/r_*.png"):
         rgba = iio.imread(path).astype(float)
@@ -233,7 +233,7 @@ def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
     display = encode_srgb(np.array(seen_sky).clip(0, 1))
     expected = display.reshape(size, finer, size, finer, 3).mean(axis=(1, 3))
 
-    # Of the 64 small pixels of one at the edge, about 10 are cut by the edge themselves, and there
+    # About 10 of the 64 small pixels of one at the edge are cut by the edge themselves, and there
     # the order of mixing and encoding matters: up to 0.25 x 10/64. Rounding and noise are smaller.
     assert abs(composited - expected).max() < 0.05
     assert abs(composited - expected).mean() < 0.004
@@ -243,7 +243,7 @@ def test_composite_over_white_agrees_with_a_render_before_a_white_sky(ball):
     assert abs(wrong - expected).max() > 0.1
 
 
-def test_lamps_are_neither_seen_nor_part_of_the_bounding_box(tmp_path, ball, captured):
+def test_lamps_are_invisible_and_outside_the_bounding_box(tmp_path, ball, captured):
     lit = write(tmp_path, "lit.xml", BALL.format(extra=LAMP))
     run(lit, tmp_path / "out", *SMALL)
     for name in (f"test/r_{i}.png" for i in range(3)):
@@ -255,7 +255,7 @@ def test_lamps_are_neither_seen_nor_part_of_the_bounding_box(tmp_path, ball, cap
     assert np.linalg.norm(positions - CENTER, axis=1).max() == pytest.approx(RADIUS, rel=1e-4)
 
 
-def test_encoding_of_known_pixels():
+def test_known_pixels_are_encoded():
     half = 0.2145  # linear value of display 0.5005
     pixels = [[0, 0, 0, 0], [half, 0, 2, 1], [half / 2, 0, 0.5, 0.5], [1e-4, 0, 0, 1e-3]]
     encoded = path_tracing.encode(np.array([pixels]))
@@ -309,7 +309,7 @@ def test_points_of_a_python_scene_lie_on_the_cube(tmp_path):
         assert pixels.max() < 20 + 1e-4
 
 
-def test_points_can_be_left_out(ball, tmp_path):
+def test_points_are_optional(ball, tmp_path):
     out = tmp_path / "out"
     run(ball, out, "--views", 1, "--test-views", 0, "--size", 4, 4, "--spp", 1, "--points", 0)
     assert set(contents(out)) == {"capture.json", "transforms_train.json", "train/r_0.png"}
@@ -329,7 +329,7 @@ def test_another_seed_gives_other_images(ball, captured, tmp_path):
         assert (tmp_path / "other" / name).read_bytes() != (captured / name).read_bytes()
 
 
-def test_a_folder_that_another_capture_writes_to_is_refused(ball, captured, tmp_path, monkeypatch):
+def test_folder_in_use_by_another_capture_is_refused(ball, captured, tmp_path, monkeypatch):
     out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
     write_png, refused = dataset.write_png, []
 
@@ -426,7 +426,7 @@ def refusal(scene, out, *options):
     assert (contents(out) if out.is_dir() else out.read_bytes()) == before
 
 
-def test_folders_of_others_are_left_alone(ball, captured, tmp_path, capsys):
+def test_foreign_folders_are_left_alone(ball, captured, tmp_path, capsys):
     write(tmp_path, "notes.txt", "mine")
     refusal(ball, tmp_path)
     assert "the folder is not empty and holds no capture.json" in capsys.readouterr().err
@@ -455,7 +455,7 @@ def test_a_folder_that_cannot_be_made_is_refused(ball, capsys):
     assert "/dev/null" in capsys.readouterr().err
 
 
-def test_a_changed_neighbour_of_a_python_scene_is_another_scene(tmp_path):
+def test_changed_import_of_a_python_scene_changes_its_fingerprint(tmp_path):
     helper = write(tmp_path, "capture_test_neighbour.py", "SIZE = 1")
     path = write(tmp_path, "s.py", "import capture_test_neighbour\n" + CUBE)
     path_tracing.load_scene(path)
@@ -482,7 +482,7 @@ def test_the_command_runs_as_a_module(ball, tmp_path):
 # The shipped scene
 
 
-def test_shipped_scene_is_in_the_image_and_has_hundreds_of_parts():
+def test_shipped_scene_fits_the_image_and_has_hundreds_of_parts():
     path = REPOSITORY / "scenes" / "brick_crane.py"
     scene = path_tracing.load_scene(path)
     low, high = path_tracing.bounding_box(scene)

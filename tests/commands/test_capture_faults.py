@@ -63,7 +63,7 @@ def refused(outcome):
     return line
 
 
-def test_files_that_were_edited_since_are_kept(ball, captured, tmp_path):
+def test_edited_files_are_kept(ball, captured, tmp_path):
     """A mask in a frame, an image that was touched up; what is missing is made again."""
     run(ball, tmp_path / "out")
     edited = ("transforms_train.json", "points3d.ply", "train/r_0.png")
@@ -80,7 +80,7 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize("place", ["before", "behind"])
 @pytest.mark.parametrize("number", range(FILES))
-def test_a_capture_that_is_killed_at_any_file_goes_on_to_the_same_bytes(
+def test_capture_killed_at_any_file_resumes_to_the_same_bytes(
     ball, captured, tmp_path, monkeypatch, number, place
 ):
     out, replaced, replace = tmp_path / "out", count(), os.replace
@@ -105,7 +105,7 @@ def test_a_capture_that_is_killed_at_any_file_goes_on_to_the_same_bytes(
 
 
 @pytest.mark.parametrize("number", range(FILES))
-def test_a_full_disk_is_said_in_one_line_and_the_capture_goes_on(
+def test_full_disk_is_reported_in_one_line_and_the_capture_resumes(
     ball, captured, tmp_path, monkeypatch, number
 ):
     out, written = tmp_path / "out", count()
@@ -144,16 +144,14 @@ def test_a_full_disk_is_said_in_one_line_and_the_capture_goes_on(
         (["--target", 1e300, 0, 0], "no camera may be farther from the scene than 100000"),
     ],
 )
-def test_what_cannot_be_held_is_refused_with_the_limit(ball, tmp_path, options, message):
+def test_sizes_beyond_limits_are_refused_with_the_limit(ball, tmp_path, options, message):
     line = refused(run(ball, tmp_path / "out", *options))
     assert message in line
     assert len(line) < 300
     assert not (tmp_path / "out").exists()
 
 
-def test_images_that_the_memory_does_not_hold_are_refused_with_its_size(
-    ball, tmp_path, monkeypatch
-):
+def test_images_larger_than_memory_are_refused(ball, tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 2 * 10**9)
     line = refused(run(ball, tmp_path / "out", "--size", 4000, 4000))
     assert "--size: 4000 x 4000 px need about 4 GB of memory, of which 2 GB are available" in line
@@ -171,7 +169,7 @@ def test_images_that_the_memory_does_not_hold_are_refused_with_its_size(
     ],
     ids=["nested without end", "too long", "no JSON", "long value", "a list"],
 )
-def test_strange_notes_of_a_capture_are_refused_and_kept(ball, tmp_path, content, message):
+def test_damaged_capture_json_is_refused_and_kept(ball, tmp_path, content, message):
     path = tmp_path / "capture.json"
     path.write_text(content)
     line = refused(run(ball, tmp_path))
@@ -180,7 +178,7 @@ def test_strange_notes_of_a_capture_are_refused_and_kept(ball, tmp_path, content
     assert contents(tmp_path) == {"capture.json": content.encode()}
 
 
-def test_an_image_of_another_size_among_the_captures_is_refused(ball, captured, tmp_path):
+def test_captured_image_of_another_size_is_refused(ball, captured, tmp_path):
     assert run(ball, tmp_path / "out").returncode == 0
     assert run(ball, tmp_path / "other", "--size", 5, 4).returncode == 0
     path = tmp_path / "out" / "train" / "r_1.png"
@@ -201,7 +199,7 @@ def test_an_image_of_another_size_among_the_captures_is_refused(ball, captured, 
     ],
 )
 @pytest.mark.parametrize("inside", [True, False])
-def test_a_scene_that_changes_the_process_is_refused(tmp_path, program, message, inside):
+def test_scene_that_modifies_the_process_is_refused(tmp_path, program, message, inside):
     lines = ["import mitsuba as mi", "def scene():", "    pass", "    return {'type': 'scene'}"]
     lines.insert(*((3, f"    {program}") if inside else (1, program)))
     path = tmp_path / "s.py"

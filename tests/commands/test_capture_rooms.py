@@ -51,7 +51,7 @@ def inside(cornell, tmp_path_factory):
     return run(cornell, out), out
 
 
-def test_a_room_is_photographed_from_inside_and_nothing_is_dark(inside):
+def test_room_is_captured_from_inside_without_dark_images(inside):
     outcome, out = inside
     assert (outcome.returncode, outcome.stderr) == (0, "")
     assert "cameras: 12 inside the scene, around (" in outcome.stdout
@@ -59,7 +59,7 @@ def test_a_room_is_photographed_from_inside_and_nothing_is_dark(inside):
     parts = lit_parts(out)
     assert len(parts) == 12
     assert min(parts) > 0.7
-    # Of its lamp, too: white, as a photograph would have it.
+    # Including its lamp: white, as in a photograph.
     images = [iio.imread(path) for path in out.glob("*/*.png")]
     assert any((rendered[:, :, :3] == 255).all(axis=2).any() for rendered in images)
 
@@ -74,7 +74,7 @@ def fitting_command(outcome):
     return REPOSITORY / config, words
 
 
-def test_it_ends_with_the_command_that_fits_its_result(inside):
+def test_output_ends_with_the_command_to_fit_the_result(inside):
     path, (data, folder, assign, assignment) = fitting_command(inside[0])
     assert (data, folder, assign) == ("--data", str(inside[1]), "--set")
     config = load_config(path, [f"data.path={folder}", assignment])
@@ -98,7 +98,7 @@ def test_a_fit_of_a_room_shows_the_room(cornell, tmp_path):
 
 
 @pytest.mark.parametrize("options", [["--cameras", "around"], ["--distance", "4"]])
-def test_images_that_are_mostly_black_are_warned_of_in_one_line(cornell, tmp_path, options):
+def test_mostly_black_images_give_a_one_line_warning(cornell, tmp_path, options):
     outcome = run(cornell, tmp_path / "out", *options)
     assert outcome.returncode == 0
     (line,) = outcome.stderr.splitlines()
@@ -106,14 +106,14 @@ def test_images_that_are_mostly_black_are_warned_of_in_one_line(cornell, tmp_pat
     assert "of the first 10 images are empty or black: give --cameras inside" in line
 
 
-def test_images_that_are_mostly_empty_are_warned_of_in_one_line(cornell, tmp_path):
+def test_mostly_empty_images_give_a_one_line_warning(cornell, tmp_path):
     outcome = run(cornell, tmp_path / "out", "--target", 50, 0, 0, "--distance", 9, "--points", 0)
     assert outcome.returncode == 0
     (line,) = outcome.stderr.splitlines()
     assert "warning: 10 of the first 10 images are empty or black" in line
 
 
-def test_the_first_images_are_spread_over_all():
+def test_first_images_are_spread_over_all_views():
     """Else those near the horizon would decide whether a warning is due."""
     order = dataset.spread_first(list(range(125)))
     assert order[:10] == list(range(0, 120, 12))
@@ -122,7 +122,7 @@ def test_the_first_images_are_spread_over_all():
         assert sorted(dataset.spread_first(list(range(count)))) == list(range(count))
 
 
-def test_ranges_of_azimuth_and_elevation_keep_before_the_open_side(cornell, tmp_path):
+def test_azimuth_and_elevation_keep_cameras_at_the_open_side(cornell, tmp_path):
     ranges = ["--azimuth", -25, 25, "--elevation", -15, 20]
     outcome = run(cornell, tmp_path / "out", *ranges)
     assert (outcome.returncode, outcome.stderr) == (0, "")
@@ -134,7 +134,7 @@ def test_ranges_of_azimuth_and_elevation_keep_before_the_open_side(cornell, tmp_
     assert "azimuth is [-25.0, 25.0], requested is [-25.0, 30.0]" in again.stderr
 
 
-def test_the_scenes_own_sensors_are_used_where_asked_for(cornell, tmp_path):
+def test_sensors_of_the_scene_are_used_if_requested(cornell, tmp_path):
     words = [cornell, "--cameras", "sensors", "--size", 12, 12, "--spp", 4, "--points", 0]
     outcome = run_in_process(capture.main, *words, "--out", tmp_path / "out")
     assert (outcome.returncode, outcome.stderr) == (0, "")
@@ -147,7 +147,7 @@ def test_the_scenes_own_sensors_are_used_where_asked_for(cornell, tmp_path):
 
 
 @pytest.mark.parametrize("nested", [False, True])
-def test_splats_are_not_left_out_silently(tmp_path, nested):
+def test_splats_in_a_captured_scene_are_refused(tmp_path, nested):
     path = write_scene(tmp_path)
     if nested:
         text = path.read_text().replace("</integrator>", "</integrator></integrator>")
@@ -165,7 +165,7 @@ INSTANCED = (
 
 
 @pytest.mark.parametrize("scene", ["{'type': 'scene', 'gaussians': shape}", INSTANCED])
-def test_shapes_of_gaussians_are_not_taken_for_surfaces(tmp_path, scene):
+def test_gaussian_shapes_are_not_treated_as_surfaces(tmp_path, scene):
     path = tmp_path / "s.py"
     path.write_text(
         "import mitsuba as mi\n"
@@ -181,7 +181,7 @@ def test_shapes_of_gaussians_are_not_taken_for_surfaces(tmp_path, scene):
     assert "the scene holds splats (it has shapes of type ellipsoids)" in line
 
 
-def test_why_mitsuba_cannot_load_a_scene_is_said_without_a_traceback(tmp_path):
+def test_scene_loading_errors_are_reported_without_a_traceback(tmp_path):
     path = write_scene(tmp_path)
     (tmp_path / "model.ply").unlink()
     line = refusal(path, tmp_path / "out")

@@ -33,7 +33,7 @@ COUNT = 600
 """Mutations of each format."""
 
 MAX_SECONDS = 5.0
-"""Of a single file. They take about 5 ms; the rest is for a machine that is busy."""
+"""Time limit of a single file. Files take about 5 ms; the rest is for a machine that is busy."""
 
 
 # Valid files
@@ -182,7 +182,7 @@ def test_damaged_masks_are_read_or_refused(photographs, layout):
     assert_both_happen(refused)
 
 
-def test_strange_names_are_found_or_said(photographs):
+def test_strange_names_are_found_or_reported(photographs):
     """Names of photographs, masks, clouds and lists: only files are read, and none twice."""
     path, refused = photographs / "transforms.json", []
     meta = json.loads(path.read_text())

@@ -24,7 +24,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import read_gaussians, readable_formats
 from drgs.results.refined_cameras import write_views
 
-OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 VIEWER_RENDERING = {"antialiased": False, "low_pass": 0.3}
 
 
@@ -45,7 +45,7 @@ def fit(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.yml").write_text("")
-    replace(gaussians_within_ranges(20), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
+    replace(gaussians_within_ranges(20), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
     viewers = replace(gaussians_within_ranges(30), rendered_with=VIEWER_RENDERING)
     viewers.save(folder / "point_cloud_viewers.ply")
     write_views(folder / "views.json", make_dataset(6, 1))
@@ -53,7 +53,7 @@ def fit(tmp_path):
 
 
 @pytest.mark.parametrize("each", readable_formats(), ids=lambda each: each.name)
-def test_each_format_is_written_beside_what_is_exported(model, each):
+def test_each_format_is_written_beside_its_source(model, each):
     if each.name == "ply":
         outcome = run(model, "--format", "ply", "--out", model.with_name("out.ply"))
         out = model.with_name("out.ply")
@@ -66,7 +66,7 @@ def test_each_format_is_written_beside_what_is_exported(model, each):
     assert read_gaussians(out)[0].name == each.name
 
 
-def test_of_a_fit_the_file_for_other_programs_is_taken(fit):
+def test_export_of_a_fit_uses_the_file_for_viewers(fit):
     outcome = run(fit, "--format", "glb")
     assert outcome.stdout.splitlines() == [
         f"{fit}/point_cloud_viewers.ply: 30 Gaussians",
@@ -77,7 +77,7 @@ def test_of_a_fit_the_file_for_other_programs_is_taken(fit):
     assert found.rendered_with is None and found.num_gaussians == 30
 
 
-def test_without_that_file_the_fit_s_own_is(fit):
+def test_export_without_the_file_for_viewers_uses_the_own_file(fit):
     (fit / "point_cloud_viewers.ply").unlink()
     outcome = run(fit, "--format", "spz")
     note = "made to be rendered with low_pass 0.1, antialiased true; programs that do not will show"
@@ -86,14 +86,14 @@ def test_without_that_file_the_fit_s_own_is(fit):
     assert Gaussians.load(fit.with_name("run.spz")).rendered_with == {"antialiased": True}
 
 
-def test_a_file_that_is_meant_for_drgs_is_exported_with_a_hint(fit):
+def test_file_with_drgs_approximations_is_exported_with_a_hint(fit):
     outcome = run(fit / "point_cloud.ply", "--out", fit.with_name("a.glb"))
     assert f"export {fit}/point_cloud_viewers.ply instead" in outcome.stdout
-    assert Gaussians.load(fit.with_name("a.glb")).rendered_with == OTHERWISE
+    assert Gaussians.load(fit.with_name("a.glb")).rendered_with == FITTED_WITH
 
 
 @pytest.mark.parametrize(("low_pass", "is_nearer"), [(0.1, True), (0.18, True), (0.2, False)])
-def test_for_playcanvas_the_file_whose_low_pass_is_nearer_is_taken(fit, low_pass, is_nearer):
+def test_playcanvas_export_uses_the_file_with_the_nearer_low_pass(fit, low_pass, is_nearer):
     """Its viewers add 0.075 square pixels, and 0.1875 is in the middle to 0.3."""
     fitted = {"antialiased": True, "low_pass": low_pass}
     replace(gaussians_within_ranges(20), rendered_with=fitted).save(fit / "point_cloud.ply")
@@ -107,7 +107,7 @@ def test_for_playcanvas_the_file_whose_low_pass_is_nearer_is_taken(fit, low_pass
     assert ("made to be rendered with" in outcome.stdout) == (not is_nearer)
 
 
-def test_what_was_exported_is_not_replaced_by_a_part_of_itself(model):
+def test_export_does_not_overwrite_its_source(model):
     run(model, "--format", "spz")
     source = model.with_name("model.spz")
     message = f"--out {source}: is the input; choose another name"
@@ -116,7 +116,7 @@ def test_what_was_exported_is_not_replaced_by_a_part_of_itself(model):
 
 
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb"])
-def test_what_is_written_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
+def test_exported_file_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
     blobs().save(tmp_path / f"model{suffix}")
     Gaussians.load(tmp_path / f"model{suffix}").save(tmp_path / "again.ply")
     camera = ["--origin", 0, -4, 1, "--size", 24, 16]
@@ -145,7 +145,7 @@ def test_smoothing_is_baked_in(tmp_path):
     np.testing.assert_allclose(found.opacities, gaussians.opacities * kept, rtol=1e-5)
 
 
-def test_usd_is_written_where_openusd_is_installed(model):
+def test_usd_is_written_if_openusd_is_installed(model):
     pxr = pytest.importorskip("pxr.UsdVol")
     from pxr import Usd, UsdGeom
 
@@ -171,7 +171,7 @@ def test_usd_is_written_where_openusd_is_installed(model):
     assert splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 1
 
 
-def test_usd_of_equal_gaussians_has_equal_bytes(model):
+def test_equal_gaussians_give_equal_usd_bytes(model):
     pytest.importorskip("pxr.UsdVol")
     contents = []
     for name in ("a.usdc", "b.usdc"):
@@ -180,18 +180,18 @@ def test_usd_of_equal_gaussians_has_equal_bytes(model):
     assert contents[0] == contents[1]
 
 
-def test_without_openusd_a_line_says_what_to_install(model, monkeypatch):
+def test_missing_openusd_is_reported_with_what_to_install(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     message = "USD: needs pxr, which is not installed; pip install 'drgs[usd]'"
     assert_refused(export.main, model, "--format", "usd", folder=model.parent, message=message)
 
 
 # ----------------------------------------------------------------------------------------------
-# What is kept, and how it lies
+# Selection and orientation
 # ----------------------------------------------------------------------------------------------
 
 
-def test_what_is_kept_is_what_the_options_say(model):
+def test_options_select_the_exported_gaussians(model):
     out = model.with_name("out.ply")
     limits = ["--crop", -1, -1, -1, 1, 1, 2, "--min-opacity", 0.2, "--max-size", 0.3]
     outcome = run(model, "--out", out, *limits)
@@ -203,7 +203,7 @@ def test_what_is_kept_is_what_the_options_say(model):
     np.testing.assert_array_equal(Gaussians.load(out).means, g.means[kept])
 
 
-def test_morton_order_puts_neighbours_together(model):
+def test_morton_order_keeps_neighbours_together(model):
     out = model.with_name("out.ply")
     run(model, "--out", out, "--order", "morton")
     before, after = (Gaussians.load(path).means for path in (model, out))
@@ -220,7 +220,7 @@ def means_of(path):
 @pytest.mark.parametrize(
     ("suffix", "up"), [(".glb", [0, 1, 0]), (".spz", [0, 1, 0]), (".compressed.ply", [0, -1, 0])]
 )
-def test_what_is_up_in_the_model_is_up_in_the_file(model, suffix, up):
+def test_up_direction_is_kept_in_the_file(model, suffix, up):
     """One format records its up axis; in the others y points down, as in COLMAP's worlds."""
     out = model.with_name(f"out{suffix}")
     direction = np.array([0.0, 3, 4]) / 5
@@ -230,14 +230,14 @@ def test_what_is_up_in_the_model_is_up_in_the_file(model, suffix, up):
     np.testing.assert_allclose(np.sort(means_of(out) @ np.array(up)), heights, atol=precision)
 
 
-def test_a_world_that_is_as_viewers_expect_it_stays_as_it_is(model):
+def test_world_with_expected_axes_is_unchanged(model):
     out = model.with_name("out.ply")
     run(model, "--out", out, "--up", 0, -1, 0)
     expected = Gaussians.load(model)
     assert_within(replace(PRECISION["glb"], means=4 * FLOAT32), expected, Gaussians.load(out))
 
 
-def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
+def test_files_without_axes_are_not_rotated_by_default(fit, model):
     out = model.with_name("out.ply")
     assert "up:" not in run(model, "--out", out).stdout
     np.testing.assert_array_equal(Gaussians.load(out).means, Gaussians.load(model).means)
@@ -246,7 +246,7 @@ def test_files_that_say_nothing_of_axes_are_not_turned_unasked(fit, model):
 
 
 @pytest.mark.parametrize("optimise", [True, False])
-def test_cameras_are_those_that_the_fit_has_refined(fit, optimise):
+def test_up_direction_uses_refined_cameras(fit, optimise):
     turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     dataset = make_dataset(6, 1)
     turned_views = [replace(v, camera_to_world=pose_turned(v, turn)) for v in dataset.train]
@@ -265,7 +265,7 @@ def pose_turned(view, rotation):
 
 
 # ----------------------------------------------------------------------------------------------
-# What is refused
+# Errors
 # ----------------------------------------------------------------------------------------------
 
 
@@ -291,12 +291,12 @@ def pose_turned(view, rotation):
         (["model.ply", "--format", "spz", "--max-size", "1e-9"], "nothing is left; crop and filt"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(model, monkeypatch, arguments, message):
+def test_invalid_exports_are_refused(model, monkeypatch, arguments, message):
     monkeypatch.chdir(model.parent)
     assert_refused(export.main, *arguments, folder=model.parent, message=message)
 
 
-def test_another_s_file_is_not_replaced_and_one_s_own_is(model):
+def test_foreign_file_is_kept_and_own_file_is_replaced(model):
     out = model.with_name("model.spz")
     out.write_bytes(b"mine")
     message = "holds model.spz, which this command would replace and has not written"

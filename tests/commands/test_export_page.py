@@ -16,7 +16,7 @@ from drgs import export
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.refined_cameras import write_views
 
-OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 
 
 @pytest.fixture
@@ -24,8 +24,8 @@ def fit(tmp_path):
     """A folder as a fit leaves it: more Gaussians of its own than for viewers."""
     folder = tmp_path / "run"
     folder.mkdir()
-    configure(folder, OTHERWISE)
-    replace(blobs(30), rendered_with=OTHERWISE).save(folder / "point_cloud.ply")
+    configure(folder, FITTED_WITH)
+    replace(blobs(30), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
     blobs(20).save(folder / "point_cloud_viewers.ply")
     write_views(folder / "views.json", make_dataset())
     return folder
@@ -46,7 +46,7 @@ def exported(what, out, *options):
     return outcome.stdout, page, json.loads(scene), Gaussians.load(model)
 
 
-def test_of_a_fit_its_own_gaussians_are_shown_as_they_were_fitted(fit, tmp_path):
+def test_page_of_a_fit_shows_its_own_gaussians(fit, tmp_path):
     said, page, scene, gaussians = exported(fit, tmp_path / "a.html")
     assert said.splitlines()[0] == f"{fit}/point_cloud.ply: 30 Gaussians"
     assert "note" not in said and gaussians.num_gaussians == 30
@@ -55,15 +55,15 @@ def test_of_a_fit_its_own_gaussians_are_shown_as_they_were_fitted(fit, tmp_path)
     assert "<title>run: Gaussian splats</title>" in page
 
 
-def test_of_a_fit_that_the_page_cannot_show_those_for_viewers_are(fit, tmp_path):
-    configure(fit, {**OTHERWISE, "order": "pixel"})
+def test_page_of_an_unsupported_fit_shows_gaussians_for_viewers(fit, tmp_path):
+    configure(fit, {**FITTED_WITH, "order": "pixel"})
     said, _, scene, gaussians = exported(fit, tmp_path / "a.html")
     assert said.splitlines()[0] == f"{fit}/point_cloud_viewers.ply: 20 Gaussians"
     assert gaussians.num_gaussians == 20
     assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.3), False)
 
 
-def test_the_first_view_of_a_fit_is_that_of_a_training_camera(fit, tmp_path):
+def test_first_view_of_a_fit_is_a_training_camera(fit, tmp_path):
     """The nearest Gaussian and the farthest one are as far away as they are from that camera."""
     _, _, scene, gaussians = exported(fit, tmp_path / "a.html")
     back = scene["settings"]["cameras"][0]["initial"]["position"]
@@ -78,7 +78,7 @@ def test_the_first_view_of_a_fit_is_that_of_a_training_camera(fit, tmp_path):
 
 
 @pytest.mark.parametrize("options", [(), ("--up", 0, 0, 1)])
-def test_a_file_is_shown_whole_with_z_up(fit, tmp_path, options):
+def test_file_is_shown_as_a_whole_with_z_up(fit, tmp_path, options):
     what = fit / "point_cloud.ply" if not options else fit
     _, _, scene, gaussians = exported(what, tmp_path / "a.html", *options)
     heights = np.sort(-gaussians.means[:, 1])

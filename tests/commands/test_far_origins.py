@@ -33,7 +33,7 @@ from drgs.results.refined_cameras import write_views
 
 PLACE = np.array([4.2e6, 1.7e5, -4.78e6])
 ORIGIN = (4200001.0, 169999.0, -4779998.0)
-"""Of the Gaussians; another one than the dataset gets from its cameras."""
+"""Origin of the Gaussians, which differs from that of the dataset."""
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_exports_keep_the_origin_and_crop_in_world_coordinates(far, tmp_path):
     assert_ends_well(export.main, far, "--format", "html", "--out", tmp_path / "page.html")
 
 
-def test_the_plugin_renders_relative_to_the_origin_and_says_so(far, tmp_path):
+def test_plugin_renders_relative_to_the_origin_and_notes_it(far, tmp_path):
     pose = pose_around(1.0, 0.4)
     moved = pose.copy()
     moved[:3, 3] += PLACE - ORIGIN

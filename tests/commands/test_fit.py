@@ -141,12 +141,12 @@ def test_fit_writes_its_outputs_and_nothing_temporary(fitted):
     assert visible(out) == {*OUTPUTS, *images}
 
 
-def test_the_terminal_ends_with_what_to_open(fitted):
+def test_last_line_names_the_file_to_open(fitted):
     result, out = fitted
     assert result.stdout.splitlines()[-1] == f"open {out / 'report.html'}"
 
 
-def test_the_report_says_how_where_and_when_it_was_made(fitted, configuration):
+def test_report_records_command_machine_and_date(fitted, configuration):
     _, out = fitted
     page = (out / "report.html").read_text()
     metrics = json.loads((out / "metrics.json").read_text())
@@ -162,7 +162,7 @@ def test_the_report_says_how_where_and_when_it_was_made(fitted, configuration):
     assert float(measured["300"]) == pytest.approx(metrics["test"]["psnr"], abs=1e-3)
 
 
-def test_fit_reaches_a_good_image_of_views_it_has_not_seen(fitted):
+def test_fit_reaches_a_good_image_of_test_views(fitted):
     _, out = fitted
     metrics = json.loads((out / "metrics.json").read_text())
     # 300 random points reach 27 dB and more; a fit that does not learn stays below 15 dB.
@@ -207,7 +207,7 @@ def make_trainer(config):
     return Trainer(config, dataset, initial_gaussians(config, dataset))
 
 
-def test_the_configuration_changes_all_that_a_fit_can_change(fitted, configuration):
+def test_configuration_covers_every_change_within_a_fit(fitted, configuration):
     """The tests below compare the bytes of such fits, this one with those of a longer process."""
     config = load_config(configuration)
     reports, degrees, opacities = [], set(), {}

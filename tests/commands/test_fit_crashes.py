@@ -21,7 +21,7 @@ from drgs.config.load import load_config
 from drgs.training import session
 
 PLANS = {2: 10, 3: 9, 5: 8}
-"""By iteration: how many there will be, as the plan is revised to; the clock ends it after 7."""
+"""Total number of iterations of the plan revised at each iteration; the clock ends it after 7."""
 
 LAST = 7
 
@@ -81,7 +81,7 @@ def config(tmp_path_factory):
     return write_project(tmp_path_factory.mktemp("project"))
 
 
-def crashed(moment, behind, *arguments):
+def run_crashing_fit(moment, behind, *arguments):
     """Run a fit that is ended at the replacement of a file, before or behind it.
 
     moment: which, by number; None: none. Returns whether it got so far, and the names of what was
@@ -125,7 +125,7 @@ def assert_same_again(out, again):
 def assert_goes_on(config, tmp_path, moment, behind, *budget):
     """The folder; None where the fit ends before that moment."""
     out = tmp_path / f"{moment}{behind}"
-    was_killed, names = crashed(moment, behind, config, "--out", out, *budget)
+    was_killed, names = run_crashing_fit(moment, behind, config, "--out", out, *budget)
     if not was_killed:
         assert len(names) == moment
         return None
@@ -140,7 +140,7 @@ def assert_goes_on(config, tmp_path, moment, behind, *budget):
 
 
 def moments_of(config, tmp_path, *budget):
-    was_killed, names = crashed(None, False, config, "--out", tmp_path / "whole", *budget)
+    was_killed, names = run_crashing_fit(None, False, config, "--out", tmp_path / "whole", *budget)
     assert not was_killed
     assert_done(tmp_path / "whole")
     return names
@@ -149,7 +149,7 @@ def moments_of(config, tmp_path, *budget):
 BUDGET = ("--budget", "60s")
 
 
-def test_a_fit_with_a_budget_that_is_killed_around_its_revised_plans_goes_on(config, tmp_path):
+def test_fit_with_budget_killed_around_revised_plans_resumes(config, tmp_path):
     """Between the two files of a revision, and behind the last file."""
     names = moments_of(config, tmp_path, *BUDGET)
     saved = [moment for moment, name in enumerate(names) if name == "checkpoint.npz"]
@@ -163,7 +163,7 @@ def test_a_fit_with_a_budget_that_is_killed_around_its_revised_plans_goes_on(con
 @pytest.mark.slow
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("budget", [(), BUDGET], ids=["plain", "budget"])
-def test_a_fit_that_is_killed_at_any_file_goes_on(config, tmp_path, budget, behind):
+def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
     count = len(moments_of(config, tmp_path, *budget))
     for moment in range(count):
         out = assert_goes_on(config, tmp_path, moment, behind, *budget)
@@ -171,9 +171,9 @@ def test_a_fit_that_is_killed_at_any_file_goes_on(config, tmp_path, budget, behi
     assert not assert_goes_on(config, tmp_path, count, behind, *budget)
 
 
-def test_a_fit_that_is_killed_while_it_writes_results_repeats_no_iteration(config, tmp_path):
+def test_fit_killed_while_writing_results_repeats_no_iteration(config, tmp_path):
     names = moments_of(config, tmp_path)
-    assert crashed(names.index("history.csv"), True, config, "--out", tmp_path / "out")[0]
+    assert run_crashing_fit(names.index("history.csv"), True, config, "--out", tmp_path / "out")[0]
     outcome = assert_fits("--resume", tmp_path / "out")
     assert f"continues at iteration {ITERATIONS}\n" in outcome.stdout
     for name in RESULTS - {"history.csv", "metrics.json", "config.yml"}:  # times, and a folder
@@ -181,7 +181,7 @@ def test_a_fit_that_is_killed_while_it_writes_results_repeats_no_iteration(confi
         assert (tmp_path / "out" / name).read_bytes() == expected, name
 
 
-def test_a_run_that_is_half_removed_is_not_finished(config, tmp_path):
+def test_half_removed_run_is_not_finished(config, tmp_path):
     out = tmp_path / "out"
     assert_fits(config, "--out", out)
     unlink, removed = os.unlink, []

@@ -80,7 +80,7 @@ def assert_as_uninterrupted(folder, projects):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_configuration_that_no_fit_has_written_is_kept(tmp_path):
+def test_foreign_configuration_is_kept(tmp_path):
     """Whether it is the one to be fitted, or another; also with --overwrite."""
     config = write_project(tmp_path)
     config = config.rename(tmp_path / "config.yml")
@@ -101,7 +101,7 @@ def test_a_configuration_that_no_fit_has_written_is_kept(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_configuration_that_a_fit_has_written_may_be_fitted_where_it_is(ended, projects):
+def test_configuration_written_by_a_fit_can_be_fitted_in_place(ended, projects):
     (ended / "again").mkdir()
     shutil.copy(ended / "out" / "config.yml", ended / "again")
     arguments = (ended / "again" / "config.yml", "--data", ended / "data")
@@ -110,7 +110,7 @@ def test_a_configuration_that_a_fit_has_written_may_be_fitted_where_it_is(ended,
     assert (ended / "again" / "point_cloud.ply").read_bytes() == expected
 
 
-def test_a_configuration_that_was_changed_before_the_first_checkpoint_is_kept(stopped):
+def test_configuration_edited_before_the_first_checkpoint_is_kept(stopped):
     (stopped / "out" / "checkpoint.npz").unlink()
     path = stopped / "out" / "config.yml"
     path.write_text(f"# by hand\n{path.read_text()}")
@@ -127,7 +127,7 @@ def test_a_configuration_that_was_changed_before_the_first_checkpoint_is_kept(st
     "name", ["notes.txt", "renders/mine.png", "renders/test/mine.png", "side_by_side/.mine"]
 )
 @pytest.mark.parametrize("recorded", [True, False])
-def test_files_of_others_are_not_removed_with_a_run(ended, name, recorded):
+def test_foreign_files_are_not_removed_with_a_run(ended, name, recorded):
     out = ended / "out"
     if not recorded:
         (out / ".drgs-fit.json").unlink()
@@ -141,13 +141,13 @@ def test_files_of_others_are_not_removed_with_a_run(ended, name, recorded):
         assert_fits(*arguments)
 
 
-def test_results_that_were_changed_are_not_removed(ended):
+def test_modified_results_are_not_removed(ended):
     (ended / "out" / "history.csv").write_text("with remarks")
     arguments = (ended / "a.yml", "--out", ended / "out", "--overwrite")
     assert_fit_refused(*arguments, folder=ended, message="got history.csv; move")
 
 
-def test_an_image_of_the_users_in_the_way_of_a_fit_is_kept(stopped):
+def test_existing_user_image_is_kept(stopped):
     (stopped / "out" / "renders" / "test").mkdir(parents=True)
     (stopped / "out" / "renders" / "test" / "r_1.png").symlink_to(
         stopped / "data" / "test" / "r_1.png"
@@ -156,7 +156,7 @@ def test_an_image_of_the_users_in_the_way_of_a_fit_is_kept(stopped):
     assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
 
 
-def test_every_file_of_a_finished_fit_is_in_its_record(ended):
+def test_record_of_a_finished_fit_lists_every_file(ended):
     files = json.loads((ended / "out" / ".drgs-fit.json").read_text())["files"]
     assert set(files) == visible(ended / "out") - {"config.yml"}
     assert all(files.values())
@@ -179,7 +179,7 @@ def another_image(folder, split="train"):
     shutil.copy(folder / split / "r_0.png", folder / split / "r_1.png")
 
 
-def other_sizes(folder):
+def resize_training_images(folder):
     """Return other sizes for all training images."""
     from PIL import Image
 
@@ -208,7 +208,7 @@ CHANGES = {
     "the training views are in another order": lambda data: edit(data, list.reverse),
     "the image of training view r_1": another_image,
     "the size (32x24, now 16x12) of training view r_0, the image of training view r_0, the size "
-    "(32x24, now 16x12) of training view r_1 and 3 more": other_sizes,
+    "(32x24, now 16x12) of training view r_1 and 3 more": resize_training_images,
     "the camera of training view r_2": lambda data: edit(data, moved_camera),
     "the mask of training view r_0": masked,
     "the image of test view r_1": lambda data: another_image(data, "test"),
@@ -216,7 +216,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("text", CHANGES)
-def test_a_fit_whose_data_has_changed_is_not_continued(stopped, text):
+def test_fit_with_changed_data_is_not_continued(stopped, text):
     CHANGES[text](stopped / "data")
     out, data = stopped / "out", stopped / "data"
     for arguments in (["--resume", out], [stopped / "a.yml", "--out", out]):
@@ -225,7 +225,7 @@ def test_a_fit_whose_data_has_changed_is_not_continued(stopped, text):
 
 
 @pytest.mark.slow
-def test_the_same_images_written_again_in_place_are_the_same_data(stopped, projects):
+def test_rewritten_identical_images_are_the_same_data(stopped, projects):
     for path in (stopped / "data").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes())
@@ -239,7 +239,7 @@ def test_the_same_images_written_again_in_place_are_the_same_data(stopped, proje
 
 
 @pytest.mark.parametrize("by", ["resume", pytest.param("same command", marks=pytest.mark.slow)])
-def test_a_project_that_was_moved_as_a_whole_goes_on(stopped, projects, tmp_path, by):
+def test_moved_project_is_continued(stopped, projects, tmp_path, by):
     moved = stopped.rename(tmp_path / "after")
     arguments = ["--resume", moved / "out"]
     if by == "same command":
@@ -251,7 +251,7 @@ def test_a_project_that_was_moved_as_a_whole_goes_on(stopped, projects, tmp_path
     assert_as_uninterrupted(moved, projects)
 
 
-def test_data_that_was_moved_alone_is_named(stopped, projects, tmp_path):
+def test_moved_data_is_reported(stopped, projects, tmp_path):
     (stopped / "data").rename(tmp_path / "elsewhere")
     message = f"data.path: there is no folder {stopped / 'data'}; say where it is (--data DIR)"
     assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
@@ -259,7 +259,7 @@ def test_data_that_was_moved_alone_is_named(stopped, projects, tmp_path):
     assert_as_uninterrupted(stopped, projects)
 
 
-def test_a_start_point_that_was_moved_with_the_data_is_found(tmp_path, monkeypatch):
+def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     config = write_project(tmp_path, init={"point_cloud": "data/points.ply"})
     blobs().save(tmp_path / "data" / "points.ply")
     with monkeypatch.context() as patched:
@@ -271,7 +271,7 @@ def test_a_start_point_that_was_moved_with_the_data_is_found(tmp_path, monkeypat
     assert found.init.point_cloud == tmp_path / "elsewhere" / "points.ply"
 
 
-def test_a_path_may_be_corrected_by_hand(stopped, projects, tmp_path):
+def test_path_may_be_edited_by_hand(stopped, projects, tmp_path):
     (stopped / "data").rename(tmp_path / "elsewhere")
     path = stopped / "out" / "config.yml"
     values = yaml.safe_load(path.read_text())
@@ -283,7 +283,7 @@ def test_a_path_may_be_corrected_by_hand(stopped, projects, tmp_path):
     assert_as_uninterrupted(stopped, projects)
 
 
-def test_other_data_is_refused_by_its_content(stopped, tmp_path):
+def test_different_data_is_refused_by_content(stopped, tmp_path):
     shutil.copytree(stopped / "data", tmp_path / "other")
     another_image(tmp_path / "other")
     arguments = ("--resume", stopped / "out", "--data", tmp_path / "other")
@@ -291,7 +291,7 @@ def test_other_data_is_refused_by_its_content(stopped, tmp_path):
     assert_fit_refused(*arguments, folder=stopped, message=message)
 
 
-def test_a_finished_fit_is_finished_wherever_its_data_is(ended, tmp_path):
+def test_finished_fit_stays_finished_without_its_data(ended, tmp_path):
     before = contents(ended)
     for options in ([], ["--data", tmp_path]):
         outcome = assert_fits("--resume", ended / "out", *options)
@@ -299,7 +299,7 @@ def test_a_finished_fit_is_finished_wherever_its_data_is(ended, tmp_path):
     assert contents(ended) == before
 
 
-def test_a_fit_without_a_record_that_was_moved_is_continued(stopped, projects, tmp_path):
+def test_moved_fit_without_a_record_is_continued(stopped, projects, tmp_path):
     """And its files have fewer values."""
     out = stopped.rename(tmp_path / "after") / "out"
     with np.load(out / "checkpoint.npz") as file:
@@ -317,7 +317,7 @@ def test_a_fit_without_a_record_that_was_moved_is_continued(stopped, projects, t
     assert_as_uninterrupted(out.parent, projects)
 
 
-def test_an_orbit_needs_nothing_but_the_folder_of_a_fit(ended, tmp_path):
+def test_orbit_needs_only_the_folder_of_a_fit(ended, tmp_path):
     """Neither its data nor a path to it; the images are those of the cameras of the data."""
     orbit = ("--orbit", 2, "--out")
     arguments = (ended / "out", "--data", ended / "data", *orbit, tmp_path / "by data")
@@ -330,7 +330,7 @@ def test_an_orbit_needs_nothing_but_the_folder_of_a_fit(ended, tmp_path):
     assert [view["file_path"] for view in views] == ["r_0", "r_1", "r_2"]
 
 
-def test_the_test_views_of_a_project_that_was_moved_are_rendered(ended, tmp_path):
+def test_views_of_a_moved_project_are_rendered(ended, tmp_path):
     moved = ended.rename(tmp_path / "moved")
     outcome = assert_ends_well(render.main, moved / "out", "--out", tmp_path / "renders")
     assert f"taken from {moved / 'data'}" in outcome.stdout
@@ -340,7 +340,7 @@ def test_the_test_views_of_a_project_that_was_moved_are_rendered(ended, tmp_path
     assert_refused(render.main, *arguments, folder=tmp_path, message=message)
 
 
-def test_a_folder_needs_no_configuration(tmp_path):
+def test_folder_is_fitted_without_a_configuration(tmp_path):
     write_project(tmp_path)
     folder, few = tmp_path / "data", ["--set", "iterations=2", "--set", "output.report=false"]
     few += ["--set", "output.save_renders=false", "--out", tmp_path / "out"]

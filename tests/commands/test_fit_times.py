@@ -51,7 +51,7 @@ def planned(monkeypatch):
     return plan
 
 
-def test_a_budget_leaves_time_for_the_second_file(planned):
+def test_budget_reserves_time_for_the_viewers_file(planned):
     """And for measuring it."""
     end, _ = planned(config_of(), 100.0)
     assert end == 90
@@ -59,7 +59,7 @@ def test_a_budget_leaves_time_for_the_second_file(planned):
     assert end == pytest.approx(84 * (1 - TIME_SHARE))
 
 
-def test_a_short_budget_is_for_iterations_and_not_for_images(planned):
+def test_short_budget_skips_report_and_images(planned):
     end, config = planned(config_of(), 13.0)
     assert end == 3 and config.output.report and config.output.save_renders
     with pytest.warns(UserNote, match=r"no report, orbit and images are written"):
@@ -71,7 +71,7 @@ def test_a_short_budget_is_for_iterations_and_not_for_images(planned):
     assert planned(nothing, 7.0) == (1, nothing)
 
 
-def test_a_fit_without_a_report(tmp_path):
+def test_fit_without_a_report_writes_everything_else(tmp_path):
     """Everything else is there; no test view is measured on the way."""
     config, written = write_project(tmp_path), {}
     for name in ("true", "false"):

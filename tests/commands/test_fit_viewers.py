@@ -25,30 +25,30 @@ from drgs.results.folder import remove_run
 from drgs.training import session
 from drgs.training.fit_folder import gaussians_on_page
 
-OTHERWISE = {"antialiased": True, "low_pass": 0.1}
+FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """The folder of a fit whose approximations are not those of viewers."""
     folder = tmp_path_factory.mktemp("viewers")
-    config = write_project(folder, model={**VALUES["model"], **OTHERWISE})
+    config = write_project(folder, model={**VALUES["model"], **FITTED_WITH})
     with pytest.MonkeyPatch.context() as patch:
         without_images(patch)
         outcome = assert_fits(config, "--out", folder / "out", "--threads", 1)
     return folder / "out", outcome
 
 
-def test_both_files_say_what_they_are_rendered_with(fitted):
+def test_both_files_record_their_approximations(fitted):
     out, _ = fitted
-    assert Gaussians.load(out / GAUSSIANS).rendered_with == OTHERWISE
+    assert Gaussians.load(out / GAUSSIANS).rendered_with == FITTED_WITH
     usual = {"antialiased": False, "low_pass": 0.3}
     assert Gaussians.load(out / GAUSSIANS_FOR_VIEWERS).rendered_with == usual
     native, other = (Gaussians.load(out / name) for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS))
     assert native.num_gaussians == other.num_gaussians and (native.means != other.means).any()
 
 
-def test_what_viewers_show_is_measured(fitted, tmp_path):
+def test_metrics_include_what_viewers_show(fitted, tmp_path):
     """The float64 reference renders as viewers do."""
     out, outcome = fitted
     metrics = json.loads((out / METRICS).read_text())
@@ -68,7 +68,7 @@ def test_what_viewers_show_is_measured(fitted, tmp_path):
     assert again["mean"]["psnr"] == found["psnr"]
 
 
-def test_the_plugin_shows_the_file_as_the_fit_does(fitted):
+def test_plugin_renders_the_file_like_the_fit(fitted):
     """To the last bit: by its name alone, and by the scene that the trainer has."""
     out, _ = fitted
     config = load_config(out / "config.yml")
@@ -88,10 +88,10 @@ def test_the_plugin_shows_the_file_as_the_fit_does(fitted):
     np.testing.assert_array_equal(np.clip(np.array(by_name), 0, 1), expected)
 
 
-def test_a_fit_that_goes_on_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
+def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     """Stopped when its iterations are done, with what is for viewers still to come."""
     out, _ = fitted
-    config = write_project(tmp_path, model={**VALUES["model"], **OTHERWISE})
+    config = write_project(tmp_path, model={**VALUES["model"], **FITTED_WITH})
     without_images(monkeypatch)
     with monkeypatch.context() as broken:
         broken.setattr(session.FitSession, "_fit_for_viewers", lambda *_: sys.exit(7))
@@ -105,7 +105,7 @@ def test_a_fit_that_goes_on_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     assert contents(tmp_path / "out") == {}
 
 
-def test_a_fit_as_viewers_render_has_one_file(tmp_path, monkeypatch):
+def test_fit_with_viewer_approximations_writes_one_file(tmp_path, monkeypatch):
     without_images(monkeypatch)
     monkeypatch.delitem(sys.modules, "drgs.training.viewers", raising=False)
     monkeypatch.delitem(sys.modules, "drgs.effects.smoothing", raising=False)
@@ -116,7 +116,7 @@ def test_a_fit_as_viewers_render_has_one_file(tmp_path, monkeypatch):
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None
 
 
-def test_a_file_of_somebody_else_is_not_replaced(tmp_path, monkeypatch):
+def test_foreign_file_is_not_replaced(tmp_path, monkeypatch):
     without_images(monkeypatch)
     config = write_project(tmp_path)
     assert_fits(config, "--out", tmp_path / "out")
@@ -132,11 +132,11 @@ def test_a_file_of_somebody_else_is_not_replaced(tmp_path, monkeypatch):
     ("approximations", "shown"),
     [
         (Approximations(), "the fit's own"),
-        (Approximations(**OTHERWISE), "the fit's own"),
+        (Approximations(**FITTED_WITH), "the fit's own"),
         (Approximations(order="pixel", low_pass=0.1), "those for viewers"),
     ],
 )
-def test_the_page_shows_the_fits_own_where_it_can(approximations, shown):
+def test_page_shows_the_gaussians_of_the_fit_if_supported(approximations, shown):
     own, other = true_blobs(), disturbed_blobs()
     found = gaussians_on_page(own, approximations, other)
     if shown == "the fit's own":
@@ -145,7 +145,7 @@ def test_the_page_shows_the_fits_own_where_it_can(approximations, shown):
         assert found.gaussians is other and found.approximations == Approximations()
 
 
-def test_the_page_shows_what_a_smoothing_filter_makes_of_gaussians():
+def test_page_shows_gaussians_with_the_filter_baked_in():
     own = true_blobs()
     own = replace(own, smoothing=np.full(own.num_gaussians, 0.2, np.float32))
     found = gaussians_on_page(own, Approximations(), None).gaussians

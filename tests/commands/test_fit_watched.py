@@ -49,7 +49,7 @@ class Screen:
 
 
 @pytest.fixture
-def looked_on(monkeypatch):
+def viewer_page(monkeypatch):
     """Makes ``--view`` a page for the screen above, without a server."""
 
     @contextmanager
@@ -62,7 +62,7 @@ def looked_on(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
     monkeypatch.setattr("drgs.viewer.training_viewer.PROGRESS_SECONDS", 0.0)
 
-    def look_on(end_at=None):
+    def attach_viewer(end_at=None):
         screens = []
 
         def watch(server, trainer, dataset, length):
@@ -76,7 +76,7 @@ def looked_on(monkeypatch):
         return screens
 
     without_images(monkeypatch)
-    return look_on
+    return attach_viewer
 
 
 def files_of(out):
@@ -85,10 +85,8 @@ def files_of(out):
     return {path.relative_to(out): path.read_bytes() for path in paths}
 
 
-def test_the_results_have_the_same_bytes_with_and_without_somebody_who_looks_on(
-    tmp_path, looked_on
-):
-    config, screens = write_project(tmp_path), looked_on()
+def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, viewer_page):
+    config, screens = write_project(tmp_path), viewer_page()
     outcome = assert_fits(config, "--out", tmp_path / "watched", "--view")
     assert "look on at http://here" in outcome.stdout
     assert screens[0].shown == screens[0].iterations == 8
@@ -98,9 +96,9 @@ def test_the_results_have_the_same_bytes_with_and_without_somebody_who_looks_on(
     assert first.replace("watched", "alone") == second
 
 
-def test_an_early_end_leaves_a_finished_fit_of_as_many_iterations(tmp_path, looked_on):
+def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page):
     config, out = write_project(tmp_path), tmp_path / "out"
-    looked_on(end_at=4)
+    viewer_page(end_at=4)
     outcome = assert_fits(config, "--out", out, "--view")
     assert "5 iterations in" in outcome.stdout
     metrics = json.loads((out / "metrics.json").read_text())
@@ -112,11 +110,11 @@ def test_an_early_end_leaves_a_finished_fit_of_as_many_iterations(tmp_path, look
     assert files_of(tmp_path / "again") == files_of(out)
 
 
-def test_a_fit_that_was_ended_and_then_killed_writes_its_results_when_resumed(
-    tmp_path, looked_on, monkeypatch
+def test_fit_ended_early_and_killed_writes_its_results_on_resume(
+    tmp_path, viewer_page, monkeypatch
 ):
     config, out = write_project(tmp_path), tmp_path / "out"
-    looked_on(end_at=4)
+    viewer_page(end_at=4)
     with monkeypatch.context() as patch:
         patch.setattr(
             fit_folder, "write_images", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
@@ -135,11 +133,11 @@ def test_a_fit_that_was_ended_and_then_killed_writes_its_results_when_resumed(
         (("--view", "--view-port", "65536"), "--view-port: must be at most 65,535"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(tmp_path, arguments, message):
+def test_contradictory_options_are_refused(tmp_path, arguments, message):
     assert_fit_refused(write_project(tmp_path), *arguments, folder=tmp_path, message=message)
 
 
-def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):
     config = write_project(tmp_path)
     monkeypatch.setitem(sys.modules, "viser", None)
     assert_fit_refused(
@@ -150,7 +148,7 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
     )
 
 
-def test_a_port_that_is_taken_and_an_address_of_another_machine_are_refused(tmp_path):
+def test_occupied_port_and_remote_address_are_refused(tmp_path):
     pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
     config = write_project(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as taken:

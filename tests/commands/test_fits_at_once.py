@@ -27,7 +27,7 @@ def project(tmp_path, monkeypatch):
     return write_project(tmp_path)
 
 
-def test_a_folder_that_another_fit_writes_to_is_refused(project, tmp_path, monkeypatch):
+def test_folder_in_use_by_another_fit_is_refused(project, tmp_path, monkeypatch):
     """Whether it is resumed, replaced or begun again; afterwards it goes on."""
     out = tmp_path / "out"
     with monkeypatch.context() as stopped:
@@ -40,7 +40,7 @@ def test_a_folder_that_another_fit_writes_to_is_refused(project, tmp_path, monke
     assert_fits("--resume", out)
 
 
-def test_of_two_that_begin_at_once_the_second_is_refused(project, tmp_path, monkeypatch):
+def test_second_of_two_simultaneous_fits_is_refused(project, tmp_path, monkeypatch):
     """The first makes the folder while the second reads its data."""
     out, load_dataset = tmp_path / "out", session.load_dataset
     with ExitStack() as first:

@@ -30,7 +30,7 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("way", VIEWS)
-def test_images_are_not_rendered_among_photographs(fitted, way):
+def test_images_are_not_written_into_a_photograph_folder(fitted, way):
     data = fitted.parent / "data"
     message = f"--out {data / 'test'}: holds images of the dataset (r_0.png, r_1.png); choose"
     arguments = [fitted, *VIEWS[way], "--out", data / "test"]
@@ -47,7 +47,7 @@ def test_images_are_not_rendered_among_photographs(fitted, way):
         ("origin", "camera.png"),
     ],
 )
-def test_a_file_of_the_users_is_not_replaced_by_an_image(fitted, tmp_path, way, name):
+def test_user_file_is_not_replaced_by_an_image(fitted, tmp_path, way, name):
     out = tmp_path / "out"
     out.mkdir()
     (out / name).write_text("[]")
@@ -66,7 +66,7 @@ def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
     assert_ends_well(render.main, scene, "--out", tmp_path)
 
 
-def test_images_are_rendered_again_into_their_own_folder_until_they_are_changed(fitted, tmp_path):
+def test_own_images_are_replaced_unless_modified(fitted, tmp_path):
     out = tmp_path / "out"
     for way in VIEWS:
         assert_ends_well(render.main, fitted, *VIEWS[way], "--out", out)
@@ -77,7 +77,7 @@ def test_images_are_rendered_again_into_their_own_folder_until_they_are_changed(
     assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
 
 
-def test_a_folder_that_another_command_writes_to_is_refused(fitted, tmp_path, monkeypatch):
+def test_folder_in_use_by_another_command_is_refused(fitted, tmp_path, monkeypatch):
     """The one that was refused leaves what the other notes of its images alone."""
     out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
     write_png, refused = render.write_png, []
@@ -93,7 +93,7 @@ def test_a_folder_that_another_command_writes_to_is_refused(fitted, tmp_path, mo
     assert refused and visible(out) == {"r_0.png", "r_1.png", "metrics.json"}
 
 
-def test_images_that_an_interrupted_command_left_are_rendered_again(fitted, tmp_path, monkeypatch):
+def test_images_of_an_interrupted_command_are_replaced(fitted, tmp_path, monkeypatch):
     expected, out = tmp_path / "whole", tmp_path / "out"
     assert_ends_well(render.main, fitted, "--out", expected)
     write_png, written = render.write_png, []
@@ -118,7 +118,7 @@ def test_images_that_an_interrupted_command_left_are_rendered_again(fitted, tmp_
 
 
 @pytest.mark.parametrize("metrics", ["[", "[]", '{"split": "test"}', "7"])
-def test_other_metrics_are_somebody_elses(fitted, tmp_path, metrics):
+def test_foreign_metrics_are_not_replaced(fitted, tmp_path, metrics):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "metrics.json").write_text(metrics)
     message = "holds metrics.json, which"

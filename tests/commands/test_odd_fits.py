@@ -62,7 +62,7 @@ def rename_view(folder, split, name):
     path.write_text(json.dumps(meta))
 
 
-def test_images_with_long_names_are_fitted_and_shown_under_shorter_ones(scene, monkeypatch):
+def test_images_with_long_names_are_written_under_shorter_ones(scene, monkeypatch):
     monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     for split in ("train", "test"):
         rename_view(scene, split, "\u4e2d" * 83)  # 249 bytes
@@ -94,7 +94,7 @@ def test_folders_whose_names_are_not_utf_8_are_refused_before_the_fit(scene, opt
     assert sorted(os.listdir(scene)) == ["a.yml", "data"]
 
 
-def test_a_start_cloud_of_points_in_one_place_and_points_far_away_is_fitted(scene, monkeypatch):
+def test_cloud_of_coinciding_and_distant_points_is_fitted(scene, monkeypatch):
     """Without a line of NumPy's about scales that are beyond float32."""
     monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     points = np.zeros(18, [(axis, "f4") for axis in "xyz"])

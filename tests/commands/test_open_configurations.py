@@ -12,14 +12,14 @@ from drgs.results.model import load_open_config
 PHOTOS = REPOSITORY / "scenes" / "photos.yml"
 
 
-def test_the_background_of_renderings_is_that_of_a_fit_to_the_photographs(photographs):
+def test_rendering_uses_the_background_of_the_photographs(photographs):
     config = load_open_config(PHOTOS, [f"data.path={photographs}"], None)
     assert config.data.background_rgb == (0, 0, 0)
     assert config.model.near == 0.2  # a twenty-fifth of 4.1, to one digit
     assert not is_open(config) and is_open(load_config(PHOTOS))
 
 
-def test_a_fit_that_decided_is_finished_for_the_configuration_that_left_it_open(tmp_path):
+def test_finished_fit_matches_the_configuration_before_defaults(tmp_path):
     given = FitConfig(data={"path": tmp_path})
     decided = with_changes(given, {"data.background": "black", "model.near": 0.3})
     claim_output_folder(tmp_path / "out", decided)

@@ -25,7 +25,7 @@ RENDER = ["a.ply", "--origin", "0", "0", "3", "--out", "out"]
 
 
 @pytest.mark.parametrize(("main", "words"), [(capture.main, CAPTURE), (render.main, RENDER)])
-def test_one_number_is_no_size_and_the_new_spelling_is_named(main, words):
+def test_single_number_size_is_refused_with_the_new_spelling(main, words):
     outcome = run_in_process(main, *words, "--size", "400")
     assert outcome.returncode == 2
     assert "argument --size: expected 2 arguments: --size W H" in outcome.stderr
@@ -40,7 +40,7 @@ def test_a_field_of_view_is_between_0_and_180_degrees(main, words, fov):
 
 
 @pytest.mark.parametrize("main", [capture.main, render.main])
-def test_help_says_units_and_what_is_behind(main):
+def test_help_states_units_and_background(main):
     text = " ".join(run_in_process(main, "--help").stdout.split())
     assert "--fov DEGREES" in text
     assert "--size W H" in text
@@ -57,7 +57,7 @@ def ball(tmp_path):
     return path
 
 
-def test_an_image_is_as_wide_and_high_and_sees_as_many_degrees_as_was_asked(ball, tmp_path):
+def test_image_has_the_given_size_and_field_of_view(ball, tmp_path):
     out = tmp_path / "out"
     options = ["--views", 1, "--test-views", 0, "--spp", 1, "--points", 20]
     options += ["--size", 24, 12, "--fov", 60]
@@ -73,7 +73,7 @@ def test_an_image_is_as_wide_and_high_and_sees_as_many_degrees_as_was_asked(ball
     assert transforms["camera_angle_x"] == math.radians(60)
 
 
-def test_another_capture_is_named_in_the_units_of_its_options(ball, tmp_path):
+def test_capture_mismatch_is_reported_in_units_of_the_options(ball, tmp_path):
     words = [ball, "--out", tmp_path / "out", "--views", 1, "--test-views", 0]
     words += ["--spp", 1, "--points", 0]
     assert run_in_process(capture.main, *words, "--size", 4, 4).returncode == 0
@@ -84,7 +84,7 @@ def test_another_capture_is_named_in_the_units_of_its_options(ball, tmp_path):
     assert "fov is 39.5978, requested is 50.0" in refused.stderr
 
 
-def test_gaussians_without_a_configuration_are_over_the_integrators_background(tmp_path):
+def test_gaussians_without_a_configuration_use_the_default_background(tmp_path):
     blobs().save(tmp_path / "blobs.ply")
     words = [tmp_path / "blobs.ply", "--origin", 0, 0, 30, "--up", 0, 1, 0, "--size", 8, 8]
     outcome = run_in_process(render.main, *words, "--out", tmp_path / "out")

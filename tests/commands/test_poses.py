@@ -5,7 +5,7 @@ import pytest
 from drgs.poses import __main__ as poses
 from drgs.poses.structure_from_motion import SfmResult, SfmSettings
 
-FOUND = SfmResult(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
+PLACED = SfmResult(("a.jpg", "b.jpg"), (), ("OPENCV 64 x 48 px (f: 50)",), 1234, 0.456, 1)
 
 
 @pytest.fixture
@@ -29,8 +29,8 @@ def run(tmp_path, monkeypatch, capsys):
     return command
 
 
-def test_what_was_found_is_said(run, tmp_path):
-    asked, lines = run(FOUND)
+def test_result_is_printed(run, tmp_path):
+    asked, lines = run(PLACED)
     assert asked == (tmp_path, SfmSettings(), False)
     *progress, found, camera, written, following = lines
     assert progress == ["camera 2/2  left 0:00"]
@@ -51,14 +51,14 @@ def test_photographs_without_a_camera_are_named(run):
     assert "so may --share one or --camera-model SIMPLE_RADIAL" in text
 
 
-def test_options_say_how_to_search(run):
+def test_options_set_the_search(run):
     options = ["--camera-model", "RADIAL", "--share", "one", "--compare", "neighbours"]
-    asked, _ = run(FOUND, *options, "--overwrite")
+    asked, _ = run(PLACED, *options, "--overwrite")
     assert asked[1:] == (SfmSettings("RADIAL", "neighbours", "one"), True)
 
 
 def test_a_wrong_option_is_refused(run, capsys):
     with pytest.raises(SystemExit) as end:
-        run(FOUND, "--camera-model", "FOV")
+        run(PLACED, "--camera-model", "FOV")
     assert end.value.code == 2
     assert "invalid choice: 'FOV'" in capsys.readouterr().err

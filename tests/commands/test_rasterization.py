@@ -132,7 +132,7 @@ def test_colors_of_any_number_of_channels_are_composited():
     np.testing.assert_allclose(twice[1] - missing, 2 * (images[1] - missing), atol=1e-12)
 
 
-def test_depths_are_sums_or_expectations_and_come_last():
+def test_depths_are_sums_or_expectations_in_the_last_channel():
     arrays = {**scene(), "colors": scene()["colors"][:, 0]}
     for name in INPUTS[:5]:
         arrays[name] = arrays[name][8:11]  # few, so that there are pixels without any
@@ -199,9 +199,9 @@ def results(arrays, name):
 
 
 STEP = 1e-5
-"""Of 0.01: 1e-7 in a mean, which changes an alpha by 1e-5 at most: no pixel of a clear scene is so
-near to a threshold. Rounding, 1e-16 / 1e-5, and the third derivative, 1e-10 of the first, matter
-less than 1e-7."""
+"""Fraction of 0.01: 1e-7 in a mean, which changes an alpha by 1e-5 at most: no pixel of a clear
+scene is so near to a threshold. Rounding, 1e-16 / 1e-5, and the third derivative, 1e-10 of the
+first, matter less than 1e-7."""
 
 
 def tangents_of(arrays, tangents, name, fixed=()):
@@ -261,7 +261,7 @@ def check_gradients_are_the_transpose_of_the_tangents(arrays, tangents, name):
     [{}, {"order": "pixel"}, {"sh_direction": "pixel", "sh_degree": 1}],
     ids=["center", "pixel order", "pixel colors"],
 )
-def test_groups_of_channels_change_no_image(monkeypatch, options):
+def test_grouping_channels_leaves_images_unchanged(monkeypatch, options):
     """All channels in one kernel, and three at a time; tangents and gradients to rounding."""
     arrays = dict(scene())
     if not options.get("sh_degree"):
@@ -293,7 +293,7 @@ def test_groups_of_channels_change_no_image(monkeypatch, options):
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_derivatives(name):
+def test_tangents_equal_differences_and_gradients_match_tangents(name):
     """Forward against differences, reverse against forward; one test, as they share kernels."""
     arrays = arguments(name)
     tangents = direction(arrays)
@@ -369,7 +369,7 @@ def test_image_and_gradients_agree_with_gsplat():
         assert np.linalg.norm(found - theirs) <= 1e-3 * norm, name
 
 
-def test_torch_differentiates_it():
+def test_torch_computes_gradients():
     """The example of the docstring, against Dr.Jit's own gradients."""
     torch = pytest.importorskip("torch")
 
@@ -401,7 +401,7 @@ def test_torch_differentiates_it():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is refused
+# Errors
 # ----------------------------------------------------------------------------------------------
 
 
@@ -438,12 +438,12 @@ SKEWED[1, 0, 1] = 0.5
         ({"projektion": "ewa"}, TypeError, "no parameter projektion; did you mean projection"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_name(changes, error, message):
+def test_mismatched_arguments_are_refused_by_name(changes, error, message):
     with pytest.raises(error, match=rf"rasterization\(\): .*{message}"):
         drgs.rasterization(**{**scene(), **FILM, "sh_degree": 3, **changes})
 
 
-def test_directions_of_pixels_need_coefficients():
+def test_pixel_sh_direction_needs_coefficients():
     arrays = {**scene(), "colors": scene()["colors"][:, 0]}
     with pytest.raises(ValueError, match="sh_direction is of spherical harmonics; give sh_degree"):
         drgs.rasterization(**arrays, **FILM, sh_direction="pixel")

@@ -76,7 +76,7 @@ def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
 
 
 @pytest.mark.parametrize("optimised", [True, False])
-def test_refined_cameras_beside_the_gaussians_are_used_or_spoken_of(tmp_path, capsys, optimised):
+def test_refined_cameras_are_used_or_mentioned(tmp_path, capsys, optimised):
     """Whether the fit's folder or its PLY file is named, as its configuration says."""
     dataset = make_dataset(2, 1)
     write_dataset(tmp_path / "data", dataset)
@@ -110,7 +110,7 @@ def test_refined_cameras_beside_the_gaussians_are_used_or_spoken_of(tmp_path, ca
             assert_shows(tmp_path / name / f"{view.name}.png", seen_from, WHITE)
 
 
-def test_a_background_is_behind_splats_and_photographs(fit, tmp_path):
+def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
     background = (0.0, 0.5, 0.25)
     run(fit, "--background", *background, "--out", tmp_path)
     expected = assert_shows(tmp_path / "r_1.png", make_dataset().test[1], background)
@@ -138,7 +138,7 @@ def test_values_of_the_configuration_can_be_set(fit, tmp_path):
     assert rendered(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)
 
 
-def test_an_image_equal_to_its_photograph_has_no_number_in_json():
+def test_infinite_psnr_is_null_in_json():
     quality = {"psnr": float("inf"), "views": {"a": {"psnr": 3.5}}}
     assert render._replace_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
 
@@ -148,7 +148,7 @@ def test_an_image_equal_to_its_photograph_has_no_number_in_json():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_an_orbit_is_around_what_the_photographs_show(fit, tmp_path):
+def test_orbit_is_around_the_focus_of_the_photographs(fit, tmp_path):
     run(fit, "--orbit", "5", "--out", tmp_path)
     names = [f"orbit_{i:03d}.png" for i in range(5)]
     assert visible(tmp_path) == {"orbit.webp", "orbit.gif", *names}
@@ -166,7 +166,7 @@ def test_an_orbit_of_a_ply_needs_no_photographs(fit, tmp_path):
         assert_shows(tmp_path / f"orbit_{index:03d}.png", camera, (0, 0, 0))
 
 
-def test_cameras_of_a_transforms_file_give_the_images_of_the_split(fit, tmp_path):
+def test_cameras_of_a_transforms_file_render_the_images_of_the_split(fit, tmp_path):
     run(fit, "--out", tmp_path / "split")
     transforms = fit.parent / "data" / "transforms_test.json"
     size = ("--size", WIDTH, HEIGHT)
@@ -187,7 +187,7 @@ def write_camera(path, begin, end=None, **says):
 
 
 @pytest.mark.parametrize("samples", [None, 3])
-def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path, samples):
+def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path, samples):
     """A global shutter that closes where it opened shows what one that stands still does."""
     begin, end = (pose_around(azimuth, 0.3) for azimuth in (0.8, 0.9))
     end[:3, 3] += 0.4 * end[:3, 0]
@@ -209,7 +209,7 @@ def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path, samples):
     # In the middle of equal times, each by the reference.
     count = samples or 8
     times = [(k + 0.5) / count for k in range(count)]
-    cameras = [small_view("", between(begin, end, time), None) for time in times]
+    cameras = [small_view("", pose_between(begin, end, time), None) for time in times]
     parts = [photograph(blobs(), camera, WHITE) for camera in cameras]
     clear = ~np.any([part.near_threshold for part in parts], axis=0)
     expected = np.clip(np.mean([part.image for part in parts], axis=0), 0, 1)
@@ -218,7 +218,7 @@ def test_a_camera_of_a_file_that_moves_is_seen_moving(fit, tmp_path, samples):
 
 
 @pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
-def test_the_plan_regards_all_cameras_and_names_what_is_ignored(fit, tmp_path, capsys, ignored):
+def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys, ignored):
     """Cameras come from a file, and from a Mitsuba scene whose first camera is plain."""
     path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3))
     values = json.loads(path.read_text())
@@ -245,7 +245,7 @@ def test_the_plan_regards_all_cameras_and_names_what_is_ignored(fit, tmp_path, c
         assert "  lens: RadialTangential (k1) (1 of 2 sensors)\n" in of_scene
 
 
-def between(begin, end, time):
+def pose_between(begin, end, time):
     """The pose at a time: the centre on a line, turning at a constant rate."""
     turn = Rotation.from_matrix(end[:3, :3] @ begin[:3, :3].T).as_rotvec()
     pose = np.eye(4)
@@ -254,7 +254,7 @@ def between(begin, end, time):
     return pose
 
 
-def test_a_camera_placed_by_hand_is_that_camera(fit, tmp_path):
+def test_camera_set_by_options_is_used(fit, tmp_path):
     pose = pose_around(0.8, 0.3)
     fov = np.degrees(FIELD_OF_VIEW)
     arguments = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", fov]

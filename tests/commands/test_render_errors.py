@@ -70,7 +70,7 @@ def fails(capsys, *arguments):
         ("", ["-D", "model=x.ply"], "--define: is not used with Gaussians"),
     ],
 )
-def test_user_errors_are_one_line_and_write_nothing(
+def test_user_errors_are_one_line_and_write_no_files(
     fit, tmp_path, capsys, what, arguments, message
 ):
     assert message in fails(capsys, fit / what, *arguments, "--out", tmp_path / "out")
@@ -81,7 +81,7 @@ EXACT = ["--set", "model.projection=exact"]
 
 
 @pytest.mark.parametrize("mode", ["--camera", "--split"])
-def test_the_exact_projection_of_a_bent_lens_is_refused(tmp_path, capsys, mode):
+def test_exact_projection_with_distortion_is_refused(tmp_path, capsys, mode):
     """With status 2, before anything is written; without the distortion it is rendered."""
     write_dataset(tmp_path / "data", make_dataset(1, 1))
     blobs().save(tmp_path / "blobs.ply")
@@ -159,7 +159,7 @@ def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word
 
 
 @pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
-def test_parameters_that_mitsubas_loader_has_itself_are_refused(tmp_path, capsys, name):
+def test_reserved_parameters_of_mitsubas_loader_are_refused(tmp_path, capsys, name):
     """Also where the file has one: it cannot be given from Python."""
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     path.write_text(path.read_text().replace("model.ply", f"${name}"))
@@ -168,13 +168,13 @@ def test_parameters_that_mitsubas_loader_has_itself_are_refused(tmp_path, capsys
     assert "taken by Mitsuba's loader" in message
 
 
-def test_parameters_that_a_scene_file_does_not_have_are_refused(tmp_path, capsys):
+def test_unknown_scene_parameters_are_refused(tmp_path, capsys):
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     message = fails(capsys, path, "-D", "colour=1", "--out", tmp_path / "out")
     assert message.startswith(f"{path}: ") and "colour" in message
 
 
-def test_it_is_a_command(fit, tmp_path):
+def test_module_runs_as_a_command(fit, tmp_path):
     result = subprocess.run(
         [sys.executable, "-m", "drgs.render", fit, "--orbit", "1", "--out", tmp_path / "out"],
         cwd=REPOSITORY,

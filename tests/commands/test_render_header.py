@@ -7,7 +7,7 @@ import yaml
 from support.render_command import run
 from support.small_capture import blobs, make_dataset, write_dataset
 
-SAID = {"antialiased": True, "low_pass": 0.02}
+HEADER_VALUES = {"antialiased": True, "low_pass": 0.02}
 CAMERA = ["--origin", 0, -4, 1, "--size", 24, 16]
 LINES = [
     "  antialiasing: opacities compensated for the low-pass filter (set by the file)",
@@ -17,15 +17,15 @@ LINES = [
 
 @pytest.fixture
 def files(tmp_path):
-    """A run whose file says SAID, as its configuration does, and a file that says nothing."""
+    """A run whose file and configuration have HEADER_VALUES, and a file without a header."""
     run_folder = tmp_path / "run"
     run_folder.mkdir()
-    replace(blobs(), rendered_with=SAID).save(run_folder / "point_cloud.ply")
+    replace(blobs(), rendered_with=HEADER_VALUES).save(run_folder / "point_cloud.ply")
     blobs().save(tmp_path / "plain.ply")
     write_dataset(tmp_path / "data", make_dataset(1, 1))
     config = {"data": {"path": str(tmp_path / "data")}}
     (tmp_path / "plain.yml").write_text(yaml.safe_dump(config))
-    (run_folder / "config.yml").write_text(yaml.safe_dump({**config, "model": SAID}))
+    (run_folder / "config.yml").write_text(yaml.safe_dump({**config, "model": HEADER_VALUES}))
     return tmp_path
 
 
@@ -35,7 +35,7 @@ def shown(files, out, *arguments):
     return rendered.read_bytes()
 
 
-def test_a_file_alone_is_shown_as_it_says(files, capsys):
+def test_single_file_is_rendered_with_its_header(files, capsys):
     said = shown(files, "a", files / "run" / "point_cloud.ply", *CAMERA)
     lines = capsys.readouterr().out.splitlines()
     assert set(LINES) <= set(lines)
@@ -43,12 +43,12 @@ def test_a_file_alone_is_shown_as_it_says(files, capsys):
     assert "set by the file" not in capsys.readouterr().out
 
 
-def test_the_file_has_the_word_before_a_configuration_and_set_before_the_file(files, capsys):
+def test_header_overrides_configuration_and_set_overrides_header(files, capsys):
     ply, config = files / "run" / "point_cloud.ply", files / "plain.yml"
     own = shown(files, "a", files / "run")
     assert shown(files, "b", ply, "--scene", config) == own
     capsys.readouterr()
-    values = [f"model.{name}={str(value).lower()}" for name, value in SAID.items()]
+    values = [f"model.{name}={str(value).lower()}" for name, value in HEADER_VALUES.items()]
     assert shown(files, "c", files / "plain.ply", "--scene", config, "--set", *values[:1]) != own
     given = [word for value in values for word in ("--set", value)]
     assert shown(files, "d", files / "plain.ply", "--scene", config, *given) == own
@@ -59,7 +59,7 @@ def test_the_file_has_the_word_before_a_configuration_and_set_before_the_file(fi
     assert "set by the file" not in capsys.readouterr().out
 
 
-def test_a_file_for_viewers_is_shown_as_they_show_it(files):
+def test_file_for_viewers_is_rendered_like_viewers(files):
     """Under the configuration of its run, which says otherwise."""
     usual = {"antialiased": False, "low_pass": 0.3}
     replace(blobs(), rendered_with=usual).save(files / "run" / "viewers.ply")

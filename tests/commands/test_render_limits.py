@@ -78,14 +78,14 @@ def test_a_background_that_mitsuba_cannot_read_is_refused(model, tmp_path, suffi
     assert "must be a PNG, JPEG, BMP, PPM or TGA image, got " in line
 
 
-def test_a_background_for_print_is_refused(model, tmp_path):
+def test_cmyk_background_is_refused(model, tmp_path):
     Image.new("CMYK", (16, 16)).save(tmp_path / "a.tif")
     background = ("--background", tmp_path / "a.tif")
     assert "mode CMYK" in refused(render.main, tmp_path / "out", model, *CAMERA, *background)
 
 
 @pytest.mark.parametrize("name", ["pipe.ply", "pipe.xml", "pipe.json", "pipe.png"])
-def test_a_pipe_is_not_waited_for(model, tmp_path, name):
+def test_pipe_is_refused_without_blocking(model, tmp_path, name):
     pipe = tmp_path / name
     os.mkfifo(pipe)
     arguments = {
@@ -98,13 +98,13 @@ def test_a_pipe_is_not_waited_for(model, tmp_path, name):
 
 @pytest.mark.parametrize("main", [fit.main, render.main, capture.main])
 @pytest.mark.parametrize("what", ["x" * 300, "x" * 300 + ".ply"])
-def test_inputs_of_names_that_no_file_can_have_are_refused(tmp_path, main, what):
+def test_invalid_file_names_are_refused(tmp_path, main, what):
     line = refused(main, tmp_path / "out", what)
     assert "255 bytes" in line or "File name too long" in line
 
 
 @pytest.mark.parametrize("main", [fit.main, render.main])
-def test_folders_of_names_that_none_can_have_are_refused(tmp_path, main):
+def test_invalid_folder_names_are_refused(tmp_path, main):
     (tmp_path / "a.yml").write_text("data: {path: .}\n")
     outcome = run_in_process(main, tmp_path / "a.yml", "--out", tmp_path / ("x" * 300))
     assert outcome.returncode == 2 and outcome.stderr.count("\n") == 1
@@ -112,7 +112,7 @@ def test_folders_of_names_that_none_can_have_are_refused(tmp_path, main):
     assert os.listdir(tmp_path) == ["a.yml"]
 
 
-def test_images_of_a_scene_with_a_long_name_have_a_shorter_one(tmp_path):
+def test_long_scene_names_are_shortened_in_image_names(tmp_path):
     scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
     long = scene.rename(scene.with_name("x" * 251 + ".xml"))
     outcome = run_in_process(render.main, long, "--out", tmp_path / "out")
@@ -127,7 +127,7 @@ def test_a_scene_whose_name_is_not_utf_8_is_refused(tmp_path):
     assert "Mitsuba takes names in UTF-8 only" in refused(render.main, tmp_path / "out", other)
 
 
-def test_a_scene_that_holds_other_bytes_is_refused(tmp_path):
+def test_scene_with_non_utf_8_content_is_refused(tmp_path):
     scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
     content = scene.read_bytes()
     assert content.count(b'type="splats"') == 1

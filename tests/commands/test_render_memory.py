@@ -46,7 +46,7 @@ def gigabytes(pixels):
     return memory.format_bytes(pixels * memory.IMAGE_BYTES)
 
 
-def test_a_size_that_cannot_be_held_is_refused(model, tmp_path):
+def test_size_larger_than_memory_is_refused(model, tmp_path):
     """With what it needs, what there is, and what fits."""
     camera = ("--origin", 0, -4, 1)
     most = 8 * 10**9 // memory.IMAGE_BYTES
@@ -59,14 +59,14 @@ def test_a_size_that_cannot_be_held_is_refused(model, tmp_path):
 
 
 @pytest.mark.parametrize("width", [1e9, 1e300])
-def test_so_is_a_camera_of_a_file(model, tmp_path, width):
+def test_camera_file_with_size_beyond_limits_is_refused(model, tmp_path, width):
     path = cameras(tmp_path, camera_angle_x=0.7, w=width, h=width)
     line = refused(render.main, tmp_path / "out", model, "--camera", path)
     assert line.startswith(f"{path}: w must be <= 16777216, got ")
     assert len(line) < 300
 
 
-def test_each_time_of_an_open_shutter_counts(photographs, model, tmp_path):
+def test_shutter_samples_count_towards_memory(photographs, model, tmp_path):
     """An image that would fit once does not a thousand times; more times are refused."""
     path = cameras(tmp_path, camera_angle_x=0.7, w=800, h=800)
     values = json.loads(path.read_text())

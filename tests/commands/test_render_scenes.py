@@ -87,7 +87,7 @@ def test_every_sensor_of_a_scene_is_rendered(tmp_path):
     assert rendered(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
 
 
-def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
+def test_scene_without_splats_is_rendered(tmp_path):
     path = tmp_path / "sphere.xml"
     path.write_text(
         f"""<scene version="3.0.0"><integrator type="direct"/>{sensor(pose_around(0.0, 0.2))}
@@ -97,7 +97,7 @@ def test_a_scene_of_mitsubas_own_is_rendered_too(tmp_path):
     assert rendered(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
 
 
-def test_ellipsoids_of_a_scene_look_as_the_same_file_of_the_integrator(tmp_path):
+def test_ellipsoids_match_the_same_file_loaded_by_the_integrator(tmp_path):
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     run(path, "--out", tmp_path / "file")
     name = '<string name="filename" value="model.ply"/>'
@@ -153,7 +153,7 @@ def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
         (("", ""), '<float name="neer" value="1"/>', "no parameter neer; did you mean near?"),
     ],
 )
-def test_what_a_scene_cannot_ask_for_is_refused_in_one_line(tmp_path, change, settings, message):
+def test_unsupported_scene_settings_are_refused_in_one_line(tmp_path, change, settings, message):
     """Before: SIGFPE, SIGSEGV, tracebacks."""
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), settings=settings)
     path.write_text(path.read_text().replace(*change))

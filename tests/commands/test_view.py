@@ -31,7 +31,7 @@ def model_of(args):
 
 
 @pytest.mark.parametrize("refined", [False, True])
-def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path, refined):
+def test_fit_is_viewed_from_its_training_cameras(fit, tmp_path, refined):
     """Refined cameras are used, where the fit has refined them."""
     run = tmp_path / "run"
     shutil.copytree(fit, run)
@@ -49,7 +49,7 @@ def test_a_fit_is_seen_from_its_training_cameras(fit, tmp_path, refined):
         assert np.allclose(camera.camera_to_world, expected.camera_to_world)
 
 
-def test_a_file_alone_is_seen_whole(fit):
+def test_single_file_is_viewed_as_a_whole(fit):
     args = parsed(fit / "point_cloud.ply", "--background", "0.5", "0.25", "0")
     model = model_of(args)
     assert model.background == (0.5, 0.25, 0.0)
@@ -63,7 +63,7 @@ def test_a_file_alone_is_seen_whole(fit):
 
 
 @pytest.mark.parametrize("name", ["", "point_cloud.ply"])
-def test_what_is_up_can_be_said(fit, name):
+def test_up_direction_can_be_set(fit, name):
     args = parsed(fit / name, "--up", "0", "-2", "0")
     model = model_of(args)
     start = view.start_of(args, model, view.cameras_of(args, model))
@@ -76,7 +76,7 @@ def test_what_is_up_can_be_said(fit, name):
             view.start_of(parsed(fit / name, "--up", *up), model, view.cameras_of(args, model))
 
 
-def test_what_is_not_there_is_refused(fit, tmp_path):
+def test_missing_input_is_refused(fit, tmp_path):
     pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
     for what, message in (
         (tmp_path / "nothing", "there is no such file or folder"),
@@ -85,7 +85,7 @@ def test_what_is_not_there_is_refused(fit, tmp_path):
         assert_refused(view.main, what, folder=tmp_path, message=message)
 
 
-def test_without_the_extra_one_line_says_what_to_install(fit, tmp_path, monkeypatch):
+def test_missing_extra_is_reported_with_what_to_install(fit, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     message = "drgs view: needs viser, which is not installed; pip install 'drgs[viewer]'"
     before = contents(fit)

@@ -4,7 +4,7 @@ from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 
 
-def test_a_shorter_schedule_keeps_its_shares():
+def test_shorter_schedule_is_scaled_in_proportion():
     config = FitConfig(
         data={"path": "."}, iterations=30_000, coarse=[{"until": 3000, "factor": 2}], seed=7
     )
@@ -19,7 +19,7 @@ def test_a_shorter_schedule_keeps_its_shares():
     assert with_iterations(short, 30_000) == config
 
 
-def test_a_reset_that_is_off_stays_off_and_no_count_falls_to_zero():
+def test_disabled_reset_stays_off_and_counts_stay_positive():
     config = FitConfig(data={"path": "."}, densify={"adc": {"white_background_reset": None}})
     short = with_iterations(config, 30)
     assert short.densify.adc.white_background_reset is None

@@ -59,7 +59,7 @@ def test_lego_paper_is_the_reference_recipe():
     assert config.iterations == 30_000 and config.coarse == []
 
 
-def test_rates_fall_unless_the_strategy_is_that_of_the_paper(load):
+def test_rates_decay_except_with_adc(load):
     assert load(MINIMAL).optimizer.decay == 0.1
     assert load(MINIMAL + "densify: {strategy: adc}").optimizer.decay == 1
     given = load(MINIMAL + "densify: {strategy: adc}\noptimizer: {decay: 0.5}")
@@ -81,12 +81,12 @@ def test_the_schedule_follows_from_the_iterations(load, iterations, start, stop,
     ("iterations", "start", "stop"),
     [(30_000, 500, 15_000), (7000, 500, 5000), (700, 250, 500), (3, 1, 2), (1, 0, 1)],
 )
-def test_adaptive_density_control_changes_the_population_for_longer(load, iterations, start, stop):
+def test_adc_has_a_longer_density_schedule(load, iterations, start, stop):
     config = load(MINIMAL + f"iterations: {iterations}\ndensify: {{strategy: adc}}")
     assert (config.densify.start, config.densify.stop) == (start, stop)
 
 
-def test_what_is_given_of_the_schedule_stays(load):
+def test_explicit_schedule_values_are_kept(load):
     given = "densify: {start: 400}\nmodel: {sh_increase_every: 900}\niterations: 500"
     config = load(MINIMAL + given)
     assert (config.densify.start, config.densify.stop) == (400, 401)
@@ -235,7 +235,7 @@ def test_a_wrong_file_is_refused(load, text, message):
     assert str(error.value) == f"scenes/x.yml: {message}"
 
 
-def test_wrong_values_are_named_together_in_one_line(load):
+def test_several_wrong_values_are_reported_in_one_line(load):
     with pytest.raises(UserError) as error:
         load(MINIMAL + "densify: {every: 0, adc: {split_count: 1}}")
     assert str(error.value) == (
@@ -252,7 +252,7 @@ def test_a_long_list_of_wrong_values_is_cut(load):
     )
 
 
-def test_a_wrong_value_is_shown_on_one_line(load):
+def test_wrong_value_with_newlines_is_shown_on_one_line(load):
     with pytest.raises(UserError) as error:
         load(MINIMAL + 'seed: ["a\\nb", 0x' + "f" * 9000 + ']\n"k\\ny": 2')
     assert str(error.value) == (
@@ -289,7 +289,7 @@ def test_a_wrong_override_is_refused(load, overrides, message):
     assert str(error.value) == message
 
 
-def test_overrides_win_over_the_file_and_the_last_one_over_the_others(load):
+def test_overrides_win_over_the_file_and_the_last_one_wins(load):
     config = load(
         MINIMAL + "seed: 1", "seed=2", "seed=3", "loss.sigma=2e0", "data.background=[0, 0.5, 1]"
     )
@@ -309,12 +309,12 @@ def test_paths_are_relative_to_the_file_and_in_overrides_to_the_current_folder(l
     assert config.output.dir == tmp_path.resolve() / "there"
 
 
-def test_an_overriding_path_need_not_be_valid_yaml(load):
+def test_overriding_path_need_not_be_valid_yaml(load):
     assert load(MINIMAL, "data.path=a: [b").data.path.name == "a: [b"
     assert load(MINIMAL, "data.path=2024").data.path.name == "2024"
 
 
-def test_path_keys_are_all_the_paths():
+def test_path_keys_list_every_path_field():
     paths = {name for name, field in fields_of(FitConfig) if "Path" in str(field.annotation)}
     assert paths == set(PATH_KEYS)
     assert set(PATH_KEYS) <= set(known_keys())
@@ -346,7 +346,7 @@ def test_shipped_configurations_load(scene):
 
 @pytest.mark.parametrize("name", ["lego", "lego_mini", "fox", "photos"])
 @pytest.mark.parametrize("overrides", [[], ["iterations=3000"], ["iterations=4300"]])
-def test_the_last_opacity_reset_of_a_short_run_is_long_before_its_end(name, overrides):
+def test_last_opacity_reset_of_a_short_run_is_long_before_its_end(name, overrides):
     config = load_config(REPOSITORY / "scenes" / f"{name}.yml", overrides)
     densify = config.densify
     resets = [*range(densify.adc.reset_every, densify.stop, densify.adc.reset_every)]

@@ -49,18 +49,18 @@ def load(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_a_wrong_value_is_named_as_it_was_given(load, section, overrides, message):
+def test_wrong_value_is_reported_as_given(load, section, overrides, message):
     with pytest.raises(UserError) as error:
         load(section, *overrides)
     assert str(error.value) == message
 
 
-def test_an_unknown_strategy_is_refused_with_those_that_there_are(load):
+def test_unknown_strategy_is_refused_with_the_known_ones(load):
     with pytest.raises(UserError, match=r"^x.yml: densify.strategy must be .*'adc'.*, got 'abc'$"):
         load({"strategy": "abc"})
 
 
-def test_other_iterations_scale_resets():
+def test_number_of_iterations_scales_resets():
     config = FitConfig(data={"path": "."}, iterations=30_000)
     adc = with_iterations(config, 3000).densify.adc
     assert (adc.reset_every, adc.white_background_reset) == (300, 50)

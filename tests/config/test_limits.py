@@ -45,7 +45,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("key", REFUSED)
-def test_a_value_that_no_fit_can_use_is_refused_by_its_name(tmp_path, key):
+def test_unusable_value_is_refused_by_name(tmp_path, key):
     (tmp_path / "a.yml").write_text("data: {path: x}\n")
     for value in REFUSED[key]:
         with warnings.catch_warnings(), pytest.raises(UserError) as error:
@@ -116,7 +116,7 @@ def scene(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("key", "ends"), NUMBERS)
-def test_a_fit_takes_every_number_at_its_limits_or_says_what_is_wrong(
+def test_fit_accepts_numbers_at_their_limits_or_reports_the_problem(
     scene, tmp_path, monkeypatch, key, ends
 ):
     monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
@@ -128,7 +128,7 @@ def test_a_fit_takes_every_number_at_its_limits_or_says_what_is_wrong(
             assert outcome.stderr.count("\n") == (outcome.returncode == 2), outcome.stderr
 
 
-def test_focal_lengths_that_run_away_are_an_error_that_names_their_rate():
+def test_diverging_focal_lengths_are_an_error_naming_their_rate():
     trainer = make_trainer(plain_dataset(), cameras__optimise=True, cameras__focal_lr=1.0)
     (effect,) = (e for e in trainer.effects if e.name == "cameras")
     assert effect.lens_change.focal == (1, 1)

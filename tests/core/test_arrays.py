@@ -31,7 +31,7 @@ def table(count, length=5) -> np.ndarray:
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 9, 12, 45, 64])
-def test_columns_become_rows(precision, count):
+def test_columns_are_transposed_to_rows(precision, count):
     flat = np.array(interleave(numbered(precision, count))).reshape(-1, count)
     np.testing.assert_array_equal(flat, table(count))
     order = UInt32(4, 0, 3, 1, 2)
@@ -41,7 +41,7 @@ def test_columns_become_rows(precision, count):
 
 @both_precisions
 @pytest.mark.parametrize("count", [*range(1, 10), 15, 16, 45])
-def test_rows_are_loaded_as_they_were_stored(precision, count):
+def test_stored_rows_are_loaded_unchanged(precision, count):
     rows = Rows.empty(precision.Float, count, 5)
     rows.store(numbered(precision, count), dr.arange(UInt32, 5))
     lanes, active = UInt32(4, 4, 0, 2), dr.llvm.ad.Bool(True, False, True, True)
@@ -49,11 +49,11 @@ def test_rows_are_loaded_as_they_were_stored(precision, count):
     np.testing.assert_array_equal(loaded, table(count)[[4, 4, 0, 2]] * [[1], [0], [1], [1]])
 
 
-# Of one to five rows of 9, 11 and 45 numbers, arrays end anywhere in a packet.
+# Arrays of one to five rows of 9, 11 and 45 numbers end anywhere in a packet.
 @both_precisions
 @pytest.mark.parametrize("num_rows", [1, 2, 3, 4, 5])
 @pytest.mark.parametrize("width", [1, 3, 4, 6, 9, 11, 24, 45])
-def test_rows_back_to_back_are_loaded_and_stored(precision, width, num_rows):
+def test_contiguous_rows_are_loaded_and_stored(precision, width, num_rows):
     flat = precision.array(table(width, num_rows).ravel())
     lanes = UInt32(np.arange(num_rows)[::-1].copy())
     for count in {1, width // 2 + 1, width}:
@@ -67,7 +67,7 @@ def test_rows_back_to_back_are_loaded_and_stored(precision, width, num_rows):
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
-def test_rows_are_stored_where_a_lane_is_active(precision, count):
+def test_rows_are_stored_for_active_lanes_only(precision, count):
     rows = Rows.empty(precision.Float, count, 6)
     rows.store([precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
     lanes, active = UInt32(5, 0, 2, 3, 1), dr.llvm.ad.Bool(True, True, True, False, True)
@@ -77,14 +77,14 @@ def test_rows_are_stored_where_a_lane_is_active(precision, count):
     assert (stored[[3, 4]] == -1).all()
 
 
-def test_rows_take_little_more_than_their_numbers():
+def test_rows_take_little_more_memory_than_their_numbers():
     widths = {count: block_widths(count) for count in range(1, 17)}
     assert all(sum(blocks) - count == (count % 4 == 3) for count, blocks in widths.items())
     assert widths[9] == (8, 1) and widths[16] == (16,)
 
 
 @both_precisions
-def test_numbers_of_the_host_are_copied(precision):
+def test_host_arrays_are_copied(precision):
     values = np.arange(6.0).reshape(2, 3)
     copy = from_host(precision.Float, values)
     values[:] = -1
@@ -92,7 +92,7 @@ def test_numbers_of_the_host_are_copied(precision):
     assert type(from_host(UInt32, [3, 1])) is UInt32 and dr.width(from_host(UInt32, [])) == 0
 
 
-def test_where_numpy_puts_numbers_makes_no_difference_to_kernels():
+def test_alignment_of_numpy_arrays_does_not_affect_kernels():
     hashes = set()
     for offset in range(8):
         values = np.arange(64, dtype=np.float32)[offset : offset + 40]
@@ -104,7 +104,7 @@ def test_where_numpy_puts_numbers_makes_no_difference_to_kernels():
 
 
 @pytest.mark.parametrize("divisor", [1, 3, 400, 1265, 65535, 2**19 - 1])
-def test_quotients_are_exact_around_every_kind_of_multiple(divisor):
+def test_quotients_are_exact_around_multiples(divisor):
     last = 2**32 - 1
     multiples = np.unique(np.linspace(0, last // divisor, 1000).astype(np.uint64)) * divisor
     index = np.concatenate([multiples, multiples[1:] - 1, multiples + (divisor - 1), [last]])

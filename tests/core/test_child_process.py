@@ -37,7 +37,7 @@ def is_running(process):
         return False
 
 
-def ends(process):
+def has_ended(process):
     """Whether it is gone within a while."""
     for _ in range(200):
         if not is_running(process):
@@ -52,12 +52,12 @@ def test_a_child_reports_and_returns():
     assert reports == [("given", 2, 3)]
 
 
-def test_what_a_user_can_repair_is_raised_here():
+def test_user_error_of_the_child_is_raised_in_the_parent():
     with pytest.raises(UserError, match=r"^a\.jpg: cannot be read$"):
         call(child_functions.refuse)
 
 
-def test_a_defect_keeps_its_traceback():
+def test_unexpected_error_of_the_child_keeps_its_traceback():
     with pytest.raises(RuntimeError, match=r"(?s)status 1:\nTraceback.*ZeroDivisionError: by not"):
         call(child_functions.fail)
 
@@ -96,10 +96,10 @@ def test_a_child_ends_with_a_parent_that_is_killed():
         child = int(parent.stdout.readline())
         assert is_running(child)
         parent.kill()
-    assert ends(child)
+    assert has_ended(child)
 
 
-def test_an_interrupt_waits_for_the_end_of_the_block():
+def test_interrupt_is_deferred_to_the_end_of_the_block():
     done = []
     with pytest.raises(KeyboardInterrupt):
         with DeferredInterrupts():
@@ -112,7 +112,7 @@ def test_an_interrupt_waits_for_the_end_of_the_block():
 
 
 @pytest.mark.parametrize("comes_before", [True, False])
-def test_an_interrupt_is_let_through_once_where_it_is_allowed(comes_before):
+def test_interrupt_is_raised_once_where_allowed(comes_before):
     done = []
     with pytest.raises(KeyboardInterrupt), DeferredInterrupts() as interrupts:
         try:

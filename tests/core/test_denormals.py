@@ -18,7 +18,7 @@ def denormal():
     return float(np.float32(1e-30) * np.float32(1e-10))
 
 
-def test_the_mode_is_as_asked_for_and_given_back():
+def test_denormal_mode_is_set_and_restored():
     assert denormal() > 0
     with denormals_flushed():
         assert denormal() == 0
@@ -29,7 +29,7 @@ def test_the_mode_is_as_asked_for_and_given_back():
     assert denormal() > 0
 
 
-def test_neighbours_of_equal_points_at_zero_are_found_in_a_command(run_python):
+def test_nearest_neighbours_of_equal_points_at_zero_are_found(run_python):
     """In another process: SciPy's tree ended it, as the least number above zero was zero."""
     result = run_python("""
 import numpy as np

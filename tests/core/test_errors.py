@@ -33,7 +33,7 @@ def test_commands_report_user_errors_in_one_line(error, capsys):
     assert (captured.out, captured.err) == ("", "error: a.yml: wrong\n")
 
 
-def test_commands_report_what_the_file_system_refuses_of_a_named_file(capsys):
+def test_commands_report_file_system_errors_with_the_file_name(capsys):
     for error, line in (
         (PermissionError(13, "Permission denied", "/a/b"), "Permission denied; choose a folder"),
         (OSError(36, "File name too long", b"/a/b"), "File name too long; choose a shorter name"),
@@ -61,7 +61,7 @@ def test_commands_name_a_package_that_cannot_be_imported(capsys):
             raise ImportError("x", name=name)
 
 
-def test_a_reader_of_the_output_may_go(run_python):
+def test_closed_output_pipe_ends_a_command_quietly(run_python):
     """Two processes are needed: the output has to go through a pipe."""
     program = (
         "import os, sys\n"
@@ -76,11 +76,11 @@ def test_a_reader_of_the_output_may_go(run_python):
     assert (result.returncode, result.stderr) == (141, "")
 
 
-def test_commands_keep_the_traceback_of_other_errors():
+def test_commands_keep_the_traceback_of_unexpected_errors():
     with pytest.raises(ZeroDivisionError), exit_on_user_error():
         print(1 / 0, file=sys.stderr)
 
 
-def test_what_others_say_fits_on_one_line():
+def test_foreign_messages_are_put_on_one_line():
     assert one_line("a\n  b\tc") == "a b c"
     assert one_line("x" * 10, limit=9) == "xxxxxx..."

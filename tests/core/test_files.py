@@ -43,9 +43,7 @@ def test_atomic_path_keeps_the_old_file_after_an_error(tmp_path):
     ],
 )
 @pytest.mark.parametrize("stage", ["write", "replace"])
-def test_what_the_file_system_refuses_is_the_users_to_repair(
-    tmp_path, monkeypatch, stage, number, message
-):
+def test_file_system_errors_are_user_errors(tmp_path, monkeypatch, stage, number, message):
     path = tmp_path / "a.txt"
     path.write_text("old")
 
@@ -63,7 +61,7 @@ def test_what_the_file_system_refuses_is_the_users_to_repair(
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_a_folder_is_not_replaced_by_a_file(tmp_path):
+def test_folder_is_not_replaced_by_a_file(tmp_path):
     (tmp_path / "a.txt").mkdir()
     message = "Is a directory; remove or rename the folder"
     with pytest.raises(UserError, match=message), atomic_path(tmp_path / "a.txt") as temporary:
@@ -71,7 +69,7 @@ def test_a_folder_is_not_replaced_by_a_file(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_a_file_is_not_replaced_by_a_folder(tmp_path):
+def test_file_is_not_replaced_by_a_folder(tmp_path):
     (tmp_path / "a").write_text("old")
     message = "choose another folder: a part of this path is a file"
     with pytest.raises(UserError, match=message), atomic_path(tmp_path / "a" / "b.txt"):
@@ -96,7 +94,7 @@ def test_text_is_read_up_to_a_limit(tmp_path):
         read_text(tmp_path, "poem", 9)
 
 
-def test_only_regular_files_are_read_and_none_is_waited_for(tmp_path):
+def test_only_regular_files_are_read_and_pipes_do_not_block(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
     for path, kind in ((tmp_path / "pipe", "a named pipe"), (tmp_path / "link", "a named pipe")):
@@ -115,14 +113,14 @@ def test_only_regular_files_are_read_and_none_is_waited_for(tmp_path):
     assert read_text(tmp_path / "link", "poem", 9) == "x"
 
 
-def test_names_are_shortened_between_two_characters():
+def test_names_are_shortened_between_characters():
     assert shorten_stem("a" * 200) == "a" * 200
     assert shorten_stem("a" * 201) == "a" * 200
     assert shorten_stem("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
     assert shorten_stem(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9
 
 
-def test_a_file_may_be_too_large_to_be_opened(tmp_path):
+def test_file_over_the_size_limit_is_not_opened(tmp_path):
     (tmp_path / "a.txt").write_bytes(b"abc")
     open_regular(tmp_path / "a.txt", "poem", 3).close()
     with pytest.raises(UserError, match=r"a.txt: cannot read the poem: more than 2 bytes"):
@@ -130,7 +128,7 @@ def test_a_file_may_be_too_large_to_be_opened(tmp_path):
 
 
 @pytest.mark.parametrize("letter", ["x", "\u00e4"])
-def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path, letter):
+def test_atomic_path_accepts_the_longest_file_names(tmp_path, letter):
     """The temporary file's name would be longer."""
     path = tmp_path / f"{letter * (250 // len(letter.encode()))}.txt"
     with atomic_path(path) as temporary:
@@ -139,7 +137,7 @@ def test_a_name_may_be_as_long_as_the_file_system_allows(tmp_path, letter):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-def test_a_file_takes_no_more_memory_than_it_has_bytes(tmp_path):
+def test_reading_allocates_no_more_than_the_file_size(tmp_path):
     (tmp_path / "a").write_bytes(b"abc")
     assert read_bytes(tmp_path / "a", "file", 1 << 60) == b"abc"
     with pytest.raises(UserError, match=r"a: cannot read the file: more than 2 bytes"):

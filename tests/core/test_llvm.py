@@ -34,7 +34,7 @@ def machine(tmp_path, monkeypatch):
     return install
 
 
-def in_use(monkeypatch, *version):
+def set_loaded_version(monkeypatch, *version):
     monkeypatch.setattr(llvm, "loaded_version", lambda: version or None)
 
 
@@ -58,7 +58,7 @@ def test_the_version_is_read_from_the_file_name(path, version):
     assert version_from_name(path) == version
 
 
-def test_the_version_of_an_unversioned_link_is_its_targets(tmp_path):
+def test_unversioned_link_has_the_version_of_its_target(tmp_path):
     (tmp_path / "libLLVM.so.21.1").touch()
     (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.21.1")
     assert version_from_name(tmp_path / "libLLVM.so") == (21, 1)
@@ -77,7 +77,7 @@ def test_the_newest_library_is_selected_even_if_it_is_a_link(machine):
     assert os.environ[llvm.PATH_VARIABLE] == str(folder / "libLLVM.so.22.1")
 
 
-def test_the_users_choice_of_a_library_is_kept(machine, monkeypatch):
+def test_library_chosen_by_the_user_is_kept(machine, monkeypatch):
     machine("libLLVM.so.22.1")
     monkeypatch.setenv(llvm.PATH_VARIABLE, "/mine.so")
     select_newest_llvm()
@@ -99,7 +99,7 @@ def test_nothing_is_selected_once_drjit_has_loaded_one(machine, monkeypatch):
 
 @pytest.mark.parametrize("version", [(19, 1, 7), (22, 1, 8)])
 def test_tested_versions_pass_silently(machine, monkeypatch, version):
-    in_use(monkeypatch, *version)
+    set_loaded_version(monkeypatch, *version)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ensure_usable_llvm()
@@ -107,7 +107,7 @@ def test_tested_versions_pass_silently(machine, monkeypatch, version):
 
 @pytest.mark.parametrize("major", [17, 18])
 def test_17_and_18_warn_as_untested(machine, monkeypatch, major):
-    in_use(monkeypatch, major, 0, 6)
+    set_loaded_version(monkeypatch, major, 0, 6)
     with pytest.warns(UserWarning) as record:
         ensure_usable_llvm()
     assert str(record[0].message) == (
@@ -120,7 +120,7 @@ def test_17_and_18_warn_as_untested(machine, monkeypatch, major):
 def test_older_versions_are_refused_with_version_command_and_variable(
     machine, monkeypatch, version
 ):
-    in_use(monkeypatch, *version)
+    set_loaded_version(monkeypatch, *version)
     with pytest.raises(LLVMVersionError) as error:
         ensure_usable_llvm()
     assert str(error.value) == (
@@ -132,14 +132,14 @@ def test_older_versions_are_refused_with_version_command_and_variable(
 
 def test_on_macos_the_command_is_brews(machine, monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
-    in_use(monkeypatch, 16, 0, 6)
+    set_loaded_version(monkeypatch, 16, 0, 6)
     with pytest.raises(LLVMVersionError, match="Install one with 'brew install llvm', or name"):
         ensure_usable_llvm()
 
 
 def test_the_refusal_names_a_usable_library_that_is_installed(machine, monkeypatch):
     folder = machine("libLLVM.so.19.1")
-    in_use(monkeypatch, 15, 0, 6)
+    set_loaded_version(monkeypatch, 15, 0, 6)
     with pytest.raises(LLVMVersionError) as error:
         ensure_usable_llvm()
     assert str(error.value).endswith(
@@ -155,13 +155,13 @@ def test_the_refusal_names_a_usable_library_that_is_installed(machine, monkeypat
         ([], "/none.so", "none that Dr.Jit can load (DRJIT_LIBLLVM_PATH=/none.so)"),
     ],
 )
-def test_where_drjit_has_no_library_the_refusal_says_what_there_is(
+def test_refusal_without_a_library_lists_the_installed_ones(
     machine, monkeypatch, names, variable, found
 ):
     folder = machine(*names)
     if variable:
         monkeypatch.setenv(llvm.PATH_VARIABLE, variable.format(folder=folder))
-    in_use(monkeypatch)
+    set_loaded_version(monkeypatch)
     with pytest.raises(LLVMVersionError) as error:
         ensure_usable_llvm()
     assert f", found {found.format(folder=folder)}. Install one" in str(error.value)

@@ -10,7 +10,7 @@ from drgs.core.errors import UserError
 from drgs.core.folders import sole_writer
 
 
-def test_a_folder_has_one_writer(tmp_path):
+def test_folder_has_one_writer(tmp_path):
     folder = tmp_path / "out"
     folder.mkdir()
     with sole_writer(folder) as keep:
@@ -25,7 +25,7 @@ def test_a_folder_has_one_writer(tmp_path):
         pass
 
 
-def test_a_new_folder_is_kept_when_it_is_made(tmp_path):
+def test_lock_creates_a_new_folder_on_demand(tmp_path):
     folder = tmp_path / "new" / "out"
     with sole_writer(folder) as keep, sole_writer(folder) as keep_as_well:
         assert not folder.exists()
@@ -35,7 +35,7 @@ def test_a_new_folder_is_kept_when_it_is_made(tmp_path):
             keep_as_well()
 
 
-def test_an_error_gives_the_folder_back(tmp_path):
+def test_error_releases_the_lock(tmp_path):
     with pytest.raises(KeyError), sole_writer(tmp_path):
         raise KeyError
     with sole_writer(tmp_path):
@@ -61,7 +61,7 @@ def test_a_killed_process_leaves_no_lock(tmp_path):
         pass
 
 
-def test_what_cannot_be_locked_is_left_to_its_writer(tmp_path):
+def test_path_that_cannot_be_locked_is_not_locked(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file" / "out", tmp_path / "file"):
         with sole_writer(path) as keep:

@@ -64,13 +64,13 @@ def test_a_control_group_of_version_2_limits_it(kernel, path):
         (RuntimeError("no memory of it"), False),
     ],
 )
-def test_exhausted_memory_is_told_from_other_errors(kernel, error, is_exhausted):
+def test_out_of_memory_is_distinguished_from_other_errors(kernel, error, is_exhausted):
     reason = memory.out_of_memory_reason(error)
     assert (reason is not None) == is_exhausted
     assert reason is None or "8.19 GB are available; close other programs" in reason
 
 
-def test_what_does_not_fit_is_refused_with_what_there_is(kernel):
+def test_memory_request_beyond_available_memory_is_refused(kernel):
     memory.require_memory("a.ply", 8_000_000 * 1024, "a scene")
     with pytest.raises(UserError) as error:
         memory.require_memory("a.ply", 8_000_000 * 1024 + 1, "a scene")
@@ -93,7 +93,7 @@ def test_a_control_group_of_version_1_limits_it(kernel):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the size of a process is read from /proc")
-def test_a_limit_of_the_process_counts():
+def test_process_memory_limit_counts():
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9,) * 2);"
         "from drgs.core.memory import available_memory; print(available_memory())"
@@ -109,7 +109,7 @@ def test_a_limit_of_the_process_counts():
     ("count", "text"),
     [(24.06e9, "24.1 GB"), (999.9e6, "1 GB"), (5e12, "5,000 GB"), (123_456, "123 kB")],
 )
-def test_numbers_are_written_with_three_digits(count, text):
+def test_byte_counts_are_written_with_three_digits(count, text):
     assert memory.format_bytes(count) == text
 
 
@@ -132,7 +132,7 @@ def test_an_image_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
     assert "with 1,000 samples each need about" in memory.too_large_reason(400, 400, samples=1000)
 
 
-def test_what_fits_into_memory_may_be_too_many_for_the_library(monkeypatch):
+def test_image_that_fits_into_memory_may_exceed_drjit_array_size(monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 10**15)
     assert memory.too_large_reason(2**15, 2**15 - 1) is None
     assert memory.too_large_reason(10**9, 100) == (
@@ -143,7 +143,7 @@ def test_what_fits_into_memory_may_be_too_many_for_the_library(monkeypatch):
     assert "too many for Dr.Jit" in memory.too_large_reason(2000, 2000, channels=2000)
 
 
-def test_what_drjit_holds_for_its_next_arrays_is_available(monkeypatch):
+def test_drjit_malloc_cache_counts_as_available(monkeypatch):
     rooms = [10**9]
     monkeypatch.setattr(memory, "available_memory", lambda: rooms[-1])
     monkeypatch.setattr(dr, "flush_malloc_cache", lambda: rooms.append(8 * GB))
@@ -154,7 +154,7 @@ def test_what_drjit_holds_for_its_next_arrays_is_available(monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc's malloc_trim")
-def test_what_is_not_used_is_given_back_to_the_system():
+def test_unused_memory_is_returned_to_the_system():
     """Below a block that is used, glibc keeps what was freed; Dr.Jit keeps all of its arrays.
 
     Of blocks there are 128 MB, of arrays 116 MB or, with Dr.Jit's powers of two, 122.

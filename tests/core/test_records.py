@@ -27,14 +27,14 @@ def refusal(function, *arguments, **options):
     return str(error.value)
 
 
-def test_what_is_there_is_somebody_elses(tmp_path):
+def test_existing_file_is_foreign(tmp_path):
     write(tmp_path, a="mine", b="mine")
     message = refusal(record(tmp_path).claim, ["a", "b", "c"])
     assert message.startswith(f"{tmp_path}: holds a, b, which this command would replace")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
 
 
-def test_what_was_claimed_may_be_written_again_until_it_is_sealed(tmp_path):
+def test_claimed_file_may_be_rewritten_until_sealed(tmp_path):
     """Also by another process, when the first was killed."""
     record(tmp_path).claim(["a"])
     write(tmp_path, a="half")
@@ -44,7 +44,7 @@ def test_what_was_claimed_may_be_written_again_until_it_is_sealed(tmp_path):
     record(tmp_path).claim(["a", "b"])
 
 
-def test_what_changed_since_is_somebody_elses(tmp_path):
+def test_file_changed_after_sealing_is_foreign(tmp_path):
     record(tmp_path).claim(["a", "b"])
     write(tmp_path, a="ours", b="ours")
     record(tmp_path).seal()
@@ -53,14 +53,14 @@ def test_what_changed_since_is_somebody_elses(tmp_path):
     assert not record(tmp_path).foreign_files(["a", "c"])
 
 
-def test_what_is_gone_may_be_anybodys(tmp_path):
+def test_file_recreated_after_deletion_is_foreign(tmp_path):
     record(tmp_path).claim(["a"])
     record(tmp_path).seal()
     write(tmp_path, a="theirs")
     assert record(tmp_path).foreign_files(["a"]) == ["a"]
 
 
-def test_a_link_or_a_folder_in_the_way_is_somebody_elses(tmp_path):
+def test_symlink_or_folder_in_place_of_a_file_is_foreign(tmp_path):
     record(tmp_path).claim(["a", "b"])
     write(tmp_path, photograph="mine")
     (tmp_path / "a").symlink_to(tmp_path / "photograph")
@@ -68,13 +68,13 @@ def test_a_link_or_a_folder_in_the_way_is_somebody_elses(tmp_path):
     assert record(tmp_path).foreign_files(["a", "b"]) == ["a", "b"]
 
 
-def test_files_of_another_command_are_somebody_elses(tmp_path):
+def test_files_of_another_command_are_foreign(tmp_path):
     record(tmp_path, "fit").claim(["a"])
     write(tmp_path, a="of a fit")
     assert record(tmp_path).foreign_files(["a"]) == ["a"]
 
 
-def test_files_of_a_version_without_records_are_known_once(tmp_path):
+def test_files_of_a_version_without_records_are_claimed_once(tmp_path):
     write(tmp_path, a="ours", b="ours")
     record(tmp_path).claim(["a"], earlier={"a", "b"})
     record(tmp_path).claim(["b"])
@@ -82,7 +82,7 @@ def test_files_of_a_version_without_records_are_known_once(tmp_path):
     assert "holds c, which" in refusal(record(tmp_path).claim, ["c"], earlier={"c"})
 
 
-def test_names_of_any_bytes_and_paths_are_kept(tmp_path):
+def test_non_utf8_names_and_paths_are_recorded(tmp_path):
     name = b"\xff.png".decode(errors="surrogateescape")
     record(tmp_path).claim([name], {"data.path": "../data"})
     write(tmp_path, **{name: "ours"})
@@ -100,7 +100,7 @@ def test_a_damaged_record_is_refused_by_name(tmp_path, text):
     assert "must be the record of the files that were written here" in refusal(record, tmp_path)
 
 
-def test_a_forgotten_record_leaves_nothing(tmp_path):
+def test_removed_record_leaves_no_file(tmp_path):
     kept = record(tmp_path)
     kept.claim(["a"])
     kept.remove()
@@ -109,7 +109,7 @@ def test_a_forgotten_record_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_killed_writers_of_the_same_files_left_is_removed(tmp_path):
+def test_temporary_files_of_killed_writers_are_removed(tmp_path):
     """Other files' may be another command's, and a process that runs goes on."""
     with subprocess.Popen([sys.executable, "-c", ""]) as dead:
         pass

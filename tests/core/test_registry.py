@@ -52,7 +52,7 @@ def test_an_installed_package_registers_by_its_entry_point(monkeypatch, tmp_path
         extension.value()
 
 
-def test_an_unknown_name_lists_those_that_exist():
+def test_unknown_name_lists_the_registered_ones():
     kinds = Registry("kind")
     kinds.register("adaptive")(object())
     with pytest.raises(UserError) as caught:
@@ -73,16 +73,16 @@ def test_a_package_that_cannot_be_imported_is_named(monkeypatch, tmp_path):
         Registry("kind").names()
 
 
-def test_a_name_of_another_module_is_not_replaced():
+def test_name_registered_by_another_module_is_not_replaced():
     kinds = Registry("kind", {"taken": "drgs.somewhere"})
     with pytest.raises(ValueError, match=r"registered by drgs\.somewhere already"):
-        kinds.register("taken")(test_an_unknown_name_lists_those_that_exist)
+        kinds.register("taken")(test_unknown_name_lists_the_registered_ones)
 
 
 def test_two_kinds_cannot_share_a_name():
     """Both would read one section of a configuration."""
     first = Registry("kind")
-    first.register("shared_by_two")(test_an_unknown_name_lists_those_that_exist)
+    first.register("shared_by_two")(test_unknown_name_lists_the_registered_ones)
     with pytest.raises(ValueError, match='a kind is called "shared_by_two" already'):
         Registry("other kind").register("shared_by_two")(object)
     first._extensions.clear()

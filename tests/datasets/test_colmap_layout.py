@@ -29,7 +29,7 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import _read_cloud, start_of
 from drgs.io.colmap import MODELS
 
-REAL = SHARED_DATA / "colmap_robothead"
+REAL_MODEL = SHARED_DATA / "colmap_robothead"
 
 
 def intrinsics(view):
@@ -56,7 +56,7 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
     assert dataset.background == (0.0, 0.0, 0.0)
 
 
-def test_folders_may_be_called_in_another_case(tmp_path):
+def test_folder_names_are_case_insensitive(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "Images")
     write_images(tmp_path / "IMAGES_2", size=(320, 240))
@@ -64,7 +64,7 @@ def test_folders_may_be_called_in_another_case(tmp_path):
     assert load(tmp_path, downscale=2).train[0].width == 320
 
 
-def test_the_images_own_size_decides_the_intrinsics(tmp_path):
+def test_intrinsics_follow_the_image_size(tmp_path):
     write_dataset(tmp_path)
     for factor in (2, 4):
         write_images(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
@@ -83,7 +83,7 @@ def test_the_images_own_size_decides_the_intrinsics(tmp_path):
         assert dataset.train[0].fx == pytest.approx(600 / factor)
 
 
-def test_the_largest_images_there_are_may_be_smaller_than_what_is_asked_for(tmp_path):
+def test_largest_available_images_are_used(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "originals")
     for factor in (4, 8):
@@ -92,7 +92,7 @@ def test_the_largest_images_there_are_may_be_smaller_than_what_is_asked_for(tmp_
 
 
 @pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
-def test_every_lens_that_can_be_rendered_is(tmp_path, name):
+def test_every_supported_lens_is_rendered(tmp_path, name):
     """Without undistorting; the coefficients are those of the file."""
     write_dataset(tmp_path, [name])
     view = load(tmp_path).train[0]
@@ -114,7 +114,7 @@ def film_points(view, points):
 
 
 @pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
-def test_points_are_seen_where_colmap_projects_them(tmp_path, name):
+def test_points_project_like_in_colmap(tmp_path, name):
     """In double precision, over the image and somewhat beyond, to a few roundings of 1,000 px."""
     pycolmap = pytest.importorskip("pycolmap")
     write_dataset(tmp_path, [name])
@@ -126,12 +126,12 @@ def test_points_are_seen_where_colmap_projects_them(tmp_path, name):
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-11)
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the shared data folder is not here")
-def test_real_points_are_seen_where_they_were_observed():
+@pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
+def test_real_points_project_to_their_observations():
     """Within the mean error that the model says of itself, through the reader of datasets."""
     pycolmap = pytest.importorskip("pycolmap")
-    theirs = pycolmap.Reconstruction(str(REAL / "sparse" / "0"))
-    dataset = load(REAL, downscale=2)
+    theirs = pycolmap.Reconstruction(str(REAL_MODEL / "sparse" / "0"))
+    dataset = load(REAL_MODEL, downscale=2)
     errors = {number: [] for number in theirs.points3D}
     for view in (*dataset.train, *dataset.test):
         image = theirs.find_image_with_name(view.files["image"].name)
@@ -156,7 +156,7 @@ def test_other_lenses_are_refused_by_name(tmp_path, name):
     assert "colmap image_undistorter" in message
 
 
-def test_masks_lie_beside_their_images(tmp_path):
+def test_masks_are_found_beside_their_images(tmp_path):
     write_dataset(tmp_path)
     mask = np.zeros((480, 640), np.uint8)
     mask[:, :320] = 255
@@ -189,7 +189,7 @@ def test_masks_lie_beside_their_images(tmp_path):
         *("masks/{0}-mask.webp", "images/{0}.mask.png", "images/{0}_mask.png"),
     ],
 )
-def test_masks_are_called_as_programs_call_them(tmp_path, pattern):
+def test_common_mask_names_are_found(tmp_path, pattern):
     write_dataset(tmp_path)
     mask = np.zeros((480, 640), np.uint8)
     mask[:, :320] = 255
@@ -206,7 +206,7 @@ def test_masks_are_called_as_programs_call_them(tmp_path, pattern):
     assert len(notes) == 1 and "2 of 4 photographs, which have no mask (b.jpg" in notes[0]
 
 
-def test_the_mask_of_the_whole_name_is_preferred(tmp_path):
+def test_mask_with_the_full_name_is_preferred(tmp_path):
     names = ["a.jpg", "b.jpg", "b_mask.jpg"]
     for file in ("a.png", "a.jpg.png", "b.png", "b_mask.png"):
         (tmp_path / "masks").mkdir(exist_ok=True)
@@ -217,7 +217,7 @@ def test_the_mask_of_the_whole_name_is_preferred(tmp_path):
     assert len(notes) == 1 and "masks of no photograph that has a camera: masks/a.png" in notes[0]
 
 
-def test_masks_may_be_for_larger_images(tmp_path):
+def test_masks_may_be_larger_than_images(tmp_path):
     """COLMAP's masks belong to its input images. A pixel counts where all of its area does."""
     write_dataset(tmp_path)
     write_images(tmp_path / "images_2", size=(320, 240))
@@ -235,7 +235,7 @@ def test_masks_may_be_for_larger_images(tmp_path):
     )
 
 
-def test_a_fit_starts_from_the_models_points(tmp_path):
+def test_fit_starts_from_the_points_of_the_model(tmp_path):
     model = write_dataset(tmp_path)
     dataset = load(tmp_path)
     assert dataset.point_cloud == tmp_path / "sparse" / "0" / "points3D.bin"
@@ -248,7 +248,7 @@ def test_a_fit_starts_from_the_models_points(tmp_path):
     assert load(tmp_path, ignore_points=True).point_cloud is None
 
 
-def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
+def test_points_with_large_error_or_short_track_are_dropped(tmp_path):
     model = write_dataset(tmp_path)
     dataset = load(tmp_path)
     positions, _, errors, lengths = (np.array(column) for column in zip(*model.points, strict=True))
@@ -280,7 +280,7 @@ def test_points_of_large_errors_and_of_few_observations_are_left_out(tmp_path):
         start(min_track_length=2, start="random")
 
 
-def test_points_whose_error_is_not_known_are_kept(tmp_path):
+def test_points_with_unknown_error_are_kept(tmp_path):
     model = some_model(np.random.default_rng(1))
     model.points = [
         (x, c, -1.0 if k < 6 else 5.0, n) for k, (x, c, _, n) in enumerate(model.points)
@@ -291,7 +291,7 @@ def test_points_whose_error_is_not_known_are_kept(tmp_path):
     assert count == 9
 
 
-def test_photographs_may_lie_beside_the_model(tmp_path):
+def test_photographs_may_be_beside_the_model(tmp_path):
     write_dataset(tmp_path)
     for path in (tmp_path / "images").iterdir():
         path.rename(tmp_path / path.name)
@@ -309,9 +309,7 @@ def test_photographs_may_lie_beside_the_model(tmp_path):
     ],
 )
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_models_and_photographs_are_found_where_programs_put_them(
-    tmp_path, place, model, images, write
-):
+def test_models_and_photographs_are_found_in_common_places(tmp_path, place, model, images, write):
     there = some(NAMES)
     write(tmp_path / model, there)
     write_images(tmp_path / images)
@@ -346,7 +344,7 @@ def some(names):
     ],
     ids=["right", "case", "suffix", "images", "backslashes", "of another machine"],
 )
-def test_a_photograph_is_found_under_nearly_its_name(tmp_path, call, is_said):
+def test_photograph_is_found_under_a_similar_name(tmp_path, call, is_said):
     model = some(NAMES)
     model.images = [(call(name), camera, pose) for name, camera, pose in model.images]
     write_binary(tmp_path / "sparse" / "0", model)
@@ -359,7 +357,7 @@ def test_a_photograph_is_found_under_nearly_its_name(tmp_path, call, is_said):
     assert [": taken under nearly the same name: " in note for note in notes] == [True] * is_said
 
 
-def test_a_file_is_not_taken_for_two_photographs(tmp_path):
+def test_file_is_not_matched_to_two_photographs(tmp_path):
     write_binary(tmp_path / "sparse" / "0", some(["a.jpg", "A.tif", "b.jpg", "c.jpg", "d.bmp"]))
     write_images(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
     dataset, notes = load_noting(tmp_path)
@@ -368,7 +366,7 @@ def test_a_file_is_not_taken_for_two_photographs(tmp_path):
 
 
 @pytest.mark.parametrize("below", ["sparse/0", "."])
-def test_test_views_are_those_of_a_list(tmp_path, below):
+def test_list_selects_the_test_views(tmp_path, below):
     write_dataset(tmp_path)
     (tmp_path / below / "test.txt").write_text("\ufeff# held out\r\nb.jpg\r\ncam/2.png\r\n")
     dataset, notes = load_noting(tmp_path)
@@ -381,7 +379,7 @@ def test_test_views_are_those_of_a_list(tmp_path, below):
     assert len(notes) == 1 and notes[0].endswith("test.txt has names that no frame has: z.jpg")
 
 
-def test_folders_may_be_the_splits(tmp_path):
+def test_folders_define_the_splits(tmp_path):
     names = ("train/a.jpg", "test/a.jpg", "test/b.jpg", "train/c.jpg")
     write_binary(tmp_path / "sparse" / "0", some(names))
     write_images(tmp_path / "images", names)
@@ -391,11 +389,11 @@ def test_folders_may_be_the_splits(tmp_path):
 
 
 # ----------------------------------------------------------------------------------------------
-# What is refused
+# Errors
 # ----------------------------------------------------------------------------------------------
 
 
-def test_an_image_that_is_not_there_is_left_out_unless_most_are(tmp_path):
+def test_missing_images_are_left_out_unless_most_are_missing(tmp_path):
     write_dataset(tmp_path)
     (tmp_path / "images" / "b.jpg").unlink()
     dataset, notes = load_noting(tmp_path)
@@ -408,14 +406,14 @@ def test_an_image_that_is_not_there_is_left_out_unless_most_are(tmp_path):
     assert message.endswith("; not there: 3 of 4 photographs")
 
 
-def test_an_image_of_another_shape_is_refused(tmp_path):
+def test_image_with_another_aspect_ratio_is_refused(tmp_path):
     write_dataset(tmp_path)
     write_images(tmp_path / "images", ["b.jpg"], (480, 640))
     assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize("original", [(4032, 3024), (3000, 4003), (101, 997)])
-def test_scaled_images_are_told_from_cropped_ones(original):
+def test_scaled_images_are_distinguished_from_cropped_ones(original):
     """However their sides were rounded; a crop by three px of each is none of them."""
     width, height = original
     for factor in (1.7, 2, 4, 5.003, 8):
@@ -427,7 +425,7 @@ def test_scaled_images_are_told_from_cropped_ones(original):
     assert is_scaled(original, original) and not is_scaled((width, height - 1), original)
 
 
-def test_an_image_that_was_turned_since_is_turned_as_exif_says(tmp_path):
+def test_image_rotated_after_colmap_is_rotated_by_exif(tmp_path):
     """COLMAP reads images as they are stored: where the stored size is the camera's, it is right.
 
     Where another program has turned what COLMAP saw, EXIF says how it is turned back.
@@ -443,7 +441,7 @@ def test_an_image_that_was_turned_since_is_turned_as_exif_says(tmp_path):
     assert np.asarray(view.image).shape == (480, 640, 3)
 
 
-def test_an_image_that_exif_turns_by_a_half_is_as_colmap_read_it(tmp_path):
+def test_exif_rotation_by_180_degrees_is_ignored_like_in_colmap(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     write_dataset(tmp_path)
     exif = Image.Exif()
@@ -468,7 +466,7 @@ def test_folders_without_images_and_models_without_folders_are_explained(tmp_pat
     )
 
 
-def test_there_are_two_views_at_least_and_no_other_splits(tmp_path):
+def test_fewer_than_two_views_is_an_error(tmp_path):
     write_dataset(tmp_path)
     assert "this layout has no split val" in refusal(tmp_path, test_split="val")
     write_binary(tmp_path / "sparse" / "0", some_model(np.random.default_rng(1), ["a.jpg"]))

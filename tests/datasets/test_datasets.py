@@ -52,7 +52,7 @@ def test_cameras_look_at_the_origin_with_y_down(blender):
         assert np.linalg.det(rotation) == pytest.approx(1)
 
 
-def test_val_is_measured_on_where_there_is_no_test_split(blender):
+def test_val_split_is_used_without_a_test_split(blender):
     dataset = load(blender[0])
     assert dataset.test_split == "val"
     assert "measured on 3 views of split val" in dataset.description
@@ -165,7 +165,7 @@ def test_a_wrong_transforms_file_is_refused_with_file_and_key(blender, change, m
 
 
 @pytest.mark.parametrize(("shear", "is_accepted"), [(0.9e-4, True), (1.1e-4, False)])
-def test_a_matrix_is_rigid_to_1e_4(blender, shear, is_accepted):
+def test_pose_must_be_rigid_within_1e_4(blender, shear, is_accepted):
     # R = [[1, shear, 0], [0, 1, 0], [0, 0, 1]] has |R R^T - I| = shear (and its square).
     matrix = np.eye(4)
     matrix[0, 1] = shear
@@ -195,7 +195,7 @@ def test_an_image_of_another_size_is_refused(blender):
     )
 
 
-def test_a_missing_image_is_left_out_and_named(blender):
+def test_missing_image_is_left_out_and_reported(blender):
     folder = blender[0]
     (folder / "train" / "r_1.png").unlink()
     path = folder / "transforms_train.json"
@@ -222,7 +222,7 @@ def test_malformed_json_names_file_and_line(blender):
     assert refusal(blender[0]).startswith(f"{path}: not valid JSON: Expecting value: line 2")
 
 
-def test_no_test_views_is_an_error(blender):
+def test_missing_test_views_are_an_error(blender):
     (blender[0] / "transforms_val.json").unlink()
     assert refusal(blender[0]) == (
         f"{blender[0]}: there are no test views: neither transforms_test.json nor "
@@ -319,7 +319,7 @@ def test_a_thin_prism_fisheye_is_read(photographs, says, lens):
 
 
 @pytest.mark.parametrize("says", [{"camera_model": "FULL_OPENCV"}, {"k5": 0.125}])
-def test_a_fourth_coefficient_that_is_opencvs_is_read(photographs, says):
+def test_opencv_k4_is_read(photographs, says):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1, k4=0.25, **says))
     given = {k: v for k, v in says.items() if k == "k5"}
     assert load(photographs).train[0].lens == RadialTangential.from_coefficients(
@@ -383,7 +383,7 @@ def test_wrong_intrinsics_are_refused_with_file_and_key(photographs, change, mes
     assert refusal(photographs) == f"{path}: {message}"
 
 
-def test_a_frames_own_wrong_value_is_named_with_the_frame(photographs):
+def test_wrong_value_of_a_frame_is_reported_with_the_frame(photographs):
     path = photographs / "transforms.json"
     edit(path, lambda m: m["frames"][4].update(fl_x=0))
     assert refusal(photographs) == f"{path}: frames[4].fl_x must be > 0, got 0"
@@ -406,12 +406,12 @@ def test_a_split_name_of_the_other_layout_is_refused(photographs):
     )
 
 
-def test_one_view_is_too_few(photographs):
+def test_single_view_is_an_error(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(frames=m["frames"][:1]))
     assert refusal(photographs).endswith("at least 2 views are needed, one of them to test; got 1")
 
 
-def test_equal_file_names_in_two_folders_stay_apart(photographs):
+def test_equal_file_names_in_two_folders_are_distinct(photographs):
     (photographs / "more").mkdir()
     iio.imwrite(photographs / "more" / "01.png", np.zeros((6, 8, 3), np.uint8))
     edit(
@@ -470,7 +470,7 @@ def test_a_photograph_that_is_listed_twice_is_reported(photographs):
     ]
 
 
-def test_a_transforms_file_may_begin_with_a_mark_of_byte_order(photographs):
+def test_transforms_file_may_begin_with_a_bom(photographs):
     path = photographs / "transforms.json"
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert len(load(photographs).train) == 8
@@ -481,7 +481,7 @@ def test_a_transforms_file_may_begin_with_a_mark_of_byte_order(photographs):
 @pytest.mark.parametrize(
     "name", ["POINTS.PLY", "/home/someone/scan/points.ply", "images\\points.ply"]
 )
-def test_a_point_cloud_is_found_under_nearly_its_name(photographs, name):
+def test_point_cloud_is_found_under_a_similar_name(photographs, name):
     cloud = photographs / ("images/points.ply" if "images" in name else "points.ply")
     cloud.touch()
     edit(photographs / "transforms.json", lambda m: m.update(ply_file_path=name))
@@ -490,7 +490,7 @@ def test_a_point_cloud_is_found_under_nearly_its_name(photographs, name):
     assert note.endswith(f"nearly the same name: 1 point cloud, such as {cloud} for {name}")
 
 
-def test_depths_and_masks_are_found_under_nearly_their_names(photographs):
+def test_depths_and_masks_are_found_under_similar_names(photographs):
     """A depth of another format has another unit: it is not taken."""
     with (photographs / "D.NPY").open("wb") as file:
         np.save(file, np.full((6, 8), 2.0))
@@ -538,7 +538,7 @@ def test_photographs_that_were_moved_are_found(photographs, call, folder):
     )
 
 
-def test_one_photograph_of_two_is_too_few(photographs):
+def test_dataset_with_one_of_two_photographs_is_refused(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(frames=m["frames"][:2]))
     (photographs / "images" / "09.png").unlink()
     assert refusal(photographs).endswith("; not there: 1 of 2 photographs")

@@ -18,12 +18,12 @@ def header(shape, kind="<f8"):
     return stream.getvalue()
 
 
-def of_several(path):
+def write_several_arrays(path):
     with path.open("wb") as file:
         np.savez(file, a=np.ones(3))
 
 
-WRONG = {
+INVALID_DEPTHS = {
     "of 8 TB": (lambda p: p.write_bytes(header((10**6, 10**6))), "cannot read the depth"),
     "of more than there is": (lambda p: p.write_bytes(header((2**40, 2**40))), "cannot read the"),
     "cut off": (lambda p: p.write_bytes(header((4, 6)) + bytes(80)), "cannot read the depth"),
@@ -39,7 +39,7 @@ WRONG = {
     ),
     "of objects": (lambda p: np.save(p, np.full((4, 6), None)), "cannot read the depth"),
     "of several arrays": (
-        of_several,
+        write_several_arrays,
         "depth must be (height, width)",
     ),
     "no numbers": (lambda p: p.write_bytes(b"hello"), "cannot read the depth"),
@@ -48,8 +48,8 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("make", "message"), WRONG.values(), ids=WRONG)
-def test_a_depth_that_is_none_is_refused_in_one_line(tmp_path, make, message):
+@pytest.mark.parametrize(("make", "message"), INVALID_DEPTHS.values(), ids=INVALID_DEPTHS)
+def test_invalid_depth_file_is_refused_in_one_line(tmp_path, make, message):
     make(tmp_path / "a.npy")
     with pytest.raises(UserError) as error:
         read_depth(tmp_path / "a.npy", 1.0, (6, 4))
@@ -58,7 +58,7 @@ def test_a_depth_that_is_none_is_refused_in_one_line(tmp_path, make, message):
 
 
 @pytest.mark.parametrize("kind", ["f2", "f4", "f8", ">f4", "u1", "i4"])
-def test_depth_of_any_real_numbers_is_read(tmp_path, kind):
+def test_depth_of_any_real_type_is_read(tmp_path, kind):
     values = np.arange(24).reshape(4, 6).astype(kind)
     for array in (values, values[:, :, None]):
         np.save(tmp_path / "a.npy", array)

@@ -42,7 +42,7 @@ def warnings_are_errors():
         ({"cx": 8.0, "cy": -1e5}, "cy must be within 1200 px of the image, got -100000"),
     ],
 )
-def test_numbers_that_no_camera_has_are_refused(tmp_path, values, message):
+def test_invalid_camera_parameters_are_refused(tmp_path, values, message):
     meta = {"w": 16, "h": 12, "fl_x": 20.0, **values, "frames": [{"transform_matrix": POSE}]}
     (tmp_path / "a.json").write_text(json.dumps(meta))
     with pytest.raises(UserError) as error:
@@ -50,7 +50,7 @@ def test_numbers_that_no_camera_has_are_refused(tmp_path, values, message):
     assert str(error.value).startswith(f"{tmp_path}/a.json: {message}")
 
 
-def test_a_camera_for_another_size_is_scaled(tmp_path):
+def test_camera_is_scaled_to_the_requested_size(tmp_path):
     meta = {"w": 16, "h": 12, "fl_x": 20.0, "cx": 8.0, "cy": 6.0}
     (tmp_path / "a.json").write_text(json.dumps({**meta, "frames": [{"transform_matrix": POSE}]}))
     (view,) = read_viewpoints(tmp_path / "a.json", (32, 24))
@@ -59,14 +59,14 @@ def test_a_camera_for_another_size_is_scaled(tmp_path):
 
 @pytest.mark.parametrize("where", ["origin", "target"])
 @pytest.mark.parametrize("size", [1e10, 1e300, np.nan])
-def test_coordinates_that_float32_cannot_tell_apart_are_refused(where, size):
+def test_coordinates_beyond_float32_resolution_are_refused(where, size):
     places = {"origin": (0, -4, 1), "target": (0, 0, 0), where: (0, size, 0)}
     with pytest.raises(UserError, match=f"camera: the coordinates of {where} must be at most"):
         look_at(**places, up=(0, 0, 1))
 
 
 @pytest.mark.parametrize(("size", "near"), [(1e38, 1e9), (1e-30, 1e-9)])
-def test_near_planes_of_scenes_of_any_size_are_within_their_limits(size, near):
+def test_near_planes_are_within_limits_for_scenes_of_any_size(size, near):
     means = np.random.default_rng(0).normal(size=(20, 3)) * size
     ones = np.ones((20, 4))
     gaussians = Gaussians.from_numpy(means, ones, ones[:, :3], 0.5 * ones[:, 0], ones[:, None, :3])

@@ -39,7 +39,7 @@ def differences(folder, function, **settings):
     return before.differences(fingerprint_of(load(folder, **settings)))
 
 
-def test_data_that_was_moved_is_the_same(rich, tmp_path):
+def test_moved_data_has_the_same_fingerprint(rich, tmp_path):
     there = shutil.copytree(rich, tmp_path / "there")
     here, there = (fingerprint_of(load(folder)) for folder in (rich, there))
     assert not here.differences(there)
@@ -69,7 +69,7 @@ def test_changes_of_a_frame_are_named(rich, text):
 @pytest.mark.parametrize(
     ("name", "what"), [("mask.png", "mask"), ("depth.npy", "depth"), ("images/05.png", "image")]
 )
-def test_the_content_of_each_file_counts(rich, name, what):
+def test_content_of_each_file_changes_the_fingerprint(rich, name, what):
     found = differences(rich, lambda: (rich / name).open("ab").write(b"\0"))
     assert found == [f"the {what} of training view 05"]
 
@@ -83,19 +83,19 @@ def test_ignored_files_do_not_count(rich):
     assert not prints[0].differences(prints[1])
 
 
-def test_the_size_that_is_configured_counts(rich):
+def test_configured_size_changes_the_fingerprint(rich):
     found = differences(rich, lambda: None, image_size=4)
     assert "the size (8x6, now 4x3) of training view 05" in found and len(found) == 10
 
 
-def test_rounding_of_another_machine_does_not_count(rich):
+def test_rounding_does_not_change_the_fingerprint(rich):
     def round_off(meta):
         meta["frames"][FRAME]["transform_matrix"][0][3] *= 1 + 1e-14
 
     assert not differences(rich, lambda: change(rich, round_off))
 
 
-def test_files_that_were_not_read_are_as_good_as_any(rich):
+def test_unread_files_are_not_compared(rich):
     before = fingerprint_of(load(rich))
     shutil.copy(rich / "images" / "05.png", rich / "images" / "04.png")
     dataset = load(rich)
@@ -105,7 +105,7 @@ def test_files_that_were_not_read_are_as_good_as_any(rich):
         assert len(before.differences(now)) == len(other)
 
 
-def test_a_file_that_is_gone_is_named(rich):
+def test_missing_file_is_named(rich):
     dataset = load(rich)
     (rich / "images" / "05.png").unlink()
     with pytest.raises(UserError, match=r"05\.png: cannot read the file: No such file"):
@@ -113,6 +113,6 @@ def test_a_file_that_is_gone_is_named(rich):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"train": [7], "test": []}', b"\xff"])
-def test_another_text_is_no_fingerprint(content):
+def test_other_text_is_not_a_fingerprint(content):
     with pytest.raises(ValueError, match="no fingerprint of data"):
         Fingerprint.from_bytes(content)

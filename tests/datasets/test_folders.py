@@ -13,7 +13,7 @@ from drgs.datasets.folders import MAX_PIXELS, config_for
 SCENES = REPOSITORY / "scenes"
 
 
-def test_photographs_are_scaled_by_a_whole_number_and_fitted_as_in_photos_yml(tmp_path):
+def test_photographs_are_scaled_by_an_integer_and_use_photos_yml(tmp_path):
     write_dataset(tmp_path)
     for size, expected in (((640, 480), 640), ((1600, 1200), 800), ((2400, 1800), 800)):
         write_images(tmp_path / "images", size=size)
@@ -31,7 +31,7 @@ def test_photographs_are_scaled_by_a_whole_number_and_fitted_as_in_photos_yml(tm
 
 
 @pytest.mark.parametrize("size", [(4032, 3024), (3023, 4031), (901, 667), (41, 60001)])
-def test_widths_are_divided_by_the_smallest_whole_number_that_will_do(tmp_path, size):
+def test_widths_are_divided_by_the_smallest_sufficient_integer(tmp_path, size):
     write_dataset(tmp_path)
     write_images(tmp_path / "images", size=size)
     config, _ = config_for(tmp_path)
@@ -43,7 +43,7 @@ def test_widths_are_divided_by_the_smallest_whole_number_that_will_do(tmp_path, 
     assert larger * round(height * larger / width) > MAX_PIXELS
 
 
-def test_the_largest_image_decides(tmp_path):
+def test_largest_image_sets_the_scale(tmp_path):
     write_dataset(tmp_path)
     sizes = [(640, 480), (1600, 1200), (1200, 1600), (700, 500)]
     for name, size in zip(NAMES, sizes, strict=True):
@@ -56,7 +56,7 @@ def test_the_largest_image_decides(tmp_path):
     assert config_for(tmp_path)[0].data.image_size == 900
 
 
-def test_cut_out_images_are_fitted_as_in_lego_yml():
+def test_images_with_alpha_use_lego_yml():
     config, reasons = config_for(SCENES / "lego")
     example = load_config(SCENES / "lego.yml")
     assert config.data.type == "nerf_synthetic" and config.iterations == example.iterations
@@ -76,7 +76,7 @@ def test_given_values_are_not_chosen(tmp_path):
     assert (config.data.image_size, config.iterations, config.seed) == (100, 30, 3)
 
 
-def test_folders_that_are_none_are_explained(tmp_path):
+def test_folders_that_are_no_datasets_are_explained(tmp_path):
     with pytest.raises(UserError, match=r"drgs poses"):
         write_images(tmp_path / "images")
         config_for(tmp_path)

@@ -16,7 +16,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.images import smaller_view
 
 
-# What a frame may have besides its photograph
+# Data of a frame besides its photograph
 def frame_of(meta, name="01.png"):
     """The frame of a photograph; frames are in another order than names."""
     return next(f for f in meta["frames"] if f["file_path"].endswith(name))
@@ -44,7 +44,7 @@ GREY_MASK = np.array([[0, 127, 128, 255, 1, 254, 200, 100]] * 6, np.uint8)
     [GREY_MASK, np.repeat(GREY_MASK[..., None], 3, axis=2), GREY_MASK.astype(np.uint16) * 257],
     ids=["grey", "rgb", "grey16"],
 )
-def test_a_mask_counts_pixels_brighter_than_half(photographs, pixels):
+def test_mask_keeps_pixels_brighter_than_half(photographs, pixels):
     iio.imwrite(photographs / "mask.png", pixels)
     give(photographs, mask_path="mask.png")
     give(photographs, "08.png", mask_path="mask")  # of a test view; .png is added
@@ -58,7 +58,7 @@ def test_a_mask_counts_pixels_brighter_than_half(photographs, pixels):
     assert "ignored" not in dataset.description
 
 
-def test_a_mask_of_one_bit_is_read(photographs):
+def test_one_bit_mask_is_read(photographs):
     kept = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
     rendered = Image.fromarray(kept)
     assert rendered.mode == "1"
@@ -75,7 +75,7 @@ def test_masks_may_be_ignored(photographs):
     assert dataset.description.endswith("; masks (mask_path) ignored")
 
 
-def test_a_smaller_mask_counts_pixels_all_of_which_count(photographs):
+def test_downscaled_mask_keeps_fully_covered_pixels(photographs):
     mask = np.full((6, 8), 255, np.uint8)
     mask[0, 0], mask[3, 5] = 0, 0
     iio.imwrite(photographs / "mask.png", mask)
@@ -101,7 +101,7 @@ def test_an_image_of_another_size_than_the_photograph_is_refused(photographs, ki
     ("key", "ignore", "kind"),
     [("mask_path", "masks", "masks"), ("depth_file_path", "depth", "files of depth")],
 )
-def test_a_missing_mask_or_depth_is_named(photographs, key, ignore, kind):
+def test_missing_mask_or_depth_is_reported(photographs, key, ignore, kind):
     give(photographs, **{key: "nowhere.png"})
     where = f"{photographs / 'transforms.json'}: frames[{index_of(photographs)}].{key}"
     assert refusal(photographs) == (
@@ -112,7 +112,7 @@ def test_a_missing_mask_or_depth_is_named(photographs, key, ignore, kind):
     assert refusal(photographs) == f"{where} must be text, got 3"
 
 
-def test_few_missing_masks_take_their_photographs_along_and_depths_do_not(photographs):
+def test_missing_masks_drop_their_photographs_and_missing_depths_do_not(photographs):
     """A photograph without its mask would be fitted where it must not; one without depth can be
     used."""
     iio.imwrite(photographs / "mask.png", GREY_MASK)
@@ -131,7 +131,7 @@ def test_few_missing_masks_take_their_photographs_along_and_depths_do_not(photog
     ]
 
 
-def test_a_mask_may_be_an_alpha_channel_or_any_colour(photographs):
+def test_mask_may_be_an_alpha_channel_or_a_colour_image(photographs):
     """Transparent pixels, and those that are dark in all channels, do not count."""
     counts = np.random.default_rng(0).integers(0, 2, (6, 8)).astype(bool)
     white, zero = np.full((6, 8, 3), 255), 0 * counts
@@ -164,7 +164,7 @@ def test_a_folder_of_unnamed_masks_is_reported(photographs):
 
 
 @pytest.mark.parametrize("name", ["01.png", "08.png"], ids=["train", "test"])
-def test_a_mask_that_leaves_out_every_pixel_is_refused(photographs, name):
+def test_empty_mask_is_refused(photographs, name):
     iio.imwrite(photographs / "mask.png", np.full((6, 8), 127, np.uint8))
     give(photographs, name, mask_path="mask.png")
     assert refusal(photographs) == (
@@ -175,7 +175,7 @@ def test_a_mask_that_leaves_out_every_pixel_is_refused(photographs, name):
     assert view_named(load(photographs, ignore_masks=True)).mask is None
 
 
-def test_a_mask_that_leaves_out_every_pixel_of_a_smaller_image_is_refused(photographs):
+def test_mask_that_is_empty_after_downscaling_is_refused(photographs):
     """One of each block of 2 x 2 pixels: none of the larger pixels counts as a whole."""
     mask = np.full((6, 8), 255, np.uint8)
     mask[::2, ::2] = 0
@@ -207,7 +207,7 @@ STEPS = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
     ],
     ids=["default", "top", "frame"],
 )
-def test_depths_of_an_image_are_in_steps_of_a_unit(photographs, place, values, unit):
+def test_integer_depths_are_multiples_of_the_unit(photographs, place, values, unit):
     iio.imwrite(photographs / "depth.png", STEPS)
     give(photographs, depth_file_path="depth.png")
     if place == "top":
@@ -228,7 +228,7 @@ def test_depths_of_an_image_are_in_steps_of_a_unit(photographs, place, values, u
 @pytest.mark.parametrize(
     ("values", "unit"), [({}, 1.0), ({"depth_unit_scale_factor": 0.25}, 0.25)], ids=["", "stated"]
 )
-def test_depths_of_an_array_are_in_scene_units_or_in_those_that_are_stated(
+def test_array_depths_are_in_scene_units_or_in_the_given_unit(
     photographs, dtype, shape, values, unit
 ):
     """Depths that are not finite or not positive are unknown."""
@@ -258,7 +258,7 @@ def test_the_description_has_the_units_of_all_depths(photographs):
     assert [float(view_named(dataset, name).depth[5, 7]) for name in ("02", "03")] == [1, 3]
 
 
-def test_smaller_depths_are_means_of_known_ones(photographs):
+def test_downscaled_depths_average_known_depths(photographs):
     depth = np.random.default_rng(0).uniform(1, 9, (6, 8))
     depth[1, 3] = np.nan
     np.save(photographs / "depth.npy", depth)
@@ -282,7 +282,7 @@ def test_smaller_depths_are_means_of_known_ones(photographs):
     ],
     ids=["colours", "broken", "empty", "objects"],
 )
-def test_an_array_that_holds_no_depths_is_refused(photographs, write, message):
+def test_invalid_depth_array_is_refused(photographs, write, message):
     write(photographs / "depth.npy")
     give(photographs, depth_file_path="depth.npy")
     assert refusal(photographs).startswith(f"{photographs / 'depth.npy'}: {message}")
@@ -293,7 +293,7 @@ def test_an_array_that_holds_no_depths_is_refused(photographs, write, message):
     [(np.full((6, 8), 9, np.uint8), "L"), (np.full((6, 8, 3), 9, np.uint8), "RGB")],
     ids=["8 bits", "colours"],
 )
-def test_an_image_of_depths_has_16_bits(photographs, pixels, mode):
+def test_depth_image_must_have_16_bits(photographs, pixels, mode):
     """Numbers of an image of 8 bits would be read as other depths."""
     iio.imwrite(photographs / "depth.png", pixels)
     give(photographs, depth_file_path="depth.png")
@@ -324,7 +324,7 @@ def test_a_fit_without_a_depth_loss_does_not_open_depths(photographs, weight):
             load_dataset(fit.data_for_training)
 
 
-def test_all_that_frames_have_may_be_ignored_and_is_named(photographs):
+def test_ignored_frame_data_is_listed(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(k1=0.1))
     values = {"mask_path": "nowhere.png", "depth_file_path": "nowhere.png"}
     give(photographs, transform_matrix_close=np.eye(4).tolist(), **values)
@@ -335,7 +335,7 @@ def test_all_that_frames_have_may_be_ignored_and_is_named(photographs):
         assert (view.lens, view.motion, view.mask, view.depth) == (None,) * 4
 
 
-def test_a_mask_for_the_whole_file_is_that_of_every_frame_without_its_own(photographs):
+def test_mask_of_the_file_is_the_default_of_its_frames(photographs):
     masks = np.random.default_rng(0).integers(0, 2, (2, 6, 8), np.uint8)
     for name, mask in zip(("all", "one"), masks, strict=True):
         iio.imwrite(photographs / f"{name}.png", 255 * mask)
@@ -346,7 +346,7 @@ def test_a_mask_for_the_whole_file_is_that_of_every_frame_without_its_own(photog
         np.testing.assert_array_equal(view.mask, masks[int(view.name == "02")])
 
 
-def test_a_unit_of_depth_is_positive(photographs):
+def test_depth_unit_must_be_positive(photographs):
     iio.imwrite(photographs / "depth.png", STEPS)
     give(photographs, depth_file_path="depth.png", depth_unit_scale_factor=0)
     where = f"{photographs / 'transforms.json'}: frames[{index_of(photographs)}]."
@@ -361,7 +361,7 @@ def test_a_unit_of_depth_is_positive(photographs):
         ("top", {"shutter": "rolling"}, "rolling"),
     ],
 )
-def test_a_second_pose_is_read(photographs, place, values, shutter):
+def test_closing_pose_is_read(photographs, place, values, shutter):
     center = (3.9, 0.5, 1.1)
     give(photographs, transform_matrix_close=look_at(center, (0, 0, 0)).tolist())
     if place == "top":
@@ -382,7 +382,7 @@ def test_a_second_pose_is_read(photographs, place, values, shutter):
     assert ignored.description.endswith("; motion (transform_matrix_close) ignored")
 
 
-def test_a_shutter_alone_is_no_motion(photographs):
+def test_shutter_without_a_closing_pose_is_static(photographs):
     edit(photographs / "transforms.json", lambda m: m.update(shutter="rolling"))
     assert all(view.motion is None for view in load(photographs).train)
 
@@ -401,7 +401,7 @@ def test_wrong_motion_is_refused_with_the_key(photographs):
     )
 
 
-def test_transparency_is_kept(photographs):
+def test_alpha_is_kept(photographs):
     """Only transparent photographs have an alpha channel."""
     rgba = np.random.default_rng(0).integers(0, 256, (6, 8, 4), np.uint8)
     iio.imwrite(photographs / "images" / "01.png", rgba)
@@ -413,7 +413,7 @@ def test_transparency_is_kept(photographs):
     np.testing.assert_allclose(smaller.alpha, blocks, rtol=1e-6)
 
 
-def test_transparency_of_synthetic_images_is_kept(blender):
+def test_alpha_of_synthetic_images_is_kept(blender):
     folder, images = blender
     for width, shape in ((None, (4, 1, 6, 1)), (3, (2, 2, 3, 2))):
         view = load(folder, image_size=width).train[1]
@@ -422,7 +422,7 @@ def test_transparency_of_synthetic_images_is_kept(blender):
     assert load(folder).test[1].alpha is None
 
 
-def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
+def test_synthetic_frames_support_masks_depths_lenses_and_motion(blender):
     """Mask, depth, lens and second pose, of both splits; what is ignored is named."""
     folder, _ = blender
     close = look_at((4, 0.5, 0), (0, 0, 0)).tolist()
@@ -452,7 +452,7 @@ def test_frames_of_the_synthetic_layout_may_have_the_same(blender):
     assert smaller.depth.shape == (2, 3)
 
 
-def test_coarse_views_have_smaller_masks_depths_and_transparency():
+def test_coarse_views_have_smaller_masks_depths_and_alpha():
     """Blocks of pixels are averaged; a block is known if all its pixels are."""
     rng = np.random.default_rng(4)
     depth = rng.uniform(1, 5, (30, 40)).astype(np.float32)

@@ -33,7 +33,7 @@ def numbers_of(pixels, background=GREY):
 
 @pytest.mark.parametrize("channels", [3, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_photograph_is_kept_as_the_file_has_it(channels, dtype):
+def test_photograph_is_stored_as_bytes(channels, dtype):
     pixels = RNG.integers(0, np.iinfo(dtype).max, (12, 16, channels), dtype)
     image, alpha = compact_photograph(pixels, GREY, None)
     assert isinstance(image, LazyImage) and image.nbytes == pixels.nbytes
@@ -51,7 +51,7 @@ def test_a_photograph_is_kept_as_the_file_has_it(channels, dtype):
 @pytest.mark.parametrize(
     ("width", "kept"), [(16, "bytes"), (8, "bytes"), (10, "rounded"), (5, "numbers")]
 )
-def test_a_small_form_is_kept(width, kept):
+def test_downscaled_photograph_is_stored_in_the_smaller_form(width, kept):
     """Numbers of half the width take as much as bytes, those of a third less.
 
     What is scaled by no whole factor is not scaled each time that somebody asks.
@@ -71,14 +71,14 @@ def test_a_small_form_is_kept(width, kept):
         np.testing.assert_allclose(image, blocks, atol=2e-7)
 
 
-def test_a_mask_is_kept_in_a_byte_a_pixel():
+def test_mask_is_stored_in_one_byte_per_pixel():
     mask = RNG.integers(0, 2, (5, 7)).astype(np.float32)
     kept = compact_mask(mask)
     assert (kept.nbytes, kept.shape) == (35, (5, 7))
     assert np.asarray(kept).tobytes() == mask.tobytes()
 
 
-def test_a_dataset_takes_the_bytes_of_its_files(photographs):
+def test_dataset_uses_the_memory_of_its_uncompressed_files(photographs):
     iio.imwrite(photographs / "images" / "01.png", RNG.integers(0, 256, (6, 8, 4), np.uint8))
     dataset = load(photographs)
     for view in (*dataset.train, *dataset.test):
@@ -104,7 +104,7 @@ def test_a_lazy_image_refuses_conversion_without_a_copy():
         image.__array__(copy=False)
 
 
-def test_a_kept_image_computes_as_an_array_does():
+def test_lazy_image_supports_array_operations():
     pixels = RNG.integers(0, 255, (4, 6, 3), np.uint8)
     image, _ = compact_photograph(pixels, GREY, None)
     numbers = numbers_of(pixels)
@@ -120,7 +120,7 @@ def test_a_kept_image_computes_as_an_array_does():
         np.testing.assert_array_equal(found, expected)
 
 
-def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photographs, monkeypatch):
+def test_photographs_larger_than_memory_are_refused_before_reading(photographs, monkeypatch):
     """Ten photographs, one with alpha: (9 x 3 + 4) x 48 bytes."""
     rgba = RNG.integers(0, 256, (6, 8, 4), np.uint8)
     iio.imwrite(photographs / "images" / "01.png", rgba)
@@ -137,7 +137,7 @@ def test_photographs_that_do_not_fit_are_refused_before_they_are_read(photograph
     check_memory(files, 2)
 
 
-def test_large_photographs_are_read_one_after_the_other(tmp_path):
+def test_large_photographs_are_read_one_at_a_time(tmp_path):
     for width, expected in ((400, 8), (6000, 1)):
         iio.imwrite(tmp_path / "a.png", np.zeros((width, width), np.uint8))
         assert num_threads([tmp_path / "a.png"]) == expected

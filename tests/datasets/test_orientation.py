@@ -32,7 +32,7 @@ def dataset(folder, orientation, pixels=STORED, **size):
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_images_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix):
+def test_images_are_rotated_like_pillow(tmp_path, orientation, suffix):
     path = tmp_path / f"a.{suffix}"
     save(path, orientation)
     found = read_header(path).orientation
@@ -44,7 +44,7 @@ def test_images_are_turned_as_pillow_turns_them(tmp_path, orientation, suffix):
 
 @pytest.mark.parametrize("compression", [None, "tiff_lzw"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_tiffs_are_read_as_they_are_stored_as_colmap_reads_them(tmp_path, orientation, compression):
+def test_tiff_orientation_is_ignored_like_in_colmap(tmp_path, orientation, compression):
     pycolmap = pytest.importorskip("pycolmap")
     path = tmp_path / "a.tif"
     save(path, orientation, compression=compression)
@@ -60,7 +60,7 @@ def test_invalid_orientations_are_ignored(tmp_path, orientation):
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_the_cameras_size_tells_whether_its_image_was_turned(tmp_path, orientation):
+def test_camera_size_decides_whether_its_image_is_rotated(tmp_path, orientation):
     dataset(tmp_path, orientation, w=6, h=8)  # stored is 8 wide
     view = load(tmp_path).train[0]
     assert (view.width, view.height) == (6, 8)
@@ -87,14 +87,14 @@ SQUARE = np.zeros((6, 6, 3), np.uint8)
     ],
     ids=["half a turn", "no size", "a square", "mirrored"],
 )
-def test_an_orientation_that_may_or_may_not_count_is_refused(tmp_path, orientation, pixels, size):
+def test_ambiguous_orientation_is_refused(tmp_path, orientation, pixels, size):
     dataset(tmp_path, orientation, pixels, **size)
     message = rf"\.png: has the EXIF orientation {orientation}, and w and h do not tell"
     with pytest.raises(UserError, match=message):
         load(tmp_path)
 
 
-def test_a_wrong_size_of_a_turned_image_names_both(tmp_path):
+def test_wrong_size_of_a_rotated_image_reports_both_sizes(tmp_path):
     dataset(tmp_path, 6, w=7, h=8)
     message = r"w and h do not tell .* \(.*json: w\) are for .* stored, 8 x 6 px, or as"
     with pytest.raises(UserError, match=message):

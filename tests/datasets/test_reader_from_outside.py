@@ -49,14 +49,14 @@ def folder(tmp_path):
     return tmp_path, views
 
 
-def test_the_page_shows_the_example():
+def test_documented_example_is_the_file():
     text = (EXAMPLE.parent.parent.parent / "docs" / "developing.md").read_text()
     assert f"```python\n{EXAMPLE.read_text()}```" in text
     assert len(EXAMPLE.read_text().splitlines()) <= 60
 
 
 @pytest.mark.parametrize("kind", ["auto", "numpy_poses"])
-def test_cameras_and_images_are_those_of_the_folder(folder, kind):
+def test_cameras_and_images_come_from_the_folder(folder, kind):
     path, views = folder
     dataset = load_dataset(path, type=kind, test_every=4)
     found = {view.name: view for view in (*dataset.train, *dataset.test)}
@@ -68,7 +68,7 @@ def test_cameras_and_images_are_those_of_the_folder(folder, kind):
         np.testing.assert_allclose(np.asarray(own.image), np.asarray(view.image), atol=0.5 / 255)
 
 
-def test_its_section_is_set_by_the_configuration(folder):
+def test_configuration_sets_the_reader_section(folder):
     path, views = folder
     mi.set_variant("llvm_ad_rgb")
     values = fits.config_of().model_dump() | {"data": {"path": str(path)}, "iterations": 2}
@@ -80,12 +80,12 @@ def test_its_section_is_set_by_the_configuration(folder):
         np.testing.assert_allclose(center, expected[name], rtol=1e-6)
 
 
-def test_an_unknown_reader_lists_those_that_exist(folder):
+def test_unknown_reader_lists_the_registered_ones(folder):
     with pytest.raises(UserError, match=r"data\.type must be one of 'auto', .*'numpy_poses'; did"):
         load_dataset(folder[0], type="numpy_pose")
 
 
-def test_what_it_finds_wrong_is_reported(folder):
+def test_errors_of_the_reader_are_reported(folder):
     path, _ = folder
     (path / "images" / "9.png").write_bytes(b"")
     with pytest.raises(UserError, match=r"poses\.npy: must have a pose for each of the 6 files"):

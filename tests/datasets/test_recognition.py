@@ -41,7 +41,7 @@ def test_folders_that_are_no_dataset_are_explained(tmp_path, names):
 
 
 @pytest.mark.parametrize(("below", "there"), [("", ""), ("images/", ""), ("input/", "/input")])
-def test_photographs_without_cameras(tmp_path, below, there):
+def test_photographs_without_cameras_are_refused_with_drgs_poses(tmp_path, below, there):
     touch(tmp_path, *(f"{below}IMG_{i}.JPG" for i in range(3)), f"{below}notes.txt")
     place = f"{tmp_path.name}/{below}".removesuffix("/")
     assert refusal(tmp_path) == (
@@ -50,19 +50,19 @@ def test_photographs_without_cameras(tmp_path, below, there):
     )
 
 
-def test_a_command_names_folders_as_a_shell_reads_them(tmp_path):
+def test_suggested_command_quotes_folder_names(tmp_path):
     touch(tmp_path / "my photos", "a.png")
     assert f"drgs poses '{tmp_path}/my photos';" in refusal(tmp_path / "my photos")
 
 
-def test_a_dataset_one_folder_below(tmp_path):
+def test_dataset_one_folder_below_is_suggested(tmp_path):
     touch(tmp_path, "a/notes.txt", "scene/transforms.json", "b.jpg")
     assert refusal(tmp_path) == (
         f"{tmp_path}: holds a dataset in its folder scene; give {tmp_path}/scene"
     )
 
 
-def test_a_model_with_its_photographs_one_folder_below(tmp_path):
+def test_model_one_folder_below_is_suggested(tmp_path):
     touch(tmp_path, *(f"my scene/sparse/0/{name}.bin" for name in ("cameras", "images")))
     touch(tmp_path, "my scene/images/a.jpg")
     assert refusal(tmp_path) == (
@@ -79,7 +79,7 @@ def test_a_model_with_its_photographs_one_folder_below(tmp_path):
     ],
     ids=["one", "several", "of images"],
 )
-def test_images_in_folders_of_the_folder(tmp_path, files, message):
+def test_images_in_subfolders_are_recognised(tmp_path, files, message):
     touch(tmp_path, *files, ".thumbs/a.jpg", "._a.jpg")
     pattern = message.format(tmp_path)
     assert re.search(f"holds photographs .*{pattern}", refusal(tmp_path))
@@ -88,14 +88,14 @@ def test_images_in_folders_of_the_folder(tmp_path, files, message):
             photographs_in(tmp_path)
 
 
-def test_a_file_in_the_folders_place(tmp_path):
+def test_file_in_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({}))
     assert refusal(tmp_path / "transforms.json") == (
         f"data.path: cannot open the folder {tmp_path}/transforms.json: Not a directory"
     )
 
 
-def test_a_dataset_is_read_whatever_else_lies_beside_it(photographs):
+def test_dataset_is_read_beside_other_files(photographs):
     touch(photographs, "sparse/0/cameras.bin", "sparse/0/images.bin", "walk.mp4")
     from support.datasets import load
 

@@ -31,7 +31,7 @@ def names(views):
         (("train",), None, range(6), range(6, 10)),
     ],
 )
-def test_the_lists_are_the_splits(photographs, keys, test_split, train, test):
+def test_lists_define_the_splits(photographs, keys, test_split, train, test):
     give(photographs, **{f"{key}_filenames": LISTS[f"{key}_filenames"] for key in keys})
     dataset, notes = load_noting(photographs, test_split=test_split)
     assert names(dataset.train) == list(train) and names(dataset.test) == list(test)
@@ -60,7 +60,7 @@ def test_unknown_names_are_reported_or_if_most_are_refused(photographs):
     )
 
 
-def test_a_photograph_that_is_gone_is_no_unknown_name(photographs):
+def test_missing_photograph_is_not_reported_as_unknown_name(photographs):
     give(photographs, **LISTS)
     (photographs / IMAGES[8]).unlink()
     dataset, notes = load_noting(photographs)
@@ -68,7 +68,7 @@ def test_a_photograph_that_is_gone_is_no_unknown_name(photographs):
     assert len(notes) == 1 and "not there: 1 of 10 photographs (images/08.png)" in notes[0]
 
 
-def test_a_photograph_in_both_splits_is_refused(photographs):
+def test_photograph_in_both_splits_is_refused(photographs):
     give(photographs, train_filenames=IMAGES, test_filenames=IMAGES[3:5])
     assert refusal(photographs) == (
         f"{photographs / 'transforms.json'}: a photograph must be either to train or to measure "
@@ -77,7 +77,7 @@ def test_a_photograph_in_both_splits_is_refused(photographs):
     )
 
 
-def test_splits_that_are_not_there_or_empty_are_refused(photographs):
+def test_missing_and_empty_splits_are_refused(photographs):
     give(photographs, test_filenames=IMAGES[:2])
     assert "there is no split val, only test; set data.test_split" in (
         refusal(photographs, test_split="val")
@@ -90,12 +90,12 @@ def test_splits_that_are_not_there_or_empty_are_refused(photographs):
     assert refusal(photographs).endswith("test_filenames[1] must be text, got 3")
 
 
-def test_empty_lists_are_none(photographs):
+def test_empty_lists_are_ignored(photographs):
     give(photographs, train_filenames=[], val_filenames=[], test_filenames=[])
     assert names(load_noting(photographs)[0].test) == [0, 8]
 
 
-def test_a_list_in_a_file_counts_as_well(photographs):
+def test_list_file_defines_the_split(photographs):
     (photographs / "train.txt").write_text("loss 0.5\nloss 0.4\n")  # a log of some program
     (photographs / "test.txt").write_text("images/03.png\n05\n")
     dataset, notes = load_noting(photographs)

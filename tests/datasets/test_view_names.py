@@ -5,7 +5,7 @@ import os
 from drgs.datasets.transforms import unique_names
 
 
-def test_views_are_named_as_their_files_with_folders_where_needed():
+def test_views_are_named_after_their_files_with_folders_if_needed():
     assert unique_names(["./train/r_0", "images/b.png"]) == ["r_0", "b"]
     assert unique_names(["a/0.png", "b\\0.png"]) == ["a_0", "b_0"]
     assert unique_names(["a.png", "a.jpg"]) == ["0000_a", "0001_a"]
@@ -16,7 +16,7 @@ def test_names_of_views_do_not_leave_the_folder():
     assert names == ["data_a_0", "data_b_0"]
 
 
-def test_names_that_no_file_can_have_are_cut():
+def test_long_view_names_are_shortened():
     """255 bytes are the limit, of which numbers, suffixes and temporary names take some."""
     long = ["\u4e2d" * 80 + f"{i}.png" for i in range(2)]
     deep = ["/".join(["x" * 100] * 5) + f"/{i}/a.png" for i in range(2)]

@@ -40,7 +40,7 @@ def assert_looks_at(viewpoint, target):
     assert (viewpoint.cx, viewpoint.cy) == (viewpoint.width / 2, viewpoint.height / 2)
 
 
-def test_look_at_is_rigid_and_shows_up_as_up():
+def test_look_at_is_rigid_and_keeps_up_upright():
     pose = look_at([1, 2, 3], [0, 0.5, -1], [0, 0, 5])
     rotation = pose[:3, :3]
     assert rotation.T @ rotation == pytest.approx(np.eye(3), abs=1e-12)
@@ -55,7 +55,7 @@ def test_look_at_is_rigid_and_shows_up_as_up():
     ("origin", "target", "up"),
     [((1, 1, 1), (1, 1, 1), (0, 0, 1)), ((0, 0, 2), (0, 0, 0), (0, 0, 1)), ((1, 0, 0),) * 3],
 )
-def test_look_at_refuses_what_determines_no_camera(origin, target, up):
+def test_look_at_refuses_degenerate_directions(origin, target, up):
     with pytest.raises(UserError, match="must not be zero or parallel to up"):
         look_at(origin, target, up)
 
@@ -75,7 +75,7 @@ def test_an_orbit_looks_at_the_focus_from_the_cameras_distance_and_height():
         assert frame.fx == pytest.approx(20 / np.tan(FIELD_OF_VIEW / 2))
 
 
-def test_an_orbit_goes_all_the_way_round_in_equal_steps():
+def test_orbit_is_a_full_circle_in_equal_steps():
     views = views_at(np.arange(9) * 2 * np.pi / 9, np.full(9, 0.4))
     frames = orbit_of_views(views, blobs()).viewpoints(8, 40, 40, 40)
     offsets = np.stack([frame.camera_to_world[:3, 3] for frame in frames]) - FOCUS
@@ -83,7 +83,7 @@ def test_an_orbit_goes_all_the_way_round_in_equal_steps():
     assert np.diff(azimuths) == pytest.approx(np.full(7, 2 * np.pi / 8), abs=1e-3)
 
 
-def test_an_orbit_stays_on_the_side_that_was_photographed():
+def test_orbit_stays_on_the_photographed_side():
     azimuths = np.linspace(2.5, 4.0, 6)
     frames = orbit_of_views(views_at(azimuths, np.full(6, 0.1)), blobs()).viewpoints(20, 40, 40, 40)
     offsets = np.stack([frame.camera_to_world[:3, 3] for frame in frames]) - FOCUS
@@ -95,7 +95,7 @@ def test_an_orbit_stays_on_the_side_that_was_photographed():
     assert np.abs(np.diff(swept, append=swept[0])).max() < 0.25
 
 
-def test_an_orbit_of_parallel_cameras_is_around_the_gaussians():
+def test_orbit_of_parallel_cameras_is_around_the_gaussians():
     views = [
         replace(v, camera_to_world=np.block([[v.camera_to_world[:, :3], offset[:, None]]]))
         for v, offset in zip(
@@ -109,7 +109,7 @@ def test_an_orbit_of_parallel_cameras_is_around_the_gaussians():
     assert_looks_at(orbit.viewpoints(1, 10, 10, 40)[0], orbit.focus)
 
 
-def test_up_is_what_level_cameras_keep_upright_from_any_side():
+def test_up_is_vertical_for_level_cameras_on_one_side():
     """The mean of the cameras' own up vectors leans over if all cameras are on one side."""
     views = views_at([0.1, 0.4, 0.5, 0.9], [0.9, 1.0, 0.8, 1.1])
     mean_up = np.mean([-v.camera_to_world[:3, 1] for v in views], axis=0)
@@ -117,7 +117,7 @@ def test_up_is_what_level_cameras_keep_upright_from_any_side():
     assert up_of(views)[2] > 0.999
 
 
-def test_up_of_one_camera_is_its_own():
+def test_up_of_one_camera_is_its_up_vector():
     v = rolled(views_at([0.3], [0.2])[0], 0.5)
     assert up_of([v, v]) == pytest.approx(-v.camera_to_world[:3, 1], abs=1e-9)
 
@@ -134,7 +134,7 @@ def test_an_orbit_of_gaussians_shows_them():
         assert inside.mean() >= 0.95
 
 
-def test_an_orbit_straight_above_is_still_an_orbit():
+def test_orbit_of_cameras_at_the_zenith_is_not_degenerate():
     orbit = Orbit(FOCUS, np.eye(3)[2], np.eye(3)[0], 2.0, 1.3, None)
     assert_looks_at(orbit.viewpoints(3, 10, 10, 40)[2], FOCUS)
     views = views_at(np.arange(5.0), np.full(5, 1.55))
@@ -205,7 +205,7 @@ def test_errors_name_the_file_and_the_key(tmp_path, top, size, message):
         ("frame", {"shutter": "rolling"}, "rolling"),
     ],
 )
-def test_cameras_of_a_file_move_as_its_frames_say(tmp_path, place, says, shutter):
+def test_camera_motion_is_read_from_frames(tmp_path, place, says, shutter):
     close = pose_around(0.4, 0.25)
     frame = {"transform_matrix_close": (close * [1, -1, -1, 1]).tolist()}
     top = {"camera_angle_x": 0.7}

@@ -56,7 +56,7 @@ def film_of(gaussians, view):
 @pytest.mark.parametrize(
     "fitted", [{"low_pass": 0.1, "antialiased": True}, {"low_pass": 0.05}, {"antialiased": True}]
 )
-def test_the_closed_form_is_that_of_its_docstring(fitted):
+def test_baking_matches_the_documented_closed_form(fitted):
     gaussians, fitted = small_blobs(), Approximations(**fitted)
     found = bake_for_viewers(gaussians.to(mi.TensorXf), cameras(), fitted)
 
@@ -85,14 +85,14 @@ def test_the_closed_form_is_that_of_its_docstring(fitted):
         np.testing.assert_array_equal(getattr(found, name), getattr(gaussians, name))
 
 
-def test_what_viewers_show_right_stays(tmp_path):
+def test_gaussians_that_viewers_render_exactly_are_unchanged(tmp_path):
     gaussians = small_blobs()
     found = bake_for_viewers(gaussians.to(mi.TensorXf), cameras(), Approximations())
     np.testing.assert_allclose(found.log_scales, gaussians.log_scales, atol=1e-6)
     np.testing.assert_allclose(found.logit_opacities, gaussians.logit_opacities, atol=1e-5)
 
 
-def test_gaussians_that_no_camera_sees_keep_their_opacities():
+def test_unseen_gaussians_keep_their_opacities():
     gaussians = small_blobs()
     behind = replace(gaussians, means=gaussians.means + np.float32([0, 0, 100]))
     found = bake_for_viewers(

@@ -25,13 +25,13 @@ def scene():
     return device_gaussians(CASE.gaussians, FLOAT32), device_camera(CASE.camera, FLOAT32)
 
 
-def test_what_is_not_called_for_leaves_the_pipeline_as_it_is(scene):
+def test_unused_effect_leaves_pipeline_unchanged(scene):
     gaussians, camera = scene
     pipeline = rendering.Pipeline(0)
     assert with_effects(pipeline, gaussians, camera) is pipeline
 
 
-def test_an_aperture_wraps_the_projection_and_the_response(scene):
+def test_aperture_wraps_projection_and_falloff(scene):
     gaussians, camera = scene
     pipeline = rendering.Pipeline(0, shape=exact_shape, model=FootprintModel(falloff=RayFalloff()))
     found = with_effects(pipeline, gaussians, replace(camera, aperture=APERTURE))
@@ -40,14 +40,14 @@ def test_an_aperture_wraps_the_projection_and_the_response(scene):
     assert replace(found, shape=exact_shape, model=pipeline.model) == pipeline
 
 
-def test_a_filter_changes_the_gaussians_first(scene):
+def test_filter_changes_the_gaussians_before_projection(scene):
     gaussians, camera = scene
     filtered = replace(gaussians, smoothing=llvm.Float(0.1) + 0 * gaussians.logit_opacities)
     pipeline = rendering.Pipeline(0)
     assert with_effects(pipeline, filtered, camera) == replace(pipeline, rows=apply_smoothing)
 
 
-def test_what_is_ignored_is_not_composed(scene):
+def test_ignored_effect_is_not_composed(scene):
     gaussians, camera = scene
     pipeline = rendering.Pipeline(0)
     blurred = replace(camera, aperture=APERTURE)
@@ -55,25 +55,27 @@ def test_what_is_ignored_is_not_composed(scene):
     assert with_effects(pipeline, gaussians, without_effects(blurred, ["defocus"])) is pipeline
 
 
-def test_adjoint_and_tangent_replay_what_was_composed(scene):
+def test_adjoint_and_tangent_replay_the_composed_pipeline(scene):
     gaussians, camera = scene
     camera = replace(camera, aperture=APERTURE)
     pipeline = with_effects(rendering.Pipeline(0), gaussians, camera)
     assert rendering.render(gaussians, camera, pipeline).pipeline is pipeline
 
 
-def asking(source):
+def reads_camera_effects(source):
     """Whether ``source`` reads an attribute ``aperture`` or ``shutter``."""
     nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute))
     return any(node.attr in ("aperture", "shutter") for node in nodes)
 
 
 @pytest.mark.parametrize("package", ["splatting", "accuracy"])
-def test_the_method_does_not_ask_a_camera_whether_it_blurs(package):
+def test_packages_do_not_query_effects_of_a_camera(package):
     paths = sorted((REPOSITORY / "drgs" / package).glob("*.py"))
     assert len(paths) > 5
-    assert [path.name for path in paths if asking(path.read_text())] == []
+    assert [path.name for path in paths if reads_camera_effects(path.read_text())] == []
 
 
-def test_a_question_is_found():
-    assert asking("x = camera.aperture is None") and not asking("aperture = 1")
+def test_query_of_a_camera_effect_is_found():
+    assert reads_camera_effects("x = camera.aperture is None") and not reads_camera_effects(
+        "aperture = 1"
+    )

@@ -57,7 +57,7 @@ SCENES = {
 }
 all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 
-# Those of test_lenses.
+# Tolerances of test_lenses.
 IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 DIFFERENCES = 1e-6
@@ -83,7 +83,7 @@ def test_image_equals_the_reference(precision, scene):
 
 
 @both_precisions
-def test_an_aperture_of_zero_takes_the_pinholes_image(precision):
+def test_zero_aperture_renders_the_pinhole_image(precision):
     case = clear(case_of({}, defocus=ThinLens(0.0, 2.0)))
     gaussians, frame = case.render(precision)
     in_focus = render_composed(gaussians, replace(frame.camera, aperture=None), case.pipeline)
@@ -104,7 +104,7 @@ def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pas
 
 
 @both_precisions
-def test_a_splat_in_focus_is_not_blurred(precision):
+def test_splat_in_focus_is_not_blurred(precision):
     """Nor dimmed; those before and behind it are."""
     camera = camera_at_origin(fx=200.0, fy=200.0)
     points = [[0.25, -0.125, 0.5], [0.5, 0.25, 2.0], [-1.0, 0.5, 8.0]]
@@ -126,7 +126,7 @@ def test_a_splat_in_focus_is_not_blurred(precision):
 @pytest.mark.parametrize("rule", [plain_opacity, compensated_opacity], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("scale", [0.1, 1e-3, 1e-6])
 @pytest.mark.parametrize("low_pass", [0.3, 0.0])
-def test_the_integral_of_a_splat_stays(precision, rule, scale, low_pass):
+def test_defocus_preserves_the_integral_of_a_splat(precision, rule, scale, low_pass):
     """2 pi opacity sqrt(det cov2d). Also of splats that are far thinner than the low-pass."""
     camera = camera_at_origin(fx=200.0, fy=200.0)
     gaussians = gaussians_at([[0.25, -0.125, 1.0]], [[scale, 2 * scale, 0.5 * scale]])
@@ -141,7 +141,7 @@ def test_the_integral_of_a_splat_stays(precision, rule, scale, low_pass):
     assert sizes[0] > sizes[1] + 100
 
 
-def test_the_sum_of_alpha_over_the_film_stays():
+def test_defocus_preserves_the_sum_of_alpha():
     """One splat without cut-offs: sums of a smooth function are its integral."""
     camera = camera_at_origin(fx=40.0, fy=40.0, cx=30.0, cy=24.0, width=60, height=48)
     gaussians = single_splat([0.05, -0.025, 1.0], 0.05)
@@ -185,13 +185,13 @@ def separate_scene() -> tuple[reference.Gaussians, reference.Camera]:
     return replace(gaussians, sh0=rng.uniform(-1, 1.7, (12, 1, 3))), camera
 
 
-# By aperture: PSNR (dB) of the blurred image and of the one in focus. Measured: 73.8 and 52.6,
+# PSNR (dB) of the blurred and the focused image, by aperture. Measured: 73.8 and 52.6,
 # 63.5 and 41.7, 51.6 and 33.1, 45.5 and 27.7.
 SAMPLED = {0.03125: (73, 53), 0.0625: (63, 42), 0.125: (51, 34), 0.25: (45, 28)}
 
 
 @pytest.mark.parametrize("aperture_radius", SAMPLED)
-def test_images_are_nearly_those_of_many_samples_of_the_aperture(aperture_radius):
+def test_defocused_image_approximates_many_aperture_samples(aperture_radius):
     """A disc and a Gaussian of its variance differ in shape, by the square of its area over the
     splat's. The splats have standard deviations of 1 to 1.6 px, the discs radii of up to 0.9, 1.9,
     3.8 and 7.5 px.
@@ -241,7 +241,7 @@ def planes_of_wall(precision=FLOAT64, pipeline=None) -> np.ndarray:
     return planes_of(render_composed(device, camera, pipeline or rendering.Pipeline(0)))
 
 
-def test_a_wall_out_of_focus_keeps_its_alpha_and_its_colour():
+def test_defocused_wall_keeps_alpha_and_colour():
     """A mean of many pinhole images has the same alpha and colour.
 
     With S the sum of all alphas at a pixel, a wall of splats that are hardly there lets exp(-S)
@@ -261,18 +261,18 @@ def test_a_wall_out_of_focus_keeps_its_alpha_and_its_colour():
 
 
 @both_precisions
-def test_a_wall_out_of_focus_is_that_of_the_reference(precision):
+def test_defocused_wall_matches_the_reference(precision):
     """Which evaluates each splat at each pixel, up to the alpha at which it ends."""
     gaussians, camera = wall()
     expected = effects.render(gaussians, camera, defocus=FAR)
     found = planes_of_wall(precision)
-    # Of 5000 splats at each pixel some hundreds end there within a rounding of its centre.
+    # Some hundreds of 5000 splats at each pixel end within a rounding of its centre.
     np.testing.assert_allclose(found[0], expected.transmittance.ravel(), rtol=0, atol=1e-5)
     np.testing.assert_allclose(found[1:].T, expected.image.reshape(-1, 3), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("order", ["center", "pixel"])
-def test_a_wall_out_of_focus_is_as_opaque_with_exact_splats(order):
+def test_defocused_wall_is_as_opaque_with_exact_splats(order):
     """They are small beside their distance. Which of equally far ones is first is open."""
     found = planes_of_wall(pipeline=pipeline_of(Approximations(projection="exact", order=order), 0))
     # A splat is seen from 12 px away, at an angle whose square is 0.09, as that much longer.
@@ -280,7 +280,7 @@ def test_a_wall_out_of_focus_is_as_opaque_with_exact_splats(order):
     np.testing.assert_allclose(found[0], planes_of_wall()[0], rtol=0, atol=1e-3)
 
 
-def test_splats_out_of_focus_end_where_they_do_in_focus():
+def test_defocus_preserves_the_cut_of_splats():
     """An alpha of 1 / 255 is 1 / 51 of the largest, below which lies that part of the integral; at
     an extent of 2 standard deviations it is exp(-2).
     """
@@ -298,7 +298,7 @@ def test_splats_out_of_focus_end_where_they_do_in_focus():
 
 
 @both_precisions
-def test_splats_that_are_not_seen_in_focus_are_not_seen_out_of_focus(precision):
+def test_splats_invisible_in_focus_stay_invisible_when_defocused(precision):
     """Opacities around 1 / 255; dimmed far below it, and down to where no sum notices."""
     opacities = np.array([0.3, 0.004, 0.0038, 0.3])
     camera = camera_at_origin(fx=40.0, fy=40.0, cx=6.0, cy=4.5, width=12, height=9)
@@ -317,7 +317,7 @@ def test_splats_that_are_not_seen_in_focus_are_not_seen_out_of_focus(precision):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_each_number_of_the_gradients_equals_a_difference_of_the_reference():
+def test_each_gradient_entry_equals_a_difference_of_the_reference():
     case = LensCase("tiny", 13, 11, 1, 5, defocus=DEFOCUS, recipe=tiny_scene, threshold_width=5e-4)
     case = clear(case)
     cotangents = Cotangents.random(case)
@@ -370,7 +370,7 @@ APPROXIMATIONS = {
 
 
 @pytest.mark.parametrize("approximations", APPROXIMATIONS.values(), ids=APPROXIMATIONS)
-def test_gradients_of_other_approximations_equal_their_own_central_differences(approximations):
+def test_gradients_with_other_approximations_equal_central_differences(approximations):
     """Gradients of Gaussians and aperture; nothing is cut, so nothing jumps."""
     case = LensCase("choices", 19, 14, 1, 20, defocus=DEFOCUS)
     pipeline = pipeline_of(
@@ -409,7 +409,7 @@ def test_gradients_of_other_approximations_equal_their_own_central_differences(a
         assert abs(float(gradient[0]) - terms.sum()) <= 1e-6 * np.abs(terms).sum(), name
 
 
-def test_exact_splats_that_are_small_are_blurred_like_affine_ones():
+def test_small_exact_splats_are_blurred_like_affine_ones():
     """But for their size, 1e-4 of their distance, squared, times some 10. Measured: 3e-8."""
     camera = camera_at_origin(fx=2e4, fy=2e4, cx=30.0, cy=24.0, width=60, height=48)
     points = np.array([[-6e-4, -4e-4, 1.0], [4e-4, 6e-4, 2.5], [2e-4, -9e-4, 1.5]])
@@ -435,7 +435,7 @@ def test_exact_splats_that_are_small_are_blurred_like_affine_ones():
 
 
 @both_precisions
-def test_splats_that_are_not_seen_poison_nothing(precision):
+def test_invisible_splats_affect_no_other_gaussian(precision):
     """Behind the camera, at its centre, no numbers: as if they were not there."""
     case = clear(case_of({}, count=30))
     means = case.gaussians.means.copy()
@@ -463,7 +463,7 @@ def test_splats_that_are_not_seen_poison_nothing(precision):
 
 
 @both_precisions
-def test_a_splat_blurred_over_thousands_of_pixels_has_the_reference_covariance(precision):
+def test_splat_blurred_over_thousands_of_pixels_matches_the_reference_covariance(precision):
     """Next to the near plane, through a large aperture."""
     camera = camera_at_origin(fx=200.0, fy=200.0)
     defocus = ThinLens(1.0, 4.0)

@@ -32,7 +32,7 @@ from drgs.splatting import feature_groups, rendering
 from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.grid import TileGrid
 
-# As in test_rendering.
+# Tolerances of test_rendering.
 IMAGE = {name: limit for name, limit in (("Float64", 1e-12), ("Float", 2e-5))}
 GRADIENTS = {name: limit for name, limit in (("Float64", 1e-7), ("Float", 1e-4))}
 
@@ -109,7 +109,7 @@ def render(case, precision):
 
 @both_precisions
 @all_cases
-def test_planes_are_those_of_the_reference(precision, case):
+def test_planes_match_the_reference(precision, case):
     case = clear(case)
     _, frame = render(case, precision)
     planes = rows(frame.planes()).T
@@ -123,7 +123,7 @@ def test_planes_are_those_of_the_reference(precision, case):
 
 
 @all_cases
-def test_what_is_seen_past_all_follows_from_the_planes(case):
+def test_transmittance_past_all_surfaces_follows_from_the_planes(case):
     """The reference composites surfaces as layers; the kernels scale."""
     case = clear(case)
     rest = np.prod([1 - alpha.ravel() for _, alpha in surfaces_of(case)], axis=0)
@@ -173,16 +173,16 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, case):
     assert abs(left.sum() - sum(r.sum() for r in right)) <= limit * size
 
 
-def test_a_surface_hides_each_group_of_features(monkeypatch):
+def test_surface_occludes_each_group_of_features(monkeypatch):
     """Two planes at a time, and the weights in front with each."""
     monkeypatch.setitem(feature_groups.FEATURES_AT_ONCE, 8, 2)
-    test_planes_are_those_of_the_reference(FLOAT64, CASES[0])
+    test_planes_match_the_reference(FLOAT64, CASES[0])
     test_gradients_equal_differences_of_the_reference(FLOAT64, CASES[0])
     test_adjoint_is_the_transpose_of_the_tangent(FLOAT64, CASES[0])
 
 
 @pytest.mark.parametrize("approximations", [{"sh_direction": "pixel"}, {"order": "pixel"}], ids=str)
-def test_with_approximations_what_is_covered_is_the_mixture(approximations):
+def test_approximated_planes_are_linear_in_coverage(approximations):
     """Linear in the coverage: of nothing and of all; the sum in front does not depend on it."""
     case = clear(CASES[0])
     gaussians = device_gaussians(case.gaussians, FLOAT64)

@@ -61,7 +61,7 @@ def filter_of(count, seed=0) -> np.ndarray:
 
 
 @both_precisions
-def test_widened_scales_and_opacities_are_those_of_the_reference(precision):
+def test_widened_scales_and_opacities_match_the_reference(precision):
     gaussians, smoothing = Case("filter", 30, 20, 1).gaussians, filter_of(60)
     device = replace(device_gaussians(gaussians, precision), smoothing=precision.array(smoothing))
     before = load_rows(device, 1)
@@ -113,7 +113,7 @@ def cameras_and_means(seed):
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 2, CAMERAS])
-def test_filter_is_that_of_the_references_sampling_rates(precision, count):
+def test_filter_matches_sampling_rates_of_the_reference(precision, count):
     cameras, means = cameras_and_means(1)
     cameras = cameras[:count]
     rates = reference_effects.sampling_rates(means, cameras)
@@ -125,7 +125,7 @@ def test_filter_is_that_of_the_references_sampling_rates(precision, count):
     np.testing.assert_allclose(actual, np.sqrt(0.2) / rates, rtol=tolerance)
 
 
-def seen_by(camera, means) -> np.ndarray:
+def visible_means(camera, means) -> np.ndarray:
     """(N,) bool, as a loop over the means says it."""
     seen = []
     for mean in means:
@@ -137,9 +137,9 @@ def seen_by(camera, means) -> np.ndarray:
     return np.array(seen)
 
 
-def test_means_that_no_camera_sees_get_the_widest_filter_of_those_that_are_seen():
+def test_unseen_means_get_the_widest_filter_of_seen_ones():
     cameras, means = cameras_and_means(1)
-    seen = np.any([seen_by(camera, means) for camera in cameras], axis=0)
+    seen = np.any([visible_means(camera, means) for camera in cameras], axis=0)
     assert 50 < seen.sum() < 350
     tensor = FLOAT64.TensorXf(FLOAT64.array(means), means.shape)
     actual = rows(smoothing_of(tensor, [device_camera(c, FLOAT64) for c in cameras]))
@@ -147,13 +147,13 @@ def test_means_that_no_camera_sees_get_the_widest_filter_of_those_that_are_seen(
     assert len(np.unique(actual[seen])) == seen.sum()
 
 
-def test_where_no_camera_sees_anything_there_is_no_filter():
+def test_filter_is_zero_if_no_camera_sees_anything():
     means = FLOAT32.TensorXf(FLOAT32.array(np.full((4, 3), 1e6)), (4, 3))
     camera = Case("", 20, 20, 0).camera
     assert (rows(smoothing_of(means, [device_camera(camera, FLOAT32)])) == 0).all()
 
 
-def test_the_nearest_of_two_cameras_decides():
+def test_nearest_camera_sets_the_filter():
     """Computed by hand: rates 100 / 2 and 100 / 4 px per unit."""
     camera = reference.Camera(np.eye(3), np.zeros(3), 100.0, 80.0, 50.0, 50.0, 100, 100, 0.1)
     farther = replace(camera, center=np.array([0, 0, -2.0]))
@@ -202,7 +202,7 @@ def _image(case):
 
 @both_precisions
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_image_is_the_references_of_the_widened_gaussians(precision, antialiased):
+def test_image_matches_the_reference_with_widened_gaussians(precision, antialiased):
     case = clear(SmoothCase("smooth", 37, 29, 1, antialiased=antialiased))
     _, frame = case.render(precision)
     assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
@@ -282,7 +282,7 @@ def outputs_of(case, gaussians) -> list[np.ndarray]:
 
 @both_precisions
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_each_number_of_the_gradients_equals_a_difference_of_the_reference(precision, antialiased):
+def test_each_gradient_entry_equals_a_difference_of_the_reference(precision, antialiased):
     """Gradients of colours, alpha and depth through the filter; a scaled one is noticed."""
     case = SmoothCase("tiny", 13, 11, 1, 6, antialiased, threshold_width=5e-4)
     case = clear(case)
@@ -337,7 +337,7 @@ def with_filter(count=12, degree=1) -> Gaussians:
     return replace(host, smoothing=filter_of(count).astype(np.float32))
 
 
-def test_a_file_holds_the_filter_as_its_last_property(tmp_path):
+def test_ply_stores_the_filter_as_last_property(tmp_path):
     gaussians = with_filter()
     gaussians.save(tmp_path / "a.ply")
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
@@ -348,14 +348,14 @@ def test_a_file_holds_the_filter_as_its_last_property(tmp_path):
         np.testing.assert_array_equal(getattr(actual, name), getattr(gaussians, name), name)
 
 
-def test_a_file_of_gaussians_without_a_filter_has_no_such_property(tmp_path):
+def test_ply_without_a_filter_has_no_filter_property(tmp_path):
     plain = replace(with_filter(), smoothing=None)
     plain.save(tmp_path / "a.ply")
     assert b"filter" not in (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0]
     assert Gaussians.load(tmp_path / "a.ply").smoothing is None
 
 
-def test_a_filter_that_is_not_finite_is_refused(tmp_path):
+def test_nonfinite_filter_is_refused(tmp_path):
     gaussians = with_filter()
     gaussians.smoothing[3] = np.nan
     gaussians.save(tmp_path / "a.ply")
@@ -364,7 +364,7 @@ def test_a_filter_that_is_not_finite_is_refused(tmp_path):
         Gaussians.load(tmp_path / "a.ply")
 
 
-def test_a_filter_of_another_type_is_read(tmp_path):
+def test_filter_of_another_type_is_read(tmp_path):
     """Tools that compute in double precision write such files."""
     gaussians = with_filter()
     gaussians.save(tmp_path / "a.ply")
@@ -411,13 +411,13 @@ def test_the_plugin_uses_the_filter_of_a_file_unless_it_is_ignored(tmp_path):
     assert np.array_equal(image_of(loaded_with(scene, **by_tensors)), smooth)
 
 
-def test_a_filter_is_no_parameter_of_a_scene():
+def test_filter_is_not_exposed_as_scene_parameter():
     values = tensors(Scene().gaussians) | {"smoothing": mi.Float(scene_filter(Scene()))}
     params = mi.traverse(mi.load_dict({"type": "splats", **values}))
     assert "smoothing" not in params and "means" in params
 
 
-def test_a_changed_filter_is_rendered_again():
+def test_changed_filter_triggers_a_new_rendering():
     scene = Scene()
     loaded = scene.load()
     before = image_of(loaded)
@@ -429,7 +429,7 @@ def test_a_changed_filter_is_rendered_again():
 
 
 @pytest.mark.parametrize("count", [1, 39, 41])
-def test_a_filter_of_another_length_is_refused(count):
+def test_filter_of_wrong_length_is_refused(count):
     values = tensors(Scene().gaussians) | {"smoothing": mi.TensorXf(np.ones(count, np.float32))}
     with pytest.raises(RuntimeError) as caught:
         mi.load_dict({"type": "splats", **values})
@@ -439,7 +439,7 @@ def test_a_filter_of_another_length_is_refused(count):
     )
 
 
-def test_a_filter_that_no_longer_fits_is_refused_when_parameters_are_updated():
+def test_filter_of_wrong_length_is_refused_on_parameter_update():
     values = tensors(Scene().gaussians) | {"smoothing": mi.Float(scene_filter(Scene()))}
     params = mi.traverse(mi.load_dict({"type": "splats", **values}))
     for name, value in tensors(Scene(count=20).gaussians).items():

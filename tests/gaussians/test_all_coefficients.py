@@ -12,7 +12,7 @@ def test_sh_is_sh0_followed_by_shn():
     assert np.array_equal(gaussians.sh[:, 1:], gaussians.shN)
 
 
-def test_sh_is_the_same_on_the_device():
+def test_sh_is_equal_on_the_device():
     gaussians = blobs()
     on_device = gaussians.to(llvm.TensorXf).sh
     assert isinstance(on_device, llvm.TensorXf)

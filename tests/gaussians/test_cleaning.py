@@ -9,7 +9,7 @@ from drgs.export import find_kept, take
 from drgs.gaussians.similarity import rotation_towards, shortest_rotation
 
 
-def test_a_selection_keeps_what_is_within_its_limits():
+def test_selection_keeps_gaussians_within_its_limits():
     g = gaussians_within_ranges(400)
     found = find_kept(g, box=(1, -1, 2, -1, 1, 0), min_opacity=0.3, max_scale=0.1)
     for name, kept in found.items():
@@ -26,7 +26,7 @@ def test_a_selection_keeps_what_is_within_its_limits():
     assert find_kept(g) == {}
 
 
-def test_rows_are_taken_from_all_that_a_gaussian_has():
+def test_rows_are_taken_from_every_parameter():
     g = gaussians_within_ranges(9)
     rows = np.array([7, 0])
     found = take(g, rows)
@@ -40,7 +40,7 @@ AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 @pytest.mark.parametrize("towards", AXES, ids=str)
 @pytest.mark.parametrize("direction", [*AXES, np.array([0.6, 0, 0.8])], ids=str)
-def test_the_shortest_rotation_is_about_what_is_perpendicular(direction, towards):
+def test_shortest_rotation_axis_is_perpendicular_to_both_directions(direction, towards):
     rotation = shortest_rotation(direction, towards)
     np.testing.assert_allclose(rotation @ direction, towards, atol=1e-15)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
@@ -49,7 +49,7 @@ def test_the_shortest_rotation_is_about_what_is_perpendicular(direction, towards
     assert angle == pytest.approx(np.arccos(direction @ towards), abs=1e-7)
 
 
-def test_a_model_is_turned_as_a_whole():
+def test_rotation_turns_means_quats_and_sh():
     g = gaussians_within_ranges(50)
     found = rotation_towards(g, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
     x, y, z = g.means.T

@@ -10,7 +10,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 5, 2000])
-def test_what_was_uploaded_does_not_change_with_its_source(precision, count):
+def test_uploaded_arrays_are_copies(precision, count):
     """Dr.Jit wraps numpy's memory, in float32 without a conversion between."""
     source = bench_gaussians(count)
     values = {name: getattr(source, name).copy() for name in PARAMETER_NAMES}
@@ -23,7 +23,7 @@ def test_what_was_uploaded_does_not_change_with_its_source(precision, count):
 
 
 @both_precisions
-def test_activated_values_are_those_of_the_raw_ones(precision):
+def test_activated_values_follow_from_raw_ones(precision):
     source = bench_gaussians(50)
     uploaded = source.to(precision.TensorXf)
     # numpy's side is float32 in both cases: a few roundings of 6e-8.

@@ -20,7 +20,7 @@ def arrays(degree=2):
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_activated_values_come_back(degree):
+def test_activated_values_survive_from_numpy(degree):
     given = arrays(degree)
     gaussians = drgs.Gaussians.from_numpy(**given)
     assert (gaussians.num_gaussians, gaussians.sh_degree) == (COUNT, degree)
@@ -33,7 +33,7 @@ def test_activated_values_come_back(degree):
         assert getattr(gaussians, name).dtype == np.float32
 
 
-def test_files_give_back_what_was_saved(tmp_path):
+def test_saved_gaussians_are_loaded_unchanged(tmp_path):
     expected = drgs.Gaussians.from_numpy(**arrays())
     expected.save(tmp_path / "a.ply")
     found = drgs.Gaussians.load(str(tmp_path / "a.ply"))
@@ -57,6 +57,6 @@ def test_files_give_back_what_was_saved(tmp_path):
         ({"opacities": np.full(COUNT, 1.5)}, "opacities must be above 0 and below 1, got 1.5"),
     ],
 )
-def test_what_is_no_gaussian_is_refused(changes, message):
+def test_invalid_gaussians_are_refused(changes, message):
     with pytest.raises(ValueError, match=rf"Gaussians.from_numpy\(\): {message}"):
         drgs.Gaussians.from_numpy(**{**arrays(), **changes})

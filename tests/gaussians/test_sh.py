@@ -29,11 +29,11 @@ def directions(count=64) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_number_of_coefficients(degree):
+def test_number_of_sh_coefficients(degree):
     assert sh.num_coefficients(degree) == len(reference.sh_basis(np.eye(3), degree).T)
 
 
-def test_constants_are_those_of_the_normalisation():
+def test_constants_normalise_the_basis():
     """Degrees 0 to 3 are derived from pi alone, to the last digit of a double."""
     pi = np.pi
     c2, c3 = np.sqrt(15 / pi) / 2, np.sqrt(105 / pi)

@@ -25,7 +25,7 @@ def directions(count=200):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("rotation", ROTATIONS)
-def test_a_rotated_function_has_the_values_of_the_directions_turned_back(rotation, degree):
+def test_rotated_sh_equals_sh_of_inversely_rotated_directions(rotation, degree):
     rng = np.random.default_rng(2)
     sh0, shN = rng.normal(0, 1, (5, 1, 3)), rng.normal(0, 1, (5, (degree + 1) ** 2 - 1, 3))
     d = directions()
@@ -40,7 +40,7 @@ def test_a_rotated_function_has_the_values_of_the_directions_turned_back(rotatio
         assert np.abs(unturned - expected).max() > 0.1
 
 
-def test_matrices_are_orthogonal_and_compose_as_rotations_do():
+def test_matrices_are_orthogonal_and_compose_like_rotations():
     a, b = ROTATIONS[:2]
     for of_a, of_b, of_both in zip(
         *(sh_rotation_matrices(r, 3) for r in (a, b, a @ b)), strict=True
@@ -49,7 +49,7 @@ def test_matrices_are_orthogonal_and_compose_as_rotations_do():
         np.testing.assert_allclose(of_a @ of_b, of_both, atol=ROUNDING)
 
 
-def test_matrices_are_as_many_as_degrees():
+def test_one_matrix_per_degree():
     assert [m.shape for m in sh_rotation_matrices(ROTATIONS[0], 3)] == [(3, 3), (5, 5), (7, 7)]
     assert sh_rotation_matrices(ROTATIONS[0], 0) == []
     for matrix in sh_rotation_matrices(np.eye(3), 3):

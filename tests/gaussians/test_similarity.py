@@ -35,14 +35,14 @@ def as_reference(gaussians) -> reference.Gaussians:
     return reference.Gaussians(**{n: np.float64(getattr(gaussians, n)) for n in PARAMETER_NAMES})
 
 
-def test_a_matrix_is_taken_apart():
+def test_matrix_is_decomposed():
     similarity = Similarity.from_matrix(MATRIX, "x")
     assert similarity.scale == pytest.approx(SCALE, rel=1e-14)
     np.testing.assert_allclose(similarity.rotation, ROTATION, atol=1e-14)
     np.testing.assert_array_equal(similarity.translation, TRANSLATION)
 
 
-def test_numbers_of_five_digits_are_a_rotation_and_the_nearest_is_used():
+def test_matrix_rounded_to_five_digits_gives_the_nearest_rotation():
     similarity = Similarity.from_matrix(np.round(MATRIX, 5), "x")
     np.testing.assert_allclose(similarity.rotation, ROTATION, atol=1e-5)
     np.testing.assert_allclose(similarity.rotation @ similarity.rotation.T, np.eye(3), atol=1e-14)
@@ -70,7 +70,7 @@ def test_anything_but_a_similarity_is_refused(case):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_a_moved_model_looks_as_before_from_a_camera_that_moved_with_it(degree):
+def test_model_and_camera_moved_together_give_the_same_image(degree):
     """Depths are multiplied. float32 parameters of a moved model are rounded anew: 1e-7 each."""
     scene, camera = Scene(degree=degree), Scene().camera
     moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(model(degree))
@@ -96,7 +96,7 @@ def test_a_smoothing_filter_grows_with_the_model():
     assert moved.smoothing.dtype == np.float32
 
 
-def test_positions_that_leave_float32_are_refused_and_quaternions_do_not():
+def test_positions_that_overflow_float32_are_refused():
     turn = Similarity.from_matrix(
         matrix_of(Rotation.from_euler("z", 45, degrees=True).as_matrix()), "it"
     )
@@ -108,7 +108,7 @@ def test_positions_that_leave_float32_are_refused_and_quaternions_do_not():
         turn.of_gaussians(far)
 
 
-def test_what_a_move_does_not_touch_stays():
+def test_translation_keeps_opacities_and_colours():
     before = model()
     moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(before)
     assert moved.logit_opacities is before.logit_opacities and moved.sh0 is before.sh0

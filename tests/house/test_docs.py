@@ -89,7 +89,7 @@ def known(plugin) -> set[str]:
 
 
 @pytest.mark.parametrize("plugin", ["splats", "splatpath", "calibrated"])
-def test_the_table_and_the_docstring_list_every_name_that_is_read(plugin):
+def test_table_and_docstring_list_every_property(plugin):
     listed = [name for row in table(plugin) for name in row.names]
     assert len(listed) == len(set(listed))
     assert set(listed) - {NESTED} == known(plugin) == names_in_docstring(plugin)
@@ -116,7 +116,7 @@ def loaded(plugin) -> list[mi.Object]:
 
 
 @both_plugins
-def test_the_table_marks_what_is_exposed_and_differentiable(plugin):
+def test_table_marks_exposed_and_differentiable_parameters(plugin):
     found = {}
 
     class Callback:
@@ -178,7 +178,7 @@ def written(text):
 
 
 @both_plugins
-def test_defaults_and_types_are_those_of_the_table(plugin):
+def test_defaults_and_types_match_the_table(plugin):
     checked = set()
     for row in table(plugin):
         for name in row.names:
@@ -192,7 +192,7 @@ def test_defaults_and_types_are_those_of_the_table(plugin):
     assert len(checked) == {"splats": 14, "calibrated": 5}[plugin]
 
 
-def test_every_row_has_a_default_or_is_one_of_several_ways_to_give_gaussians():
+def test_every_property_has_a_default_except_sources_of_gaussians():
     without = {name for p in ("splats", "calibrated") for r in table(p) for name in r.names}
     without -= {name for p in ("splats", "calibrated") for r in table(p) for name in r.defaults}
     ways = {"filename", *PARAMETER_NAMES, "feature_..."}

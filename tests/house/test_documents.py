@@ -52,21 +52,21 @@ def inline_code(page) -> list[str]:
 # The README
 # ----------------------------------------------------------------------------------------------
 
-MOST_WORDS = 900
+MAX_README_WORDS = 900
 
 
-def test_the_readme_is_short():
-    assert len(text_of("README.md").split()) <= MOST_WORDS
+def test_readme_is_short():
+    assert len(text_of("README.md").split()) <= MAX_README_WORDS
 
 
-def test_the_readme_has_two_commands_each_alone_on_its_line():
+def test_readme_has_two_commands_each_on_its_own_line():
     assert [block.strip() for block in fenced("README.md", "sh")] == [
         "bash .ci/setup python -m drgs.fit scenes/lego.yml",
         "bash .ci/setup python -m pytest",
     ]
 
 
-def test_the_readme_leads_to_every_page():
+def test_readme_links_to_every_page():
     for page in PAGES:
         if page not in ("README.md", "docs/index.md"):
             assert f"]({page})" in text_of("README.md")
@@ -86,7 +86,7 @@ def anchors(path) -> set[str]:
 
 
 @each_page
-def test_links_lead_somewhere(page):
+def test_links_have_targets(page):
     path = REPOSITORY / page
     for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
         if "://" in target:
@@ -98,15 +98,15 @@ def test_links_lead_somewhere(page):
 
 
 FOLDERS = ("drgs", "plugins", "scenes", "tests", "docs")
-OF_WORKED_EXAMPLES = {"drgs/effects/fog.py"}
+WORKED_EXAMPLE_FILES = {"drgs/effects/fog.py"}
 
 
 @each_page
-def test_paths_in_the_text_exist(page):
+def test_mentioned_paths_exist(page):
     for code in inline_code(page):
         if code.startswith(tuple(f"{folder}/" for folder in FOLDERS)):
             for path in code.split()[:1]:
-                assert path in OF_WORKED_EXAMPLES or (REPOSITORY / path).exists(), path
+                assert path in WORKED_EXAMPLE_FILES or (REPOSITORY / path).exists(), path
 
 
 def test_the_layout_lists_every_package():
@@ -116,13 +116,13 @@ def test_the_layout_lists_every_package():
         assert folder == Path() or f"`{folder.as_posix()}/`" in table, folder
 
 
-GONE = {"drgs.rendering"}  # of the changelog
+REMOVED_MODULES = {"drgs.rendering"}  # of the changelog
 
 
 @each_page
-def test_names_of_modules_and_their_contents_exist(page):
+def test_mentioned_modules_and_names_exist(page):
     for code in inline_code(page):
-        if re.fullmatch(r"drgs(\.\w+)+", code) and code not in GONE:
+        if re.fullmatch(r"drgs(\.\w+)+", code) and code not in REMOVED_MODULES:
             assert _exists(code), code
 
 
@@ -140,7 +140,7 @@ def _exists(name) -> bool:
 
 
 @each_page
-def test_keys_of_the_configuration_exist(page):
+def test_mentioned_configuration_keys_exist(page):
     for code in inline_code(page):
         match = re.fullmatch(r"((\w+)(\.\w+)+)(=.*)?", code)
         if match and match[3] != ".json" and match[2] in FitConfig.model_fields:
@@ -185,7 +185,7 @@ def help_of(*command) -> str:
 
 
 @each_page
-def test_commands_and_their_options_exist(page):
+def test_mentioned_commands_and_options_exist(page):
     for name, *arguments in commands(page):
         assert name in MODULES, name
         command = (name, *arguments[:1]) if name == "bench" and arguments else (name,)
@@ -193,7 +193,7 @@ def test_commands_and_their_options_exist(page):
         assert options <= set(re.findall(r"--?[a-zA-Z][\w-]*", help_of(*command))), arguments
 
 
-def test_the_pages_show_every_command():
+def test_documents_show_every_command():
     shown = {command[0] for page in PAGES for command in commands(page)}
     benches = {tuple(c[1:2]) for page in PAGES for c in commands(page) if c[0] == "bench"}
     assert shown == set(MODULES)
@@ -204,7 +204,7 @@ def test_the_pages_show_every_command():
 # Programs
 # ----------------------------------------------------------------------------------------------
 
-WITH_PROGRAMS = tuple(page for page in PAGES if fenced(page, "python"))
+PAGES_WITH_PROGRAMS = tuple(page for page in PAGES if fenced(page, "python"))
 
 SMALL_FIT = """
 data: {path: lego}
@@ -235,10 +235,10 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-def test_the_programs_of_the_pages_run(folder, run_python):
+def test_programs_in_the_documents_run(folder, run_python):
     """Each page's one after the other, as if they were pasted, then its scenes in XML."""
     program = []
-    for page in WITH_PROGRAMS:
+    for page in PAGES_WITH_PROGRAMS:
         name = f"page_{Path(page).stem}"
         (folder / f"{name}.py").write_text(python_of(page))
         program.append(f"exec(compile(open('{name}.py').read(), {page!r}, 'exec'), {{}})")
@@ -249,4 +249,4 @@ def test_the_programs_of_the_pages_run(folder, run_python):
             program.append(f"assert mi.render(mi.load_file('{name}_{k}.xml')).shape")
     result = run_python("\n".join(program), cwd=folder, PYTHONPATH=str(REPOSITORY))
     assert result.returncode == 0, result.stderr
-    assert result.stdout.count("ran ") >= len(WITH_PROGRAMS) == 4, result.stdout
+    assert result.stdout.count("ran ") >= len(PAGES_WITH_PROGRAMS) == 4, result.stdout

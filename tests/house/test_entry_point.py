@@ -54,7 +54,7 @@ def test_one_entry_point_names_the_plugins():
     assert entry_points() == {"drgs": "drgs.plugins"}
 
 
-def test_the_installed_metadata_says_the_same():
+def test_installed_metadata_has_the_same_entry_point():
     found = importlib.metadata.entry_points(group="mitsuba", name="drgs")
     if not found:
         pytest.skip("drgs is not installed here, or was before it had an entry point")

@@ -32,12 +32,12 @@ def test_a_public_name_is_documented(name):
 
 
 @pytest.mark.parametrize("name", ["Gaussians", "rasterization"])
-def test_names_are_imported_when_they_are_used(run_python, name):
+def test_public_names_are_imported_lazily(run_python, name):
     result = run_python(LAZILY.format(name=name))
     assert result.returncode == 0, result.stderr
 
 
-def test_a_type_checker_imports_the_same_names():
+def test_type_checkers_see_the_same_names():
     package = REPOSITORY / "drgs"
     (block,) = (
         node
@@ -49,7 +49,7 @@ def test_a_type_checker_imports_the_same_names():
     assert (package / "py.typed").is_file()
 
 
-def test_another_name_is_refused():
+def test_unknown_name_is_refused():
     with pytest.raises(AttributeError, match="module 'drgs' has no attribute 'fitt'"):
         _ = drgs.fitt
 
@@ -76,11 +76,11 @@ def shared_names(source, modules):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(REPOSITORY)))
-def test_nothing_is_called_like_a_module_that_defines_or_holds_it(file):
+def test_no_name_equals_its_module_or_package(file):
     assert not shared_names(file.read_text(), names_around(file))
 
 
-def test_public_names_are_those_of_no_module():
+def test_public_names_differ_from_module_names():
     assert not PUBLIC & {path.stem for path in (REPOSITORY / "drgs").iterdir()}
 
 

@@ -49,7 +49,7 @@ MAY_IMPORT = {
         *TRAINING,
     },
 }
-"""By package: the others that it may import. ``drgs`` itself may be imported for its version."""
+"""Packages that a package may import. ``drgs`` itself may be imported for its version."""
 
 COMMANDS = {"__main__", "fit", "poses", "render", "export", "view", "capture"}
 
@@ -111,7 +111,7 @@ def test_imports_point_down(module):
         assert allowed, f"{module} imports {imported}"
 
 
-def circle_among(imports):
+def find_cycle(imports):
     """A circle of modules each of which imports the next one; None: there is none."""
     finished, trail = set(), []
 
@@ -131,33 +131,33 @@ def circle_among(imports):
     return next((circle for circle in map(visit, imports) if circle), None)
 
 
-def test_effects_of_a_fit_know_no_trainer():
+def test_training_effects_do_not_import_the_trainer():
     effects = [name for name in MODULES if name.startswith("drgs.training.effects.")]
     assert effects
     for module in effects:
         assert "drgs.training.trainer" not in IMPORTS[module], module
 
 
-def test_no_circle_among_modules():
-    assert circle_among({name: found - {"drgs"} for name, found in IMPORTS.items()}) is None
+def test_no_import_cycles_among_modules():
+    assert find_cycle({name: found - {"drgs"} for name, found in IMPORTS.items()}) is None
 
 
-def test_no_circle_among_packages():
+def test_no_import_cycles_among_packages():
     packages = {name: set() for name in MAY_IMPORT}
     for module, found in IMPORTS.items():
         packages[package_of(module)] |= {package_of(name) for name in found - {"drgs"}}
-    assert circle_among(packages) is None
+    assert find_cycle(packages) is None
 
 
-def test_a_circle_is_found():
-    assert circle_among({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
-    assert circle_among({"a": {"b", "c"}, "b": {"c"}, "c": set()}) is None
+def test_import_cycle_is_found():
+    assert find_cycle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
+    assert find_cycle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) is None
 
 
 @pytest.mark.parametrize(
     "module", [name for name in MODULES if MODULES[name].name == "__init__.py" and name != "drgs"]
 )
-def test_a_package_says_what_lives_there_and_what_it_may_import(module):
+def test_package_docstrings_describe_contents_and_allowed_imports(module):
     documentation = ast.get_docstring(ast.parse(MODULES[module].read_text()))
     first, _, rest = documentation.partition("\n\n")
     assert first.endswith("."), "the first line says what lives there"

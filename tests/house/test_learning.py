@@ -23,7 +23,7 @@ def section(page, heading):
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/guide.md", "docs/how_it_works.md"])
-def test_reading_the_code_begins_at_the_reference(page):
+def test_reading_guide_begins_with_the_reference(page):
     first = re.search(r"\]\((.*?)\)", section(page, "Reading the code"))[1]
     assert first.removeprefix("../") == REFERENCE
 
@@ -46,7 +46,7 @@ def identifiers(*paths):
     return found
 
 
-def test_the_papers_symbols_have_names_in_the_code():
+def test_symbols_of_the_paper_are_mapped_to_names_in_the_code():
     kernels = (
         *("drgs/splatting/projection.py", "drgs/splatting/footprint.py"),
         *("drgs/cameras/camera.py", "drgs/cameras/lens.py"),
@@ -64,7 +64,7 @@ def test_the_papers_symbols_have_names_in_the_code():
             assert not missing, (symbol, missing)
 
 
-def test_both_forms_of_the_projected_covariance_are_there():
+def test_both_forms_of_the_projected_covariance_are_documented():
     text = (REPOSITORY / "docs" / "how_it_works.md").read_text()
     assert r"\Sigma' = J W \Sigma W^T J^T = J W R S S^T R^T W^T J^T = M M^T" in text
     assert "scenes/images/tiles.png" in text
@@ -94,7 +94,7 @@ def test_no_function_and_no_variable_has_an_invented_name():
     assert {p: n for p, n in found.items() if n} == {"drgs/training/optimizer.py": {"added"}}
 
 
-def test_an_invented_name_is_found():
+def test_invented_name_is_found():
     assert invented("def added(R):\n    sharp = 2") == {"added", "R", "sharp"}
 
 
@@ -103,7 +103,7 @@ def test_an_invented_name_is_found():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_limits_are_those_of_the_program():
+def test_documented_limits_match_the_code():
     text = section("docs/limits.md", "Sizes")
     cap = FitConfig.model_fields["densify"].annotation.model_fields["max_gaussians"]
     (largest,) = (limit.le for limit in cap.metadata if hasattr(limit, "le"))
@@ -124,5 +124,5 @@ def test_the_limits_are_those_of_the_program():
     assert f"{cap.default:,}" in rows["Gaussians"]
 
 
-def test_the_page_of_splats_says_how_colours_are_stored():
+def test_splats_page_documents_how_colours_are_stored():
     assert f"0.5 + {splatting.C_00:.4f} sh0" in (REPOSITORY / "docs" / "mitsuba.md").read_text()

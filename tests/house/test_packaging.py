@@ -12,7 +12,9 @@ import zipfile
 import pytest
 from conftest import REPOSITORY
 
-SHOW = "import drgs, drgs.plugins, drgs.io, drgs.datasets; print(drgs.plugins.__file__)"
+PRINT_PLUGINS_PATH = (
+    "import drgs, drgs.plugins, drgs.io, drgs.datasets; print(drgs.plugins.__file__)"
+)
 
 
 def copy_checkout(folder):
@@ -50,23 +52,23 @@ def installed(tmp_path):
 
 
 def test_plugins_are_found_in_a_plain_checkout(run_python):
-    result = run_python(SHOW)
+    result = run_python(PRINT_PLUGINS_PATH)
     assert result.stdout.strip() == str(REPOSITORY / "plugins" / "__init__.py"), result.stderr
 
 
 def test_plugins_are_found_from_another_folder(run_python, tmp_path):
-    result = run_python(SHOW, cwd=tmp_path, PYTHONPATH=str(REPOSITORY))
+    result = run_python(PRINT_PLUGINS_PATH, cwd=tmp_path, PYTHONPATH=str(REPOSITORY))
     assert result.stdout.strip() == str(REPOSITORY / "plugins" / "__init__.py"), result.stderr
 
 
-def test_an_installed_package_holds_its_plugins(run_python, tmp_path, installed):
-    result = run_python(SHOW, cwd=tmp_path, PYTHONPATH=str(installed))
+def test_installed_package_contains_its_plugins(run_python, tmp_path, installed):
+    result = run_python(PRINT_PLUGINS_PATH, cwd=tmp_path, PYTHONPATH=str(installed))
     expected = installed / "drgs" / "plugins" / "__init__.py"
     assert result.stdout.strip() == str(expected), result.stderr
 
 
 def test_a_checkout_that_shadows_an_installed_package_finds_its_own_plugins(run_python, installed):
-    result = run_python(SHOW, PYTHONPATH=str(installed))
+    result = run_python(PRINT_PLUGINS_PATH, PYTHONPATH=str(installed))
     assert result.stdout.strip() == str(REPOSITORY / "plugins" / "__init__.py"), result.stderr
 
 
@@ -93,7 +95,7 @@ def test_an_editable_install_wins_over_a_clone_of_the_same_name(tmp_path):
     assert integrator == "SplatsIntegrator"
 
 
-def test_every_file_of_the_packages_is_installed(installed):
+def test_every_package_file_is_installed(installed):
     def files(folder):
         return {
             path.relative_to(folder).as_posix()
@@ -107,7 +109,7 @@ def test_every_file_of_the_packages_is_installed(installed):
     assert files(installed / "drgs") == expected
 
 
-def test_the_version_is_that_of_the_project_file():
+def test_version_matches_the_project_file():
     import drgs
 
     assert f'\nversion = "{drgs.__version__}"\n' in (REPOSITORY / "pyproject.toml").read_text()

@@ -24,29 +24,29 @@ def undocumented(source):
     ]
 
 
-def test_they_are_called_nowhere_else():
+def test_undocumented_functions_are_used_in_one_module_only():
     found = {str(p.relative_to(REPOSITORY)): undocumented(p.read_text()) for p in FILES}
     assert {name for name, uses in found.items() if uses} == {"drgs/core/private.py"}
 
 
-def test_a_use_is_found():
+def test_use_of_an_undocumented_function_is_found():
     assert undocumented("def f(x):\n    return dr.detail.collect_indices(x)") == ["dr.detail"]
 
 
-def test_lanes_of_a_block_are_ordered_stably():
+def test_bucket_order_is_stable_within_blocks():
     keys = np.random.default_rng(0).integers(0, 8, 100)
     order = private.bucket_order(UInt32(keys), 64, 8)
     expected = [np.argsort(keys[b : b + 64], kind="stable") + b for b in (0, 64)]
     np.testing.assert_array_equal(order, np.concatenate(expected))
 
 
-def test_variables_are_the_same_or_have_equal_values():
+def test_same_variables_compares_identity():
     a, b = Float(1, 2), Float(1, 2)
     assert private.same_variables([a, {"b": b}], (a, b))
     assert not private.same_variables(a, b)
 
 
-def test_the_library_has_a_version():
+def test_llvm_version_is_known():
     assert private.llvm_version()[0] > 10
 
 
@@ -75,7 +75,7 @@ print("<8 x float>" in ir, "+avx512" in ir, "+avx2" in ir)
 """
 
 
-def test_a_processor_with_avx512_can_do_without():
+def test_avx512_can_be_disabled():
     """In a process of its own, since there is no way back."""
     run = [sys.executable, "-c", PROGRAM]
     result = subprocess.run(run, capture_output=True, text=True, check=True).stdout
@@ -85,7 +85,7 @@ def test_a_processor_with_avx512_can_do_without():
         assert "cannot leave out AVX-512" in result and "omit it" in result
 
 
-def test_the_peak_of_memory_is_that_since_it_was_cleared():
+def test_memory_peak_is_measured_since_the_last_reset():
     private.clear_memory_peak()
     before = private.memory_peak()
     held = dr.full(Float, 1.0, 1 << 22)

@@ -64,7 +64,7 @@ def write_stubs(folder):
         )
 
 
-def test_a_type_checker_finds_nothing(tmp_path):
+def test_type_checker_finds_no_errors(tmp_path):
     write_stubs(tmp_path / "stubs")
     settings = {
         "typeCheckingMode": "standard",

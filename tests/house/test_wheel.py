@@ -96,7 +96,7 @@ def files_of(package):
     return {path for path in found if "__pycache__" not in path.parts}
 
 
-def test_the_package_is_the_wheels_and_holds_every_file(scripts, tmp_path):
+def test_installed_package_contains_every_file(scripts, tmp_path):
     program = "import drgs, drgs.plugins; print(drgs.__file__, drgs.plugins.__file__, sep='\\n')"
     shown = run(scripts / "python", "-c", program, cwd=tmp_path).splitlines()
     package, plugins = (Path(file).parent for file in shown)
@@ -205,7 +205,7 @@ def photographs(tmp_path):
     return tmp_path
 
 
-def test_a_package_beside_the_wheel_adds_to_every_extension_point(scripts, photographs):
+def test_external_package_can_use_every_extension_point(scripts, photographs):
     """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
     folder = photographs
     source = shutil.copytree(REPOSITORY / "tests" / "examples", folder / "source")

@@ -57,7 +57,7 @@ def test_cut_out_objects_have_no_coarse_stages(photographs):
         assert stages(CONFIG, with_alpha(many, lambda i, k=opaque: i == k or left_of(60))) == []
 
 
-def test_neither_are_small_images_and_the_papers_recipe(photographs):
+def test_small_images_and_adc_have_no_coarse_stage(photographs):
     assert stages(CONFIG, photographs_of(120, 99)) == []
     assert stages(with_changes(CONFIG, {"iterations": 1}), photographs) == []
     assert stages(with_changes(CONFIG, {"densify.strategy": "adc"}), photographs) == []
@@ -70,7 +70,7 @@ def test_given_values_stay(photographs):
     assert stages(quarter, photographs) == [(9, 4)]
 
 
-def test_it_stays_open_until_there_is_a_dataset(photographs):
+def test_stages_stay_open_until_the_dataset_is_known(photographs):
     assert with_iterations(CONFIG, 200).coarse is None
     known = resolve_defaults(CONFIG, photographs)
     assert with_decisions(CONFIG, known) == known

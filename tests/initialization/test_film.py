@@ -30,7 +30,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_points_are_where_the_reference_projects_them(name):
+def test_projected_points_match_the_reference(name):
     host, lens = LENSES[name]
     view = replace(view_at((3, -2, 1), (0.5, 0.25, 0)), lens=host, fy=35.0, cx=17.0)
     camera = Camera(
@@ -64,7 +64,7 @@ def test_points_on_the_optical_axis_are_at_the_principal_point():
         np.testing.assert_allclose(places, [[20, 20], [15, 15], [2, 0]])
 
 
-def test_a_camera_that_moves_has_no_one_place_for_a_point():
+def test_moving_camera_is_not_projectable():
     view = view_at((0, -2, 0), (0, 0, 0))
     assert is_projectable(view)
     assert not is_projectable(replace(view, motion=CameraMotion(np.eye(4), "global")))

@@ -68,14 +68,14 @@ def test_a_point_does_not_get_the_colour_of_an_occluder():
     assert (colors[COUNT:, 0] > colors[COUNT:, 1]).mean() > 0.99
 
 
-def test_an_image_that_shows_something_else_does_not_matter(ball):
+def test_outlier_image_does_not_affect_colours(ball):
     points, spacing = on_the_ball()
     wrong = replace(ball[0], image=np.zeros_like(ball[0].image), alpha=np.ones_like(ball[0].alpha))
     colors = colors_from_images(points, spacing, [wrong, *ball[1:], *ball[1:]], WHITE)
     assert np.abs(colors - colors_at(points)).mean() < 0.02
 
 
-def test_pixels_that_a_mask_leaves_out_are_not_looked_at(ball):
+def test_masked_pixels_are_not_used(ball):
     points, spacing = on_the_ball()
     nothing = np.zeros((64, 64), np.float32)
     masked = [replace(view, image=0 * view.image, mask=nothing) for view in ball]
@@ -85,7 +85,7 @@ def test_pixels_that_a_mask_leaves_out_are_not_looked_at(ball):
     assert colors_from_images(points, spacing, masked, WHITE) is None
 
 
-def test_a_point_that_no_image_sees_is_coloured_as_the_nearest_that_one_does(ball):
+def test_unseen_point_gets_the_colour_of_the_nearest_seen_one(ball):
     points, spacing = on_the_ball()
     aside = 30 * points[::50] + [0, 0, 0.1]
     both, wide = np.concatenate([points, aside]), np.append(spacing, spacing[::50])
@@ -104,7 +104,7 @@ def test_points_that_no_image_shows_have_no_colours(ball):
     assert colors_from_images(points, spacing, moving, WHITE) is None
 
 
-def test_of_very_many_points_few_views_are_looked_at(ball, monkeypatch):
+def test_few_views_are_used_for_very_many_points(ball, monkeypatch):
     monkeypatch.setattr(point_colors, "MAX_BYTES", 12 * COUNT * 9)
     looked_at = []
     seen = point_colors._find_shown_points
@@ -119,7 +119,7 @@ def test_of_very_many_points_few_views_are_looked_at(ball, monkeypatch):
     assert np.abs(colors - colors_at(points)).mean() < 0.02
 
 
-def test_the_middle_half_is_averaged():
+def test_colour_is_the_interquartile_mean():
     rng = np.random.default_rng(0)
     samples = rng.random((11, 6, 3)).astype(np.float32)
     counts = (0, 1, 2, 4, 7, 11)

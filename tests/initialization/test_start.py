@@ -24,7 +24,7 @@ from drgs.initialization.start_box import points_in_view
 
 
 # Either layout
-def test_a_missing_folder_is_an_error_that_says_where_to_get_the_data(tmp_path):
+def test_missing_folder_is_an_error_with_the_download_command(tmp_path):
     folder = tmp_path / "none"
     assert refusal(folder, source="our server") == (
         f"data.path: there is no folder {folder}; say where it is (--data DIR), or get it from our "
@@ -35,7 +35,7 @@ def test_a_missing_folder_is_an_error_that_says_where_to_get_the_data(tmp_path):
     )
 
 
-def test_a_folder_of_neither_layout_is_refused(tmp_path):
+def test_folder_of_unknown_layout_is_refused(tmp_path):
     assert refusal(tmp_path) == (
         f"{tmp_path}: neither transforms_train.json nor transforms.json is there, nor a model of "
         f"COLMAP in sparse/0 with its photographs in images; see {GUIDE}"
@@ -110,7 +110,7 @@ def test_extent_is_1_1_times_the_largest_distance_from_the_centroid():
     assert dataset_of(views).extent == pytest.approx(expected)
 
 
-def test_extent_is_1_where_all_cameras_share_a_centre():
+def test_extent_is_1_if_all_cameras_share_a_centre():
     views = [view_at((1, 2, 3), (0, 0, 0)), view_at((1, 2, 3), (5, 0, 0))]
     assert dataset_of(views).extent == 1
 
@@ -120,7 +120,7 @@ def config(**sections):
     return FitConfig(data={"path": "unused"}, **sections)
 
 
-def test_random_points_fill_the_reference_box_and_repeat_with_the_seed(blender):
+def test_random_points_fill_the_reference_box_and_depend_on_the_seed_only(blender):
     dataset = load(blender[0])
     a = initial_gaussians(config(init={"num_points": 2000}), dataset)
     b = initial_gaussians(config(init={"num_points": 2000}), dataset)
@@ -204,7 +204,7 @@ def test_a_point_cloud_of_the_wrong_size_is_refused(tmp_path):
     )
 
 
-def test_the_focus_is_what_the_cameras_look_at():
+def test_focus_is_the_point_that_cameras_look_at():
     target = np.array([1.0, -2.0, 0.5])
     centers = [(5, 0, 0), (0, 6, 1), (4, 3, 2)]
     focus, distance = focus_of([view_at(center, target) for center in centers])
@@ -212,7 +212,7 @@ def test_the_focus_is_what_the_cameras_look_at():
     assert distance == pytest.approx(np.median([math.dist(c, target) for c in centers]))
 
 
-def test_points_in_view_are_seen_and_not_in_front_of_a_lens():
+def test_points_in_view_are_visible_and_not_close_to_a_camera():
     views = [view_at(c, (1, 0, 0)) for c in [(5, 0, 0), (4, 2, 0), (4, -2, 1)]]
     points = points_in_view(views, 500, np.random.default_rng(0))
     assert points.shape == (500, 3)
@@ -228,7 +228,7 @@ def test_points_in_view_are_seen_and_not_in_front_of_a_lens():
     assert seen.all()
 
 
-def test_half_of_the_points_in_view_are_behind_it_uniform_in_one_over_the_distance():
+def test_half_of_the_points_in_view_are_uniform_in_inverse_distance():
     centers = [(4, 0, 0), (-4, 0, 0), (0, 4, 0), (0, -4, 0), (0, 0.1, 4), (0, 0.1, -4)]
     views = [replace(view_at(c, (0, 0, 0)), fx=5.0, fy=5.0) for c in centers]  # they see all of it
     focus, distance = focus_of(views)
@@ -237,11 +237,11 @@ def test_half_of_the_points_in_view_are_behind_it_uniform_in_one_over_the_distan
     behind = nearness[nearness < 1]
     assert 0.45 < len(behind) / len(points) < 0.65  # parts of the cube are too near to a camera
     assert behind.min() >= 0.1
-    # Of 2,000, a share of 4/9 varies by 0.011 (one sigma).
+    # A fraction of 4/9 of 2,000 varies by 0.011 (one sigma).
     assert np.mean(behind < 0.5) == pytest.approx((0.5 - 0.1) / (1 - 0.1), abs=0.05)
 
 
-def test_a_fit_says_that_random_points_reach_behind_what_is_looked_at():
+def test_description_of_random_points_states_their_extent():
     dataset = dataset_of([view_at(c, (1, 0, 0)) for c in [(5, 0, 0), (1, 4, 0), (1, -4, 0)]])
     start = start_of(config(init={"num_points": 99}), dataset)
     assert start.description == (
@@ -250,7 +250,7 @@ def test_a_fit_says_that_random_points_reach_behind_what_is_looked_at():
     )
 
 
-def test_half_extent_wins_over_the_layouts_and_the_cameras_box(blender):
+def test_half_extent_overrides_the_default_box(blender):
     g = initial_gaussians(config(init={"half_extent": 0.25, "num_points": 99}), load(blender[0]))
     assert np.abs(g.means).max() <= 0.25
     views = [view_at((5, 0, 0), (0, 0, 0)), view_at((0, 5, 0), (0, 0, 0))]
@@ -278,7 +278,7 @@ def test_cameras_that_determine_no_box_are_refused(views, reason):
     )
 
 
-def test_one_camera_determines_no_box():
+def test_single_camera_does_not_determine_a_box():
     with pytest.raises(UserError) as error:
         initial_gaussians(config(), dataset_of([view_at((4, 0, 0), (0, 0, 0))]))
     assert str(error.value) == (

@@ -14,7 +14,7 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, initial_gaussians, start_of
 from drgs.initialization.start_box import start_box_of
 
-AROUND = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
+REFERENCE_CENTERS = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
 
 
 def config(**sections):
@@ -34,14 +34,14 @@ def refusal(views, **init):
 
 
 # The layout's own box
-def test_the_references_box_is_taken_where_the_cameras_are_as_it_expects():
-    box = start_box_of(InitConfig(), dataset_of(views_from(AROUND), 1.3))
+def test_reference_box_is_used_for_cameras_of_the_reference_layout():
+    box = start_box_of(InitConfig(), dataset_of(views_from(REFERENCE_CENTERS), 1.3))
     assert (box.center == 0).all() and box.half_extent == 1.3
 
 
 @pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
 def test_otherwise_the_box_is_scaled_and_moved_to_the_focus(scale, target):
-    dataset = dataset_of(views_from(AROUND, target, scale), 1.3)
+    dataset = dataset_of(views_from(REFERENCE_CENTERS, target, scale), 1.3)
     box = start_box_of(InitConfig(), dataset)
     np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
     # Views of 40 px with a focal length of 40 px see half a unit to each side at distance 1.
@@ -51,8 +51,8 @@ def test_otherwise_the_box_is_scaled_and_moved_to_the_focus(scale, target):
 
 
 # A box that is given
-def test_a_box_that_most_cameras_do_not_look_into_is_refused():
-    views = views_from(AROUND, target=(50, 0, 0))
+def test_box_outside_most_views_is_refused():
+    views = views_from(REFERENCE_CENTERS, target=(50, 0, 0))
     message = refusal(views, half_extent=1.3)
     assert message == (
         "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at (around "
@@ -62,20 +62,22 @@ def test_a_box_that_most_cameras_do_not_look_into_is_refused():
 
 
 def test_a_box_at_the_edge_of_the_images_is_refused():
-    views = views_from(AROUND, target=(0, 0, 1.6))
+    views = views_from(REFERENCE_CENTERS, target=(0, 0, 1.6))
     assert "but only 0 of 4 have it in the middle of" in refusal(views, half_extent=0.4)
 
 
-def test_a_box_that_hardly_shows_in_the_images_is_refused():
-    views = views_from(AROUND, scale=100)
+def test_box_that_is_tiny_in_the_images_is_refused():
+    views = views_from(REFERENCE_CENTERS, scale=100)
     assert "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of an image (the " in (
         refusal(views, half_extent=1.3)
     )
 
 
 @pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
-def test_a_box_that_the_cameras_look_into_or_that_surrounds_them_is_taken(half_extent):
-    box = start_box_of(InitConfig(half_extent=half_extent), dataset_of(views_from(AROUND)))
+def test_box_in_view_or_around_the_cameras_is_accepted(half_extent):
+    box = start_box_of(
+        InitConfig(half_extent=half_extent), dataset_of(views_from(REFERENCE_CENTERS))
+    )
     assert box.half_extent == half_extent
 
 
@@ -87,8 +89,8 @@ def cloud(tmp_path):
     return tmp_path / "cloud.ply"
 
 
-def test_a_cloud_in_another_frame_of_reference_is_refused(cloud):
-    message = refusal(views_from(AROUND, target=(30, 30, 30)), point_cloud=cloud)
+def test_cloud_in_another_coordinate_system_is_refused(cloud):
+    message = refusal(views_from(REFERENCE_CENTERS, target=(30, 30, 30)), point_cloud=cloud)
     assert message == (
         f"{cloud}: must hold what the cameras look at (around (30, 30, 30), from 4.03 away), in "
         "their frame of reference, but only 0 of 4 have any of its 50 points in the middle of "
@@ -97,7 +99,7 @@ def test_a_cloud_in_another_frame_of_reference_is_refused(cloud):
     )
 
 
-def test_the_point_cloud_that_a_dataset_names_is_started_from(photographs, cloud):
+def test_point_cloud_of_the_dataset_is_the_start(photographs, cloud):
     from support.datasets import edit
 
     edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="cloud.ply"))
@@ -112,7 +114,7 @@ def test_the_point_cloud_that_a_dataset_names_is_started_from(photographs, cloud
     assert initial_gaussians(config(init=few), ignoring).num_gaussians == 30
 
 
-def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
+def test_missing_point_cloud_falls_back_to_random_points(photographs):
     from support.datasets import edit
 
     edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="gone.ply"))
@@ -121,18 +123,18 @@ def test_a_point_cloud_that_is_missing_leaves_random_points(photographs):
     assert note.endswith("not there: 1 of 1 point cloud (gone.ply); the fit starts without")
 
 
-def test_points_that_are_all_black_get_the_colours_of_the_images(tmp_path):
+def test_black_points_are_coloured_from_the_images(tmp_path):
     """Some pipelines write points without colours."""
     positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
     given = config(init={"point_cloud": tmp_path / "black.ply"})
-    views = [replace(view, image=view.image + 0.75) for view in views_from(AROUND)]
+    views = [replace(view, image=view.image + 0.75) for view in views_from(REFERENCE_CENTERS)]
     g = initial_gaussians(given, dataset_of(views))
     np.testing.assert_allclose(0.5 + SH_C0 * g.sh0, 0.75, rtol=1e-6)
     assert not initial_gaussians(given, dataset_of([])).sh0.any()  # grey: colour is SH + 0.5
 
 
-# What else follows from the data
+# Other defaults derived from the data
 @pytest.mark.parametrize(("mode", "background"), [("RGB", "black"), ("RGBA", "white")])
 def test_the_background_follows_from_the_images(photographs, mode, background):
     from PIL import Image
@@ -151,14 +153,14 @@ def test_the_background_follows_from_the_images(photographs, mode, background):
     ("scale", "near"), [(1, 0.2), (1.5, 0.2), (1000, 200), (1e-9, 1e-9), (1e12, 1e9)]
 )
 def test_the_near_plane_follows_from_the_cameras(scale, near):
-    dataset = dataset_of(views_from(AROUND, scale=scale))
+    dataset = dataset_of(views_from(REFERENCE_CENTERS, scale=scale))
     assert resolve_defaults(config(), dataset).model.near == near
     given = resolve_defaults(config(model={"near": 1e-9}), dataset)
     assert given.model.near == 1e-9
 
 
-def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
-    near = dataset_of(views_from(AROUND, scale=0.01))
+def test_near_plane_beyond_the_focus_is_refused():
+    near = dataset_of(views_from(REFERENCE_CENTERS, scale=0.01))
     with pytest.raises(UserError) as error:
         resolve_defaults(config(model={"near": 0.2}), near)
     assert str(error.value) == (
@@ -168,13 +170,13 @@ def test_a_near_plane_behind_what_the_cameras_look_at_is_refused():
 
 
 def test_derived_values_are_recorded():
-    dataset = dataset_of(views_from(AROUND), 1.3)
+    dataset = dataset_of(views_from(REFERENCE_CENTERS), 1.3)
     decided = resolve_defaults(config(), dataset)
     assert (decided.model.near, decided.data.background) == (0.2, "white")
     assert resolve_defaults(decided, dataset) == decided
 
 
-def test_photographs_are_scaled_down_to_the_references_width_unless_a_size_is_given(photographs):
+def test_photographs_are_downscaled_to_the_reference_width_by_default(photographs):
     from PIL import Image
     from support.datasets import edit
 

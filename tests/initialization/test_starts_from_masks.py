@@ -54,7 +54,7 @@ def refusal(dataset, **init):
     return str(error.value)
 
 
-def test_where_images_are_masks_a_fit_starts_on_their_hull(masks):
+def test_fit_with_alpha_images_starts_on_the_visual_hull(masks):
     for kind in ("auto", "masks"):
         start = start_of(config(start=kind), masks)
         assert start.description == f"{len(start.means)} points on the hull of 12 masks, coloured"
@@ -76,7 +76,7 @@ def test_starting_gaussians_have_the_colours_opacity_and_scale(masks):
     np.testing.assert_allclose(whole.scales[:, 0], np.sqrt(nearest), rtol=1e-4)
 
 
-def test_without_masks_a_fit_starts_as_before(opaque, masks):
+def test_fit_without_masks_starts_at_random(opaque, masks):
     plain = with_alpha(masks, lambda _: None)
     expected = np.random.default_rng(0).uniform(-1.3, 1.3, (300, 3))
     for dataset, kind in ((opaque, "auto"), (plain, "auto"), (masks, "random")):
@@ -86,14 +86,14 @@ def test_without_masks_a_fit_starts_as_before(opaque, masks):
         assert start.description == "300 random points in [-1.3, 1.3]^3"
 
 
-def test_a_box_or_a_cloud_that_is_given_comes_before_masks(masks, cloud):
+def test_explicit_box_or_cloud_takes_precedence_over_masks(masks, cloud):
     assert "random points in [-1, 1]^3" in start_of(config(half_extent=1.0), masks).description
     start = start_of(config(point_cloud=cloud), masks)
     assert start.description == f"the points of {cloud}"
     np.testing.assert_allclose(start.colors, 0.2)
 
 
-def test_masks_come_before_the_cloud_of_the_dataset(masks, opaque, cloud):
+def test_masks_take_precedence_over_the_cloud_of_the_dataset(masks, opaque, cloud):
     of_masks, of_opaque = (replace(d, point_cloud=cloud) for d in (masks, opaque))
     assert "on the hull" in start_of(config(), of_masks).description
     assert start_of(config(), of_opaque).description == f"the points of {cloud}"
@@ -101,13 +101,13 @@ def test_masks_come_before_the_cloud_of_the_dataset(masks, opaque, cloud):
     assert "random points in" in start_of(config(start="random"), of_opaque).description
 
 
-def test_masks_are_carved_within_the_box_that_is_given(masks):
+def test_masks_are_carved_within_the_given_box(masks):
     start = start_of(config(start="masks", half_extent=0.7), masks)
     assert len(start.means) > 100 and np.abs(start.means).max() <= 0.7
 
 
 @pytest.mark.parametrize("distance", [DISTANCE, 0.01 * DISTANCE])
-def test_where_no_box_is_known_it_follows_from_the_cameras(masks, distance):
+def test_unknown_box_is_derived_from_the_cameras(masks, distance):
     scale = distance / DISTANCE
 
     def scaled(view):
@@ -129,7 +129,7 @@ def test_masks_without_a_hull_are_reported_and_not_used(masks, opaque):
         assert start.description == f"300 random points in [-1.3, 1.3]^3 ({reason})"
 
 
-def test_masks_and_clouds_that_are_not_there_are_refused(masks, opaque):
+def test_missing_masks_and_clouds_are_refused(masks, opaque):
     few = replace(opaque, train=(*masks.train[:2], *opaque.train[2:]))
     assert refusal(few, start="masks") == (
         "init.start: masks needs nearly all training images to be transparent where there is "
@@ -152,7 +152,7 @@ def test_masks_and_clouds_that_are_not_there_are_refused(masks, opaque):
         ({"scale": 0.0}, "greater than or equal to 0.001"),
     ],
 )
-def test_starts_that_contradict_each_other_are_refused(init, message):
+def test_contradictory_starts_are_refused(init, message):
     with pytest.raises(ValueError, match=message):
         config(**init)
 

@@ -12,10 +12,10 @@ from drgs.initialization.start_box import Box
 from drgs.initialization.visual_hull import are_masks, hull_points, silhouettes_of
 from drgs.reference import effects as reference
 
-WHOLE = Box(np.zeros(3), 1.3)
+START_BOX = Box(np.zeros(3), 1.3)
 
 
-def carved(views, count=1500, seed=0, within=WHOLE):
+def carved(views, count=1500, seed=0, within=START_BOX):
     return hull_points(silhouettes_of(views), within, count, seed)
 
 
@@ -55,7 +55,7 @@ def test_points_of_a_brick_are_on_its_faces(brick):
 
 
 @pytest.mark.parametrize("views", ["ball", "brick"])
-def test_no_image_shows_a_point_empty(views, request):
+def test_every_image_is_opaque_at_hull_points(views, request):
     """Points are projected by the reference, pixel by pixel."""
     views = request.getfixturevalue(views)
     points = carved(views)
@@ -67,14 +67,14 @@ def test_the_number_of_points_is_never_exceeded_and_nearly_reached(ball):
         assert 0.6 * count <= len(carved(ball, count)) <= count
 
 
-def test_a_body_that_is_small_in_its_box_has_as_many_points():
+def test_small_object_in_a_large_box_has_as_many_points():
     views = images_of(sphere(0.05, (0.3, 0.2, -0.1)), 12, size=200, samples=1)
     points = carved(views, 500)
     assert len(points) > 300
     assert np.linalg.norm(points - [0.3, 0.2, -0.1], axis=1).max() < 0.08
 
 
-def test_a_thin_pole_is_not_lost():
+def test_thin_pole_is_kept():
     """Its width is a fifth of a pixel and a fifteenth of a cube; beside it is a body."""
     pole = box((-0.004, 0.596, -1), (0.004, 0.604, 1))
     views = images_of(together(pole, sphere(0.4)), 10, samples=7)
@@ -89,27 +89,27 @@ def test_the_same_seed_gives_the_same_points(ball):
     assert not np.array_equal(carved(ball, 300, seed=1), first)
 
 
-def test_little_memory_is_taken(ball):
+def test_carving_uses_little_memory(ball):
     """The limit is a chunk of cubes, and some numbers of each cube."""
     silhouettes = silhouettes_of(ball)
     tracemalloc.start()
-    hull_points(silhouettes, WHOLE, 3000, 0)
+    hull_points(silhouettes, START_BOX, 3000, 0)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 20e6
 
 
-def test_silhouettes_of_noise_take_little_memory(ball):
+def test_noisy_silhouettes_use_little_memory(ball):
     rng = np.random.default_rng(2)
     noisy = [replace(v, alpha=rng.uniform(0, 1, v.alpha.shape).astype(np.float32)) for v in ball]
     tracemalloc.start()
-    hull_points(silhouettes_of(noisy), WHOLE, 3000, 0)
+    hull_points(silhouettes_of(noisy), START_BOX, 3000, 0)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 60e6
 
 
-def test_large_images_are_looked_at_in_larger_pixels(ball):
+def test_silhouettes_of_large_images_are_downscaled(ball):
     large = [replace(v, alpha=np.kron(v.alpha, np.ones((20, 20), np.float32))) for v in ball[:2]]
     for silhouette, view in zip(silhouettes_of(large), ball, strict=False):
         assert silhouette.scale == 3 and silhouette.solid.shape == (427, 427)
@@ -131,13 +131,13 @@ def test_masked_pixels_do_not_carve_the_hull(ball):
     assert np.abs(np.linalg.norm(points, axis=1) - 0.8).max() < 0.3
 
 
-def test_a_camera_that_moves_is_left_out(ball):
+def test_moving_camera_is_left_out(ball):
     moving = replace(ball[0], motion=CameraMotion(np.eye(4), "global"), alpha=0 * ball[0].alpha)
     assert len(silhouettes_of([moving, *ball[1:]])) == 15
     assert len(carved([moving, *ball[1:]], 300)) > 200
 
 
-def test_distorted_images_are_carved_as_they_are():
+def test_distorted_images_are_carved_without_undistortion():
     lens = reference.OpenCV(k1=-0.3, k2=0.05, p1=0.01)
     body = sphere(0.5, (0.6, 0, 0))
     views = images_of(body, 12, size=24, samples=1, lens=lens, focal=1.0)
@@ -148,7 +148,7 @@ def test_distorted_images_are_carved_as_they_are():
     assert np.all([opaque_at(view, points, lens) for view in views])
 
 
-def test_masks_that_contradict_each_other_have_no_hull(ball):
+def test_contradictory_masks_have_no_hull(ball):
     elsewhere = images_of(sphere(0.1, (0, 0, 1.1)), 12)
     assert len(carved([*ball[::2], *elsewhere])) == 0
     assert len(carved([replace(view, alpha=0 * view.alpha) for view in ball])) == 0
@@ -159,7 +159,7 @@ def test_regions_that_few_images_show_are_not_part_of_the_hull(ball):
     assert np.linalg.norm(points, axis=1).max() < 1.1
 
 
-def test_alpha_is_a_mask_where_nearly_all_images_are_transparent_somewhere(ball):
+def test_alpha_is_a_mask_if_nearly_all_images_have_transparency(ball):
     opaque = [replace(view, alpha=np.ones_like(view.alpha)) for view in ball]
     plain = [replace(view, alpha=None) for view in ball]
     for views, expected in (

@@ -49,7 +49,7 @@ all_configs = pytest.mark.parametrize("kind", CONFIGS, ids=lambda kind: kind.__n
 
 
 # ----------------------------------------------------------------------------------------------
-# What they render
+# Rendering
 # ----------------------------------------------------------------------------------------------
 
 
@@ -176,7 +176,7 @@ def test_images_one_percent_brighter_differ(name):
 
 
 @all_configs
-def test_forward_derivatives_are_differences(kind):
+def test_forward_derivatives_equal_differences(kind):
     error_mean, error_max = errors_of_forward(kind, forward(kind))
     print(f"mean {error_mean:.1e}, maximum {error_max:.1e}")
     assert error_mean <= kind.error_mean_threshold
@@ -184,14 +184,14 @@ def test_forward_derivatives_are_differences(kind):
 
 
 @all_configs
-def test_backward_derivatives_are_differences(kind):
+def test_backward_derivatives_equal_differences(kind):
     error = error_of_backward(kind, backward(kind, weights_of(kind)))
     print(f"{error:.1e}")
     assert error <= kind.error_mean_threshold_bwd
 
 
 @all_configs
-def test_thresholds_are_below_mitsubas_and_tell_derivatives_that_are_a_percent_off(kind):
+def test_thresholds_are_below_mitsubas_and_detect_one_percent_errors(kind):
     assert kind.error_mean_threshold <= 0.05
     assert kind.error_max_threshold <= 0.5
     assert kind.error_mean_threshold_bwd <= 0.05

@@ -14,9 +14,9 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 # Both evaluate the same splats at the same points, which one of them finds by looking back at the
 # rays: single precision, on films of 40 pixels with colours and depths up to 4, so that a place is
 # off by 1e-5 px and a colour by the same times its slope. Measured 3e-6.
-SAME = 3e-5
+TOLERANCE = 3e-5
 
-OWN = "t:depth, a:alpha"
+OWN_AOVS = "t:depth, a:alpha"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -25,7 +25,7 @@ def variant():
 
 
 @dataclass(frozen=True)
-class Seen(View):
+class SensorView(View):
     """The view through a sensor of another type; its lens need not see the same part."""
 
     others: tuple = ()  # (name, value) of the sensor's parameters
@@ -41,10 +41,10 @@ LENS = (("type", "calibrated"), ("fx", 40.0), ("lens", "opencv"), ("k1", -0.1))
 SENSORS = {
     "perspective": VIEWS[1],
     "crop window": VIEWS[12],
-    "thinlens": Seen("", others=THIN),
-    "orthographic": Seen("", others=(("type", "orthographic"),)),
-    "calibrated": Seen("", others=LENS),
-    "fisheye": Seen("", others=(*LENS[:2], ("lens", "fisheye"), ("k1", -0.02))),
+    "thinlens": SensorView("", others=THIN),
+    "orthographic": SensorView("", others=(("type", "orthographic"),)),
+    "calibrated": SensorView("", others=LENS),
+    "fisheye": SensorView("", others=(*LENS[:2], ("lens", "fisheye"), ("k1", -0.02))),
 }
 
 
@@ -59,7 +59,7 @@ def wall(view) -> dict:
     }
 
 
-def load(scene, outer=None, own=OWN, shapes=None, **film):
+def load(scene, outer=None, own=OWN_AOVS, shapes=None, **film):
     """A Mitsuba scene; outer: what the integrator is nested in."""
     integrator = scene.settings | tensors(scene.gaussians) | ({"aovs": own} if own else {})
     integrator = integrator if outer is None else outer | {"img": integrator}
@@ -75,7 +75,7 @@ AOV = {"type": "aov", "aovs": "far:depth"}
     [(SENSORS["perspective"], False), *((view, True) for view in SENSORS.values())],
     ids=["splats alone", *SENSORS],
 )
-def test_aov_shows_the_image_and_its_own_channels(view, surfaces):
+def test_aov_outputs_the_image_and_its_own_channels(view, surfaces):
     """Channels: colour, alpha and AOVs of the nested image, those AOVs again, and its own."""
     scene, shapes = Scene(view), {"wall": wall(view)} if surfaces else {}
     alone = image_of(load(scene, shapes=shapes, samples=3), seed=5)
@@ -84,13 +84,15 @@ def test_aov_shows_the_image_and_its_own_channels(view, surfaces):
     film = np.array(nested.sensors()[0].film().develop())
     assert image.shape[-1] == 9 and np.ptp(alone[..., 0]) > 0.1
     assert np.array_equal(image[..., :6], alone)
-    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=SAME)
+    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=TOLERANCE)
     direct = mi.load_dict(AOV | {"img": {"type": "direct"}})
     expected = image_of(nested, integrator=direct, seed=5)[..., -1]
     assert (expected.max() > 0) == surfaces
     assert np.array_equal(image[..., -1], expected)
     for first in (0, 4):  # the film's own colours, and those that it has under the nested name
-        np.testing.assert_allclose(film[..., first:][..., :3], alone[..., :3], rtol=0, atol=SAME)
+        np.testing.assert_allclose(
+            film[..., first:][..., :3], alone[..., :3], rtol=0, atol=TOLERANCE
+        )
 
 
 @pytest.mark.parametrize("srgb_primitives", [False, True])
@@ -104,8 +106,8 @@ def test_any_filter_and_sampler_may_be_used(srgb_primitives, rfilter, samples, s
     alone = image_of(load(scene, **film), seed=2)
     image = image_of(load(scene, AOV, **film), seed=2)
     # Filters other than a box are added up in an order that varies.
-    np.testing.assert_allclose(image[..., :6], alone, rtol=0, atol=SAME)
-    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=SAME)
+    np.testing.assert_allclose(image[..., :6], alone, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=TOLERANCE)
 
 
 def test_one_sample_is_at_the_pixel_centre_in_the_image_and_on_the_ray_in_aovs():
@@ -115,7 +117,7 @@ def test_one_sample_is_at_the_pixel_centre_in_the_image_and_on_the_ray_in_aovs()
     assert np.abs(image[..., 6] - image[..., 4]).max() > 0.01
 
 
-def test_derivatives_of_the_image_are_those_without_aov():
+def test_image_derivatives_are_the_same_without_aov():
     """With the same seed; aov hands on what is asked of the first channels."""
     scene = Scene()
     weights = scene.weights()
@@ -163,7 +165,7 @@ def test_derivatives_with_own_aovs_are_refused():
     )
 
 
-def test_other_integrators_are_refused():
+def test_unsupported_integrators_are_refused():
     assert refusal(load(Scene(), {"type": "moment"})) == (
         "splats: this integrator renders whole images: of those that sample the rays of another "
         "one, such as 'moment', it can only be nested in 'aov'"
@@ -174,13 +176,13 @@ MOVING = (*LENS, ("shutter_close", 1.0))
 
 
 @pytest.mark.parametrize("case", ["border", "moving", "batch"])
-def test_rays_that_do_not_cover_a_film_are_refused(case):
+def test_rays_not_covering_the_film_are_refused(case):
     view, film = VIEWS[1], {}
     if case == "border":
         film = {"sample_border": True, "rfilter": "gaussian"}
     if case == "moving":
         close = mi.ScalarTransform4f().translate([0.1, 0, 0])
-        view = Seen("", others=(*MOVING, ("to_world_close", close)))
+        view = SensorView("", others=(*MOVING, ("to_world_close", close)))
     loaded = load(Scene(view), AOV, **film)
     arguments = {}
     if case == "batch":

@@ -13,7 +13,7 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
-# As in test_splats: single precision, relative to the largest value of an array.
+# Tolerances of test_splats: single precision, relative to the largest value of an array.
 IMAGE, GRADIENTS = 1e-5, 1e-4
 
 STEP = 1e-7
@@ -83,7 +83,7 @@ def channels_of(scene, gaussians=None, features=None) -> np.ndarray:
 
 @pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[13]], ids=lambda view: view.name)
 @pytest.mark.parametrize("srgb_primitives", [False, True])
-def test_normals_and_features_are_composited_as_numbers(view, srgb_primitives):
+def test_normals_and_features_are_composited_without_colour_conversion(view, srgb_primitives):
     """Not converted as colours are; under Mitsuba's names."""
     scene = clear(Scene(view, srgb_primitives=srgb_primitives))
     loaded = with_features(scene)
@@ -142,7 +142,7 @@ def test_an_unused_feature_costs_nothing():
     assert len(frame.planes()) == 4 and loaded.integrator().gaussians.features is None
 
 
-def test_a_row_whose_feature_is_not_finite_is_not_drawn():
+def test_gaussian_with_nonfinite_feature_is_not_drawn():
     """Neither a pixel nor another row is affected, as with other parameters."""
     scene = clear(Scene())
     spoiled = features_of(scene)
@@ -187,7 +187,7 @@ def test_gradients_equal_differences_of_the_reference():
             assert np.abs(terms).sum() > 0
 
 
-def test_gradients_of_features_are_the_weights_of_compositing():
+def test_gradients_of_features_are_compositing_weights():
     """Row by row: they are linear."""
     scene = clear(Scene())
     rng = np.random.default_rng(6)
@@ -252,7 +252,7 @@ def test_several_samples_average_the_channels():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is refused
+# Errors
 # ----------------------------------------------------------------------------------------------
 
 

@@ -29,7 +29,7 @@ def row(name) -> str:
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_the_page_of_splats_documents_what_is_declared(name):
+def test_splats_page_documents_declared_properties(name):
     declared = DECLARED[name]
     text = row(name).replace("`", "")
     assert text.startswith(f"{KINDS[declared.kind]} | {declared.description} (Default: ")
@@ -38,7 +38,7 @@ def test_the_page_of_splats_documents_what_is_declared(name):
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_the_configuration_has_what_is_declared(name):
+def test_configuration_has_declared_properties(name):
     field, declared = ModelConfig.model_fields[name], DECLARED[name]
     assert field.description.startswith(declared.description)
     assert ModelConfig(**VIEWER_RENDERING).approximations == Approximations()
@@ -46,14 +46,14 @@ def test_the_configuration_has_what_is_declared(name):
     assert field.metadata == [getattr(annotated_types, k.title())(v) for k, v in limits.items()]
 
 
-def test_every_annotation_is_read():
+def test_declared_properties_match_the_annotations():
     assert list(DECLARED) == list(Approximations.__dataclass_fields__)
     assert DECLARED["projection"].words == ("ewa", "unscented", "exact")
     assert DECLARED["order_window"].kind is int and DECLARED["antialiased"].kind is bool
     assert DECLARED["extent"].limits.finite == {"gt": 0, "le": 1e9}
 
 
-def test_a_default_that_is_not_rounded_is_the_default():
+def test_unrounded_default_counts_as_default():
     """A configuration writes 0.99 for the float32 next to it."""
     written = ModelConfig(alpha_max=0.99, alpha_cut=1 / 255, extent=None, **VIEWER_RENDERING)
     assert written.approximations == Approximations()
@@ -62,7 +62,7 @@ def test_a_default_that_is_not_rounded_is_the_default():
     assert chosen.non_default == {"alpha_max": 0.98, "extent": 3.0}
 
 
-def test_a_value_that_float32_rounds_to_a_limit_is_refused(tmp_path):
+def test_value_that_rounds_to_a_limit_in_float32_is_refused(tmp_path):
     path = tmp_path / "x.yml"
     path.write_text("data: {path: lego}\nmodel: {alpha_max: 0.999999999}\n")
     with pytest.raises(UserError, match=r"model.alpha_max must be above 0 and below 1 in float32"):

@@ -84,7 +84,7 @@ def to_display(x) -> np.ndarray:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def over(splats, behind, srgb_primitives) -> np.ndarray:
+def composite_over(splats, behind, srgb_primitives) -> np.ndarray:
     """Splats (display space, premultiplied) in front of linear radiance; covered film."""
     transmittance = 1 - splats[..., 3:]
     if srgb_primitives:
@@ -94,7 +94,7 @@ def over(splats, behind, srgb_primitives) -> np.ndarray:
     return np.concatenate([color, np.ones_like(transmittance)], axis=-1)
 
 
-def gaussians_before(camera):
+def gaussians_in_front(camera):
     """Three groups: the corners of the film stay free."""
     return Scene(camera.view).gaussians
 
@@ -107,20 +107,22 @@ def gaussians_before(camera):
 @both_emitters
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
 @all_cameras
-def test_an_environment_is_seen_past_the_splats(camera, srgb_primitives, emitter):
+def test_environment_shows_behind_the_splats(camera, srgb_primitives, emitter):
     camera = CAMERAS[camera]
-    gaussians = gaussians_before(camera)
+    gaussians = gaussians_in_front(camera)
     sensor = camera.dictionary()
     settings = {"srgb_primitives": srgb_primitives, "background": [0.2, 0.4, 0.6]}
     image = image_of(load(sensor, integrator_of(gaussians, **settings), sky=EMITTERS[emitter]()))
     splats, behind = splats_alone(sensor, gaussians), PixelCenters.image(sensor, emitter)
-    np.testing.assert_allclose(image, over(splats, behind, srgb_primitives), atol=2 * IMAGE)
+    np.testing.assert_allclose(
+        image, composite_over(splats, behind, srgb_primitives), atol=2 * IMAGE
+    )
     assert splats[..., 3].max() > 0.9 and splats[..., 3].min() < 0.1
     assert (image[..., 3] == 1).all()
 
 
 @both_emitters
-def test_what_is_seen_past_the_splats_is_what_path_renders(emitter):
+def test_environment_behind_splats_matches_path(emitter):
     """With as many samples at the same points: Mitsuba's samplers give both the same."""
     sensor, scene = Camera().dictionary(), Scene()
     far = {**tensors(scene.gaussians), "logit_opacities": mi.Float(np.full(40, -20, np.float32))}
@@ -151,14 +153,14 @@ def test_each_sample_has_its_own_background_radiance(seed):
 def test_the_background_is_black_beyond_the_lens_model(camera):
     camera = CAMERAS[camera]
     sensor = camera.dictionary()
-    loaded = load(sensor, integrator_of(gaussians_before(camera)), sky=EMITTERS["constant"]())
+    loaded = load(sensor, integrator_of(gaussians_in_front(camera)), sky=EMITTERS["constant"]())
     image = image_of(loaded)
     corner = PixelCenters.image(sensor, "constant")[0, 0, :3]
     assert (corner == 0).all() and (image[0, 0, :3] == 0).all()
     assert (image[12, 18, :3] > 0).all()
 
 
-def test_hidden_emitters_leave_the_background():
+def test_hide_emitters_keeps_the_background_color():
     scene = Scene()
     for hide, expected_alpha in ((True, None), (False, 1)):
         settings = {"hide_emitters": hide, "background": [0.2, 0.4, 0.6]}
@@ -173,7 +175,7 @@ def test_hidden_emitters_leave_the_background():
             assert image[..., 3].min() < 0.1
 
 
-def test_only_environment_emitters_are_seen():
+def test_only_environment_emitters_are_visible():
     """A point light is no environment."""
     scene, sensor = Scene(), Camera().dictionary()
     light = {"type": "point", "intensity": 10.0}
@@ -181,7 +183,7 @@ def test_only_environment_emitters_are_seen():
     assert np.array_equal(image, image_of(load(sensor, integrator_of(scene.gaussians))))
 
 
-def test_without_an_environment_alpha_is_that_of_the_splats():
+def test_alpha_without_an_environment_is_that_of_the_splats():
     scene, sensor = Scene(), Camera().dictionary()
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels()), "raw": True}
     image = image_of(load(sensor, integrator_of(scene.gaussians, background=bitmap)))
@@ -204,11 +206,11 @@ def test_a_background_texture_is_stretched_over_the_film_upright(view, srgb_prim
     """A texel for each pixel of the whole film, of which a crop window shows a part."""
     camera = Camera(view)
     values = image_of_film(view.width, view.height)
-    gaussians = gaussians_before(camera)
+    gaussians = gaussians_in_front(camera)
     settings = {"background": rendered(values), "srgb_primitives": srgb_primitives}
     image = image_of(load(camera.dictionary(), integrator_of(gaussians, **settings)))
     splats = splats_alone(camera.dictionary(), gaussians)
-    expected = over(splats, values[view.window].astype(np.float64), srgb_primitives=False)
+    expected = composite_over(splats, values[view.window].astype(np.float64), srgb_primitives=False)
     if srgb_primitives:  # it is the last splat
         expected = to_linear(expected)
     np.testing.assert_allclose(image[..., :3], expected[..., :3], atol=2 * IMAGE)

@@ -55,7 +55,7 @@ def hidden_splats() -> dict:
     return {"type": "splats", **gaussians, "logit_opacities": mi.Float(np.full(40, -20.0))}
 
 
-def test_an_environment_out_of_focus_is_the_mean_of_what_pinholes_in_the_aperture_see():
+def test_defocused_environment_is_the_mean_of_pinholes_in_the_aperture():
     """The pinholes' principal points agree on the plane in focus."""
     sensor = thin_lens().dictionary()
     image = image_of(load(sensor, hidden_splats(), sky=EMITTERS["envmap"]()))
@@ -73,7 +73,7 @@ def test_an_environment_out_of_focus_is_the_mean_of_what_pinholes_in_the_apertur
     assert np.abs(image - images[0]).max() > 0.3
 
 
-def test_an_environment_out_of_focus_is_what_path_renders():
+def test_defocused_environment_matches_path():
     """``path`` traces many rays through the aperture; in focus at another distance it is less
     blurred."""
     for distance in (1.25, 2.5):
@@ -88,10 +88,10 @@ def test_an_environment_out_of_focus_is_what_path_renders():
 
 
 @pytest.mark.parametrize("name", ["sensor.aperture_radius", "sensor.focus_distance", "sky.data"])
-def test_an_environment_out_of_focus_is_differentiated(name):
+def test_defocused_environment_has_derivatives(name):
     """Against differences, in single precision."""
     scene = load(thin_lens().dictionary(), hidden_splats(), sky=smooth_sky())
-    # What is lost by blurring: a loss that all of them change.
+    # The change by blurring: a loss that all parameters affect.
     in_focus = load(thin_lens().dictionary(), hidden_splats() | SHARP, sky=smooth_sky())
     weights = image_of(in_focus) - image_of(scene)
     params = mi.traverse(scene)
@@ -109,8 +109,8 @@ def test_an_environment_out_of_focus_is_differentiated(name):
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
     actual = np.sum(direction * np.array(dr.grad(leaves[name])))
     expected = (losses[0] - losses[1]) / (2 * step)
-    # Where a ray crosses from one texel to the next within a step, the slope changes by some
-    # percent: of one ray in 20, of either sign. Measured: 1e-3.
+    # Rays that cross into another texel within a step, one in 20, have slopes that are off by
+    # some percent, of either sign. Measured: 1e-3.
     assert actual == pytest.approx(expected, rel=4e-3)
     assert abs(actual) > 1
 
@@ -135,7 +135,7 @@ def moving(**changes) -> Camera:
 
 
 @pytest.mark.parametrize("times", [{}, {"shutter_open": 2.0, "shutter_close": 2.5}])
-def test_motion_blurs_the_environment_as_it_does_the_splats(times):
+def test_motion_blurs_environment_and_splats_alike(times):
     """The mean of images from where the camera was, whatever the clock says."""
     gaussians = Scene().gaussians
     count = 3
@@ -160,7 +160,7 @@ def test_motion_blurs_the_environment_as_it_does_the_splats(times):
     ],
     ids=["distortion", "blur", "rolling shutter"],
 )
-def test_ignored_effects_are_ignored_in_the_background(camera, ignored):
+def test_ignored_effects_do_not_apply_to_the_background(camera, ignored):
     gaussians = Scene().gaussians
     image, expected = (
         image_of(

@@ -58,7 +58,7 @@ def gradient_of(loaded, key, weights) -> np.ndarray:
     return np.array(dr.grad(leaves[key])).astype(np.float64)
 
 
-def like(parameter, values):
+def value_like(parameter, values):
     """Numbers as a value of a parameter: of a colour, of a flat array, of a tensor."""
     values = np.asarray(values, np.float32)
     if isinstance(parameter, mi.Color3f):
@@ -75,7 +75,7 @@ all_kinds = pytest.mark.parametrize("kind", KINDS)
 
 @all_kinds
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
-def test_derivatives_of_the_radiance_are_differences(kind, srgb_primitives):
+def test_derivatives_of_the_radiance_equal_differences(kind, srgb_primitives):
     """Along random directions. In linear radiance the image is linear in it: any step is exact
     up to rounding; in display space a step of 1e-2 leaves its square.
     """
@@ -89,7 +89,7 @@ def test_derivatives_of_the_radiance_are_differences(kind, srgb_primitives):
         both = []
         for sign in (1, -1):
             params = mi.traverse(loaded)
-            params[key] = like(params[key], start + np.float32(sign * step) * direction)
+            params[key] = value_like(params[key], start + np.float32(sign * step) * direction)
             params.update()
             both.append(np.sum(weights * image_of(loaded)))
         difference = (both[0] - both[1]) / (2 * step)
@@ -120,8 +120,8 @@ def floor() -> dict:
 FLOOR = "floor.bsdf.reflectance.value"
 
 
-TWICE = "two images", "two losses", "two losses of one graph"
-"""What a factor reaches the backdrop through, more than once."""
+TWO_PATHS = "two images", "two losses", "two losses of one graph"
+"""Cases in which a factor reaches the backdrop more than once."""
 
 
 def factored(way, kind):
@@ -152,19 +152,19 @@ BACKGROUND = "integrator.background.data"
 
 @all_kinds
 @pytest.mark.parametrize(
-    "way", [*TWICE, "batch", "surface", "surface of the same", "splats of the same"]
+    "way", [*TWO_PATHS, "batch", "surface", "surface of the same", "splats of the same"]
 )
 def test_gradients_reach_the_inputs_of_the_radiance(way, kind):
     """A factor of all of it, by central differences, from the same points of the emitters."""
     loaded, keys = factored(way, kind)
     start = {key: np.array(mi.traverse(loaded)[key]) for key in keys}
-    count = 2 if way in TWICE else 1
+    count = 2 if way in TWO_PATHS else 1
     weights = single(np.random.default_rng(1).uniform(0.5, 1.5, image_of(loaded).shape))
 
     def loss(factor, **seeds):
         params = mi.traverse(loaded)
         for key, values in start.items():
-            params[key] = like(params[key], values) * factor
+            params[key] = value_like(params[key], values) * factor
         params.update()
         renders = [mi.render(loaded, params, **seeds) for _ in range(count)]
         return [dr.sum(image * tensor(weights), axis=None) for image in renders]
@@ -231,7 +231,7 @@ def test_derivatives_of_gaussians_include_the_background(kind):
     )
     for name in PARAMETER_NAMES:
         actual = np.array(dr.grad(params[f"integrator.{name}"])).astype(np.float64)
-        # As in test_splats.
+        # Tolerance of test_splats.
         np.testing.assert_allclose(
             actual, expected[name], atol=1e-4 * np.abs(expected[name]).max(), err_msg=name
         )
@@ -256,7 +256,7 @@ def test_forward_and_backward_derivatives_are_transposed(kind, srgb_primitives):
         k: single(np.sign(g) * np.abs(rng.normal(size=g.shape))) for k, g in gradients.items()
     }
     for k, direction in directions.items():
-        dr.set_grad(leaves[k], like(leaves[k], direction))
+        dr.set_grad(leaves[k], value_like(leaves[k], direction))
     tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
     terms = [np.sum(directions[k] * gradients[k]) for k in keys]
     size = np.abs(weights * tangent).sum()
@@ -264,7 +264,7 @@ def test_forward_and_backward_derivatives_are_transposed(kind, srgb_primitives):
     assert min(terms) > 5e-4 * size
 
 
-def test_derivatives_of_a_sensor_see_the_environment_move():
+def test_derivatives_of_a_sensor_include_the_environment():
     """A smooth one, before splats that end nowhere: a quotient in single precision."""
     y, x = np.mgrid[:32, :64]
     waves = [np.sin(x / 32 * np.pi), np.cos(y / 32 * np.pi), np.cos(x / 16 * np.pi)]
@@ -296,7 +296,7 @@ def test_derivatives_of_a_sensor_see_the_environment_move():
         both.append(np.sum(weights * image_of(scene)))
     difference = (both[0] - both[1]) / (2 * step)
     assert dr.grad(turn)[0] == pytest.approx(difference, rel=0.01)
-    # Of a constant behind the splats it would be another.
+    # A constant background would have another derivative.
     plain = load(Camera().dictionary(), integrator_of(Scene().gaussians, **settings))
     turn = mi.Float(0)
     dr.enable_grad(turn)
@@ -338,7 +338,7 @@ def test_a_changed_environment_needs_no_new_frame_and_no_new_kernel():
     assert loaded.integrator().state.cache.kept["frames 0"] is frames
 
 
-def test_a_new_view_before_an_environment_needs_no_new_kernel():
+def test_new_view_with_an_environment_needs_no_new_kernel():
     loaded, _ = scene_with("envmap")
     poses = [replace(VIEW, to_world=VIEWS[k].to_world) for k in (1, 2, 3)]
     sensors = [mi.load_dict(Camera(view).dictionary()) for view in poses]

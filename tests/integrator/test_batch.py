@@ -13,7 +13,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 SCENE = Scene(VIEWS[1])
 SENSORS = (VIEWS[1], VIEWS[2], VIEWS[10])
 
-# As in test_splats.
+# Tolerance of test_splats.
 GRADIENTS = 1e-4
 
 
@@ -53,7 +53,7 @@ def parts(image) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("wall", [False, True], ids=["splats", "hybrid"])
 @pytest.mark.parametrize("pixel_format", ["rgba", "xyz"])
-def test_images_stand_side_by_side(wall, pixel_format):
+def test_images_are_side_by_side(wall, pixel_format):
     settings = {"aovs": "z:depth", "srgb_primitives": True, "hide_emitters": not wall}
     image = image_of(load(batch(pixel_format=pixel_format), wall, **settings))
     for part, view in zip(parts(image), SENSORS, strict=True):
@@ -63,7 +63,7 @@ def test_images_stand_side_by_side(wall, pixel_format):
         assert differs.mean() <= (0.1 if wall else 0)
 
 
-def test_several_samples_are_those_of_the_whole_film():
+def test_samples_cover_the_whole_film():
     """A box filter averages them; each image's are a part of the film's. Half a percent
     of noise with 256 of them is a percent with 64."""
     center = image_of(load(batch()))
@@ -100,7 +100,7 @@ def test_gradients_of_a_batch_are_sums_over_its_sensors():
     assert bitwise(actual) == bitwise(gradients(batch(), weights))
 
 
-def test_the_gradient_of_a_sensor_is_that_of_its_part_of_the_film():
+def test_gradient_of_a_sensor_comes_from_its_part_of_the_film():
     weights = weights_of()
     loaded = load(batch())
     params = mi.traverse(loaded)
@@ -165,7 +165,7 @@ def test_a_crop_window_is_refused():
         loaded.integrator().render(loaded)
 
 
-def test_the_plan_is_that_of_the_first_sensor():
+def test_plan_describes_the_first_sensor():
     loaded = load(batch())
     plan = loaded.integrator().summary(loaded, loaded.sensors()[0])
     assert plan.startswith("simulated:")

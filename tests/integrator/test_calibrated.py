@@ -19,7 +19,7 @@ from support.calibrated_sensors import (
     FISHEYE,
     OPENCV,
     PINHOLE,
-    STILL,
+    STATIC_SENSORS,
     THIN_PRISM,
     Calibrated,
     by_name,
@@ -71,7 +71,7 @@ def film_of(world, camera, lens) -> np.ndarray:
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
-def test_rays_of_a_pinhole_are_those_of_perspective(view):
+def test_pinhole_rays_match_perspective(view):
     camera = view.camera
     focal, principal = (float(camera.fx),) * 2, (float(camera.cx), float(camera.cy))
     sensor = Calibrated("", view=view, f=focal, c=principal).load()
@@ -86,8 +86,8 @@ def test_rays_of_a_pinhole_are_those_of_perspective(view):
     np.testing.assert_array_equal(np.array(ray.time), np.array(expected.time))
 
 
-@pytest.mark.parametrize("sensor", STILL, **by_name)
-def test_points_on_rays_are_seen_where_the_rays_start(sensor):
+@pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
+def test_points_on_rays_project_to_their_pixels(sensor):
     ray, weight, sample = sampled_rays(sensor.load())
     assert (weight == 1).all()
     film = film_of(points_along(ray), sensor.camera, sensor.lens)
@@ -96,7 +96,7 @@ def test_points_on_rays_are_seen_where_the_rays_start(sensor):
 
 @pytest.mark.parametrize("sensor", [s for s in MOVING if s.shutter == "global"], **by_name)
 @pytest.mark.parametrize("time", [0.0, 0.375, 1.0])
-def test_a_global_shutter_sees_from_where_the_camera_is_at_the_rays_time(sensor, time):
+def test_global_shutter_uses_the_pose_at_the_ray_time(sensor, time):
     ray, _, sample = sampled_rays(sensor.load(), time)
     film = film_of(points_along(ray), sensor.camera_at(time), sensor.lens)
     assert np.abs(film - (sample * sensor.size + sensor.corner)).max() < PIXELS
@@ -104,7 +104,7 @@ def test_a_global_shutter_sees_from_where_the_camera_is_at_the_rays_time(sensor,
 
 
 @pytest.mark.parametrize("sensor", [s for s in MOVING if s.shutter == "rolling"], **by_name)
-def test_a_rolling_shutter_sees_from_where_the_camera_is_when_the_row_is_read(sensor):
+def test_rolling_shutter_uses_the_pose_at_the_row_time(sensor):
     """Rows of the whole film, not of the crop window; whatever the ray's time."""
     ray, _, sample = sampled_rays(sensor.load(), time=0.75)
     expected = sample * sensor.size + sensor.corner
@@ -113,7 +113,7 @@ def test_a_rolling_shutter_sees_from_where_the_camera_is_when_the_row_is_read(se
         assert np.abs(film_of(point[None], camera, sensor.lens) - place).max() < PIXELS
 
 
-def test_times_are_between_those_at_which_the_shutter_opens_and_closes():
+def test_ray_times_are_within_the_exposure():
     """A moving camera is open from 0 to 1 by default, as in Mitsuba's integrators."""
     sensor = replace(PINHOLE, close=CLOSE)
     loaded = sensor.load()
@@ -137,7 +137,7 @@ WIDE_FISHEYE = Calibrated(
 
 
 @pytest.mark.parametrize("sensor", [BARREL, WIDE_FISHEYE], **by_name)
-def test_rays_carry_no_weight_where_the_lens_shows_nothing(sensor):
+def test_rays_outside_the_lens_have_zero_weight(sensor):
     ray, weight, sample = sampled_rays(sensor.load(), count=2000)
     points = points_at(sensor.lens, sensor.camera, sample * sensor.size, np.ones(2000))
     shown = ~np.isnan(points).any(axis=1)
@@ -149,8 +149,8 @@ def test_rays_carry_no_weight_where_the_lens_shows_nothing(sensor):
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("sensor", [*STILL, MOVING[3], BARREL], **by_name)
-def test_differentials_are_the_rays_of_the_neighbouring_pixels(sensor):
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, MOVING[3], BARREL], **by_name)
+def test_ray_differentials_are_rays_of_neighbouring_pixels(sensor):
     loaded = sensor.load()
     sample = np.random.default_rng(0).uniform(0.1, 0.8, (2, 50)).astype(np.float32)
     arguments = (0.0, 0.5, mi.Point2f(sample), mi.Point2f(0.5))
@@ -171,7 +171,7 @@ def test_differentials_are_the_rays_of_the_neighbouring_pixels(sensor):
         assert turned[shown].min() > 0.3 / 44
 
 
-@pytest.mark.parametrize("sensor", [*STILL, MOVING[3]], **by_name)
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, MOVING[3]], **by_name)
 def test_rays_end_at_the_far_plane(sensor):
     """From depth ``near_clip`` to ``far_clip``: z, with a fisheye the distance."""
     near_view = replace(sensor.view, near_clip=0.5)
@@ -248,7 +248,7 @@ def test_path_traced_images_equal_those_of_perspective(integrator, view):
 @pytest.mark.parametrize(
     "sensor", [OPENCV, FISHEYE, BARREL, WIDE_FISHEYE, MOVING[3], MOVING[5]], **by_name
 )
-def test_a_path_traced_image_shows_a_sphere_where_the_reference_sees_it(sensor):
+def test_path_traced_sphere_is_where_the_reference_projects_it(sensor):
     """A luminous sphere, seen by pixels whose rays are nearer to its centre than its radius."""
     middle = sensor.corner + sensor.size / 2
     middle_time = middle[1] / sensor.view.height
@@ -284,7 +284,7 @@ def test_a_path_traced_image_shows_a_sphere_where_the_reference_sees_it(sensor):
     assert not image[outside].any()
 
 
-def test_a_camera_that_moves_blurs_a_path_traced_image():
+def test_moving_camera_blurs_a_path_traced_image():
     """With a global shutter: a point is spread over the path that the reference says it takes."""
     sensor = replace(PINHOLE, view=FILM, close=pose([0.3, -1.0, 0.5], 40, (0.7, -0.7, 1.1)))
     center = (np.array(FILM.to_world) @ [0, 0, 4, 1])[:3]
@@ -308,8 +308,8 @@ def test_a_camera_that_moves_blurs_a_path_traced_image():
     np.testing.assert_allclose(found, path.mean(axis=0), atol=0.05)
 
 
-@pytest.mark.parametrize("sensor", [*STILL, BARREL], **by_name)
-def test_splats_are_seen_through_it_as_by_the_reference(sensor):
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, BARREL], **by_name)
+def test_splats_through_the_sensor_match_the_reference(sensor):
     camera = replace(sensor.camera, near=0.01)
     gaussians, rendered = clear_gaussians(
         sensor,
@@ -319,6 +319,6 @@ def test_splats_are_seen_through_it_as_by_the_reference(sensor):
     )
     image = image_of(splats_scene(sensor, gaussians))
     expected = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
-    # As in test_rendering, float32; Mitsuba's numbers are float32 too.
+    # Tolerance of test_rendering in float32; Mitsuba's numbers are float32 too.
     np.testing.assert_allclose(image, expected[sensor.view.window], rtol=0, atol=5e-5)
     assert image[..., 3].max() > 0.8

@@ -15,7 +15,7 @@ from support.calibrated_sensors import (
     FISHEYE,
     OPENCV,
     PINHOLE,
-    STILL,
+    STATIC_SENSORS,
     THIN_PRISM,
     by_name,
     sampled_rays,
@@ -49,16 +49,16 @@ CHANGES = {
 }
 
 
-CHANGING = replace(OPENCV, close=CLOSE, shutter="rolling")
+MOVING_SENSOR = replace(OPENCV, close=CLOSE, shutter="rolling")
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_changed_parameter_is_followed(name):
+def test_changed_parameter_takes_effect(name):
     convert, value = CHANGES[name]
     given = transform(value) if name.startswith("to_world") else value
-    expected = CHANGING.load(**{name: given})
-    gaussians = splats_before(CHANGING.view, 1, 40, 0)
-    scene = splats_scene(CHANGING, gaussians)
+    expected = MOVING_SENSOR.load(**{name: given})
+    gaussians = splats_before(MOVING_SENSOR.view, 1, 40, 0)
+    scene = splats_scene(MOVING_SENSOR, gaussians)
     before = image_of(scene)
     sensor = scene.sensors()[0]
     params = mi.traverse(scene)
@@ -75,7 +75,7 @@ def test_a_changed_parameter_is_followed(name):
     assert np.abs(image - before).max() > 0.01
 
 
-def test_where_the_lens_model_ends_follows_its_coefficients():
+def test_valid_region_of_the_lens_follows_its_coefficients():
     scene = splats_scene(BARREL, splats_before(FILM, 1, 40, 0))
     params = mi.traverse(scene)
     key = next(key for key in params.keys() if key.endswith("k1"))  # noqa: SIM118
@@ -87,11 +87,11 @@ def test_where_the_lens_model_ends_follows_its_coefficients():
     assert (weight == 1).all()
 
 
-def test_coefficients_that_are_not_given_are_not_exposed():
+def test_missing_coefficients_are_not_exposed():
     assert set(mi.traverse(PINHOLE.load()).keys()) >= {"to_world", "fx", "fy", "cx", "cy"}
     keys = set(mi.traverse(replace(OPENCV, lens=OpenCV(k1=0.125)).load()).keys())
     assert "k1" in keys and not keys & {"k2", "k3", "k4", "p1", "to_world_close"}
-    assert "to_world_close" in mi.traverse(CHANGING.load()).keys()  # noqa: SIM118
+    assert "to_world_close" in mi.traverse(MOVING_SENSOR.load()).keys()  # noqa: SIM118
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_coefficients_that_are_not_given_are_not_exposed():
     [(OPENCV, ("k1", "k2", "p1")), (FISHEYE, ("k1", "k4")), (THIN_PRISM, ("k1", "p1", "sx1"))],
     ids=["opencv", "fisheye", "thin prism"],
 )
-def test_coefficients_that_are_given_as_zero_can_be_optimised(sensor, names):
+def test_zero_coefficients_can_be_optimised(sensor, names):
     """Each has a derivative, that of a difference across 0, and stays when another is changed.
 
     Of splats on the film: without distortion, all places on a side of the film bound the slopes at
@@ -145,7 +145,7 @@ def test_an_opencv_lens_without_coefficients_is_a_pinhole():
     np.testing.assert_allclose(np.array(ray.d), np.array(expected.d), rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize("sensor", STILL, **by_name)
+@pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
 def test_gradients_of_an_image_reach_the_calibration(sensor):
     """Against central differences in single precision; some slopes are clamped."""
     gaussians = splats_before(FILM, 1, 40, 0)
@@ -180,7 +180,8 @@ def test_gradients_of_an_image_reach_the_calibration(sensor):
         dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
         actual = float(dr.grad(params[keys[0]])[0])
         params[keys[0]] = dr.detach(params[keys[0]])
-        # Of the differences: 1e-6 of 4000 numbers of either sign, over the step, and its square.
+        # Error of the differences: 1e-6 of 4000 numbers of either sign, over the step, and its
+        # square.
         assert actual == pytest.approx(expected, rel=2e-3, abs=1e-4 / step), name
 
 
@@ -270,7 +271,7 @@ def test_an_unknown_property_is_refused():
         mi.load_dict({"type": "calibrated", "shutter_sample": 3})
 
 
-def test_defaults_are_those_of_the_description():
+def test_documented_defaults_are_used():
     sensor = mi.load_dict({"type": "calibrated", "film": {"type": "hdrfilm", "width": 30}})
     width, height = sensor.film().size()
     values = [float(v[0]) for v in (sensor.fx, sensor.fy, sensor.cx, sensor.cy)]
@@ -281,7 +282,7 @@ def test_defaults_are_those_of_the_description():
     assert not sensor.needs_aperture_sample()
 
 
-def test_a_sensor_describes_itself():
+def test_sensor_has_a_readable_repr():
     description = str(replace(OPENCV, lens=OpenCV(k1=0.125, p2=0.25)).load())
     assert description.startswith("CalibratedSensor[\n  fx = [40], fy = [44],\n  cx = [24]")
     assert "lens = RadialTangential, k1, p1, p2" in description
@@ -308,7 +309,7 @@ XML = """
 """
 
 
-def test_a_sensor_of_an_xml_file_is_that_of_a_dictionary():
+def test_sensor_from_xml_equals_sensor_from_a_dictionary():
     sensor = replace(OPENCV, lens=OpenCV(k1=-0.25, p2=0.015625), close=CLOSE, shutter="rolling")
     open, close = (
         " ".join(repr(float(value)) for row in matrix for value in row)

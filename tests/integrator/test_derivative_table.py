@@ -44,7 +44,7 @@ CORE = [
     ("`to_world`, rough", "`splatpath`"),
     ("`to_world`, mirror or glass", "`rays`"),
 ]
-"""Of the cells, those that are tested always."""
+"""Cells that are not marked slow."""
 
 MODES = 1e-3
 """Difference of forward from reverse mode: both add up the same numbers, in another order."""
@@ -68,7 +68,7 @@ def test_cells_equal_the_measured_errors(row, route):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row, route", [cell for cell in CELLS if cell not in CORE])
-def test_all_other_cells_equal_the_measured_errors(row, route):
+def test_other_cells_equal_the_measured_errors(row, route):
     check(row, route)
 
 
@@ -81,12 +81,12 @@ def test_the_table_has_all_parameters_and_routes():
         assert empty == ([] if case.is_seen_alone else [ALONE])
 
 
-def test_only_poses_with_light_of_splats_are_partly_differentiated():
+def test_only_poses_lit_by_splats_are_partly_differentiated():
     rows = {row for row, route in CELLS if TABLE[row][route] == IN_PART}
     assert rows == {"`to_world`, diffuse", "`to_world`, rough"}
 
 
-def test_poses_seen_by_other_surfaces_are_differentiated():
+def test_poses_lit_by_other_surfaces_are_differentiated():
     """Along the rays that find it, which see it in the same solid angle."""
     to_world = identity().translate([0, 3, -3]).rotate([1, 0, 0], 45).scale(30)
     bsdf = {"type": "diffuse", "reflectance": rgb(0.7)}  # or Mitsuba would merge it with the panel
@@ -95,7 +95,7 @@ def test_poses_seen_by_other_surfaces_are_differentiated():
     assert measure(case, "`splatpath`").error < 0.01
 
 
-def test_hair_is_rendered_though_one_of_its_parameters_has_no_value():
+def test_hair_is_rendered_despite_a_parameter_without_value():
     """Mitsuba cannot list its parameters with their values."""
     scene = load(Case("lamp.intensity.value", {"type": "hair"}, spp=16), "`splatpath`")
     assert dr.mean(mi.render(scene), axis=None) > 0

@@ -104,7 +104,7 @@ def assert_mean(values, expected, missed):
 @pytest.mark.parametrize(
     ("fog", "num_samples"), [*((fog, 4) for fog in FOGS), (FOGS[2], 1), (FOGS[7], 2)]
 )
-def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
+def test_sampled_splats_have_the_mean_light_of_all_splats(fog, num_samples):
     """The same polynomial decodes both, which is sRGB's curve within its distance."""
     light = fog.light(num_samples)
     seen, T = map(rows, light.splats.composite_segment(segments(1)))
@@ -120,7 +120,7 @@ def test_light_of_drawn_splats_is_that_of_all_on_average(fog, num_samples):
         assert (np.abs(rows(exact) - expected) < 2e-3).all()
 
 
-def test_roulette_lets_as_much_light_through_to_an_emitter():
+def test_roulette_preserves_mean_light_of_an_emitter():
     light = Fog(40, 0.12, True).light(4)
     T = rows(light.splats.composite_segment(segments(1))[1])[:, None]
     assert T.min() < ROULETTE_TRANSMITTANCE / 2 and T.max() > ROULETTE_TRANSMITTANCE, T
@@ -132,7 +132,7 @@ def test_roulette_lets_as_much_light_through_to_an_emitter():
 
 
 @pytest.mark.parametrize("apart", [1, 2, 255])
-def test_draws_of_two_splats_are_independent(apart):
+def test_samples_of_two_splats_are_independent(apart):
     """Neighbours in memory are tested, and indices that differ in one bit.
 
     As often as by chance: within 5 standard errors of 2^20 seeds.

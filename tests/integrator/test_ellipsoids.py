@@ -19,7 +19,7 @@ from support.ellipsoids import (
     ROTATION,
     SCALE,
     TRANSLATION,
-    Held,
+    EllipsoidsCase,
     assert_images_agree,
     gradients_held,
     joined,
@@ -53,8 +53,8 @@ def variant():
 
 @both_kinds
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_shape_looks_as_the_reference_draws_its_gaussians(kind, degree):
-    scene = clear(Held(degree=degree, kind=kind))
+def test_shape_matches_the_reference(kind, degree):
+    scene = clear(EllipsoidsCase(degree=degree, kind=kind))
     loaded = scene.load()
     assert_images_agree(image_of(loaded), scene.image())
     assert loaded.integrator().sh_degree == degree
@@ -63,11 +63,11 @@ def test_a_shape_looks_as_the_reference_draws_its_gaussians(kind, degree):
 
 @both_kinds
 @pytest.mark.parametrize("degree", [1, 3])
-def test_a_file_looks_the_same_through_a_shape(kind, degree, tmp_path):
+def test_file_renders_the_same_through_a_shape(kind, degree, tmp_path):
     """To what float32 makes of exp, log and the sigmoid."""
     scene = Scene(degree=degree)
     path = write_model(tmp_path / "model.ply", scene.gaussians)
-    loaded = Held().load(shape={"type": kind, "filename": path})
+    loaded = EllipsoidsCase().load(shape={"type": kind, "filename": path})
     assert_images_agree(image_of(loaded), image_of(scene.load()))
 
 
@@ -79,15 +79,15 @@ def test_a_file_looks_the_same_through_a_shape(kind, degree, tmp_path):
 VOLPRIM = 0.04
 
 
-AS_VOLPRIM = {
+VOLPRIM_APPROXIMATIONS = {
     "projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0,
     "extent": 3.0, "alpha_max": 0.9999, "alpha_cut": 0.0, "transmittance_stop": 0.01,
 }  # fmt: skip
 
 
 @both_kinds
-def test_the_same_shapes_look_as_volprim_rf_basic_draws_them(kind):
-    scene = Held(degree=2, count=60)
+def test_shapes_match_volprim_rf_basic(kind):
+    scene = EllipsoidsCase(degree=2, count=60)
     held = scene.held
     held["data"][:, 6:] /= np.linalg.norm(held["data"][:, 6:], axis=1, keepdims=True)
 
@@ -105,7 +105,7 @@ def test_the_same_shapes_look_as_volprim_rf_basic_draws_them(kind):
     expected = rendered(held, "volprim_rf_basic", max_depth=256)
 
     def error(**changes):
-        actual = rendered(held | changes, "splats", **AS_VOLPRIM)
+        actual = rendered(held | changes, "splats", **VOLPRIM_APPROXIMATIONS)
         return np.abs(actual - expected).mean() / expected.mean()
 
     assert error() < VOLPRIM
@@ -129,9 +129,7 @@ def follower(view):
 
 @both_kinds
 @pytest.mark.parametrize("names", ["shapes_to_world", "shapes_to_world_shape"])
-def test_a_model_looks_the_same_moved_by_the_integrator_a_shape_or_the_camera(
-    kind, names, tmp_path
-):
+def test_moving_integrator_shape_or_camera_gives_the_same_image(kind, names, tmp_path):
     """In single precision: positions of 4 units, rounded to 2e-7, at 40 px to a unit: 1e-5 px."""
     path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
     view = VIEWS[1]
@@ -147,7 +145,7 @@ def test_a_model_looks_the_same_moved_by_the_integrator_a_shape_or_the_camera(
     assert np.abs(unturned - unmoved).max() > 0.02
 
 
-def test_each_shape_may_have_a_to_world_of_its_own(tmp_path):
+def test_each_shape_may_have_its_own_to_world(tmp_path):
     path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
     half = mi.ScalarTransform4f().rotate([0, 0, 1], 180).scale(0.5)
     far = mi.ScalarTransform4f().translate([0.25, 0, 0.5])
@@ -167,7 +165,7 @@ def test_each_shape_may_have_a_to_world_of_its_own(tmp_path):
     assert_images_agree(actual, expected, 3 * IMAGE)
 
 
-def test_tensors_are_moved_as_a_file_is(tmp_path):
+def test_tensors_are_moved_like_a_file(tmp_path):
     scene = Scene(degree=2)
     path = write_model(tmp_path / "model.ply", scene.gaussians)
     from_file = mi.load_dict({"type": "splats", "filename": path, "to_world": transform()})
@@ -180,7 +178,7 @@ def test_tensors_are_moved_as_a_file_is(tmp_path):
     assert not np.array_equal(moved.shN, np.float32(scene.gaussians.shN))
 
 
-def test_gradients_of_turned_coefficients_are_those_of_the_unturned_before_a_turned_camera(
+def test_gradients_of_rotated_sh_match_unrotated_sh_with_a_rotated_camera(
     tmp_path,
 ):
     """The images are the same functions of the coefficients."""
@@ -197,7 +195,7 @@ def test_gradients_of_turned_coefficients_are_those_of_the_unturned_before_a_tur
         assert_arrays_agree({name: actual[name]}, {name: expected[name]}, GRADIENTS)
 
 
-def test_another_rotation_needs_no_other_kernel(tmp_path):
+def test_rotation_change_needs_no_new_kernel(tmp_path):
     path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
     shape = {"type": "ellipsoids", "filename": path}
 
@@ -220,7 +218,7 @@ def test_another_rotation_needs_no_other_kernel(tmp_path):
 SCENES = REPOSITORY / "scenes"
 
 
-def test_the_shipped_model_is_what_its_program_makes(monkeypatch):
+def test_shipped_model_is_the_output_of_its_program(monkeypatch):
     """To rounding: sines and inverse matrices may differ between machines."""
     monkeypatch.syspath_prepend(SCENES)
     import knot
@@ -233,7 +231,7 @@ def test_the_shipped_model_is_what_its_program_makes(monkeypatch):
     np.testing.assert_allclose(np.abs(cosines), 1, atol=1e-5)
 
 
-def test_the_shipped_scene_is_compared(monkeypatch, tmp_path, capsys):
+def test_shipped_scene_is_compared_with_volprim(monkeypatch, tmp_path, capsys):
     """On a film so small that the low-pass of 0.3 px^2 shows: 24 dB; a mirrored one has 10."""
     monkeypatch.syspath_prepend(SCENES)
     import compare_shapes

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from support.ellipsoids import (
     GRADIENTS,
-    HELD,
     MERGED,
-    Held,
+    SHAPE_ATTRIBUTES,
+    EllipsoidsCase,
     Merged,
     apart,
     assert_held_agree,
@@ -46,21 +46,21 @@ def variant():
 
 @pytest.mark.parametrize("srgb_primitives", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_gradients_equal_the_references(degree, srgb_primitives):
-    scene = clear(Held(degree=degree, srgb_primitives=srgb_primitives))
+def test_gradients_match_the_reference(degree, srgb_primitives):
+    scene = clear(EllipsoidsCase(degree=degree, srgb_primitives=srgb_primitives))
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
 
-def test_gradients_equal_the_references_for_a_mesh():
-    scene = clear(Held(kind="ellipsoidsmesh"))
+def test_gradients_match_the_reference_for_a_mesh():
+    scene = clear(EllipsoidsCase(kind="ellipsoidsmesh"))
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
 
-@pytest.mark.parametrize("name", HELD)
-def test_only_what_is_enabled_receives_gradients(name):
-    scene = Held()
+@pytest.mark.parametrize("name", SHAPE_ATTRIBUTES)
+def test_only_enabled_parameters_receive_gradients(name):
+    scene = EllipsoidsCase()
     loaded = scene.load()
     params = mi.traverse(loaded)
     dr.enable_grad(params[f"shape.{name}"])
@@ -68,11 +68,13 @@ def test_only_what_is_enabled_receives_gradients(name):
     dr.backward(dr.sum(image * mi.TensorXf(scene.weights().astype(np.float32)), axis=None))
     everything = gradients_held(scene.load(), scene.weights())
     np.testing.assert_array_equal(gradient(params[f"shape.{name}"]), everything[name])
-    assert not any(dr.grad_enabled(params[f"shape.{other}"]) for other in HELD if other != name)
+    assert not any(
+        dr.grad_enabled(params[f"shape.{other}"]) for other in SHAPE_ATTRIBUTES if other != name
+    )
 
 
-def test_gradients_reach_what_a_shapes_parameters_were_computed_from():
-    scene = clear(Held())
+def test_gradients_reach_the_inputs_of_shape_parameters():
+    scene = clear(EllipsoidsCase())
     loaded = scene.load()
     params = mi.traverse(loaded)
     factor = mi.Float(1.0)
@@ -106,10 +108,12 @@ def forward_image(loaded, directions, prefix="shape") -> np.ndarray:
     return np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
 
 
-@pytest.mark.parametrize("names", [*((name,) for name in HELD), HELD], ids="+".join)
+@pytest.mark.parametrize(
+    "names", [*((name,) for name in SHAPE_ATTRIBUTES), SHAPE_ATTRIBUTES], ids="+".join
+)
 def test_forward_mode_equals_central_differences(names):
     """STEP: as in test_splats."""
-    scene = clear(Held(degree=2))
+    scene = clear(EllipsoidsCase(degree=2))
     directions = {name: directions_of(scene.held)[name] for name in names}
 
     def moved(step):
@@ -128,20 +132,20 @@ def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
     directions = directions_of(scene.shapes[0].held)
     image = forward_image(scene.load(**settings), directions, "first")
     gradients = gradients_held(scene.load(**settings), scene.weights(), "first")
-    terms = [np.sum(directions[name].ravel() * gradients[name]) for name in HELD]
+    terms = [np.sum(directions[name].ravel() * gradients[name]) for name in SHAPE_ATTRIBUTES]
     forward = np.sum(image * scene.weights())
     assert forward == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
 
 
-def test_the_gradient_tests_would_notice_one_percent():
-    scene = clear(Held())
+def test_gradient_tests_detect_one_percent_errors():
+    scene = clear(EllipsoidsCase())
     expected = apart(held_gradients(scene.held, scene.gradients(scene.weights())))
     for name, values in expected.items():
         with pytest.raises(AssertionError):
             assert_arrays_agree({name: 1.01 * values}, {name: values}, GRADIENTS)
 
 
-def test_backward_passes_give_the_same_bytes_and_add_nothing_atomically():
+def test_backward_passes_give_the_same_bytes_without_float_atomics():
     scene = Merged()
     first = gradients_held(scene.load(), scene.weights(), "first")
     again = {}
@@ -153,18 +157,18 @@ def test_backward_passes_give_the_same_bytes_and_add_nothing_atomically():
     found, count = float_reductions(turned)
     assert not found and count > 5
     again = gradients_held(scene.load(), scene.weights(), "first")
-    assert all(first[name].tobytes() == again[name].tobytes() for name in HELD)
+    assert all(first[name].tobytes() == again[name].tobytes() for name in SHAPE_ATTRIBUTES)
 
 
 def test_adam_reduces_the_loss():
     """Every parameter starts somewhat off; the image it had is the target."""
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
     target = mi.TensorXf(image_of(loaded).astype(np.float32))
     params = mi.traverse(loaded)
     rng = np.random.default_rng(4)
     optimizer = mi.ad.Adam(lr=0.003)
-    for name in HELD:
+    for name in SHAPE_ATTRIBUTES:
         factors = rng.uniform(0.9, 1.1, scene.held[name].size).astype(np.float32)
         optimizer[f"shape.{name}"] = params[f"shape.{name}"] * mi.Float(factors)
     losses = []
@@ -178,7 +182,7 @@ def test_adam_reduces_the_loss():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is kept from one rendering to the next
+# Caching between renderings
 # ----------------------------------------------------------------------------------------------
 
 
@@ -201,17 +205,17 @@ def counted(monkeypatch):
     return frames, conversions
 
 
-def test_a_backward_pass_reuses_the_frame_and_converts_once_more(counted):
-    scene = Held()
+def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
+    scene = EllipsoidsCase()
     loaded = scene.load()
     gradients_held(loaded, scene.weights())
     image_of(loaded)
     assert [len(calls) for calls in counted] == [1, 2]
 
 
-@pytest.mark.parametrize("name", HELD)
+@pytest.mark.parametrize("name", SHAPE_ATTRIBUTES)
 def test_a_changed_parameter_is_rendered_again(name, counted):
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
     before = image_of(loaded)
     params = mi.traverse(loaded)
@@ -223,8 +227,8 @@ def test_a_changed_parameter_is_rendered_again(name, counted):
     np.testing.assert_array_equal(after, image_of(scene.load(shape=shape_of(halved))))
 
 
-def test_a_shape_may_be_given_other_gaussians(counted):
-    scene, other = Held(), Held(count=60, seed=9)
+def test_gaussians_of_a_shape_may_be_replaced(counted):
+    scene, other = EllipsoidsCase(), EllipsoidsCase(count=60, seed=9)
     loaded = scene.load()
     image_of(loaded)
     params = mi.traverse(loaded)
@@ -234,7 +238,7 @@ def test_a_shape_may_be_given_other_gaussians(counted):
     np.testing.assert_array_equal(image_of(loaded), image_of(other.load()))
 
 
-def test_a_changed_parameter_of_the_integrators_own_is_rendered_again():
+def test_changed_integrator_parameter_is_rendered_again():
     scene = Merged()
     loaded = scene.load()
     image_of(loaded)
@@ -246,8 +250,8 @@ def test_a_changed_parameter_of_the_integrators_own_is_rendered_again():
     np.testing.assert_array_equal(image_of(loaded), expected)
 
 
-def test_an_integrator_shows_the_shapes_of_the_scene_that_it_renders():
-    first, second = Held(), Held(seed=9)
+def test_integrator_renders_the_shapes_of_the_current_scene():
+    first, second = EllipsoidsCase(), EllipsoidsCase(seed=9)
     scenes = [scene.load() for scene in (first, second)]
     expected = [image_of(loaded) for loaded in scenes]
     integrator = mi.load_dict(first.settings)
@@ -296,7 +300,7 @@ MODULES = (
 )
 
 
-def test_scenes_without_shapes_or_to_world_import_no_gathering_and_keep_their_kernels(
+def test_scenes_without_shapes_or_to_world_skip_merging_modules(
     run_python,
 ):
     results = [

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.ellipsoids import (
-    Held,
+    EllipsoidsCase,
     Merged,
     assert_images_agree,
     gradients_held,
@@ -48,30 +48,34 @@ def changed(held, **changes):
     return held
 
 
-SEEN = 3
+LARGE_SPLAT_ROW = 3
 """The large splat of ``views.splats_before``."""
 
 
 def test_an_opacity_of_one_is_the_largest_below_one():
-    scene = Held()
-    largest = rendered_of(scene, opacities=(SEEN, 0, 1 - 2.0**-24))
+    scene = EllipsoidsCase()
+    largest = rendered_of(scene, opacities=(LARGE_SPLAT_ROW, 0, 1 - 2.0**-24))
     for value in (1.0, 1.5, np.inf):
-        np.testing.assert_array_equal(rendered_of(scene, opacities=(SEEN, 0, value)), largest)
-    assert np.abs(largest - rendered_of(scene, opacities=(SEEN, 0, 0.9))).max() > 0.01
+        np.testing.assert_array_equal(
+            rendered_of(scene, opacities=(LARGE_SPLAT_ROW, 0, value)), largest
+        )
+    assert np.abs(largest - rendered_of(scene, opacities=(LARGE_SPLAT_ROW, 0, 0.9))).max() > 0.01
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"opacities": (SEEN, 0, value)} for value in (0.0, -0.5, np.nan)),
-        *({"data": (SEEN, 4, value)} for value in (0.0, -0.0, np.nan)),
+        *({"opacities": (LARGE_SPLAT_ROW, 0, value)} for value in (0.0, -0.5, np.nan)),
+        *({"data": (LARGE_SPLAT_ROW, 4, value)} for value in (0.0, -0.0, np.nan)),
     ],
     ids=str,
 )
 def test_invisible_gaussians_leave_the_image_unchanged(changes):
     """With any least alpha."""
-    scene = Held()
-    others = {name: np.delete(values, SEEN, axis=0) for name, values in scene.held.items()}
+    scene = EllipsoidsCase()
+    others = {
+        name: np.delete(values, LARGE_SPLAT_ROW, axis=0) for name, values in scene.held.items()
+    }
     for settings in ({}, {"alpha_cut": 0.0}):
         loaded = scene.load(settings, shape=shape_of(changed(scene.held, **changes)))
         expected = scene.load(settings, shape=shape_of(others))
@@ -79,25 +83,25 @@ def test_invisible_gaussians_leave_the_image_unchanged(changes):
         derivatives = gradients_held(loaded, scene.weights())
         for name, width in (("data", 10), ("opacities", 1), ("sh_coeffs", 12)):
             rows = derivatives[name].reshape(40, width)
-            assert np.isfinite(rows).all() and (rows[SEEN] == 0).all() and rows.any()
+            assert np.isfinite(rows).all() and (rows[LARGE_SPLAT_ROW] == 0).all() and rows.any()
 
 
 def test_the_sign_of_a_standard_deviation_is_ignored():
     """Derivatives change theirs."""
-    scene = Held()
+    scene = EllipsoidsCase()
     loaded = scene.load()
-    width = scene.held["data"][SEEN, 4]
-    other = scene.load(shape=shape_of(changed(scene.held, data=(SEEN, 4, -width))))
+    width = scene.held["data"][LARGE_SPLAT_ROW, 4]
+    other = scene.load(shape=shape_of(changed(scene.held, data=(LARGE_SPLAT_ROW, 4, -width))))
     np.testing.assert_array_equal(image_of(other), image_of(loaded))
     plain, negated = (
-        gradients_held(each, scene.weights())["data"].reshape(-1, 10)[SEEN]
+        gradients_held(each, scene.weights())["data"].reshape(-1, 10)[LARGE_SPLAT_ROW]
         for each in (loaded, other)
     )
     np.testing.assert_array_equal(negated, plain * np.repeat([1, -1, 1], [4, 1, 5]))
     assert plain[4] != 0
 
 
-def test_a_to_world_that_mirrors_makes_the_mirror_image(tmp_path):
+def test_mirroring_to_world_gives_the_mirror_image(tmp_path):
     """Before a camera that is mirrored with it: of degree 0, the same image."""
     path = write_model(tmp_path / "model.ply", Scene(degree=0).gaussians)
     shape = {"type": "ellipsoids", "filename": path}
@@ -110,18 +114,20 @@ def test_a_to_world_that_mirrors_makes_the_mirror_image(tmp_path):
     assert_images_agree(mirrored, image)
 
 
-def test_the_derivative_at_an_opacity_of_one_is_that_of_the_inside():
+def test_derivative_at_opacity_one_is_the_one_sided_limit():
     """A splat behind all others, its peak beside the film: images are linear in its opacity."""
     settings = {"alpha_cut": 0.0, "transmittance_stop": 0.0, "extent": 3.0}
-    scene = Held(degree=0)
+    scene = EllipsoidsCase(degree=0)
     camera = scene.camera
     held = {name: values.copy() for name, values in scene.held.items()}
-    held["data"][SEEN, :3] = camera.center + [7, 0, 9] @ camera.rotation
-    held["data"][SEEN, 3:6] = 2.5
+    held["data"][LARGE_SPLAT_ROW, :3] = camera.center + [7, 0, 9] @ camera.rotation
+    held["data"][LARGE_SPLAT_ROW, 3:6] = 2.5
 
     def derivative(opacity):
-        loaded = scene.load(settings, shape=shape_of(changed(held, opacities=(SEEN, 0, opacity))))
-        return gradients_held(loaded, scene.weights())["opacities"][SEEN]
+        loaded = scene.load(
+            settings, shape=shape_of(changed(held, opacities=(LARGE_SPLAT_ROW, 0, opacity)))
+        )
+        return gradients_held(loaded, scene.weights())["opacities"][LARGE_SPLAT_ROW]
 
     expected = derivative(0.9)
     assert derivative(1.0) == pytest.approx(expected, rel=1e-4) and abs(expected) > 0.1
@@ -174,7 +180,7 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_shapes_with_missing_attributes_are_refused(case):
     make, expected = REFUSED[case]
-    scene = Held()
+    scene = EllipsoidsCase()
     assert expected in refusal(scene.load(shape=shape_of(make(scene.held))))
 
 
@@ -190,11 +196,11 @@ def test_a_scene_without_gaussians_is_refused():
 
 def test_a_degree_above_that_of_the_shapes_is_refused():
     assert "integer from 0 to 1, the degree of the Gaussians, got 2" in refusal(
-        Held(degree=1).load({"sh_degree": 2})
+        EllipsoidsCase(degree=1).load({"sh_degree": 2})
     )
 
 
-def test_a_degree_that_only_shapes_have_may_be_asked_for():
+def test_degree_of_shapes_may_be_chosen():
     """When loaded, later, and still after a parameter of the integrator's own has changed."""
     scene = clear(Merged(own_degree=0, degrees=(0, 3), sh_degree=2))
     loaded = scene.load()
@@ -209,7 +215,7 @@ def test_a_degree_that_only_shapes_have_may_be_asked_for():
     assert_images_agree(image_of(loaded), expected)
 
 
-def test_own_coefficients_may_be_fewer_than_those_of_shapes_were():
+def test_own_coefficients_may_be_of_lower_degree_than_those_of_shapes():
     """The highest degree is still that of a shape."""
     loaded = Merged().load()
     before = image_of(loaded)
@@ -222,7 +228,7 @@ def test_own_coefficients_may_be_fewer_than_those_of_shapes_were():
 
 def test_a_to_world_for_an_unknown_shape_is_refused():
     settings = {"shapes_to_world_chair": transform()}
-    assert refusal(Held().load(settings)) == (
+    assert refusal(EllipsoidsCase().load(settings)) == (
         "splats: shapes_to_world_chair must end with the id of a shape of type ellipsoids or "
         "ellipsoidsmesh, ids are: 'shape'"
     )
@@ -266,7 +272,7 @@ def test_wrong_properties_are_refused(case):
 
 def instanced(kind="ellipsoids", group="shapegroup", **settings) -> mi.Scene:
     """A scene whose Gaussians are in a group, beside a ball that stands alone."""
-    scene = Held(kind=kind)
+    scene = EllipsoidsCase(kind=kind)
     return mi.load_dict(
         {
             "type": "scene",

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.ellipsoids import (
     GRADIENTS,
-    HELD,
     MERGED,
+    SHAPE_ATTRIBUTES,
     Merged,
     assert_held_agree,
     assert_images_agree,
@@ -44,17 +44,17 @@ def test_several_shapes_and_tensors_merge(scene):
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_a_degree_below_the_highest_may_be_asked_for(degree):
+def test_degree_below_the_highest_may_be_chosen(degree):
     scene = clear(Merged(sh_degree=degree))
     assert_images_agree(image_of(scene.load()), scene.image())
 
 
-def test_gradients_of_merged_gaussians_reach_where_they_came_from():
+def test_gradients_of_merged_gaussians_reach_their_sources():
     scene = clear(Merged())
     weights = scene.weights()
     loaded = scene.load()
     params = mi.traverse(loaded)
-    keys = [f"{shape}.{name}" for shape in ("first", "second") for name in HELD]
+    keys = [f"{shape}.{name}" for shape in ("first", "second") for name in SHAPE_ATTRIBUTES]
     for key in keys:
         dr.enable_grad(params[key])
     own = gradients_of(loaded, weights)
@@ -66,11 +66,11 @@ def test_gradients_of_merged_gaussians_reach_where_they_came_from():
     for prefix, shape, part in zip(("first", "second"), scene.shapes, rows[1:], strict=True):
         of_gaussians = {name: expected[name][part] for name in PARAMETER_NAMES}
         of_gaussians["shN"] = of_gaussians["shN"][:, : shape.gaussians.shN.shape[1]]
-        actual = {name: gradient(params[f"{prefix}.{name}"]) for name in HELD}
+        actual = {name: gradient(params[f"{prefix}.{name}"]) for name in SHAPE_ATTRIBUTES}
         assert_held_agree(actual, held_gradients(shape.held, of_gaussians))
 
 
-def test_features_of_the_shapes_gaussians_are_zero():
+def test_features_of_gaussians_of_shapes_are_zero():
     scene = Merged()
     feature = np.random.default_rng(3).normal(0, 1, (40, 2)).astype(np.float32)
     settings = {"aovs": "f:feature_mine, z:depth"}
@@ -90,7 +90,7 @@ def test_features_of_the_shapes_gaussians_are_zero():
     assert derivative.shape == (40, 2) and np.abs(derivative).max() > 0
 
 
-def test_the_shapes_gaussians_have_no_smoothing_filter():
+def test_gaussians_of_shapes_have_no_smoothing_filter():
     scene = Merged()
     filters = np.full(40, 0.05, np.float32)
     loaded = scene.load(smoothing=mi.Float(filters))

@@ -65,7 +65,7 @@ def test_invalid_spp_of_a_rendering_is_refused(spp, message):
     assert message in refusal(load(), spp=spp)
 
 
-def test_poses_of_a_shutter_count_as_samples():
+def test_shutter_samples_count_as_samples():
     film, moved = SCENE.view.sensor()["film"], mi.ScalarTransform4f().translate([0.1, 0, 0])
     sensor = {"type": "calibrated", "film": film, "to_world_close": moved}
     sensor |= {"shutter_samples": 1000}
@@ -104,7 +104,7 @@ def test_available_memory_limits_images(monkeypatch):
 
 
 @pytest.mark.parametrize(("available", "most"), [(2**50, 2**32 - 1), (2**33, 2**27)])
-def test_nested_samples_too_many_for_memory_are_refused(monkeypatch, available, most):
+def test_nested_samples_beyond_memory_are_refused(monkeypatch, available, most):
     monkeypatch.setattr(checks, "available_memory", lambda: available)
     integrator = SCENE.settings | tensors(SCENE.gaussians) | {"nested_spp": 10**9}
     wall = WALL.shape(SCENE.view.camera)
@@ -120,7 +120,7 @@ def test_nested_samples_too_many_for_memory_are_refused(monkeypatch, available, 
         load(nested_spp=2**32)
 
 
-def test_samples_of_light_have_a_limit():
+def test_light_samples_are_limited():
     with pytest.raises(RuntimeError, match="light_samples must be an integer from 0 to 4096"):
         load(light_samples=4097)
     load(light_samples=4096)
@@ -130,7 +130,7 @@ def features(count):
     return mi.TensorXf(np.zeros((8, count), np.float32))
 
 
-def test_features_have_at_most_the_columns_of_a_kernel():
+def test_feature_columns_are_limited():
     """Only features that an AOV uses are compiled."""
     message = (
         r"splats: aovs can have at most 64 channels together, got 2,003 \(n 3, f 2,000\); render "
@@ -142,7 +142,7 @@ def test_features_have_at_most_the_columns_of_a_kernel():
     load(aovs="f:feature_x, a:alpha", feature_x=features(MAX_FEATURES))
 
 
-def test_updated_features_have_at_most_the_columns_of_a_kernel():
+def test_updated_feature_columns_are_limited():
     params = mi.traverse(load(aovs="f:feature_x", feature_x=features(2)))
     params["integrator.feature_x"] = features(2000)
     with pytest.raises(ValueError, match="at most 64 channels together, got 2,000"):
@@ -157,7 +157,7 @@ def rasterized(colors, width=4, height=4):
     )
 
 
-def test_colors_of_rasterization_have_as_many_channels():
+def test_color_channels_of_rasterization_are_limited():
     with pytest.raises(ValueError, match=r"colors must be of at most 64 channels, got 2000"):
         rasterized(colors=np.ones((1, 2000), np.float32))
     with pytest.raises(ValueError, match=r"width and height must be smaller: .* too many"):

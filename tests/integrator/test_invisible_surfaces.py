@@ -85,7 +85,7 @@ def without_panes(name) -> np.ndarray:
 @pytest.mark.parametrize("z", [2.0, 0.05, -1.5], ids=["before", "amid", "behind"])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("pane", PANES)
-def test_invisible_surfaces_change_no_image(pane, name, z):
+def test_invisible_surfaces_leave_the_image_unchanged(pane, name, z):
     objects, settings = SCENES[name]
     found = rendered(objects | {"pane": plane(z, PANES[pane])}, settings)
     expected = without_panes(name)
@@ -104,7 +104,7 @@ def sensor_of(kind, origin) -> dict:
 
 
 @pytest.mark.parametrize("kind", ["batch", "thinlens", "aov"])
-def test_windows_are_seen_by_every_sensor(kind):
+def test_every_sensor_sees_windows(kind):
     """Images equal a pinhole's alone: two sensors side by side, one without a window; and
     ``aov``."""
     to_world = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(0.4)

@@ -184,7 +184,7 @@ def test_a_notebook_shows_the_cause_last(capsys):
 
 
 @pytest.mark.parametrize("error", [PluginError("splats: a"), wrapped(ValueError("another"))])
-def test_only_own_causes_that_are_not_last_are_repeated(monkeypatch, error):
+def test_only_drgs_causes_that_are_not_last_are_repeated(monkeypatch, error):
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     sys.excepthook(type(error), error, None)

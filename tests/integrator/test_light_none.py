@@ -18,7 +18,7 @@ MODULES = (
     "drgs.integrator.splat_transport",
     "drgs.integrator.shadows",
 )
-"""Of light between splats and surfaces, and of nothing else; and so is this package:"""
+"""Modules used only for light between splats and surfaces, like all of ``PACKAGE``."""
 
 PACKAGE = ["drgs", "light"]
 
@@ -84,7 +84,7 @@ def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
 
 
 @pytest.mark.parametrize("objects", [dict, surfaces], ids=["splats alone", "splats and surfaces"])
-def test_light_is_none_by_default(objects):
+def test_light_defaults_to_none(objects):
     """The same kernels and bytes, also after another scene had light."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, objects())
@@ -97,7 +97,7 @@ def test_light_is_none_by_default(objects):
     assert kernels_and_bytes(tensors, objects(), light="none") == plain
 
 
-def test_light_changes_nothing_without_surfaces():
+def test_light_has_no_effect_without_surfaces():
     """The property makes no kernel of its own, and no difference."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, {})
@@ -108,7 +108,7 @@ def test_light_changes_nothing_without_surfaces():
     assert kernels_and_bytes(tensors, sky, light="rays") == kernels_and_bytes(tensors, sky)
 
 
-def test_a_nested_integrator_drops_the_transport_of_its_last_outer_integrator():
+def test_nested_integrator_forgets_the_transport_of_its_previous_owner():
     tensors, shared = gaussians(), mi.load_dict({"type": "splatpath"})
 
     def rendered(nested, **settings):
@@ -154,7 +154,7 @@ def imported_for(run_python, scenes) -> list[list[str]]:
     return json.loads(result.stdout)
 
 
-def test_nothing_of_light_is_imported_until_a_scene_asks_for_it(run_python):
+def test_light_package_is_imported_only_if_a_scene_uses_it(run_python):
     nested = {"nested": {"type": "path"}}
     plain = [(s, light) for s in (False, True) for light in ({}, {"light": "none"})]
     plain += [(True, nested), (True, {"nested": {"type": "splatpath"}}), (False, {"light": "rays"})]

@@ -55,7 +55,7 @@ def growth(action, warm, count) -> float:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_renderings_do_not_take_more_and_more_memory(kind):
+def test_rendering_does_not_leak_memory(kind):
     """2,000 of splats, measured by hand, stayed at 185.6 MB from the 500th on."""
     scene = load(kind)
     count = 400 if kind == "splats" else 120
@@ -67,7 +67,7 @@ def test_renderings_do_not_take_more_and_more_memory(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_scenes_that_are_gone_do_not_take_memory(kind):
+def test_deleted_scenes_free_their_memory(kind):
     """Rendered, and differentiated, before they go."""
 
     def use(k):
@@ -79,7 +79,7 @@ def test_scenes_that_are_gone_do_not_take_memory(kind):
     assert growth(use, 12, 50) < 12
 
 
-def test_steps_of_an_optimizer_do_not_take_more_and_more_memory():
+def test_optimizer_steps_do_not_leak_memory():
     scene = load("splats")
     params = mi.traverse(scene)
     optimizer = mi.ad.Adam(lr=1e-4, params={"integrator.means": params["integrator.means"]})

@@ -24,7 +24,7 @@ def ply(tmp_path_factory):
 
 
 @pytest.mark.parametrize("pixel_format", ["rgb", "rgba"])
-def test_images_and_gradients_are_those_of_splats_at_its_defaults(ply, pixel_format):
+def test_images_and_gradients_match_splats_with_defaults(ply, pixel_format):
     results = []
     for kind in ("splats", "splats_minimal"):
         sensor = VIEWS[1].sensor(pixel_format)

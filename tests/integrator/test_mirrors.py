@@ -54,13 +54,13 @@ def rendered(*arguments, **others):
     return np.array(mi.render(scene(*arguments, **others), seed=3), np.float64)
 
 
-def of_three(probes="floor", **others):
+def images_by_light(probes="floor", **others):
     """Images without light, with probes, and with rays."""
     own = rendered(None, **others), rendered(probes=probes, **others)
     return *own, rendered("rays", **others)
 
 
-def test_a_mirror_shows_what_the_mirrored_camera_sees(monkeypatch):
+def test_mirror_matches_the_mirrored_camera(monkeypatch):
     """40 dB of the float64 reference, of which much is the noise of 64 paths: rays have 43."""
     monkeypatch.syspath_prepend(REPOSITORY / "scenes")
     import flat_mirror
@@ -134,23 +134,23 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_flat_mirror_shows_what_rays_show(kind):
+def test_flat_mirror_matches_traced_rays(kind):
     """46 dB, between texels; without light there are less than 24."""
-    none, probe, rays = of_three(**KINDS[kind]())
+    none, probe, rays = images_by_light(**KINDS[kind]())
     assert metrics.psnr(probe, rays) > 46
     assert metrics.psnr(none, rays) < 24
 
 
-def test_rough_mirrors_and_mirrors_in_mirrors_are_seen_from_the_mirrored_camera():
+def test_rough_and_nested_mirrors_use_the_mirrored_camera():
     """Both are approximate; from the middles of the objects, there are 25 and 29 dB."""
     rough = {"floor": floor(bsdf={"type": "roughconductor", "alpha": 0.1})}
     for probes, objects, least in (("floor", rough, 29), ("floor, wall", {"wall": wall()}, 34)):
-        none, probe, rays = of_three(probes, **objects)
+        none, probe, rays = images_by_light(probes, **objects)
         assert metrics.psnr(probe, rays) > least
         assert metrics.psnr(none, rays) < 24
 
 
-def test_images_are_kept_until_something_changes(monkeypatch):
+def test_mirror_images_are_cached_until_the_scene_changes(monkeypatch):
     counts, render = [], Mirrors.render
     monkeypatch.setattr(Mirrors, "render", lambda *values: counts.append(1) or render(*values))
     ball = {"type": "sphere", "radius": 0.3, "to_world": at(0.1, 0.9, 0)}
@@ -176,7 +176,7 @@ def test_images_are_kept_until_something_changes(monkeypatch):
         counts.pop()
 
 
-def test_a_camera_that_goes_on_needs_no_new_kernels():
+def test_camera_motion_needs_no_new_kernels():
     found, kernels = scene(), []
     for _ in range(3):
         params = mi.traverse(found)

@@ -51,13 +51,13 @@ def load(scene, sensor, **others):
 # ----------------------------------------------------------------------------------------------
 
 VIEW = View("", 53, 41, crop=WINDOW)
-OWN = {name: replace(VIEW, to_world=to_world) for name, to_world in (POSES | SCALED).items()}
+OWN_VIEWS = {name: replace(VIEW, to_world=to_world) for name, to_world in (POSES | SCALED).items()}
 ROLLING, BLURRED = (replace(OPENCV, close=CLOSE, shutter=s) for s in ("rolling", "global"))
 TIMES = 3
 
 
 @dataclass(frozen=True)
-class Seen:
+class SensorCase:
     """A sensor, and what the reference makes of it."""
 
     sensor: Callable[[], dict]
@@ -93,21 +93,21 @@ class Seen:
 
 
 SENSORS = {
-    "perspective": Seen(VIEW.sensor, VIEW.camera),
-    "thinlens": Seen(lambda: own_sensor("thinlens", VIEW), VIEW.camera),
+    "perspective": SensorCase(VIEW.sensor, VIEW.camera),
+    "thinlens": SensorCase(lambda: own_sensor("thinlens", VIEW), VIEW.camera),
     **{
-        f"orthographic, {name}": Seen(
+        f"orthographic, {name}": SensorCase(
             lambda view=view: own_sensor("orthographic", view), own_camera(view), Orthographic()
         )
-        for name, view in OWN.items()
+        for name, view in OWN_VIEWS.items()
     },
-    "calibrated": Seen(PINHOLE.dictionary, PINHOLE.camera),
-    "calibrated, opencv": Seen(OPENCV.dictionary, OPENCV.camera, OPENCV.lens),
-    "calibrated, fisheye": Seen(FISHEYE.dictionary, FISHEYE.camera, FISHEYE.lens),
-    "calibrated, rolling shutter": Seen(
+    "calibrated": SensorCase(PINHOLE.dictionary, PINHOLE.camera),
+    "calibrated, opencv": SensorCase(OPENCV.dictionary, OPENCV.camera, OPENCV.lens),
+    "calibrated, fisheye": SensorCase(FISHEYE.dictionary, FISHEYE.camera, FISHEYE.lens),
+    "calibrated, rolling shutter": SensorCase(
         ROLLING.dictionary, OPENCV.camera, OPENCV.lens, ROLLING.close_camera, rolling=True
     ),
-    "calibrated, blurred": Seen(
+    "calibrated, blurred": SensorCase(
         lambda: BLURRED.dictionary(shutter_samples=TIMES),
         OPENCV.camera,
         OPENCV.lens,
@@ -130,7 +130,7 @@ def tilted_plane(camera) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 @pytest.mark.parametrize("seen", SENSORS.values(), ids=SENSORS)
-def test_the_depth_of_a_plane_is_that_of_its_rays_through_every_sensor(seen):
+def test_depth_of_a_plane_matches_rays_for_every_sensor(seen):
     """Without a splat in sight."""
     normal, offset, to_world = tilted_plane(seen.camera)
     behind = replace(
@@ -163,7 +163,7 @@ COLORS = {"luminance": TO_XYZ[1:2], "xyz": TO_XYZ, "rgb": np.eye(3)}
 @pytest.mark.parametrize("component_format", ["float16", "float32"])
 @pytest.mark.parametrize("alpha", [False, True], ids=["without alpha", "with alpha"])
 @pytest.mark.parametrize("colors", COLORS)
-def test_every_format_of_a_film_holds_the_same_image(colors, alpha, component_format, tmp_path):
+def test_every_film_format_has_the_same_image(colors, alpha, component_format, tmp_path):
     scene = clear(Scene(srgb_primitives=True))
     names = {"luminance": "luminance_alpha", "xyz": "xyza", "rgb": "rgba"}
     pixel_format = names[colors] if alpha else colors
@@ -240,7 +240,7 @@ def test_forward_mode_is_the_transpose_of_the_gradients_through_every_sensor(sen
     assert size > 0 and abs(left - right) < 1e-5 * size
 
 
-def test_two_renders_are_both_differentiated_at_what_was_changed_in_between():
+def test_two_renders_are_both_differentiated_at_the_current_parameters():
     """The backward pass knows the scene as it is then."""
     before, after = clear(Scene()), clear(Scene(seed=100))
     loaded = before.load()
@@ -326,7 +326,7 @@ def test_xml_and_dictionary_give_the_same_image(kind, tmp_path):
 
 
 @pytest.mark.parametrize("call", ["render", "render_backward", "render_forward"])
-def test_recording_by_freeze_is_refused_without_side_effects(call):
+def test_dr_freeze_is_refused_without_side_effects(call):
     gc.collect()  # scenes of other tests that die while Dr.Jit records change its own message
     scene = Scene()
     loaded = scene.load()

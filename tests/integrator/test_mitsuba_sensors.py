@@ -33,7 +33,7 @@ def variant():
 
 @pytest.mark.parametrize("crop", [None, WINDOW])
 @pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
-def test_points_on_the_rays_of_a_thin_lens_are_seen_where_the_rays_start(crop, to_world):
+def test_points_on_thin_lens_rays_project_to_their_pixels(crop, to_world):
     """Rays go through the middle of the aperture."""
     view = View("", 53, 41, crop=crop, to_world=to_world)
     sensor = mi.load_dict(own_sensor("thinlens", view))
@@ -43,7 +43,7 @@ def test_points_on_the_rays_of_a_thin_lens_are_seen_where_the_rays_start(crop, t
 
 
 @pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
-def test_rays_of_a_thin_lens_start_on_its_aperture_and_meet_where_it_is_in_focus(to_world):
+def test_thin_lens_rays_start_on_the_aperture_and_meet_in_focus(to_world):
     """Rays of one place on the film."""
     view = View("", 53, 41, to_world=to_world)
     sensor = mi.load_dict(own_sensor("thinlens", view))
@@ -68,7 +68,7 @@ def test_rays_of_a_thin_lens_start_on_its_aperture_and_meet_where_it_is_in_focus
 
 @pytest.mark.parametrize("crop", [None, WINDOW])
 @pytest.mark.parametrize("to_world", (POSES | SCALED).values(), ids=POSES | SCALED)
-def test_points_on_the_rays_of_an_orthographic_sensor_are_seen_where_they_start(crop, to_world):
+def test_points_on_orthographic_rays_project_to_their_pixels(crop, to_world):
     view = View("", 53, 41, crop=crop, to_world=to_world)
     sensor = mi.load_dict(own_sensor("orthographic", view))
     points, expected = points_on_rays(sensor)
@@ -80,7 +80,7 @@ def test_points_on_the_rays_of_an_orthographic_sensor_are_seen_where_they_start(
 
 
 @pytest.mark.parametrize("factors", [(2.0, 2.0, 1.0), (2.0, 1.5, 1.0)])
-def test_an_orthographic_image_is_that_of_the_reference(factors):
+def test_orthographic_image_matches_the_reference(factors):
     view = View("", 53, 41, crop=WINDOW, to_world=scaled(VIEWS[1].to_world, *factors))
     sensor = Calibrated("orthographic", view=view)
     camera = own_camera(view)
@@ -98,7 +98,7 @@ def test_an_orthographic_image_is_that_of_the_reference(factors):
     assert image[..., 3].max() > 0.8
 
 
-def test_an_image_through_a_thin_lens_is_that_of_the_reference():
+def test_thin_lens_image_matches_the_reference():
     view = View("", 53, 41, crop=WINDOW)
     sensor = Calibrated("thin lens", view=view)
     camera, defocus = replace(view.camera, near=0.01), ThinLens(0.125, 3.0)
@@ -115,7 +115,7 @@ def test_an_image_through_a_thin_lens_is_that_of_the_reference():
     assert np.abs(in_focus.image - rendered.image)[view.window].max() > 0.05
 
 
-def test_colours_along_rays_turn_with_a_rolling_shutter():
+def test_view_dependent_colours_follow_a_rolling_shutter():
     """Rays of small splats have the direction of the mean, with which colours change."""
     count = 3000
     directions = np.random.default_rng(0).normal(size=(count, 3))

@@ -71,7 +71,7 @@ class PluginCase(MovingCase):
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{s.name}, {s.shutter}")
-def test_a_calibrated_sensors_image_is_that_of_the_reference(variant, sensor):
+def test_calibrated_sensor_image_matches_the_reference(variant, sensor):
     gaussians, rendered = clear_gaussians(
         sensor, lambda gaussians: image_by_reference(sensor, gaussians)
     )
@@ -111,7 +111,7 @@ def test_gradients_add_up_over_the_times(variant, sensor):
         assert abs(1.01 * terms.sum() - expected) > 2e-5 * np.abs(terms).sum(), parameter
 
 
-def test_poses_that_kernels_share_change_no_byte(variant, monkeypatch):
+def test_sharing_kernels_among_poses_changes_no_byte(variant, monkeypatch):
     """More poses than :data:`PASSES_PER_KERNEL` are compiled in parts."""
     gaussians, _ = clear_gaussians(
         SENSORS[0], lambda gaussians: image_by_reference(SENSORS[0], gaussians)
@@ -174,18 +174,18 @@ print(np.array(mi.render(mi.load_dict({{"type": "scene", "i": splats, "s": senso
 """
 
 
-MOVES = '"to_world_close": T().translate([0, 0.1, -2])'
+CLOSING_POSE = '"to_world_close": T().translate([0, 0.1, -2])'
 
 
-CALLED_FOR = {
+SENSOR_MODULES = {
     "lens": ('{"type": "calibrated", "lens": "opencv"}', "cameras.radial_tangential"),
     "orthographic": ('{"type": "orthographic"}', "cameras.orthographic"),
     "thin lens": ('{"type": "thinlens", "aperture_radius": 0.1}', "effects.defocus"),
-    "moving": (f'{{"type": "calibrated", {MOVES}}}', "cameras.motion"),
+    "moving": (f'{{"type": "calibrated", {CLOSING_POSE}}}', "cameras.motion"),
 }
 
 
-@pytest.mark.parametrize(("sensor", "module"), CALLED_FOR.values(), ids=CALLED_FOR)
+@pytest.mark.parametrize(("sensor", "module"), SENSOR_MODULES.values(), ids=SENSOR_MODULES)
 def test_a_sensor_requires_its_module(run_python, sensor, module):
     """test_summary covers other sensors, and kernels without these modules."""
     result = run_python(RENDERING.format(blocked=module, sensor=sensor))

@@ -58,7 +58,7 @@ def test_objects_are_sorted_together(own):
         start = end
 
 
-def test_each_object_has_a_place_of_its_own(tmp_path):
+def test_each_object_has_its_own_to_world(tmp_path):
     place = mi.ScalarTransform4f().translate([0.2, 0, 0.1]).rotate([0, 1, 0], 25)
     later = mi.Transform4f().translate([-0.1, 0.1, 0])
     files = {
@@ -99,7 +99,7 @@ def test_xml_names_objects_by_their_ids(tmp_path):
     assert "all.lego.to_world" in mi.traverse(scene)
 
 
-def test_features_of_objects_without_them_are_zeros():
+def test_missing_features_of_objects_are_zero():
     values = mi.TensorXf(np.random.default_rng(2).normal(0, 1, (22, 2)).astype(np.float32))
     feature = {"feature_x": values}
     objects = nested(lego=feature)
@@ -137,7 +137,7 @@ def test_a_nested_integrator_of_another_kind_renders_surfaces():
 @pytest.mark.parametrize(
     "name", ["background", "aovs", "light", "low_pass", "sh_degree", "srgb_primitives"]
 )
-def test_settings_of_rendering_are_refused_of_an_object(name):
+def test_rendering_settings_are_refused_for_an_object(name):
     value = {"aovs": "d:depth", "light": "none", "low_pass": 0.1, "sh_degree": 0}.get(name, True)
     if name == "background":
         value = [1, 1, 1]
@@ -146,7 +146,7 @@ def test_settings_of_rendering_are_refused_of_an_object(name):
         load(nested(lego={name: value}))
 
 
-def test_an_object_without_gaussians_or_with_objects_is_refused():
+def test_empty_and_nested_objects_are_refused():
     with pytest.raises(
         Exception,
         match=r"splats: lego is nested .* must be given Gaussians by filename, .* nothing",
@@ -205,7 +205,7 @@ def test_forward_mode_is_the_transpose_for_one_object_of_two():
     assert left == pytest.approx(terms.sum(), abs=1e-5 * np.abs(terms).sum()) and left != 0
 
 
-def test_an_object_that_stands_twice_receives_both_derivatives():
+def test_object_used_twice_receives_both_derivatives():
     lego = mi.load_dict({"type": "splats"} | tensors(MODELS["lego"]))
     integrator = SCENE.settings | {"a": lego, "b": lego}
     twice = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor()})
@@ -217,7 +217,7 @@ def test_an_object_that_stands_twice_receives_both_derivatives():
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(both).max())
 
 
-def test_gradient_descent_finds_where_an_object_stands():
+def test_gradient_descent_recovers_the_position_of_an_object():
     """One of two, turned by 12 degrees and moved by a fifth of a unit, from one image."""
     scene = load(nested())
     true = {"axis_angle": [0.12, -0.15, 0.1], "position": [0.15, -0.1, 0.08]}

@@ -71,7 +71,7 @@ def rendered(scene, gaussians) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_moved_object_looks_as_the_reference_draws_its_gaussians():
+def test_moved_object_matches_the_reference():
     scene, model = scene_and_object()
     expected = rendered(scene, moved_by(MATRIX, model))
     given = load(scene, model)
@@ -90,7 +90,7 @@ def gradient_free(params, name) -> np.ndarray:
     return np.array(params[f"integrator.{name}"]).astype(np.float64)
 
 
-def test_a_moved_object_looks_as_a_file_saved_moved(tmp_path):
+def test_moved_object_matches_a_file_saved_after_moving(tmp_path):
     """With its smoothing filter."""
     scene, model = scene_and_object()
     filters = np.linspace(0.005, 0.05, len(model.means), dtype=np.float32)
@@ -113,7 +113,7 @@ def test_a_moved_object_looks_as_a_file_saved_moved(tmp_path):
 
 
 @pytest.mark.parametrize("later", [False, True])
-def test_the_identity_costs_nothing(later):
+def test_identity_transform_costs_nothing(later):
     """Given, or set after another place: the arrays that are rendered are the integrator's own."""
     scene, model = scene_and_object()
     loaded = load(scene, model, MATRIX if later else np.eye(4))
@@ -159,7 +159,7 @@ ROUTES = {
 
 
 @pytest.mark.parametrize("route", ROUTES)
-def test_every_route_sees_the_moved_object(route):
+def test_every_light_route_sees_the_moved_object(route):
     """The same bytes as of the Gaussians that the integrator says it renders."""
     scene, model = scene_and_object()
     sensor = scene.view.sensor()
@@ -201,7 +201,7 @@ def slopes() -> np.ndarray:
     return found
 
 
-def test_a_filter_that_grows_with_an_object_is_differentiated():
+def test_smoothing_filter_of_a_scaled_object_has_derivatives():
     """At a fifth of the splats' size, and at five times of it."""
     scene, model = scene_and_object()
     filters = single(np.geomspace(0.005, 0.1, len(model.means)))
@@ -231,14 +231,14 @@ def gradient_of_matrix(loaded, weights) -> np.ndarray:
     return np.array(dr.grad(params[KEY]).matrix).astype(np.float64)[:, :, 0]
 
 
-def test_each_number_of_the_matrix_has_the_derivative_of_central_differences():
+def test_each_matrix_entry_has_the_derivative_of_central_differences():
     scene, model = scene_and_object()
     found = gradient_of_matrix(load(scene, model), scene.weights())
     assert_arrays_agree({"to_world": found[:3]}, {"to_world": slopes()}, GRADIENTS)
     assert not found[3].any()
 
 
-def test_an_object_that_is_not_moved_has_the_same_derivatives():
+def test_unmoved_object_has_the_same_derivatives():
     """Moving an object in place: by the chain rule, the derivatives above times MATRIX^-1."""
     scene, _ = scene_and_object()
     unmoved = load(scene, scene.gaussians, matrix=None)
@@ -318,7 +318,7 @@ def test_derivatives_reach_the_inputs_of_a_transform():
     assert gradient(shift)[0] == pytest.approx(expected, abs=GRADIENTS * np.abs(slopes()).max())
 
 
-def test_a_matrix_that_is_no_similarity_is_refused_when_it_is_set():
+def test_setting_a_matrix_that_is_no_similarity_is_refused():
     scene, model = scene_and_object()
     loaded = load(scene, model)
     params = mi.traverse(loaded)
@@ -333,7 +333,7 @@ def test_a_matrix_that_is_no_similarity_is_refused_when_it_is_set():
     np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, model)))
 
 
-def test_gaussians_that_leave_float32_are_refused():
+def test_gaussians_that_overflow_float32_are_refused():
     scene, model = scene_and_object()
     means = model.means.copy()
     means[2] = 3e38
@@ -342,7 +342,7 @@ def test_gaussians_that_leave_float32_are_refused():
         loaded.integrator().render(loaded)
 
 
-def test_nan_gaussians_add_nothing_to_derivatives():
+def test_nan_gaussians_do_not_contribute_to_derivatives():
     scene, model = scene_and_object()
     means, shN = model.means.copy(), model.shN.copy()
     means[5], shN[6] = np.nan, np.inf

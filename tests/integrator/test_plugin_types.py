@@ -30,13 +30,13 @@ def test_plugin_errors_have_their_types():
     assert issubclass(UnsupportedError, NotImplementedError)
 
 
-def test_a_sensor_that_is_not_supported_is_an_error_of_type():
+def test_unsupported_sensor_is_a_type_error():
     sensor = mi.load_dict({"type": "batch", "one": {"type": "perspective"}})
     with pytest.raises(PluginTypeError, match=r"^splats: the sensor must be of type perspective"):
         read_sensor(sensor, 0.01)
 
 
-def test_a_degree_that_the_gaussians_lack_is_an_error_of_the_plugin():
+def test_degree_above_that_of_the_gaussians_is_a_plugin_error():
     integrator = splats()
     integrator.sh_degree = 2
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
@@ -55,7 +55,7 @@ def test_the_integrator_splats_is_recognised_by_its_state():
     assert is_splats(splats()) and not is_splats(mi.load_dict({"type": "path"}))
 
 
-def test_the_samples_of_surfaces_may_be_set_and_other_settings_not():
+def test_only_nested_spp_can_be_set():
     integrator = splats()
     integrator.nested_spp = 3
     assert integrator.nested_spp == 3 and "nested_spp = 3" in str(integrator)
@@ -64,5 +64,5 @@ def test_the_samples_of_surfaces_may_be_set_and_other_settings_not():
             setattr(integrator, name, getattr(integrator, name))
 
 
-def test_messages_have_names_for_lenses():
+def test_repr_contains_the_lens_name():
     assert "lens = Pinhole" in str(mi.load_dict({"type": "calibrated"}))

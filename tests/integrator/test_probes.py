@@ -42,7 +42,7 @@ def render(splats, seed=0, **settings):
     return np.array(mi.render(scene_of(splats, **settings), seed=seed))
 
 
-def test_a_mirror_ball_reflects_what_rays_show():
+def test_mirror_ball_matches_traced_rays():
     """30 dB, of which the noise of drawn splats is no part."""
     splats = around()
     rays = render(splats, spp=16, light_samples=0, **mirror_ball())
@@ -52,7 +52,7 @@ def test_a_mirror_ball_reflects_what_rays_show():
     assert errors[0] < 1e-3 < 0.02 < errors[1]
 
 
-def test_a_lamp_with_a_probe_is_shaded_by_fog():
+def test_lamp_with_a_probe_is_dimmed_by_fog():
     """Fog before the lamp dims it by its alpha; up to 0.01, as rays with four times that."""
     rng = np.random.default_rng(1)
     splats = gaussians(rng.uniform(-1, 1, (30, 3)) * [1, 1, 0.3] + [0, 0, 1.5], 0.4, 0.3, 0.0)
@@ -70,7 +70,7 @@ def test_a_lamp_with_a_probe_is_shaded_by_fog():
     np.testing.assert_allclose(probe.mean(2), rays.mean(2), atol=0.03)
 
 
-def test_objects_without_a_probe_pass_no_splats():
+def test_objects_without_a_probe_see_no_splats():
     # Inside the ball, where no ray comes.
     other = {"other": {"type": "sphere", "radius": 0.1, "id": "other"}}
     none = render(around(), light="none", nested="splatpath", spp=4, **mirror_ball(**other))
@@ -78,7 +78,7 @@ def test_objects_without_a_probe_pass_no_splats():
     np.testing.assert_array_equal(probe, none)
 
 
-def test_rays_without_a_probe_answer_meet_nothing_or_are_traced():
+def test_rays_unknown_to_a_probe_are_empty_or_traced():
     """Splats in the ball hide all others from the probe, and none from its rays."""
     parts = [vars(around()), vars(around(count=400, distance=0.3, size=0.08))]
     splats = splatting.Gaussians(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
@@ -92,7 +92,7 @@ def test_rays_without_a_probe_answer_meet_nothing_or_are_traced():
     np.testing.assert_array_equal(found["none"], nothing)
 
 
-def test_probes_are_kept_until_something_changes(monkeypatch):
+def test_probes_are_cached_until_the_scene_changes(monkeypatch):
     counts, render = [], Probes.render
     monkeypatch.setattr(Probes, "render", lambda *values: counts.append(1) or render(*values))
     scene = scene_of(around(20), light="probe", probes="ball", spp=1, **mirror_ball())
@@ -122,7 +122,7 @@ def test_probes_see_smoothed_gaussians():
     np.testing.assert_allclose(smoothed, render(wide, **settings), atol=1e-3)
 
 
-def test_objects_too_close_to_splats_are_warned_of_once():
+def test_objects_too_close_to_splats_give_one_warning():
     """A splat is nearer to the middle than 1.25 radii; changes repeat no warning."""
     lines = []
 
@@ -150,7 +150,7 @@ def test_objects_too_close_to_splats_are_warned_of_once():
         logger.remove_appender(appender)
 
 
-def test_objects_that_cannot_have_a_probe_are_refused():
+def test_invalid_probe_settings_are_refused():
     def scene(**settings):
         return scene_of(around(4), light="probe", **settings, **mirror_ball(sky=SKY))
 

@@ -68,7 +68,7 @@ def make_gaussians(view, count=40, degree=2, seed=0):
 
 
 @pytest.mark.parametrize("samples", [None, 3])
-def test_a_moving_views_sensor_blurs_with_as_many_times(samples):
+def test_sensor_of_a_moving_view_has_the_configured_shutter_samples(samples):
     """The configuration sets their number; the default is the sensor's own."""
     data = DataConfig(path=".", **({} if samples is None else {"shutter_samples": samples}))
     view = make_view()
@@ -85,7 +85,7 @@ def test_a_moving_views_sensor_blurs_with_as_many_times(samples):
     [make_view(), make_view(23, 37, cx=8.0, cy=20.0), make_view(64, 64, 80, 80, 32, 32)],
     ids=["wide", "tall", "centred"],
 )
-def test_a_sensor_has_the_views_camera(view):
+def test_sensor_has_the_camera_of_its_view(view):
     (sensor,) = make_sensors([view])
     camera = camera_of(sensor)
     actual = numbers(camera)
@@ -97,7 +97,7 @@ def test_a_sensor_has_the_views_camera(view):
     assert (camera.width, camera.height) == (view.width, view.height)
 
 
-def test_a_sensors_rays_are_the_views():
+def test_sensor_rays_match_the_view():
     """Independent of the integrator's reading of a sensor."""
     view = make_view()
     points, positions = points_on_rays(make_sensors([view])[0])
@@ -122,7 +122,7 @@ def test_views_of_one_size_share_a_film():
         ThinPrismFisheye.from_coefficients(k1=0.1, sx1=0.01),
     ],
 )
-def test_cameras_beyond_mitsubas_sensors_are_calibrated(lens):
+def test_cameras_unsupported_by_mitsuba_become_calibrated_sensors(lens):
     view = replace(make_view(fx=30.0, fy=33.0), lens=lens)
     (sensor,) = make_sensors([view])
     camera = camera_of(sensor)
@@ -171,11 +171,11 @@ def test_a_scene_renders_the_views_image_in_display_space(antialiased, near):
     scene = make_scene(gaussians, model, BACKGROUND)
     image = image_of(scene, sensor=make_sensors([view])[0])
     expected = expected_image(gaussians, view, near, antialiased)
-    # As for the integrator: see test_splats.
+    # Tolerance of test_splats.
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
 
 
-def test_derivatives_are_possible_between_two_images_and_when_no_more_are_asked_for():
+def test_derivatives_work_between_images_of_an_unfinished_iterator():
     """A command that was interrupted leaves images that nobody takes."""
     view = make_view()
     scene = make_scene(make_gaussians(view), ModelConfig(**VIEWER_RENDERING), BACKGROUND)
@@ -210,7 +210,7 @@ def test_a_scene_takes_gaussians_from_host_or_device():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 16])
-def test_a_scene_may_hold_few_gaussians(count):
+def test_scene_may_contain_few_gaussians(count):
     """Mitsuba turns three numbers into a colour, four or sixteen could be a matrix."""
     view = make_view()
     rows = slice(3, 3 + count)
@@ -222,7 +222,7 @@ def test_a_scene_may_hold_few_gaussians(count):
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
 
 
-def test_a_scenes_parameters_are_copies_under_the_integrators_name():
+def test_scene_parameters_are_copies_named_after_the_integrator():
     gaussians = make_gaussians(make_view()).to(mi.TensorXf)
     scene = make_scene(gaussians, ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     params = mi.traverse(scene)

@@ -317,7 +317,7 @@ def forward(loaded, **directions) -> np.ndarray:
 
 
 @every_parameter
-def test_derivatives_are_central_differences(name, parameter):
+def test_derivatives_equal_central_differences(name, parameter):
     """Backward of a weighted sum, and forward, of every pixel."""
     case, scene = CASES[name], clear_scene(name)
     expected = case.difference(scene, parameter)
@@ -392,7 +392,7 @@ def test_derivatives_of_depth_and_alpha_channels():
     assert actual == pytest.approx(np.sum(weights * expected), rel=VALUE)
 
 
-def test_derivatives_of_a_camera_and_of_gaussians_come_together():
+def test_camera_and_gaussian_derivatives_are_computed_together():
     """To the last bits as they come alone."""
     case, scene = CASES["perspective"], clear_scene("perspective")
     weights = scene.weights()
@@ -436,7 +436,7 @@ def test_several_samples_per_pixel_have_derivatives():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is the same
+# Reproducibility
 # ----------------------------------------------------------------------------------------------
 
 
@@ -506,12 +506,12 @@ def test_another_camera_needs_no_new_kernel():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is refused, what is ignored
+# Errors and ignored effects
 # ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["backward", "forward"])
-def test_colors_along_each_ray_refuse_a_cameras_derivatives(mode):
+def test_pixel_sh_direction_refuses_camera_derivatives(mode):
     """They do not depend on the camera through the splats alone."""
     case, scene = CASES["perspective"], clear_scene("perspective")
     loaded = case.load(scene, sh_direction="pixel")
@@ -536,7 +536,7 @@ IGNORED = [
 
 
 @pytest.mark.parametrize(("name", "ignored", "parameter"), IGNORED)
-def test_what_is_ignored_has_no_derivative(name, ignored, parameter):
+def test_ignored_effect_has_no_derivative(name, ignored, parameter):
     case, scene = CASES[name], clear_scene(name)
     weights = scene.weights()
     loaded = case.load(scene, ignore=ignored)

@@ -68,7 +68,7 @@ SKY = {"type": "constant"}
 
 
 @pytest.mark.parametrize(("height", "radius"), [(1.0, 1.0), (0.5, 0.2), (2.0, 6.0)])
-def test_a_disc_blocks_its_part_of_the_sky(height, radius, monkeypatch):
+def test_disc_blocks_its_solid_angle_of_the_sky(height, radius, monkeypatch):
     """1 - sin^2 of half the angle under which it is seen (Lambert)."""
     monkeypatch.setattr(
         shadows, "EMITTER_SAMPLES", 512
@@ -83,7 +83,7 @@ def test_a_disc_blocks_its_part_of_the_sky(height, radius, monkeypatch):
 
 
 @pytest.mark.parametrize("pane", [None, 3.0, 1.0], ids=["alone", "pane above", "pane below"])
-def test_a_lamp_is_shaded_where_the_object_is_before_it(pane):
+def test_object_before_a_lamp_casts_a_shadow(pane):
     """Sharply, as it is a point: behind the edge of the shadow all is as it was. A pane that lets
     everything pass makes no difference."""
     x = np.linspace(-2, 2, 81)
@@ -98,7 +98,7 @@ def test_a_lamp_is_shaded_where_the_object_is_before_it(pane):
     np.testing.assert_array_equal(factor[np.abs(x) > 1.02], 1)
 
 
-def test_objects_that_are_not_named_cast_no_shadow():
+def test_unlisted_objects_cast_no_shadow():
     means = np.zeros((10, 3))
     objects = {
         "lid": disc(1.0, 1.0),
@@ -110,7 +110,7 @@ def test_objects_that_are_not_named_cast_no_shadow():
     np.testing.assert_array_equal(factor, 1)  # it is behind the lid
 
 
-def test_shadows_are_kept_until_something_changes():
+def test_shadows_are_cached_until_the_scene_changes():
     scene = scene_of(
         discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY, floor=disc(-0.05, 50.0)
     )

@@ -62,7 +62,7 @@ def room():
 
 
 @pytest.mark.parametrize("max_depth", [1, 2, 3, 8])
-def test_surfaces_alone_look_as_by_path(max_depth):
+def test_image_without_splats_matches_path(max_depth):
     """Within five standard errors everywhere, and within one and a bit on average."""
     found = []
     for nested, light in (("splatpath", "rays"), ("path", "none")):
@@ -103,7 +103,7 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     assert expected.max() > 0.3
 
 
-def test_a_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
+def test_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
     """The pixel shows one point of the wall, from which the lamp is seen through every Gaussian."""
     rng = np.random.default_rng(1)
     lamp, count = np.array([0.5, 0.3, 3.0]), 30
@@ -137,7 +137,7 @@ def test_a_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
     np.testing.assert_allclose(ratio[clear], seen.transmittances[clear], atol=0.02)
 
 
-def test_in_a_white_furnace_everything_is_white():
+def test_white_furnace_is_white():
     """White splats before a white sky around a white ball: none can be told from the others."""
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(300, 3))
@@ -180,7 +180,7 @@ class Furnace:
     """On the axis along which the camera looks."""
 
     @property
-    def let_through(self) -> float:
+    def path_transmittance(self) -> float:
         return (1 - self.alpha) ** 2
 
     def radiances(self, most_depth) -> list[float]:
@@ -190,12 +190,12 @@ class Furnace:
         with cos cos / (pi d^2) = 1 / 4 pi, whichever they are, and what a bounce brings is the mean
         over the sphere. That of the lamp's irradiance is its intensity, pi, without fog.
         """
-        fog = (1 - self.let_through) * self.exposure * linear(np.array(self.color))
-        of_lamp = self.albedo * (1 + self.let_through) / 2
-        of_lamp_there = self.albedo * self.let_through / (1 - self.LAMP) ** 2
+        fog = (1 - self.path_transmittance) * self.exposure * linear(np.array(self.color))
+        of_lamp = self.albedo * (1 + self.path_transmittance) / 2
+        of_lamp_there = self.albedo * self.path_transmittance / (1 - self.LAMP) ** 2
         seen, mean = [1.0], 1.0
         for _ in range(most_depth - 1):
-            bounced = self.albedo * (fog + self.let_through * mean)
+            bounced = self.albedo * (fog + self.path_transmittance * mean)
             seen, mean = [*seen, 1 + of_lamp_there + bounced], 1 + of_lamp + bounced
         return seen
 
@@ -235,10 +235,10 @@ FURNACES = {
 }
 
 DEPTHS = [1, 2, 3, 4, 5, -1]
-"""Of paths. The last has no limit, and Russian roulette ends it from 5 on."""
+"""Maximum path depths. -1 is unlimited, and Russian roulette begins at 5."""
 
 ROUNDING = 1e-5
-"""Of means of 64 samples, of 3 at most, that are added up in single precision: 64 * 3 * 6e-8."""
+"""Error of means of 64 samples up to 3, summed in single precision: 64 * 3 * 6e-8."""
 
 
 @pytest.mark.parametrize("furnace", FURNACES.values(), ids=FURNACES.keys())
@@ -259,7 +259,7 @@ def test_bounces_in_a_furnace_of_fog_converge_to_its_radiance(furnace):
 
 
 @pytest.mark.parametrize("color", [0.02, 0.5, (0.9, 0.3, 0.1)])
-def test_drawn_splats_have_the_colour_of_all_on_average(color):
+def test_sampled_splats_have_the_mean_colour_of_all_splats(color):
     """Splats of several colours overlap: their mean is decoded, not each of them."""
     rng = np.random.default_rng(3)
     colors = np.clip(np.asarray(color) * rng.uniform(0, 2, (40, 3)), 0, 1)
@@ -282,13 +282,13 @@ def test_drawn_splats_have_the_colour_of_all_on_average(color):
     np.testing.assert_allclose(mean.mean((0, 1)), exact, atol=2e-3 + 5 * error.max())
 
 
-def test_the_sum_of_powers_decodes_within_its_error():
+def test_sum_of_powers_decodes_within_its_error_bound():
     color = np.linspace(0, 1, 1001)
     found = sum(factor * color**k for k, factor in enumerate(DECODING, 1))
     assert np.abs(found - linear(color)).max() < 2e-3
 
 
-def test_glass_that_does_not_refract_changes_nothing():
+def test_glass_without_refraction_is_invisible():
     splats = gaussians([[0, 0, -1], [0.3, 0.2, -2]], 0.4, 0.8, [[0.9, 0.2, 0.1], [0.1, 0.3, 0.8]])
     slab = {
         "slab": {
@@ -305,7 +305,7 @@ def test_glass_that_does_not_refract_changes_nothing():
     assert rendered.max() > 0.3
 
 
-def test_materials_and_lamps_are_differentiated_among_splats():
+def test_materials_and_lamps_have_derivatives_among_splats():
     """Central differences use images with many paths."""
     splats = gaussians([[0.3, 1.2, 0.5], [-0.8, 0.6, 0.4]], 0.4, 0.7, 0.8)
     objects = room()
@@ -329,7 +329,7 @@ def test_materials_and_lamps_are_differentiated_among_splats():
         assert gradient == pytest.approx((means[1] - means[0]) / (2 * step), rel=0.05), key
 
 
-def test_what_would_be_wrong_is_refused():
+def test_unsupported_derivatives_and_settings_are_refused():
     splats = gaussians([[0, 0, -1]])
     scene = scene_of(splats, **room())
     params = mi.traverse(scene)

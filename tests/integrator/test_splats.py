@@ -112,7 +112,7 @@ def test_xml_has_the_same_defaults_as_a_dictionary(tmp_path):
     )
 
 
-def test_its_text_names_what_is_not_as_usual():
+def test_repr_lists_non_default_settings():
     settings = {"aovs": "d:depth,a:alpha", "ignore": "motion, defocus", "hide_emitters": True}
     integrator = mi.load_dict(
         {"type": "splats", **tensors(Scene(degree=0).gaussians), **settings, "low_pass": 0.1}
@@ -158,7 +158,7 @@ def test_a_background_may_be_given_as_any_rgb(background):
     assert np.array_equal(np.array(integrator.state.background).ravel(), [0.5, 0.5, 0.5])
 
 
-def test_a_scenes_parameters_are_not_the_callers_arrays():
+def test_scene_parameters_are_copies_of_the_arguments():
     """Mitsuba assigns to parameters in place: two scenes of one dictionary would share them."""
     scene = Scene()
     values = tensors(scene.gaussians)
@@ -181,7 +181,7 @@ def test_a_scenes_parameters_are_not_the_callers_arrays():
 # ----------------------------------------------------------------------------------------------
 
 
-SWITCHING = """
+SWITCHING_PROGRAM = """
 import mitsuba as mi
 {order}
 import sys
@@ -212,8 +212,8 @@ for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
     ["import drgs; mi.set_variant('llvm_ad_rgb')", "mi.set_variant('llvm_ad_rgb'); import drgs"],
     ids=["drgs first", "variant first"],
 )
-def test_variants_may_be_switched_and_others_refuse_in_one_line(order, run_python):
-    result = run_python(SWITCHING.format(order=order))
+def test_variants_can_be_switched_and_unsupported_ones_are_refused(order, run_python):
+    result = run_python(SWITCHING_PROGRAM.format(order=order))
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines() == [
         f"PluginError: {plugin}: the variant '{variant}' is not supported, "
@@ -284,7 +284,7 @@ def test_every_setting_changes_the_image():
         assert difference > 0.05, changes
 
 
-def test_pixels_near_a_threshold_are_all_that_may_differ():
+def test_only_pixels_near_a_threshold_may_differ():
     """Not a seed that avoids them: a few hundred splats on a larger film."""
     scene = Scene(View("large", 120, 90), count=300)
     marked = scene.rendered.near_threshold
@@ -295,7 +295,7 @@ def test_pixels_near_a_threshold_are_all_that_may_differ():
 
 
 @pytest.mark.parametrize("crop", [(13, 7, 29, 18), (40, 30, 13, 11), (0, 0, 5, 5)])
-def test_a_window_is_a_part_of_the_whole_image(crop):
+def test_crop_window_is_a_part_of_the_whole_image(crop):
     """Large splats reach into the window from far outside."""
     whole = Scene(View("whole", 53, 41))
     values = tensors(whole.gaussians)
@@ -309,7 +309,7 @@ def test_a_window_is_a_part_of_the_whole_image(crop):
     assert_images_agree(window_image, whole_image[window.window])
 
 
-def test_background_is_seen_where_there_are_no_splats():
+def test_background_shows_where_there_are_no_splats():
     scene = Scene(View("elsewhere", to_world=pose([1, 0, 0], -90, (0, 1000, 0))), count=8)
     scene = replace(scene, srgb_primitives=True)
     loaded = mi.load_dict(
@@ -331,7 +331,7 @@ def test_background_is_seen_where_there_are_no_splats():
 VOLPRIM = 0.05
 
 
-def test_isolated_splats_look_as_volprim_rf_basic_draws_them():
+def test_isolated_splats_match_volprim_rf_basic():
     view = View("apart", 72, 54, fov=25.0, to_world=pose([0.3, 1, 0.2], 30, (0.4, -0.7, 1.1)))
     camera = view.camera
     rng = np.random.default_rng(2)
@@ -374,7 +374,7 @@ def test_isolated_splats_look_as_volprim_rf_basic_draws_them():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_border_of_the_film_does_not_change_the_image():
+def test_film_border_does_not_change_the_image():
     scene = Scene(VIEWS[-1])
     image = fresh_image(scene, rfilter="box", samples=1, sample_border=True)
     assert np.array_equal(image, fresh_image(scene, rfilter="box", samples=1))
@@ -391,7 +391,7 @@ def test_formats_of_the_film():
     assert np.allclose(luminance[..., 0], expected, rtol=1e-3)
 
 
-def test_the_film_holds_the_image(tmp_path):
+def test_film_contains_the_image(tmp_path):
     scene = Scene()
     loaded = scene.load(component_format="float16")
     image = image_of(loaded)

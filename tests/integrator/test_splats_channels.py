@@ -43,7 +43,7 @@ def channels_of(scene, kinds) -> np.ndarray:
 @both_color_spaces
 @pytest.mark.parametrize(("pixel_format", "count"), [("rgb", 3), ("rgba", 4)])
 @pytest.mark.parametrize("view", [VIEWS[1], VIEWS[13]], ids=lambda view: view.name)
-def test_depth_and_alpha_are_put_out_behind_the_colors(view, pixel_format, count, srgb_primitives):
+def test_depth_and_alpha_follow_the_colors(view, pixel_format, count, srgb_primitives):
     """In the order in which they are asked for, as linear numbers."""
     scene = clear(Scene(view, srgb_primitives=srgb_primitives))
     sensor = view.sensor(pixel_format=pixel_format)
@@ -65,7 +65,7 @@ def test_depth_and_alpha_are_put_out_behind_the_colors(view, pixel_format, count
         assert loaded.integrator().aov_names() == names[count:]
 
 
-def test_a_kind_may_be_put_out_twice_under_two_names():
+def test_channel_may_be_output_twice_under_two_names():
     scene = Scene()
     image = image_of(with_channels(scene, " first:depth,second:depth ,a:alpha,"))
     np.testing.assert_array_equal(image[..., 4], image[..., 5])
@@ -73,7 +73,7 @@ def test_a_kind_may_be_put_out_twice_under_two_names():
 
 
 @both_color_spaces
-def test_gradients_of_depth_and_alpha_equal_the_references(srgb_primitives):
+def test_gradients_of_depth_and_alpha_match_the_reference(srgb_primitives):
     """With those of the colours, from random weights on all channels."""
     scene = clear(Scene(srgb_primitives=srgb_primitives))
     weights = scene.weights()
@@ -95,7 +95,7 @@ def test_gradients_of_depth_and_alpha_equal_the_references(srgb_primitives):
     )
 
 
-def test_gradients_of_the_channels_are_those_of_a_film_without_alpha():
+def test_gradients_of_channels_are_the_same_on_a_film_without_alpha():
     scene = clear(Scene())
     weights = np.random.default_rng(9).normal(0, 1, (*scene.weights().shape[:2], 5))
     of_rgb = gradients_of(
@@ -133,7 +133,7 @@ def test_forward_mode_of_the_channels_equals_central_differences():
     assert_images_agree(tangent[..., 4:], expected, GRADIENTS)
 
 
-def test_channels_that_are_not_asked_for_cost_nothing():
+def test_unused_channels_cost_nothing():
     """The planes of the frame are those of the features."""
     scene = Scene()
     for aovs, count in (("", 4), ("a:alpha", 4), ("z:depth", 5)):

@@ -226,14 +226,14 @@ def test_parameters_are_assigned_numpy_arrays():
     np.testing.assert_array_equal(integrator.gaussians.means.numpy(), means)
 
 
-def test_numpy_arrays_are_refused_by_mitsuba_with_what_to_do():
+def test_numpy_arrays_are_refused_with_a_remedy():
     """Before the plugin sees them."""
     with pytest.raises(RuntimeError, match=r"\[means\] could .* cast this value into a Dr.Jit arr"):
         mi.load_dict({"type": "splats", **valid(), "means": np.zeros((8, 3))})
 
 
 @pytest.mark.parametrize("degree", [4, -1, 0.0, True])
-def test_the_degree_in_use_is_checked(degree):
+def test_sh_degree_in_use_is_checked(degree):
     integrator = mi.load_dict({"type": "splats", **valid()})
     with pytest.raises(ValueError, match=rf"integer from 0 to 3, got {degree}"):
         integrator.sh_degree = degree
@@ -242,7 +242,7 @@ def test_the_degree_in_use_is_checked(degree):
 
 @pytest.mark.parametrize("use", ["render", "summary"])
 @pytest.mark.parametrize("given", [True, False], ids=["when loaded", "later"])
-def test_a_degree_above_that_of_the_scenes_gaussians_is_refused(given, use):
+def test_degree_above_that_of_the_gaussians_is_refused(given, use):
     """Before that, shapes of the scene might have it."""
     loaded = replace(Scene(), sh_degree=2 if given else None).load()
     integrator = loaded.integrator()
@@ -287,7 +287,7 @@ def test_parameters_that_were_refused_are_not_rendered(name):
     np.testing.assert_array_equal(np.array(mi.render(loaded)), expected)
 
 
-def test_other_sensors_are_refused():
+def test_unsupported_sensors_are_refused():
     loaded = mi.load_dict(
         {
             "type": "scene",

@@ -134,7 +134,7 @@ def kernels_of(action) -> int:
     return sum(kernel["type"] == dr.KernelType.JIT for kernel in history)
 
 
-def test_an_unchanged_scene_is_not_rendered_again():
+def test_unchanged_scene_reuses_the_frame():
     """All that is launched reads the pixels and lays out the image."""
     loaded = Scene().load()
     dr.eval(mi.render(loaded))
@@ -315,7 +315,7 @@ def test_a_stale_frame_is_not_kept():
     assert frame() is None
 
 
-def test_no_graph_stays_behind_after_a_backward_pass():
+def test_backward_pass_leaves_no_autodiff_graph():
     """The film would hold it until the next rendering."""
     scene = Scene()
     loaded = scene.load()

@@ -40,7 +40,7 @@ def variant():
 
 
 @all_settings
-def test_gradients_equal_the_references_for_any_setting(scene):
+def test_gradients_match_the_reference_for_any_setting(scene):
     """Gradients of all parameters, from random weights on colour and alpha."""
     scene = clear(scene)
     names = [n for n in ALL_PARAMETERS if n != "shN" or scene.degree > 0]
@@ -50,7 +50,7 @@ def test_gradients_equal_the_references_for_any_setting(scene):
 
 @both_color_spaces
 @pytest.mark.parametrize("view", [VIEWS[6], VIEWS[10], VIEWS[12]], ids=lambda view: view.name)
-def test_gradients_equal_the_references_from_other_views(view, srgb_primitives):
+def test_gradients_match_the_reference_from_other_views(view, srgb_primitives):
     """A tall film, an off-centre principal point, a crop window."""
     scene = clear(Scene(view, srgb_primitives=srgb_primitives))
     actual = gradients_of(scene.load(), scene.weights())
@@ -76,7 +76,7 @@ def test_gradients_of_a_film_that_converts_colors(pixel_format, matrix):
     assert_gradients_agree(actual, scene.gradients(of_rgba))
 
 
-def test_a_derivative_that_is_not_a_number_reaches_the_parameters():
+def test_nan_derivatives_reach_the_parameters():
     """Dr.Jit's derivative of a gather, such as of the film's pixels, would drop it."""
     scene = Scene()
     weights = scene.weights()
@@ -88,7 +88,7 @@ def test_a_derivative_that_is_not_a_number_reaches_the_parameters():
     assert fault is not None and fault[1] in PARAMETER_NAMES
 
 
-def test_a_film_that_is_not_linear_refuses_gradients(monkeypatch):
+def test_nonlinear_film_refuses_gradients(monkeypatch):
     scene = Scene()
     loaded = scene.load()
     develop = exposure.develop_pixels
@@ -97,7 +97,7 @@ def test_a_film_that_is_not_linear_refuses_gradients(monkeypatch):
         gradients_of(loaded, scene.weights())
 
 
-def test_the_gradient_tests_would_notice_one_percent():
+def test_gradient_tests_detect_one_percent_errors():
     scene = clear(Scene())
     expected = scene.gradients(scene.weights())
     scaled = {name: 1.01 * expected[name] for name in ALL_PARAMETERS}
@@ -121,14 +121,14 @@ def test_only_enabled_parameters_receive_gradients(names):
     assert not any(dr.grad_enabled(params[f"integrator.{name}"]) for name in others)
 
 
-def test_an_image_of_no_enabled_parameter_is_detached():
+def test_image_without_enabled_parameters_is_detached():
     loaded = Scene().load()
     assert not dr.grad_enabled(mi.render(loaded, mi.traverse(loaded)))
     dr.enable_grad(mi.traverse(loaded)["integrator.means"])
     assert not dr.grad_enabled(mi.render(loaded))
 
 
-def test_gradients_reach_what_parameters_were_computed_from():
+def test_gradients_reach_the_inputs_of_parameters():
     """A shift of all means: its gradient is the sum of theirs."""
     scene = clear(Scene())
     loaded = scene.load()
@@ -169,7 +169,7 @@ def test_render_backward_may_be_called_directly(suspended):
         assert np.array_equal(gradient(params[f"integrator.{name}"]), expected[name]), name
 
 
-ASIDE = View("aside", 31, 27, to_world=pose([0.3, -1.0, 0.5], 16, (0.6, -0.9, 0.9)))
+ASIDE_VIEW = View("aside", 31, 27, to_world=pose([0.3, -1.0, 0.5], 16, (0.6, -0.9, 0.9)))
 """Sees 26 of the 40 Gaussians before ``VIEWS[1]``."""
 
 
@@ -187,7 +187,7 @@ def reference_gradients_from(view, scene, weights) -> dict[str, np.ndarray]:
 
 def test_two_views_before_one_backward_pass():
     """The second replaces the first's frame, which the backward pass has to render again."""
-    scene, aside = clear(Scene()), mi.load_dict(ASIDE.sensor())
+    scene, aside = clear(Scene()), mi.load_dict(ASIDE_VIEW.sensor())
     loaded = scene.load()
     params = mi.traverse(loaded)
     for name in ALL_PARAMETERS:
@@ -200,12 +200,12 @@ def test_two_views_before_one_backward_pass():
         loss += dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None).array
     dr.backward(loss)
     from_first = scene.gradients(first + third)
-    from_aside = reference_gradients_from(ASIDE, scene, second)
+    from_aside = reference_gradients_from(ASIDE_VIEW, scene, second)
     actual = {name: gradient(params[f"integrator.{name}"]) for name in ALL_PARAMETERS}
     assert_gradients_agree(actual, {name: from_first[name] + from_aside[name] for name in actual})
 
 
-def test_a_backward_pass_differentiates_the_parameters_of_its_time():
+def test_backward_pass_differentiates_the_current_parameters():
     """Mitsuba's other integrators do the same, since they know only the scene. Documented."""
     before, after = clear(Scene()), clear(Scene(seed=100))
     loaded = before.load()
@@ -221,13 +221,13 @@ def test_a_backward_pass_differentiates_the_parameters_of_its_time():
     assert_gradients_agree(actual, after.gradients(before.weights()))
 
 
-def test_last_holds_what_density_control_needs():
+def test_last_provides_inputs_of_density_control():
     scene = clear(Scene())
     loaded = mi.load_dict(
         {
             "type": "scene",
             "integrator": scene.settings | tensors(scene.gaussians),
-            "sensor": ASIDE.sensor(),
+            "sensor": ASIDE_VIEW.sensor(),
         }
     )
     assert loaded.integrator().last is None
@@ -235,10 +235,10 @@ def test_last_holds_what_density_control_needs():
     gradients_of(loaded, weights, ["means"])
     last = loaded.integrator().last
     actual = {"means2d": np.array(last.means2d_grad).astype(np.float64)}
-    assert_gradients_agree(actual, reference_gradients_from(ASIDE, scene, weights))
+    assert_gradients_agree(actual, reference_gradients_from(ASIDE_VIEW, scene, weights))
 
     # Visible: the box around the ellipse alpha = 1/255 holds a pixel's centre.
-    splats = reference.project(scene.gaussians, ASIDE.camera)
+    splats = reference.project(scene.gaussians, ASIDE_VIEW.camera)
     k = 2 * np.log(np.maximum(splats.opacities / reference.ALPHA_CUT, 1))
     radius = np.sqrt(k[:, None] * np.diagonal(splats.cov2d, axis1=1, axis2=2))
     first = np.maximum(np.ceil(splats.means2d - radius - 0.5), 0)

@@ -54,7 +54,7 @@ IGNORED = {
 
 
 @pytest.mark.parametrize("case", IGNORED)
-def test_what_is_ignored_leaves_a_pinhole_that_stands_still(case):
+def test_ignored_effects_leave_a_static_pinhole(case):
     """And what is not asked to be ignored is seen."""
     ignored, sensor = IGNORED[case]
     scene = Scene()
@@ -72,7 +72,7 @@ def test_what_is_ignored_leaves_a_pinhole_that_stands_still(case):
     assert np.array_equal(image(ignore=", ".join([*others, "smoothing"])), image())
 
 
-def test_an_orthographic_lens_is_no_distortion():
+def test_orthographic_lens_does_not_count_as_distortion():
     """No pinhole could take its place."""
     scene = Scene()
     loaded = mi.load_dict(
@@ -103,7 +103,7 @@ def test_a_plan_of_a_plain_scene():
     )
 
 
-def test_a_plan_names_what_asked_for_each_effect():
+def test_plan_lists_the_setting_of_each_effect():
     sensor = sensor_like(VIEWS[1], **BENT, **moving(shutter="rolling"))
     smoothing = mi.Float(np.full(40, 0.01, np.float32))
     settings = {"sky": True, "degree": 0, "antialiased": True, "smoothing": smoothing}

@@ -42,7 +42,7 @@ MODULES = (
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
     "training.effects.view_parameters",
 )  # fmt: skip
-"""Of effects, and of nothing else."""
+"""Modules used only by effects."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,7 +61,7 @@ def config_of(**changes):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_a_plan_is_a_line_for_each_effect_and_one_for_all_others():
+def test_plan_has_a_line_per_effect_and_one_for_unused_ones():
     effects = [
         SimulatedEffect("a", "much", "x.y"),
         SimulatedEffect("b", None),
@@ -122,7 +122,7 @@ EVERYTHING = {
 }
 
 
-def test_the_plan_of_a_fit_names_what_asked_for_each_effect():
+def test_plan_of_a_fit_lists_the_setting_of_each_effect():
     config = config_of(**EVERYTHING, model__sh_degree=0, cameras__focal_lr=1e-4)
     assert format_effects(summary_of_fit(config, rich_dataset())) == (
         "simulated:\n"
@@ -172,7 +172,7 @@ def test_the_plan_follows_the_configuration(changes, name, expected):
     assert (None if effect.what is None else (effect.what, effect.why)) == expected
 
 
-def test_the_plan_of_a_fit_names_what_its_data_has_and_is_ignored():
+def test_plan_of_a_fit_lists_ignored_data():
     """Not what is ignored and not there."""
     ignored = replace(fits.plain_dataset(), ignored=("distortion", "motion", "masks", "depth"))
     assert format_effects(summary_of_fit(config_of(), ignored)).splitlines()[-1] == (
@@ -192,7 +192,7 @@ def rich_scene(**settings):
     return mi.load_dict({"type": "splats", **gaussians, **settings})
 
 
-def test_the_plan_of_views_regards_all_of_them():
+def test_plan_of_views_covers_all_views():
     views = rich_dataset().train
     assert format_effects(summary_of_views(rich_scene().state, views[1:])) == (
         "simulated:\n"
@@ -204,7 +204,7 @@ def test_the_plan_of_views_regards_all_of_them():
     )
 
 
-def test_the_plan_of_views_names_what_they_have_and_is_ignored():
+def test_plan_of_views_lists_ignored_effects():
     integrator = rich_scene(ignore="distortion, motion, defocus, smoothing")
     assert format_effects(summary_of_views(integrator.state, rich_dataset().train)).splitlines()[
         -1
@@ -233,7 +233,7 @@ def cameras_of_sensors():
     return [camera_from_sensor(read_sensor(mi.load_dict(sensor), 0.01)) for sensor in sensors]
 
 
-def test_the_plan_of_sensors_regards_all_of_them():
+def test_plan_of_sensors_covers_all_sensors():
     cameras = cameras_of_sensors()
     assert format_effects(summary_of_sensors(rich_scene().state, cameras, None)).splitlines()[
         3:
@@ -258,7 +258,7 @@ def test_the_plan_of_sensors_regards_all_of_them():
     ] == ("  not simulated: lens, depth of field, motion, surfaces")
 
 
-def test_the_plan_of_a_fit_says_what_takes_part_in_it():
+def test_plan_of_a_fit_matches_its_effects():
     """Both are made of the same configuration and dataset; neither knows of the other."""
     names = {
         "background": "background",
@@ -284,11 +284,11 @@ def test_the_plan_of_a_fit_says_what_takes_part_in_it():
 
 
 # ----------------------------------------------------------------------------------------------
-# What takes part in a fit
+# Effects of a fit
 # ----------------------------------------------------------------------------------------------
 
 
-def test_nothing_takes_part_in_a_plain_fit():
+def test_plain_fit_has_no_effects():
     assert training_effects(config_of(), fits.plain_dataset()) == []
     assert integrator_settings([]) == {}
     trainer = fits.make_trainer(fits.plain_dataset())
@@ -308,14 +308,14 @@ def test_nothing_takes_part_in_a_plain_fit():
         (EVERYTHING, ["depth", "colors", "background", "masks", "smoothing", "cameras"]),
     ],
 )
-def test_what_is_called_for_takes_part_in_an_order(changes, names):
+def test_effects_of_a_fit_are_ordered(changes, names):
     """Depth is taken off the image first, masks come after what changes colours."""
     effects = training_effects(config_of(**changes), rich_dataset())
     assert [effect.name for effect in effects] == names
     assert integrator_settings(effects) == {"aovs": "depth:depth, alpha:alpha"}
 
 
-def test_everything_takes_part_in_one_fit():
+def test_all_effects_work_in_one_fit():
     """And it learns, and goes on from a checkpoint to the same bytes."""
     dataset = rich_dataset()
     # No camera is bent or moves: the photographs show none of it.
@@ -327,7 +327,7 @@ def test_everything_takes_part_in_one_fit():
     fits.assert_resumes_to_the_same_bytes(lambda: fits.make_trainer(dataset, **changes), 3, 4)
 
 
-def test_a_checkpoint_file_holds_the_state_of_effects(tmp_path):
+def test_checkpoint_contains_the_state_of_effects(tmp_path):
     changes = {key: value for key, value in EVERYTHING.items() if key != "model__antialiased"}
     dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
     trainer = fits.steps(fits.make_trainer(dataset, **changes), 3)
@@ -391,7 +391,7 @@ print(json.dumps(found))
 """
 
 
-def in_a_new_process(run_python, blocked=(), **changes) -> dict:
+def run_in_new_process(run_python, blocked=(), **changes) -> dict:
     """Raises RuntimeError with the process's last line of error."""
     modules = [f"drgs.{name}" for name in MODULES]
     program = PLAIN.format(
@@ -406,10 +406,10 @@ def in_a_new_process(run_python, blocked=(), **changes) -> dict:
     return json.loads(result.stdout)
 
 
-def test_kernels_are_the_same_when_the_modules_of_effects_are_gone(run_python):
+def test_kernels_are_the_same_without_effect_modules(run_python):
     """Hashes and operations of an image with its derivatives, and of a fit's iterations."""
-    whole = in_a_new_process(run_python)
-    reduced = in_a_new_process(run_python, blocked=MODULES)
+    whole = run_in_new_process(run_python)
+    reduced = run_in_new_process(run_python, blocked=MODULES)
     assert whole == reduced
     assert whole["imported"] == []
     assert all(len(kernels) > 30 for name, kernels in whole.items() if name != "imported")
@@ -423,9 +423,9 @@ def test_kernels_are_the_same_when_the_modules_of_effects_are_gone(run_python):
         ({"model__smoothing": True}, "training.effects.smoothing"),
     ],
 )
-def test_what_is_gone_is_missed_when_it_is_called_for(run_python, changes, module):
+def test_missing_module_fails_only_when_its_effect_is_used(run_python, changes, module):
     with pytest.raises(RuntimeError, match=f"drgs.{module} is not there"):
-        in_a_new_process(run_python, blocked=[module], **changes)
+        run_in_new_process(run_python, blocked=[module], **changes)
 
 
 IMPORTS = """
@@ -517,14 +517,14 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
     }
 
 
-def test_a_plain_plugin_has_no_parameter_of_an_effect():
+def test_plain_plugin_has_no_effect_parameters():
     params = mi.traverse(mi.load_dict({"type": "splats", **tensors(Scene().gaussians)}))
     names = ["means", "quats", "log_scales", "logit_opacities", "sh0", "shN"]
     names += ["to_world", "background"]
     assert list(params.keys()) == names
 
 
-def test_a_plain_sensor_has_no_parameter_of_an_effect():
+def test_plain_sensor_has_no_effect_parameters():
     kept = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
     sensor = mi.load_dict({"type": "calibrated", **kept})
     own = {key for key in mi.traverse(sensor).keys() if not key.startswith(("film.", "shutter_"))}  # noqa: SIM118

@@ -63,7 +63,7 @@ def test_gradients_equal_differences_of_the_reference(srgb_primitives):
         assert terms.sum() == pytest.approx(difference, abs=GRADIENTS * size), name
 
 
-def test_the_gradient_of_what_the_wall_shows_is_its_share():
+def test_gradient_of_wall_radiance_is_its_transmittance():
     scene = replace(apart(SCENE), srgb_primitives=True)
     weights = weights_of(scene)
     loaded = load(scene)
@@ -151,12 +151,12 @@ NESTED = {
 
 @pytest.mark.parametrize("mode", ["backward", "forward"])
 @pytest.mark.parametrize("nested", NESTED)
-def test_a_camera_that_moves_surfaces_is_refused_by_its_parameters_name(nested, mode):
+def test_camera_derivatives_with_surfaces_are_refused_by_name(nested, mode):
     check_refused("perspective", ["to_world"], NESTED[nested], mode)
 
 
 @pytest.mark.parametrize("kind", SENSORS)
-def test_parameters_of_all_cameras_are_refused(kind):
+def test_camera_derivatives_with_surfaces_are_refused_for_every_sensor(kind):
     check_refused(kind, SENSORS[kind][1], {}, "backward")
 
 
@@ -180,7 +180,7 @@ def test_gradients_are_the_same_to_the_last_bit():
 
 
 # ----------------------------------------------------------------------------------------------
-# What runs, and when
+# Runs of the nested integrator
 # ----------------------------------------------------------------------------------------------
 
 
@@ -212,7 +212,7 @@ def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
 
 @pytest.mark.parametrize("use", ["an image", "a gradient", "an image with gradients"])
 @pytest.mark.parametrize("with_shapes", [False, True])
-def test_a_scene_is_freed_when_nobody_holds_it(use, with_shapes):
+def test_unreferenced_scene_is_freed(use, with_shapes):
     """Though its integrator keeps what it saw of it."""
     loaded = load(SCENE, sky=True, shapes={"blob": blob([0, 0, 0])} if with_shapes else {})
     params = mi.traverse(loaded)
@@ -227,7 +227,7 @@ def test_a_scene_is_freed_when_nobody_holds_it(use, with_shapes):
     assert integrator() is None
 
 
-def test_samples_of_the_nested_integrator_are_not_those_of_the_splats():
+def test_nested_samples_are_independent_of_the_splats():
     """Whatever the nested integrator writes into the sensor's sampler."""
     scene, weights = apart(SCENE), weights_of(SCENE)
     loaded = load(scene, nested_spp=16)
@@ -239,7 +239,7 @@ def test_samples_of_the_nested_integrator_are_not_those_of_the_splats():
 
 
 @pytest.mark.parametrize("mode", ["backward", "forward"])
-def test_derivatives_of_a_surface_leave_the_number_of_samples(mode):
+def test_surface_derivatives_keep_the_sample_count(mode):
     loaded = load(apart(SCENE), nested_spp=16)
     params = mi.traverse(loaded)
     dr.enable_grad(params[RADIANCE_KEY])
@@ -250,7 +250,7 @@ def test_derivatives_of_a_surface_leave_the_number_of_samples(mode):
     assert loaded.sensors()[0].sampler().sample_count() == 1
 
 
-def test_a_nested_integrator_can_be_given():
+def test_nested_integrator_can_be_set():
     """``direct`` does not see a light by way of another surface."""
     scene = load(apart(SCENE), nested=mi.load_dict({"type": "direct"}))
     np.testing.assert_allclose(
@@ -260,7 +260,7 @@ def test_a_nested_integrator_can_be_given():
 
 
 @pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
-def test_samples_of_the_nested_integrator_are_left_to_it(spp):
+def test_nested_integrator_keeps_its_own_sample_count(spp):
     """Mitsuba's integrators leave their count with the sampler: the next image is the same."""
     loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
     first = image_of(loaded, spp=spp, seed=3)
@@ -269,7 +269,7 @@ def test_samples_of_the_nested_integrator_are_left_to_it(spp):
     np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
 
 
-def test_gradients_are_those_of_the_image_whatever_the_nested_samples():
+def test_gradients_match_the_image_for_any_nested_samples():
     """Splats at the centres of pixels, before a wall that covers the film and has no noise."""
     scene, weights = apart(SCENE), weights_of(SCENE)
     alone = gradients_of(load(scene), weights, ["means"])["means"]
@@ -277,7 +277,7 @@ def test_gradients_are_those_of_the_image_whatever_the_nested_samples():
     np.testing.assert_allclose(with_more, alone, rtol=0, atol=GRADIENTS * np.abs(alone).max())
 
 
-def test_a_wall_that_has_moved_is_seen_where_it_is():
+def test_moved_wall_is_rendered_at_its_new_place():
     scene = apart(SCENE)
     loaded = load(scene)
     image_of(loaded)
@@ -288,7 +288,7 @@ def test_a_wall_that_has_moved_is_seen_where_it_is():
     np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, wall=Wall(z=2.9))))
 
 
-def test_an_image_in_between_does_not_change_the_gradients():
+def test_rendering_another_image_keeps_gradients():
     scene, weights = apart(SCENE), weights_of(SCENE)
     loaded = load(scene)
     expected = gradients_of(loaded, weights, ["means"])["means"]
@@ -301,7 +301,7 @@ def test_an_image_in_between_does_not_change_the_gradients():
     np.testing.assert_array_equal(gradient(params["integrator.means"]), expected)
 
 
-def test_gaussians_of_shapes_are_splats_and_no_surfaces():
+def test_gaussians_of_shapes_are_not_surfaces():
     """They equal the integrator's own, and the nested image does not show them."""
     scene = apart(SCENE)
     center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center

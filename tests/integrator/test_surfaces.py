@@ -46,7 +46,7 @@ def variant():
 @pytest.mark.parametrize("scene", [SCENE, CROPPED], ids=lambda scene: scene.view.name)
 @pytest.mark.parametrize("srgb_primitives", [False, True])
 @pytest.mark.parametrize("sky", [None, SKY], ids=["constant background", "sky"])
-def test_a_wall_hides_what_is_behind_it_and_is_hidden_by_what_is_before(
+def test_wall_occludes_splats_behind_it_and_is_occluded_by_splats_before(
     scene, srgb_primitives, sky
 ):
     scene = apart(replace(scene, srgb_primitives=srgb_primitives))
@@ -69,7 +69,7 @@ def covered_by(wall, camera, count=32) -> np.ndarray:
     return share / count**2
 
 
-def test_a_wall_that_covers_a_part_of_the_film_ends_where_rays_say():
+def test_edges_of_a_wall_match_ray_coverage():
     """Pixels that it covers are as before it, others as without it, those at its edge between."""
     scene, wall = apart(SCENE), Wall(half=0.5)
     image = image_of(load(scene, wall=wall, nested_spp=1024))
@@ -85,7 +85,7 @@ def test_a_wall_that_covers_a_part_of_the_film_ends_where_rays_say():
     assert np.all(np.abs(image - share * whole - (1 - share) * without) <= tolerance)
 
 
-def test_without_splats_the_image_is_the_nested_one():
+def test_image_without_splats_is_the_nested_image():
     """With an environment that is seen past the edges of the wall, and a mirror that shows it."""
     scene = apart(SCENE)
     empty = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
@@ -100,13 +100,13 @@ def test_without_splats_the_image_is_the_nested_one():
         image = image_of(loaded, seed=3)
         nested = image_of(loaded, integrator=mi.load_dict({"type": "path"}), spp=64, seed=3)
         difference = np.abs(image - nested)
-        # Where none of the 16 rays at an edge meets what one of the 64 did, the surface is lost:
-        # an eighth of a pixel at most, seen by some more of 64 random samples.
+        # A surface at an edge that one of 64 rays meets may be missed by all 16: an eighth of a
+        # pixel at most, seen by some more of 64 random samples.
         assert (difference[..., :3].max(axis=-1) > 1e-5).mean() < 0.02
         assert difference.max() < 0.125 + 0.1
 
 
-def test_several_samples_of_a_pixel_each_have_their_depth():
+def test_each_sample_of_a_pixel_has_its_own_depth():
     """The mean over the samples, of a wall whose edge crosses pixels."""
     scene, count = apart(SCENE), 256
     sensor = scene.view.sensor(samples=count)
@@ -121,7 +121,7 @@ def test_several_samples_of_a_pixel_each_have_their_depth():
 
 
 @pytest.mark.parametrize("pixel_format", ["luminance", "luminance_alpha", "xyz", "xyza", "rgb"])
-def test_films_of_other_formats_show_the_same(pixel_format):
+def test_other_film_formats_show_the_same_image(pixel_format):
     scene = replace(apart(SCENE), srgb_primitives=True)
     image = image_of(load(scene, scene.view.sensor(pixel_format), sky=True))
     rgb = rgba(scene, sky=SKY)
@@ -139,7 +139,7 @@ def test_films_of_other_formats_show_the_same(pixel_format):
     np.testing.assert_allclose(image, colors, rtol=0, atol=IMAGE * image.max())
 
 
-def test_the_film_holds_the_image_when_it_is_not_developed():
+def test_film_contains_the_image_with_develop_false():
     scene = load(apart(SCENE), sky=True)
     image = image_of(scene)
     nothing = scene.integrator().render(scene, develop=False)
@@ -147,7 +147,7 @@ def test_the_film_holds_the_image_when_it_is_not_developed():
     np.testing.assert_array_equal(np.array(scene.sensors()[0].film().develop()), image)
 
 
-def test_depth_alpha_and_normal_are_those_of_both():
+def test_depth_alpha_and_normal_include_surfaces_and_splats():
     scene = apart(SCENE)
     image = image_of(load(scene, aovs="z:depth, a:alpha, n:normal"))
     planes = expected(scene)
@@ -161,7 +161,7 @@ def test_depth_alpha_and_normal_are_those_of_both():
     np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=IMAGE)
 
 
-def test_depth_of_surfaces_is_that_of_mitsubas_own_positions():
+def test_depth_of_surfaces_matches_mitsubas_position_aov():
     """Pixels with surfaces alone, and one whose splats are all in front of them."""
     scene, wall = apart(SCENE), Wall(tilt=(0.3, -0.2))
     bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
@@ -189,7 +189,7 @@ def feature(scene) -> dict:
 
 
 @pytest.mark.parametrize("rfilter", ["gaussian", "tent"])
-def test_one_sample_that_is_anywhere_in_its_pixel_sees_surfaces(rfilter):
+def test_single_jittered_sample_sees_surfaces(rfilter):
     """Mitsuba's default filter, with a sample count of 1."""
     scene = apart(SCENE)
     bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
@@ -201,7 +201,7 @@ def test_one_sample_that_is_anywhere_in_its_pixel_sees_surfaces(rfilter):
     )
 
 
-def test_emitters_that_are_hidden_are_looked_through():
+def test_hidden_emitters_are_transparent():
     scene = apart(SCENE)
     hidden = image_of(load(scene, hide_emitters=True))
     np.testing.assert_array_equal(hidden, image_of(load(scene, wall=None)))
@@ -216,14 +216,14 @@ def test_emitters_that_are_hidden_are_looked_through():
     np.testing.assert_allclose(hidden[..., 4], planes["depth"], rtol=0, atol=4e-4)
 
 
-def test_surfaces_nearer_than_the_near_plane_are_not_seen():
+def test_surfaces_before_the_near_plane_are_invisible():
     scene = apart(replace(SCENE, near=0.5))
     shapes = {"close": Wall(z=0.4, tilt=(0, 0)).shape(scene.camera)}
     image = image_of(load(scene, shapes=shapes, aovs="z:depth"))
     np.testing.assert_allclose(image[..., 4], expected(scene)["depth"], rtol=0, atol=IMAGE * 4)
 
 
-def test_surfaces_beyond_the_far_clip_are_not_seen():
+def test_surfaces_beyond_the_far_clip_are_invisible():
     """``path`` does the same. Splats are seen there."""
     scene = apart(SCENE)
     loaded = load(scene, sensor=scene.view.sensor() | {"far_clip": 1.5}, aovs="z:depth")
@@ -246,7 +246,7 @@ def masked(opacity) -> dict:
 
 
 @pytest.mark.parametrize("bsdf", [{"type": "null"}, masked(0.0)], ids=["null", "mask"])
-def test_surfaces_that_let_everything_pass_hide_nothing(bsdf):
+def test_fully_transparent_surfaces_are_invisible(bsdf):
     scene = apart(SCENE)
     image = image_of(load(scene, shapes={"pane": pane(1.7, bsdf)}, aovs="z:depth,n:normal"))
     expected = image_of(load(scene, aovs="z:depth,n:normal"))
@@ -256,7 +256,7 @@ def test_surfaces_that_let_everything_pass_hide_nothing(bsdf):
 
 @pytest.mark.parametrize("nested", ["path", "prb"])
 @pytest.mark.parametrize("srgb_primitives", [True, False])
-def test_splats_are_seen_between_a_window_and_what_stands_behind_it(srgb_primitives, nested):
+def test_splats_between_windows_and_a_wall_are_visible(srgb_primitives, nested):
     """Each of two windows and a wall lies at its own depth; a third window is invisible."""
     scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
     windows = [(Wall(z=1.6), 0.25), (Wall(z=1.9), 0.5)]
@@ -274,7 +274,7 @@ def test_splats_are_seen_between_a_window_and_what_stands_behind_it(srgb_primiti
     np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=8e-4)
 
 
-def test_edges_are_the_same_at_the_border_of_a_crop_window():
+def test_surface_edges_match_at_the_border_of_a_crop_window():
     scene, (x, y, width, height) = apart(SCENE), (9, 4, 17, 9)
     wall = Wall(half=0.5)
     planes = covered_by(wall, scene.camera)[y : y + height, x : x + width]
@@ -294,7 +294,7 @@ def test_edges_are_the_same_at_the_border_of_a_crop_window():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_users_scene_stays_as_it_is():
+def test_scene_of_the_user_is_not_modified():
     """Names of its objects, and what Mitsuba's own integrators see, with Gaussians of shapes."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)}
     shapes = {"floor": floor, "sun": {"type": "directional"}, "blob": blob([0, 0, 0])}
@@ -358,7 +358,7 @@ def test_one_integrator_can_render_a_scene_with_and_without_mitsubas_gaussians()
         np.testing.assert_array_equal(image_of(loaded, integrator=one), fresh)
 
 
-def test_numbers_of_the_host_count_too():
+def test_changed_host_values_are_noticed():
     """A lamp of which the sampling weight becomes zero, in a scene with Mitsuba's Gaussians."""
     lamps = {
         f"lamp_{k}": {"type": "point", "position": list(SCENE.camera.center + k)} for k in range(2)
@@ -390,7 +390,7 @@ def test_two_nested_integrators_are_refused():
 
 
 @pytest.mark.parametrize("value", [-1, 1.5, True])
-def test_counts_of_samples_that_are_none_are_refused(value):
+def test_invalid_sample_counts_are_refused(value):
     with pytest.raises(RuntimeError, match="nested_spp must be an integer from 0 to"):
         load(SCENE, nested_spp=value)
 

@@ -17,7 +17,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def in_two_threads(work):
+def run_in_two_threads(work):
     """Return ``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
     results = [None, None]
 
@@ -46,7 +46,7 @@ def scene_of(view, **objects):
 
 
 @pytest.mark.parametrize("shared", [True, False], ids=["one scene", "two scenes"])
-def test_two_threads_get_the_images_that_one_gets(shared):
+def test_two_threads_render_the_same_images_as_one(shared):
     """From sensors in turn, so that no frame is that of the image before."""
     first = scene_of(VIEWS[1])
     scenes = [first, first if shared else scene_of(VIEWS[3])]
@@ -56,12 +56,12 @@ def test_two_threads_get_the_images_that_one_gets(shared):
         turns = [n % 2 for n in range(10)]
         return [(s, image_of(scenes[number], sensor=2 * number + s)) for s in turns]
 
-    for number, images in enumerate(in_two_threads(work)):
+    for number, images in enumerate(run_in_two_threads(work)):
         for sensor, rendered in images:
             np.testing.assert_array_equal(rendered, expected[number][sensor])
 
 
-def test_one_integrator_makes_one_image_at_a_time():
+def test_integrator_renders_one_image_at_a_time():
     """Its frames, its film and the nested integrator's recordings are not those of two."""
     active, most = [], []
 
@@ -82,5 +82,5 @@ def test_one_integrator_makes_one_image_at_a_time():
     sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(2)}
     floor = {"type": "rectangle"}
     loaded = mi.load_dict({"type": "scene", "integrator": integrator, "floor": floor, **sensors})
-    in_two_threads(lambda number: [image_of(loaded, sensor=number) for _ in range(3)])
+    run_in_two_threads(lambda number: [image_of(loaded, sensor=number) for _ in range(3)])
     assert most == [1] * 6

@@ -109,7 +109,7 @@ def test_isolated_splats_agree_with_volprim(splats):
     assert_within(difference_of(gaussians, view), allowed)
 
 
-def test_the_same_numbers_agree_where_the_low_pass_is_small():
+def test_unmodified_splats_agree_with_volprim_if_the_low_pass_is_negligible():
     """Nothing is undone: drgs's variances on the film, at least 18^2 px^2, are larger by 0.3."""
     splats = Splats(angle=0.005, sizes=((27.0, 22.0, 18.0),), film=128)
     gaussians, view = splats.gaussians, splats.view
@@ -120,7 +120,7 @@ def test_the_same_numbers_agree_where_the_low_pass_is_small():
 
 
 @all_scenes
-def test_nothing_but_the_derived_difference_sets_them_apart(splats):
+def test_difference_from_volprim_is_the_derived_one(splats):
     """Only rounding is left when it is subtracted."""
     gaussians, view = splats.gaussians, splats.view
     on_film = footprints(gaussians, view.camera, widened(gaussians, view.camera))
@@ -204,7 +204,7 @@ def observed_orders(splats, angles) -> np.ndarray:
 
 
 @pytest.mark.parametrize("splats", FIRST_ORDER.values(), ids=FIRST_ORDER.keys())
-def test_the_difference_is_of_first_order_where_depth_goes_with_place(splats):
+def test_difference_is_first_order_if_depth_correlates_with_position(splats):
     """In alpha it is rho^2 exp(-rho^2 / 2) e.kappa, at most 1.16 |kappa|.
 
     It is followed by at most (w rho^4 / 2 + 2 kappa^2 rho^4 + kappa^2 rho^6 / 2) exp(-rho^2 / 2),
@@ -216,7 +216,7 @@ def test_the_difference_is_of_first_order_where_depth_goes_with_place(splats):
 
 
 @pytest.mark.parametrize("splats", SECOND_ORDER.values(), ids=SECOND_ORDER.keys())
-def test_the_difference_is_of_second_order_where_it_does_not(splats):
+def test_difference_is_second_order_otherwise(splats):
     """In alpha it is w rho^4 / 2 exp(-rho^2 / 2), largest at rho = 2.
 
     The next term is that times w (rho^4 / 4 - rho^2), which vanishes there: less than w = 0.02.

@@ -49,26 +49,26 @@ def with_axes_exchanged(gaussians, camera):
     return replace(gaussians, log_scales=gaussians.log_scales[:, [1, 0, 2]])
 
 
-def two_percent_wider(gaussians, camera):
+def widened_by_two_percent(gaussians, camera):
     return replace(gaussians, log_scales=gaussians.log_scales + 0.02)
 
 
-def a_tenth_of_a_pixel_to_the_right(gaussians, camera):
+def shifted_by_a_tenth_of_a_pixel(gaussians, camera):
     z = (gaussians.means - camera.center) @ camera.rotation[2]
     shift = 0.1 * z[:, None] / camera.fx * camera.rotation[0]
     return replace(gaussians, means=gaussians.means + shift)
 
 
-def half_a_percent_more_opaque(gaussians, camera):
+def more_opaque_by_half_a_percent(gaussians, camera):
     opacities = 1.005 * opacities_of(gaussians)
     return replace(gaussians, logit_opacities=np.log(opacities / (1 - opacities)))
 
 
-def a_thousandth_brighter(gaussians, camera):
+def brighter_by_a_thousandth(gaussians, camera):
     return replace(gaussians, sh0=gaussians.sh0 + 0.001 / reference.C_00)
 
 
-def in_another_order(gaussians, camera):
+def with_swapped_depths(gaussians, camera):
     """The first splat in the second's place in depth, the image of each unchanged."""
     factors = np.array([4.0, 1.0])
     means = camera.center + (gaussians.means - camera.center) * factors[:, None]
@@ -85,22 +85,24 @@ def with_coefficients_in_another_order(gaussians, camera):
     return replace(gaussians, shN=gaussians.shN.transpose(0, 2, 1).reshape(gaussians.shN.shape))
 
 
-WRONG = (
+WRONG_SPLATS = (
     (SMALL, conjugated),
     (SMALL, with_quats_read_as_xyzw),
     (SMALL, with_axes_exchanged),
-    (SMALL, two_percent_wider),
-    (SMALL, a_tenth_of_a_pixel_to_the_right),
-    (SMALL, half_a_percent_more_opaque),
-    (SMALL, a_thousandth_brighter),
-    (TWO, in_another_order),
+    (SMALL, widened_by_two_percent),
+    (SMALL, shifted_by_a_tenth_of_a_pixel),
+    (SMALL, more_opaque_by_half_a_percent),
+    (SMALL, brighter_by_a_thousandth),
+    (TWO, with_swapped_depths),
     (COLORED, seen_from_behind),
     (COLORED, with_coefficients_in_another_order),
 )
 
 
-@pytest.mark.parametrize("splats, wrong", WRONG, ids=[wrong.__name__ for _, wrong in WRONG])
-def test_the_bound_refuses_splats(splats, wrong):
+@pytest.mark.parametrize(
+    "splats, wrong", WRONG_SPLATS, ids=[wrong.__name__ for _, wrong in WRONG_SPLATS]
+)
+def test_bound_rejects_wrong_splats(splats, wrong):
     gaussians, view = splats.gaussians, splats.view
     covariance = widened(gaussians, view.camera)
     expected = volprim_image(gaussians, view, *axes_of(covariance))
@@ -109,7 +111,7 @@ def test_the_bound_refuses_splats(splats, wrong):
         assert_within(difference, bound(gaussians, view.camera, covariance))
 
 
-def test_the_bound_refuses_splats_without_the_low_pass():
+def test_bound_rejects_splats_without_the_low_pass():
     gaussians, view = SMALL.gaussians, SMALL.view
     covariance = covariances(gaussians)
     difference = volprim_image(gaussians, view, *axes_of(covariance)) - drgs_image(gaussians, view)

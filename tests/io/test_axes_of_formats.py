@@ -19,8 +19,8 @@ ROUNDING = {
     "glb": 0,
     "splat": 1 / 255,
 }
-"""By name of a format: the largest error of a coefficient, which is more than any other error of a
-colour; of ``splat``, which has none, of a base colour."""
+"""Largest error of an SH coefficient by format, which exceeds any other error of a colour; for
+``splat``, which has none, of a base colour."""
 
 
 def asymmetric_scene() -> Gaussians:
@@ -53,7 +53,7 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
 
 @pytest.mark.parametrize("each", readable_formats(), ids=lambda each: each.name)
 @pytest.mark.filterwarnings("ignore:.*left out")
-def test_a_scene_looks_the_same_in_the_axes_of_the_file(tmp_path, each):
+def test_scene_renders_the_same_in_the_axes_of_the_file(tmp_path, each):
     scene = asymmetric_scene()
     scene.save(tmp_path / f"a{each.value.suffix}")
     if not each.value.has_harmonics:

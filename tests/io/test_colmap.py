@@ -13,7 +13,7 @@ from drgs.io.colmap import MODELS, ColmapCamera, model_files, read_model, read_p
 
 MUTATIONS = 500  # of each format
 
-REAL = SHARED_DATA / "colmap_robothead" / "sparse" / "0"
+REAL_MODEL = SHARED_DATA / "colmap_robothead" / "sparse" / "0"
 
 each_format = pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 
@@ -40,12 +40,12 @@ def test_written_models_are_read_back(tmp_path, model, write):
 
 
 @each_format
-def test_without_points_there_are_none(tmp_path, model, write):
+def test_model_without_points_has_no_points(tmp_path, model, write):
     read = read_model(write(tmp_path, model, with_points=False))
     assert read.points_file is None and not read.has_points
 
 
-def test_binary_files_are_read_where_there_are_both(tmp_path, model):
+def test_binary_files_are_preferred_to_text(tmp_path, model):
     write_text(tmp_path, model)
     assert model_files(tmp_path)["images"].suffix == ".txt"
     write_binary(tmp_path, model)
@@ -53,7 +53,7 @@ def test_binary_files_are_read_where_there_are_both(tmp_path, model):
     assert model_files(tmp_path / "nothing") is None
 
 
-def test_parameters_have_names(tmp_path):
+def test_camera_parameters_are_named(tmp_path):
     cameras = [(k, name, 640, 480, values) for k, (name, values) in enumerate(PARAMETERS.items())]
     for name, write in WRITERS.items():
         read = read_model(write(tmp_path / name, Model(cameras))).cameras
@@ -100,7 +100,7 @@ def pycolmap():
     return pytest.importorskip("pycolmap")
 
 
-def test_every_model_is_read_as_colmap_reads_it(tmp_path, pycolmap):
+def test_every_model_is_read_like_colmap(tmp_path, pycolmap):
     rng = np.random.default_rng(4)
     for name, (number, _) in MODELS.items():
         if name not in PARAMETERS:
@@ -113,10 +113,10 @@ def test_every_model_is_read_as_colmap_reads_it(tmp_path, pycolmap):
             assert_as_colmap_reads(pycolmap, write(tmp_path / name / kind, model))
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the shared data folder is not here")
-def test_a_real_model_is_read_as_colmap_reads_it(tmp_path, pycolmap):
-    assert_as_colmap_reads(pycolmap, REAL)
-    reconstruction = pycolmap.Reconstruction(str(REAL))
+@pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
+def test_real_model_is_read_like_colmap(tmp_path, pycolmap):
+    assert_as_colmap_reads(pycolmap, REAL_MODEL)
+    reconstruction = pycolmap.Reconstruction(str(REAL_MODEL))
     for write in (reconstruction.write_text, reconstruction.write_binary):
         write(str(tmp_path))
         assert_as_colmap_reads(pycolmap, tmp_path)
@@ -198,7 +198,7 @@ def test_a_wrong_word_in_a_text_file_is_refused(tmp_path, model, file, old, new,
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
 @pytest.mark.parametrize("name", ["a.jpg", "my photo 1.jpg"])  # the latter line has 12 words
-def test_images_of_one_line_each_are_read(tmp_path, model, ending, name):
+def test_images_with_one_line_each_are_read(tmp_path, model, ending, name):
     """Exporters leave out the lines of what images observe."""
     model.images = [(name, *model.images[0][1:]), *model.images[1:]]
     file = write_text(tmp_path, model) / "images.txt"
@@ -232,7 +232,7 @@ def test_a_folder_without_a_model_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_binary_file_that_was_cut_off_is_refused_wherever_it_ends(tmp_path, model, name):
+def test_truncated_binary_file_is_refused_at_any_length(tmp_path, model, name):
     path = write_binary(tmp_path, model) / f"{name}.bin"
     whole = path.read_bytes()
     for end in range(len(whole)):
@@ -243,7 +243,7 @@ def test_a_binary_file_that_was_cut_off_is_refused_wherever_it_ends(tmp_path, mo
 
 
 @each_format
-def test_damaged_files_are_read_or_refused_by_file_and_place(tmp_path, model, write):
+def test_damaged_files_are_read_or_refused_with_file_and_place(tmp_path, model, write):
     """Bytes are changed, left out or put in: nothing comes but a UserError with the place."""
     rng = np.random.default_rng(5)
     write(tmp_path, model)

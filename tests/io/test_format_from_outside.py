@@ -55,7 +55,7 @@ def test_gaussians_are_saved_and_loaded(installed, tmp_path):
         np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
 
 
-def test_a_plugin_renders_the_file(installed, tmp_path):
+def test_plugin_renders_the_file(installed, tmp_path):
     mi.set_variant("llvm_ad_rgb")
     images = []
     for name in ("a.npz", "a.ply"):
@@ -85,7 +85,7 @@ def test_commands_export_and_render_it(installed, tmp_path):
     assert list((tmp_path / "out").glob("**/*.png"))
 
 
-def test_helps_and_messages_list_it(installed, tmp_path):
+def test_help_and_messages_list_the_format(installed, tmp_path):
     _, text = drgs(installed, "export", "--help")
     assert "npz: NumPy's archive of arrays" in " ".join(text.split())
     (tmp_path / "a.obj").touch()
@@ -111,13 +111,13 @@ ARRAYS = {name: getattr(blobs(), name) for name in PARAMETER_NAMES}
         ),
     ],
 )
-def test_what_it_raises_is_reported_with_its_name(installed, tmp_path, content, reason):
+def test_errors_of_the_format_are_reported_with_its_name(installed, tmp_path, content, reason):
     np.savez(tmp_path / "a.npz", **content)
     with pytest.raises(UserError, match=rf'a\.npz: file format "npz" \(npz_format\): {reason}'):
         Gaussians.load(tmp_path / "a.npz")
 
 
-def test_what_it_raises_when_it_writes_ends_a_command_with_a_line(installed, tmp_path):
+def test_error_while_writing_ends_a_command_with_one_line(installed, tmp_path):
     module = installed / "npz_format.py"
     module.write_text(module.read_text().replace("return content.getvalue()", "return 1 / 0"))
     blobs().save(tmp_path / "a.ply")
@@ -135,7 +135,7 @@ def test_a_format_without_a_suffix_is_refused_with_its_package(installed):
         formats.format_for("a.npz")
 
 
-def test_a_broken_package_does_not_disturb_formats_that_drgs_ships(installed, tmp_path):
+def test_broken_package_does_not_affect_shipped_formats(installed, tmp_path):
     (installed / "npz_format.py").write_text("import no_such_module")
     blobs().save(tmp_path / "a.ply")
     assert Gaussians.load(tmp_path / "a.ply").num_gaussians == 30
@@ -143,14 +143,14 @@ def test_a_broken_package_does_not_disturb_formats_that_drgs_ships(installed, tm
         blobs().save(tmp_path / "a.npz")
 
 
-def test_a_suffix_that_drgs_has_stays_its_own(installed):
+def test_shipped_suffix_cannot_be_replaced(installed):
     module = installed / "npz_format.py"
     module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = ".ply"'))
     assert formats.format_for("a.ply").name == "ply"
     assert {each.name for each in formats.file_formats()} >= {"npz", "ply"}
 
 
-def test_numbers_that_are_not_finite_are_refused(installed, tmp_path):
+def test_nonfinite_numbers_are_refused(installed, tmp_path):
     means = ARRAYS["means"].copy()
     means[3, 1] = np.nan
     np.savez(tmp_path / "a.npz", **{**ARRAYS, "means": means, "rendered_with": "{}"})

@@ -34,7 +34,7 @@ checked = pytest.mark.parametrize(
 
 @each_format
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_written_is_read_within_the_format_s_precision(tmp_path, each, degree):
+def test_round_trip_is_within_the_precision_of_the_format(tmp_path, each, degree):
     path, expected = tmp_path / f"a{each.value.suffix}", gaussians_within_ranges(degree=degree)
     expected.save(path)
     found = Gaussians.load(path)
@@ -51,7 +51,7 @@ def test_equal_gaussians_give_equal_bytes(each):
 
 
 @each_format
-def test_one_gaussian_is_enough(tmp_path, each):
+def test_single_gaussian_survives_a_round_trip(tmp_path, each):
     path, expected = tmp_path / f"a{each.value.suffix}", gaussians_within_ranges(1, degree=0)
     expected.save(path)
     assert_within(PRECISION[each.name], expected, Gaussians.load(path))
@@ -99,12 +99,12 @@ def test_the_longest_suffix_decides_the_format():
     assert format_for("a.obj") is None
 
 
-def test_another_suffix_is_not_written(tmp_path):
+def test_unknown_suffix_is_not_written(tmp_path):
     with pytest.raises(UserError, match=r"a.obj: the name must end in one of \.ply, "):
         gaussians_within_ranges(5).save(tmp_path / "a.obj")
 
 
-def test_compressed_elements_behind_lists_are_missed(tmp_path):
+def test_compressed_elements_after_lists_are_refused(tmp_path):
     """The end of a list is unknown; harmonics behind it are not taken for none."""
     content = gaussians_within_ranges(5).to_bytes("compressed-ply")
     lists = b"element foo 1\nproperty list uchar int bar\nelement sh"
@@ -114,7 +114,7 @@ def test_compressed_elements_behind_lists_are_missed(tmp_path):
         Gaussians.load(path)
 
 
-def test_a_compressed_file_needs_no_suffix_of_its_own(tmp_path):
+def test_compressed_file_is_recognised_without_its_suffix(tmp_path):
     expected = gaussians_within_ranges(300)
     (tmp_path / "a.ply").write_bytes(expected.to_bytes("compressed-ply"))
     found = matched(expected, Gaussians.load(tmp_path / "a.ply"))
@@ -147,7 +147,7 @@ def test_damaged_files_are_read_or_refused_by_file(tmp_path, each):
 
 
 @checked
-def test_a_file_that_was_cut_off_is_refused_wherever_it_ends(tmp_path, each):
+def test_truncated_file_is_refused_at_any_length(tmp_path, each):
     path = tmp_path / f"a{each.value.suffix}"
     content = gaussians_within_ranges(1, degree=1).to_bytes(each.name)
     for end in range(0, len(content), max(1, len(content) // 200)):
@@ -156,7 +156,7 @@ def test_a_file_that_was_cut_off_is_refused_wherever_it_ends(tmp_path, each):
             Gaussians.load(path)
 
 
-def test_bounds_of_a_compressed_file_leave_finite_numbers_or_are_refused(tmp_path):
+def test_bounds_of_a_compressed_file_give_finite_numbers_or_are_refused(tmp_path):
     path = tmp_path / "a.compressed.ply"
     gaussians_within_ranges().save(path)
     rows, _ = read_elements(path, ["chunk", "vertex", "sh"])

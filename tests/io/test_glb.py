@@ -100,7 +100,7 @@ def test_extras_record_rendered_with(tmp_path, gaussians):
 
 
 @pytest.mark.parametrize("extras", [7, None, [{"drgs": 1}], {"theirs": {"low_pass": []}}])
-def test_extras_of_others_are_ignored(tmp_path, parts, extras):
+def test_foreign_extras_are_ignored(tmp_path, parts, extras):
     document, binary = parts
     primitive_of(document)["extras"] = extras
     (tmp_path / "a.glb").write_bytes(joined(document, binary))
@@ -119,7 +119,7 @@ def test_extras_of_others_are_ignored(tmp_path, parts, extras):
         {"Two words": 1},
     ],
 )
-def test_extras_of_ours_that_are_damaged_are_refused(tmp_path, parts, said):
+def test_damaged_drgs_extras_are_refused(tmp_path, parts, said):
     document, binary = parts
     primitive_of(document)["extras"] = {"drgs": said}
     refused = refusal(tmp_path / "a.glb", document, binary)
@@ -218,7 +218,7 @@ PRIMITIVE = "meshes 0 primitives 0"
         ("meshes", {}, "meshes: Input should be a valid list, got {}"),
     ],
 )
-def test_a_document_that_cannot_be_read_is_refused(tmp_path, parts, path, value, message):
+def test_invalid_document_is_refused(tmp_path, parts, path, value, message):
     document, binary = parts
     edited(document, path, value)
     assert refusal(tmp_path / "a.glb", document, binary).startswith(message)
@@ -244,7 +244,7 @@ def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute,
     assert text.startswith("byte ") and f", row 5: {name} {message}" in text
 
 
-def test_numbers_that_have_no_logarithm_are_the_next_that_have(tmp_path):
+def test_zero_scales_and_opacities_are_clamped_before_the_logarithm(tmp_path):
     gaussians = gaussians_within_ranges(3, degree=0)
     gaussians.log_scales[1] = -300
     gaussians.logit_opacities[:] = [-300, 0, 300]

@@ -39,14 +39,14 @@ def assert_found_alike(path, degree):
 
 @pytest.mark.parametrize("suffix", READERS)
 @pytest.mark.parametrize("degree", [0, 3])
-def test_it_reads_what_is_written_here(tmp_path, suffix, degree):
+def test_our_files_are_read_by_it(tmp_path, suffix, degree):
     path = tmp_path / f"ours{suffix}"
     gaussians_within_ranges(degree=degree).save(path)
     assert_found_alike(path, degree)
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_what_it_writes_as_spz_is_read_here(tmp_path, version):
+def test_its_spz_files_are_read_here(tmp_path, version):
     if version == 4:
         pytest.importorskip("zstandard")
     gaussians_within_ranges().save(tmp_path / "ours.spz")

@@ -32,7 +32,7 @@ def gaussians_with(logits):
 # Infinite logits
 
 
-def test_infinite_logits_are_opacities_that_a_sigmoid_tells_from_1_and_0(tmp_path):
+def test_infinite_logits_become_opacities_distinct_from_0_and_1(tmp_path):
     """Files that went through SPZ or compressed PLY contain opacities 0 and 255 of 8 bits."""
     path = tmp_path / "a.ply"
     gaussians_with([0.5, np.inf, -np.inf, np.inf, 80.0]).save(path)
@@ -58,7 +58,7 @@ def test_finite_logits_are_read_without_a_note(tmp_path):
     np.testing.assert_array_equal(opacities[2:], [1, 0])
 
 
-def test_an_opacity_that_is_no_number_is_refused(tmp_path):
+def test_nan_opacity_is_refused(tmp_path):
     gaussians_with([np.inf, np.nan]).save(tmp_path / "a.ply")
     with pytest.raises(UserError, match=r"finite: logit_opacities of Gaussian 1 is nan"):
         Gaussians.load(tmp_path / "a.ply")
@@ -75,7 +75,7 @@ def lists(count):
     return PlyElement.describe(rows, "face")
 
 
-def test_a_mesh_is_read_for_its_vertices(tmp_path):
+def test_vertices_of_a_mesh_are_read(tmp_path):
     vertices = PlyElement.describe(POINTS, "vertex")
     for text in (False, True):
         PlyData([vertices, lists(3)], text=text).write(str(tmp_path / "a.ply"))
@@ -84,7 +84,7 @@ def test_a_mesh_is_read_for_its_vertices(tmp_path):
         )
 
 
-def test_elements_before_the_vertices_are_passed_over(tmp_path):
+def test_elements_before_the_vertices_are_skipped(tmp_path):
     cameras = PlyElement.describe(np.zeros(3, [("f", "f8"), ("n", "u1")]), "camera")
     vertices = PlyElement.describe(POINTS, "vertex")
     for text in (False, True):
@@ -99,7 +99,7 @@ def test_elements_before_the_vertices_are_passed_over(tmp_path):
 
 @pytest.mark.parametrize("line_end", ["\r\n", "\r", "\n"])
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_line_ends_and_byte_orders_of_all_systems_are_read(tmp_path, line_end, order):
+def test_all_line_ends_and_byte_orders_are_read(tmp_path, line_end, order):
     name = {"<": "little", ">": "big"}[order]
     header = f"ply\nformat binary_{name}_endian 1.0\ncomment end_header\nelement vertex 2\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
@@ -108,7 +108,7 @@ def test_line_ends_and_byte_orders_of_all_systems_are_read(tmp_path, line_end, o
     np.testing.assert_array_equal(read_points(tmp_path / "a.ply")[0], [[1, 2, 3], [4, 5, 6]])
 
 
-def test_vertices_with_lists_are_refused_before_they_take_memory(tmp_path):
+def test_vertices_with_lists_are_refused_before_allocation(tmp_path):
     """4 MB of empty lists became 4.9 GB of objects."""
     header = b"ply\nformat binary_little_endian 1.0\nelement vertex 13000\n"
     header += b"".join(b"property float %s\n" % axis for axis in (b"x", b"y", b"z"))
@@ -122,7 +122,7 @@ def test_vertices_with_lists_are_refused_before_they_take_memory(tmp_path):
     assert grown < 50_000 and time.perf_counter() - started < 2  # kB
 
 
-def test_faces_take_no_memory(tmp_path):
+def test_faces_allocate_no_memory(tmp_path):
     """Elements that are not needed are not made into objects."""
     header = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
     header += b"".join(b"property float %s\n" % axis for axis in (b"x", b"y", b"z"))
@@ -158,7 +158,7 @@ def elements_reordered(lines):
 
 
 @pytest.mark.parametrize("name", ["ply", "compressed-ply"])
-def test_headers_of_another_structure_are_refused(tmp_path, name):
+def test_malformed_headers_are_refused(tmp_path, name):
     path = tmp_path / "a.ply"
     header, end, rows = gaussians_within_ranges(300, 1).to_bytes(name).partition(b"end_header\n")
     lines = (header + end).splitlines()
@@ -177,14 +177,14 @@ def test_headers_of_another_structure_are_refused(tmp_path, name):
 # Other files
 
 
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+def test_pipe_is_refused_without_blocking(tmp_path):
     os.mkfifo(tmp_path / "a.ply")
     with pytest.raises(UserError, match="must be a regular file, got a named pipe"):
         read_points(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("count", ["-1", "0", "x", "9" * 5000])
-def test_counts_that_are_none_are_refused(tmp_path, count):
+def test_invalid_counts_are_refused(tmp_path, count):
     header = f"ply\nformat ascii 1.0\nelement vertex {count}\nproperty float x\nend_header\n1\n"
     (tmp_path / "a.ply").write_text(header)
     with pytest.raises(UserError, match=r"a.ply: ") as error:

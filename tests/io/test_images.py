@@ -28,7 +28,7 @@ def frames_of(path):
     return rendered, frames
 
 
-def test_a_png_holds_the_image_rounded_and_clamped(tmp_path):
+def test_png_contains_the_image_rounded_and_clamped(tmp_path):
     image = np.array([[[-0.5, 0.0, 0.5019], [0.999, 1.0, 7.0]]])
     images.write_png(tmp_path / "new" / "a.png", image)
     assert np.asarray(Image.open(tmp_path / "new" / "a.png")).tolist() == [
@@ -36,7 +36,7 @@ def test_a_png_holds_the_image_rounded_and_clamped(tmp_path):
     ]
 
 
-def test_an_animation_loops_and_holds_every_frame(tmp_path):
+def test_animation_loops_and_contains_every_frame(tmp_path):
     frames = moving_square()
     images.write_animation(tmp_path / "a.webp", frames)
     rendered, decoded = frames_of(tmp_path / "a.webp")
@@ -47,7 +47,7 @@ def test_an_animation_loops_and_holds_every_frame(tmp_path):
 
 
 @pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (131, 97, 202)])
-def test_before_a_flat_background_there_is_no_haze(tmp_path, background):
+def test_compression_leaves_a_flat_background_clean(tmp_path, background):
     """Soft blobs of noise, whose codes would spread over the blocks around them."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:64, :96]
@@ -64,7 +64,7 @@ def test_before_a_flat_background_there_is_no_haze(tmp_path, background):
         assert np.abs(frame - expected).max() <= (images.LOSSLESS_STEP + 1) / 2 / 255
 
 
-def test_images_that_fill_the_frame_are_coded_with_loss(tmp_path, monkeypatch):
+def test_images_without_flat_background_are_compressed_lossily(tmp_path, monkeypatch):
     noise = list(np.random.default_rng(0).uniform(size=(3, 64, 64, 3)))
     images.write_animation(tmp_path / "full.webp", noise)
     assert b"VP8 " in (tmp_path / "full.webp").read_bytes()
@@ -77,7 +77,7 @@ def test_images_that_fill_the_frame_are_coded_with_loss(tmp_path, monkeypatch):
     assert b"VP8 " in (tmp_path / "small.webp").read_bytes()
 
 
-def test_the_gif_beside_it_is_smaller_and_keeps_the_background_exactly(tmp_path):
+def test_gif_is_smaller_and_keeps_the_background_exactly(tmp_path):
     frames = [np.where(frame == 1, 0.93, frame) for frame in moving_square()]
     images.write_animation(tmp_path / "a.webp", frames)
     rendered, decoded = frames_of(tmp_path / "a.gif")
@@ -125,7 +125,7 @@ def test_an_exr_is_written_with_one_thread(tmp_path):
     np.testing.assert_array_equal(np.array(read_exr(tmp_path / "new" / "a.exr")), pixels)
 
 
-# What is read, and what is said not to be
+# Reading, and notes on ignored content
 
 
 def write_tiff16(path, pixels):
@@ -156,7 +156,7 @@ def test_colours_of_16_bits_keep_the_upper_8_with_a_note(tmp_path):
     assert images.unused_content(tmp_path / "grey.png") == []
 
 
-def test_a_colour_that_a_png_names_is_transparent(tmp_path):
+def test_transparent_colour_of_a_png_is_respected(tmp_path):
     pixels = np.zeros((2, 3, 3), np.uint8)
     pixels[0, 1] = 9, 8, 7
     for array, key in ((pixels, (9, 8, 7)), (pixels[:, :, 0], 9)):

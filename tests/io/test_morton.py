@@ -12,7 +12,7 @@ def interleaved(cell):
     )
 
 
-def test_points_are_in_the_order_of_their_interleaved_bits():
+def test_points_are_sorted_by_interleaved_bits():
     rng = np.random.default_rng(0)
     cells = rng.integers(0, 2**MORTON_BITS, (300, 3))
     cells[:2] = [[0, 0, 0], [2**MORTON_BITS - 1] * 3]  # the box that cells are counted in
@@ -23,5 +23,5 @@ def test_points_are_in_the_order_of_their_interleaved_bits():
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((4, 3), 7.5)], ids=["none", "one"])
-def test_points_in_one_place_stay_as_they_are(points):
+def test_coinciding_points_keep_their_order(points):
     assert morton_order(points).tolist() == list(range(len(points)))

@@ -46,7 +46,7 @@ def test_only_far_scenes_get_an_origin_with_few_digits():
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])
-def test_an_origin_is_read_as_it_was_written(tmp_path, suffix):
+def test_origin_survives_a_round_trip(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     replace(blobs(), origin=EARTH, rendered_with={"low_pass": 0.1}).save(path)
     read = Gaussians.load(path)
@@ -106,14 +106,14 @@ def test_far_positions_of_float64_are_kept_to_the_last_digit(tmp_path):
     np.testing.assert_array_equal(near.means, blobs().means)
 
 
-def test_points_of_a_file_with_an_origin_are_where_they_belong(tmp_path):
+def test_points_of_a_file_with_an_origin_are_in_world_coordinates(tmp_path):
     replace(blobs(), origin=EARTH).save(tmp_path / "a.ply")
     positions, _ = read_points(tmp_path / "a.ply")
     np.testing.assert_array_equal(positions, blobs().means.astype(np.float64) + EARTH)
 
 
 @pytest.mark.parametrize("line", ["origin_x 5.0", "origin_x a", "origin_x 1e13", "origin_x true"])
-def test_an_origin_that_is_no_three_numbers_is_refused(tmp_path, line):
+def test_origin_must_be_three_numbers(tmp_path, line):
     path = tmp_path / "a.ply"
     replace(blobs(), origin=EARTH).save(path)
     header = b"comment drgs origin_x 4200000.0\n"
@@ -125,7 +125,7 @@ def test_an_origin_that_is_no_three_numbers_is_refused(tmp_path, line):
         Gaussians.load(path)
 
 
-def test_turning_turns_the_origin_as_well():
+def test_rotation_applies_to_the_origin():
     from drgs.gaussians.similarity import rotation_towards
 
     far = replace(blobs(), origin=EARTH)
@@ -134,7 +134,7 @@ def test_turning_turns_the_origin_as_well():
     np.testing.assert_allclose(world(turned), world(far) @ rotation.T, atol=1e-5)
 
 
-def test_spz_refuses_a_scene_that_is_too_small_for_its_scales():
+def test_spz_refuses_a_scene_too_small_for_its_scales():
     small = replace(blobs(), log_scales=blobs().log_scales + np.float32(np.log(1e-6)))
     with pytest.raises(UserError, match=r"from 4.5e-05 to 379, and those of 30 of 30 Gaussians"):
         small.to_bytes("spz")

@@ -52,7 +52,7 @@ def test_a_file_without_gaussians_is_refused(tmp_path):
         Gaussians.load(tmp_path / "a.ply")
 
 
-def test_the_file_is_laid_out_as_the_3dgs_reference_writes_it(tmp_path):
+def test_file_layout_matches_the_3dgs_reference(tmp_path):
     g = random_gaussians(2, 3)
     g.save(tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes()
@@ -201,7 +201,7 @@ def test_point_colours_out_of_range_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
-def test_points_that_are_not_finite_are_refused(tmp_path, value):
+def test_nonfinite_points_are_refused(tmp_path, value):
     rows = points()
     rows["y"][1] = value
     write_elements(tmp_path / "a.ply", vertex=rows)
@@ -212,7 +212,7 @@ def test_points_that_are_not_finite_are_refused(tmp_path, value):
     )
 
 
-def test_the_first_gaussian_that_is_not_finite_is_named(tmp_path):
+def test_first_nonfinite_gaussian_is_named(tmp_path):
     g = random_gaussians(9, 1)
     g.quats[3, 2] = g.quats[5, 1] = -np.inf
     g.save(tmp_path / "a.ply")
@@ -223,14 +223,14 @@ def test_the_first_gaussian_that_is_not_finite_is_named(tmp_path):
     )
 
 
-def test_a_property_that_is_not_read_may_be_anything(tmp_path):
+def test_unused_property_may_be_anything(tmp_path):
     write_elements(tmp_path / "a.ply", vertex=points(weight=np.full(2, np.nan)))
     assert len(read_points(tmp_path / "a.ply")[0]) == 2
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
 @pytest.mark.parametrize("change", [-1, 1], ids=["fewer", "more"])
-def test_another_number_of_rows_than_the_header_says_is_refused(tmp_path, text, change):
+def test_row_count_that_differs_from_the_header_is_refused(tmp_path, text, change):
     path = tmp_path / "a.ply"
     write_elements(path, text, vertex=points())
     content = path.read_bytes()
@@ -246,7 +246,7 @@ def test_another_number_of_rows_than_the_header_says_is_refused(tmp_path, text, 
 
 @pytest.mark.parametrize("count", [10**4, 10**12, 10**30])
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
-def test_rows_that_the_file_cannot_hold_take_no_memory(tmp_path, text, count):
+def test_impossible_row_count_takes_no_memory(tmp_path, text, count):
     path = tmp_path / "a.ply"
     write_elements(path, text, vertex=points())
     path.write_bytes(path.read_bytes().replace(b"vertex 2", b"vertex %d" % count))

@@ -12,7 +12,7 @@ from drgs.config.approximations import Approximations, from_ply_header
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
 
-SAID = {"antialiased": True, "low_pass": 0.1, "order_window": 8, "projection": "exact"}
+HEADER_VALUES = {"antialiased": True, "low_pass": 0.1, "order_window": 8, "projection": "exact"}
 
 
 def with_lines(path, *lines):
@@ -25,8 +25,8 @@ def with_lines(path, *lines):
     return path
 
 
-def test_what_is_written_is_read_back_with_its_types(tmp_path):
-    expected = SAID | {"alpha_cut": Approximations().alpha_cut, "extent": np.inf}
+def test_values_are_read_back_with_their_types(tmp_path):
+    expected = HEADER_VALUES | {"alpha_cut": Approximations().alpha_cut, "extent": np.inf}
     replace(blobs(10), rendered_with=expected).save(tmp_path / "a.ply")
     found = Gaussians.load(tmp_path / "a.ply")
     assert found.rendered_with == expected
@@ -36,7 +36,7 @@ def test_what_is_written_is_read_back_with_its_types(tmp_path):
 
 
 def test_each_value_is_a_comment_after_the_format(tmp_path):
-    replace(blobs(10), rendered_with=SAID).save(tmp_path / "a.ply")
+    replace(blobs(10), rendered_with=HEADER_VALUES).save(tmp_path / "a.ply")
     lines = (tmp_path / "a.ply").read_bytes().split(b"\n")[1:7]
     assert lines[1:5] == [
         b"comment drgs antialiased true",
@@ -75,14 +75,14 @@ def test_other_comments_are_ignored(tmp_path, line):
 
 
 @pytest.mark.parametrize("line_end", [b"\r\n", b"\r"])
-def test_line_ends_of_all_systems_say_the_same(tmp_path, line_end):
+def test_all_line_ends_are_read(tmp_path, line_end):
     path = with_lines(tmp_path / "a.ply", b"comment drgs low_pass 0.1")
     header, end, rows = path.read_bytes().partition(b"end_header\n")
     path.write_bytes((header + end).replace(b"\n", line_end) + rows)
     assert Gaussians.load(path).rendered_with == {"low_pass": 0.1}
 
 
-def test_values_that_contradict_each_other_are_refused(tmp_path):
+def test_contradictory_values_are_refused(tmp_path):
     line = b"comment drgs low_pass 0.1"
     path = with_lines(tmp_path / "a.ply", line, line)
     assert Gaussians.load(path).rendered_with == {"low_pass": 0.1}
@@ -116,9 +116,7 @@ def test_values_that_contradict_each_other_are_refused(tmp_path):
         ("alpha_max", "0.99999999999", "above 0 and below 1 in float32, got 0.99999999999"),
     ],
 )
-def test_values_outside_of_their_limits_are_refused_where_they_are_used(
-    tmp_path, name, text, expected
-):
+def test_values_outside_their_limits_are_refused_on_use(tmp_path, name, text, expected):
     path = with_lines(tmp_path / "a.ply", f"comment drgs {name} {text}".encode())
     said = Gaussians.load(path).rendered_with  # reading the Gaussians does not depend on it
     with pytest.raises(UserError) as error:
@@ -136,7 +134,7 @@ def said_noted(values):
     return found
 
 
-def test_names_that_are_not_known_are_noted(tmp_path):
+def test_unknown_names_are_noted(tmp_path):
     lines = [f"comment drgs new{letter} 1".encode() for letter in "abcde"]
     path = with_lines(tmp_path / "a.ply", b"comment drgs low_pas 0.2", *lines)
     with pytest.warns(UserNote) as notes:
@@ -147,7 +145,7 @@ def test_names_that_are_not_known_are_noted(tmp_path):
     )
 
 
-def test_a_header_full_of_statements_is_read_at_once(tmp_path):
+def test_large_header_is_read_quickly(tmp_path):
     names = ["".join(letters) for letters in product("abcdefghijklmnopqrst", repeat=3)]
     path = with_lines(tmp_path / "a.ply", *(f"comment drgs {n} 1".encode() for n in names))
     said = Gaussians.load(path).rendered_with

@@ -50,7 +50,7 @@ def test_a_scene_with_openexr_files_is_loaded_on_one_thread(sky, one_thread):
     assert scene.environment() is not None
 
 
-def test_so_is_a_dictionary(sky, one_thread):
+def test_dictionary_scene_with_openexr_files_is_loaded_on_one_thread(sky, one_thread):
     program = sky.with_name("scene.py")
     program.write_text(
         "def scene():\n"
@@ -59,7 +59,7 @@ def test_so_is_a_dictionary(sky, one_thread):
     assert load_scene(program).environment() is not None
 
 
-def test_more_threads_stay():
+def test_other_thread_counts_are_kept():
     before = dr.thread_count()
     dr.set_thread_count(3)
     try:
@@ -78,7 +78,7 @@ def test_a_sampler_without_samples_is_refused(sky, sampler):
     load_scene_file(sky, sampler=sampler, count="4")
 
 
-def test_a_program_without_samples_is_refused_as_well(tmp_path):
+def test_python_scene_with_a_sampler_without_samples_is_refused(tmp_path):
     program = tmp_path / "scene.py"
     sampler = {"type": "multijitter", "sample_count": 0}
     description = {"type": "scene", "sensor": {"type": "perspective", "sampler": sampler}}
@@ -90,7 +90,7 @@ def test_a_program_without_samples_is_refused_as_well(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["config", "filename"])
-def test_parameters_may_have_the_names_of_the_parsers_own(tmp_path, name):
+def test_scene_parameters_may_be_named_like_parser_options(tmp_path, name):
     path = tmp_path / "scene.xml"
     path.write_text(
         '<scene version="3.0.0"><integrator type="path">'

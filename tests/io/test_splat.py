@@ -16,7 +16,7 @@ def row(
     return struct.pack("<6f8B", *mean, *scale, *rgba, *quat)
 
 
-def test_a_row_is_read_as_the_format_says(tmp_path):
+def test_row_is_read_as_specified(tmp_path):
     (tmp_path / "a.splat").write_bytes(row() + row(scale=(0, 1, 1), rgba=(0, 0, 0, 255)))
     found = Gaussians.load(tmp_path / "a.splat")
     np.testing.assert_array_equal(found.means[0], [1, 2, 3])
@@ -29,7 +29,7 @@ def test_a_row_is_read_as_the_format_says(tmp_path):
     assert 1 - 2.0**-22 < found.opacities[1] < 1
 
 
-def test_rows_fall_by_opacity_times_volume(tmp_path):
+def test_rows_are_sorted_by_opacity_times_volume(tmp_path):
     gaussians = gaussians_within_ranges(100)
     with pytest.warns(UserNote, match=r"the format splat has no room for harmonics: left out"):
         gaussians.save(tmp_path / "a.splat")

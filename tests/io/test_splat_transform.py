@@ -38,7 +38,7 @@ RIGHT_DOWN_FORWARD = np.diag([1, -1, -1])
 """Turns right, up, back, as SPZ has it, into what it takes PLY files for."""
 
 HALF_TURN = np.diag([-1, -1, 1])
-"""Of PLY files, when it makes something else of them."""
+"""Rotation by splat-transform when it converts PLY files."""
 
 ALIKE = replace(
     PRECISION["glb"], means=4 * FLOAT32, quats=1e-6, colors=4 * FLOAT32, harmonics=16 * FLOAT32
@@ -53,7 +53,7 @@ READ = {
     ),  # divides by 255, not 256
     ".spz": (RIGHT_DOWN_FORWARD @ Z_TO_Y, ALIKE),
 }
-"""By suffix, from our world to that of the PLY file that it makes of a file, and how precisely."""
+"""Rotation from our world to that of the converted PLY file, and precision, by suffix."""
 
 COARSE = replace(
     PRECISION["spz"],
@@ -67,7 +67,7 @@ WRITTEN = {
     ".spz of version 4": (["--spz-version", "4"], (RIGHT_DOWN_FORWARD @ Z_TO_Y).T, COARSE),
     ".glb": ([], Z_TO_Y.T @ HALF_TURN, ALIKE),
 }
-"""By suffix: options, from the world of a PLY file to ours of what it makes of that, precision."""
+"""Options, rotation from the world of a PLY file to ours after conversion, and precision."""
 
 
 def convert(*arguments) -> None:
@@ -77,7 +77,7 @@ def convert(*arguments) -> None:
 
 
 @pytest.mark.parametrize("suffix", READ)
-def test_it_reads_what_is_written_here(tmp_path, suffix):
+def test_our_files_are_read_by_it(tmp_path, suffix):
     rotation, precision = READ[suffix]
     path = tmp_path / f"ours{suffix}"
     gaussians_within_ranges().save(path)
@@ -87,7 +87,7 @@ def test_it_reads_what_is_written_here(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("case", WRITTEN)
-def test_what_it_writes_is_read_here(tmp_path, case):
+def test_its_files_are_read_here(tmp_path, case):
     if "4" in case:
         pytest.importorskip("zstandard")
     options, rotation, precision = WRITTEN[case]

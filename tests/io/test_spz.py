@@ -42,9 +42,7 @@ def with_largest_coordinate(size):
     ("size", "bits"),
     [(1e-6, 24), (0.9, 16), (1.0, 15), (15.9, 12), (2000, 12), (3000, 11), (8.3e6, 0)],
 )
-def test_positions_have_12_bits_behind_the_point_more_in_small_scenes_fewer_in_large_ones(
-    tmp_path, size, bits
-):
+def test_fractional_bits_of_positions_depend_on_the_scene_size(tmp_path, size, bits):
     gaussians = with_largest_coordinate(size)
     gaussians.save(tmp_path / "a.spz")
     assert unpacked(gaussians)[BITS] == bits
@@ -76,7 +74,7 @@ def test_rotations_of_version_2_are_three_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("said", [{"antialiased": True}, None])
-def test_compensated_opacities_are_a_flag(tmp_path, said):
+def test_antialiasing_is_stored_as_a_flag(tmp_path, said):
     gaussians = replace(gaussians_within_ranges(5), rendered_with=said)
     gaussians.save(tmp_path / "a.spz")
     assert Gaussians.load(tmp_path / "a.spz").rendered_with == said
@@ -89,7 +87,7 @@ def test_values_that_spz_cannot_record_are_noted(tmp_path):
         gaussians.save(tmp_path / "a.spz")
 
 
-def test_extensions_are_passed_over(tmp_path):
+def test_extensions_are_skipped(tmp_path):
     content = unpacked(gaussians_within_ranges(5))
     expected, _ = Spz().read(written(tmp_path / "a.spz", content))
     path = written(tmp_path / "b.spz", content + b"of a vendor" * 99)
@@ -133,7 +131,7 @@ def test_a_grid_of_equal_gaussians_is_read(tmp_path):
     np.testing.assert_allclose(found, grid, atol=2.0**-13 + FLOAT32 * 3)
 
 
-def test_a_wrong_checksum_and_what_follows_the_stream_are_refused(tmp_path):
+def test_wrong_checksum_and_trailing_bytes_are_refused(tmp_path):
     content = gaussians_within_ranges(5).to_bytes("spz")
     (tmp_path / "a.spz").write_bytes(content[:-8] + b"1234" + content[-4:])
     assert "the gzip stream is damaged" in refusal(tmp_path / "a.spz")
@@ -160,7 +158,7 @@ def streams_of(gaussians, compress) -> bytes:
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_version_4_holds_the_same(tmp_path, degree):
+def test_version_4_contains_the_same_gaussians(tmp_path, degree):
     zstandard = pytest.importorskip("zstandard")
     gaussians = gaussians_within_ranges(2, degree)
     (tmp_path / "a.spz").write_bytes(gaussians.to_bytes("spz"))
@@ -173,7 +171,7 @@ def test_version_4_holds_the_same(tmp_path, degree):
         assert refusal(tmp_path / "b.spz").startswith("byte ")
 
 
-def test_version_4_without_zstandard_says_what_to_install(tmp_path, monkeypatch):
+def test_version_4_without_zstandard_reports_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
     (tmp_path / "a.spz").write_bytes(streams_of(gaussians_within_ranges(2), bytes))
     assert refusal(tmp_path / "a.spz").endswith(

@@ -50,13 +50,18 @@ from drgs.reference import splatting as reference
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import load_rows
 
-AS_RAYS = {"projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0}
+RAY_APPROXIMATIONS = {
+    "projection": "exact",
+    "order": "pixel",
+    "sh_direction": "pixel",
+    "low_pass": 0.0,
+}
 """The approximations of an image that shows what rays pass."""
 
-MOST_ON_A_RAY = 64
+MAX_SPLATS_PER_RAY = 64
 """Splats that a pixel may put in order, at most; fewer are on any ray of these scenes."""
 
-OF_VOLPRIM = Cutoffs(alpha_max=0.9999, alpha_cut=0.0, transmittance_stop=0.0)
+VOLPRIM_CUTOFFS = Cutoffs(alpha_max=0.9999, alpha_cut=0.0, transmittance_stop=0.0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -87,7 +92,7 @@ def rays_of_sensor(view) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(rows(ray.o), directions.shape), directions
 
 
-def pass_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
+def composite_all(gaussians, rays, precision, view, cutoffs=None) -> np.ndarray:
     """Transmittance and colour (H, W, 4) of what rays pass on their whole length."""
     device = load_rows(device_gaussians(gaussians, precision), gaussians.sh_degree)
     splats = RaySplats.from_gaussians(device, gaussians.sh_degree, cutoffs or Cutoffs())
@@ -124,7 +129,7 @@ class Problem:
         rendered = reference_rays.render(
             self.gaussians,
             self.camera,
-            model=reference_rays.ImageModel(**AS_RAYS),
+            model=reference_rays.ImageModel(**RAY_APPROXIMATIONS),
             threshold_width=marked,
         )
         planes = np.concatenate([rendered.transmittance[..., None], rendered.image], axis=-1)
@@ -136,7 +141,7 @@ some_views = pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[10]], id
 
 @both_precisions
 @some_views
-def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
+def test_primary_rays_match_the_exact_image(precision, view):
     """The reference of images projects; rays, and the reference of rays, do not.
 
     Within what images by the kernels are.
@@ -144,14 +149,14 @@ def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
     problem = Problem.of(view)
     expected, kept = problem.planes_of_reference(MARKED[precision])
     rays = rays_of(problem.camera)
-    actual = {"kernels": pass_all(problem.gaussians, rays, precision, view)}
+    actual = {"kernels": composite_all(problem.gaussians, rays, precision, view)}
     if precision is FLOAT64:
         far = np.full(len(rays[0]), np.inf)
         passed = reference_light.composite_segments(problem.gaussians, *rays, far)
         planes = np.column_stack([passed.transmittances, passed.colors])
         actual["reference of rays"] = planes.reshape(expected.shape)
         # Many on a ray; and the image with a window puts all of them in order.
-        assert 20 < passed.counts.max() < MOST_ON_A_RAY
+        assert 20 < passed.counts.max() < MAX_SPLATS_PER_RAY
     assert kept.mean() > 0.9 and expected[..., 0].min() < 0.01 and expected[..., 1:].max() > 0.9
     assert_arrays_agree(
         {name: planes[kept] for name, planes in actual.items()},
@@ -161,22 +166,22 @@ def test_primary_rays_pass_what_an_exact_image_shows(precision, view):
 
 
 @some_views
-def test_an_image_of_the_plugin_shows_what_the_sensors_rays_pass(view):
+def test_plugin_image_matches_rays_of_the_sensor(view):
     """Both against the reference."""
     problem = Problem.of(view)
     expected, kept = problem.planes_of_reference(MARKED[FLOAT32])
     integrator = {
         "type": "splats",
         "srgb_primitives": False,
-        "order_window": MOST_ON_A_RAY,
-        **AS_RAYS,
+        "order_window": MAX_SPLATS_PER_RAY,
+        **RAY_APPROXIMATIONS,
         **tensors(problem.gaussians),
     }
     image = image_of(
         mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view.sensor()})
     )
     rendered = np.concatenate([1 - image[..., 3:], image[..., :3]], axis=-1)
-    passed = pass_all(problem.gaussians, rays_of_sensor(view), FLOAT32, view)
+    passed = composite_all(problem.gaussians, rays_of_sensor(view), FLOAT32, view)
     assert_arrays_agree(
         {"image": rendered[kept], "rays": passed[kept]},
         dict.fromkeys(("image", "rays"), expected[kept]),
@@ -190,12 +195,12 @@ def test_an_image_of_the_plugin_shows_what_the_sensors_rays_pass(view):
 
 
 @pytest.mark.parametrize("splats", SCENES.values(), ids=SCENES.keys())
-def test_primary_rays_pass_what_volprim_shows(splats):
+def test_primary_rays_match_volprim(splats):
     """Within rounding, as the image of ``splats`` is but for what is derived there."""
     gaussians, view = splats.gaussians, splats.view
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     expected = volprim_image(gaussians, view, np.exp(gaussians.log_scales), quats[:, [1, 2, 3, 0]])
-    passed = pass_all(gaussians, rays_of_sensor(view), FLOAT32, view, OF_VOLPRIM)
+    passed = composite_all(gaussians, rays_of_sensor(view), FLOAT32, view, VOLPRIM_CUTOFFS)
     on_film = footprints(gaussians, view.camera, covariances(gaussians))
     allowed = propagated(on_film, on_film.alpha_rounding, on_film.color_rounding)
     assert expected.max() > 1000 * allowed.max()

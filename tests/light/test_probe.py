@@ -71,7 +71,7 @@ def directions(count, seed=0):
 
 
 @both_precisions
-def test_every_direction_has_one_place_on_the_cube(precision):
+def test_cube_map_lookup_is_a_bijection(precision):
     """The vector to the place that a vector points to is parallel to it, on all faces."""
     towards = directions(5000)
     face, x, y = probe._place_on_cube(precision.vectors(towards))
@@ -83,7 +83,7 @@ def test_every_direction_has_one_place_on_the_cube(precision):
 
 @both_precisions
 @pytest.mark.parametrize("number", [0, 1])
-def test_from_its_centre_a_probe_sees_what_rays_do(precision, number):
+def test_probe_matches_rays_from_its_centre(precision, number):
     """Fourteen balls side by side, also across the edges of the cube.
 
     Between texels, 2/256 of a distance apart, a Gaussian of 0.08 of it differs from a line by less
@@ -103,7 +103,7 @@ def test_from_its_centre_a_probe_sees_what_rays_do(precision, number):
     np.testing.assert_allclose(color, expected.colors, atol=1.2e-3 + 1 / 255)
 
 
-def test_a_place_off_the_centre_sees_the_same_surface():
+def test_probe_shows_the_same_surface_off_its_centre():
     """A shell is seen without gaps: all is known, and where it is met decides about its colour.
 
     A shell of thickness 0.025, whose colours change by up to 1.2 a unit, is met half of that
@@ -120,7 +120,7 @@ def test_a_place_off_the_centre_sees_the_same_surface():
     assert errors[0] < 1.2 * 0.5 * 0.025 < 0.2 * errors[1]
 
 
-def test_levels_are_means_of_the_finer_one():
+def test_mip_levels_are_means_of_the_finer_level():
     """From the centre, at the middles of texels of level 5, on all faces."""
     probes = probes_of(shell(count=500), FLOAT32, CENTERS[:1])
     middles = np.linspace(-1, 1, 17)[1::2]
@@ -137,7 +137,7 @@ def test_levels_are_means_of_the_finer_one():
         np.testing.assert_allclose(seen(places, axis, sign, 5), np.mean(finer, 0), atol=1e-5)
 
 
-def test_rays_end_before_what_is_behind():
+def test_rays_end_before_surfaces_beyond_their_length():
     probes = probes_of(shell(), FLOAT32)
     towards = directions(300, 9)
     for far, coverage in ((1.2, 0), (1.8, 1)):
@@ -147,7 +147,7 @@ def test_rays_end_before_what_is_behind():
         np.testing.assert_allclose(found, coverage, atol=0.1)
 
 
-def test_what_the_centre_does_not_see_is_not_known():
+def test_regions_hidden_from_the_centre_are_unknown():
     """A wall hides what is behind it; a ray that is there from the start on, or gets there."""
     place = np.linspace(-1, 1, 21)
     y, z = (p.ravel() for p in np.meshgrid(place, place))

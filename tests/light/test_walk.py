@@ -44,7 +44,7 @@ def random_rays(count, seed=1) -> Rays:
     axes = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1, 1], (count, 1))
     targets[along] = (origins + axes)[along]
     found = Rays.towards(origins, targets, far)
-    # Of unit length in double precision: else distances along rays are not in world units.
+    # Unit length in double precision: else distances along rays are not in world units.
     directions = found.directions / np.linalg.norm(found.directions, axis=1, keepdims=True)
     return Rays(found.origins, np.where(np.abs(directions) < 1e-6, 0, directions), found.far)
 
@@ -56,15 +56,16 @@ def passed(splats, rays, precision):
 
 
 TOLERANCE = {np.float64: 1e-11, np.float32: 2e-4}
-"""Of a transmittance. An offset of 30 from a needle 1e-3 thick is 3e4 standard deviations, whose
-rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours up to 3, three times as much."""
+"""Tolerance of a transmittance. An offset of 30 from a needle 1e-3 thick is 3e4 standard
+deviations, whose rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours up to 3, three
+times as much."""
 
 
 @both_precisions
 @pytest.mark.parametrize(
     ("count", "spread", "size"), [(1, 1, 0.5), (30, 1, 0.5), (1000, 1, 0.05), (3000, 0.3, 0.1)]
 )
-def test_rays_pass_what_the_reference_says(precision, count, spread, size):
+def test_composited_rays_match_the_reference(precision, count, spread, size):
     gaussians, rays = random_gaussians(count, count, spread, size), random_rays(600)
     close = 0 if precision.dtype == np.float64 else 1e-4
     exact = reference.composite_segments(
@@ -82,7 +83,7 @@ def test_rays_pass_what_the_reference_says(precision, count, spread, size):
 
 
 @both_precisions
-def test_splats_that_do_not_show_let_everything_through(precision):
+def test_invisible_splats_have_full_transmittance(precision):
     """And so do Gaussians that are not finite, beside one that is."""
     gaussians, rays = random_gaussians(20), random_rays(50)
     faint = replace(gaussians, logit_opacities=np.full(20, -9.0))

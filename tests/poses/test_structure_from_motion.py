@@ -38,7 +38,7 @@ def placed(tmp_path_factory):
     return folder, found, poses, watched
 
 
-def test_cameras_are_those_that_images_were_taken_with(placed):
+def test_true_cameras_are_recovered(placed):
     """Up to a similarity. Features are found to a tenth of a pixel: an angle of 3e-4."""
     folder, found, poses, _ = placed
     assert found.names == tuple(NAMES) and found.missing == ()
@@ -62,14 +62,14 @@ def test_cameras_are_those_that_images_were_taken_with(placed):
     assert np.abs(scale * around - true).max() < 0.005 * np.linalg.norm(true, axis=1).max()
 
 
-def test_steps_are_watched(placed):
+def test_progress_of_every_step_is_reported(placed):
     _, _, _, watched = placed
     for what, total in (("photograph", 7), ("pair of photographs", 21), ("camera", 7)):
         steps = [step for step in watched if step[0] == what]
         assert steps[-1] == (what, total, total)
 
 
-def test_nothing_but_the_model_is_left_behind(placed):
+def test_only_the_model_is_left(placed):
     folder, _, _, _ = placed
     assert {path.name for path in folder.iterdir()} == {*NAMES, "sparse"}
     files = {path.name for path in (folder / "sparse" / "0").iterdir()}
@@ -85,7 +85,7 @@ def test_plain_images_have_no_cameras_and_leave_no_files(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
 
 
-def test_photographs_without_a_mask_are_looked_at_as_well(tmp_path):
+def test_photographs_without_a_mask_are_used(tmp_path):
     pytest.importorskip("pycolmap")
     names = ["a.png", "b.png", "c.png", "d.png"]
     write_photographs(tmp_path, names)
@@ -107,7 +107,7 @@ def masks_for_colmap(folder, masks):
     return [np.asarray(Image.open(given / f"{name}.png")) for name in some.names]
 
 
-def test_masks_are_found_by_any_name(tmp_path):
+def test_masks_are_found_under_common_names(tmp_path):
     """Fits find them by the same names; transparent pixels do not count."""
     alpha = Image.new("LA", (8, 6), (255, 255))
     alpha.putpixel((3, 2), (255, 0))
@@ -121,7 +121,7 @@ def test_masks_are_found_by_any_name(tmp_path):
     np.testing.assert_array_equal(masks, [first, third, expected])
 
 
-def test_masks_are_read_as_a_fit_reads_them(tmp_path):
+def test_masks_are_read_like_in_a_fit(tmp_path):
     """Black or white, and of larger photographs scaled: COLMAP would look elsewhere in them."""
     grey = np.repeat([[100, 150]], 6, axis=0).repeat(4, axis=1)
     larger = np.zeros((12, 16))
@@ -143,7 +143,7 @@ def test_photographs_of_two_sizes_share_no_camera(tmp_path):
         work(tmp_path, ["0.png", "1.png", "2.png"], share="one")._groups()
 
 
-def test_without_pycolmap_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_pycolmap_is_reported_with_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(
         UserError, match=r"needs pycolmap, which is not installed; pip install 'drgs\[colmap\]'"
@@ -166,7 +166,7 @@ def test_errors_of_colmap_are_one_line(tmp_path, monkeypatch):
 
 
 # ----------------------------------------------------------------------------------------------
-# What is replaced, and what is left behind
+# Replaced and leftover files
 # ----------------------------------------------------------------------------------------------
 
 
@@ -208,7 +208,7 @@ def test_a_model_is_replaced_only_on_request(search, tmp_path):
     assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "second")
 
 
-def test_other_files_beside_a_model_stay(search, tmp_path):
+def test_other_files_beside_a_model_are_kept(search, tmp_path):
     model = tmp_path / "sparse" / "0"
     model.mkdir(parents=True)
     own = {"notes.txt": "mine", "project.ini": "COLMAP's", "cameras.txt": "a copy"}
@@ -238,7 +238,7 @@ def test_a_model_of_another_program_is_not_replaced(search, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["sparse", "sparse/0"])
-def test_a_file_in_the_place_of_the_model_is_refused_before_the_search(search, tmp_path, name):
+def test_file_in_place_of_the_model_is_refused_before_the_search(search, tmp_path, name):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("mine")
     with pytest.raises(UserError, match=rf"{name}: must be a folder, got something else; move"):
@@ -269,7 +269,7 @@ def test_a_second_search_in_the_same_folder_is_refused(search, tmp_path):
     assert model_in(tmp_path) == dict.fromkeys(sfm.MODEL_FILES, "first")
 
 
-def test_an_interrupt_while_files_are_moved_leaves_a_whole_model(search, tmp_path, monkeypatch):
+def test_interrupt_while_moving_files_leaves_a_complete_model(search, tmp_path, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     replace = Path.replace
 
@@ -287,7 +287,7 @@ def test_an_interrupt_while_files_are_moved_leaves_a_whole_model(search, tmp_pat
     assert not list(tmp_path.glob(".drgs-*"))
 
 
-def test_a_run_killed_while_files_are_moved_leaves_no_mixture(search, tmp_path, monkeypatch):
+def test_run_killed_while_moving_files_leaves_no_mixed_model(search, tmp_path, monkeypatch):
     search("first")
     replace, replaced = Path.replace, []
 
@@ -315,7 +315,7 @@ def test_a_crash_is_reported_and_leaves_no_files(search, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
 
 
-def test_temporary_files_are_on_the_disk_of_the_model(search, tmp_path):
+def test_temporary_files_are_on_the_same_disk_as_the_model(search, tmp_path):
     """``sparse`` may be a link to another one, to which nothing can be moved."""
     elsewhere = tmp_path / "other disk"
     elsewhere.mkdir()
@@ -327,7 +327,7 @@ def test_temporary_files_are_on_the_disk_of_the_model(search, tmp_path):
 
 
 # ----------------------------------------------------------------------------------------------
-# What is compared, and what shares a camera
+# Matched pairs and shared cameras
 # ----------------------------------------------------------------------------------------------
 
 
@@ -337,13 +337,13 @@ def work(folder, names, **search):
     )
 
 
-def test_masks_beside_photographs_are_no_photographs(tmp_path):
+def test_masks_beside_photographs_are_not_photographs(tmp_path):
     for name in ("a.jpg", "a_mask.png", "b.jpg", "b.jpg.mask.png", "face_mask.jpg"):
         Image.new("RGB", (8, 6)).save(tmp_path / name)
     assert photographs_in(tmp_path)[1] == ["a.jpg", "b.jpg", "face_mask.jpg"]
 
 
-def test_names_are_in_the_order_of_their_numbers(tmp_path):
+def test_names_are_sorted_by_number(tmp_path):
     for name in ("2.png", "10.png", "1.JPG", "b/3.png", "notes.txt"):
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(tmp_path / "images" / name, format="PNG")
@@ -354,7 +354,7 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
         photographs_in(tmp_path)
 
 
-def test_a_name_that_colmap_cannot_hold_is_refused(tmp_path):
+def test_non_utf_8_name_is_refused(tmp_path):
     Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     (tmp_path / "a.png").rename(tmp_path / "a\udcff.png")
     with pytest.raises(UserError, match=r"COLMAP knows names in UTF-8 only; rename it"):
@@ -428,7 +428,7 @@ def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
     assert work(tmp_path, names, share="each")._groups() == [[name] for name in names]
 
 
-def test_few_photographs_are_compared_with_all_and_many_with_some(tmp_path):
+def test_few_photographs_are_matched_exhaustively_and_many_selectively(tmp_path):
     few, many = sfm.ALL_PAIRS, sfm.ALL_PAIRS + 1
     assert len(list(work(tmp_path, range(few))._pairs())) == few * (few - 1) // 2
     pairs = set(work(tmp_path, range(many))._pairs())

@@ -35,7 +35,7 @@ def assert_images_agree(actual, expected, tolerance) -> None:
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [None, 1])
-def test_image_behind_a_pinhole_is_the_reference_image(antialiased, degree):
+def test_pinhole_image_matches_the_reference(antialiased, degree):
     gaussians, camera = small_scene()
     expected = reference.render(gaussians, camera, BACKGROUND, degree, antialiased)
     actual = effects.render(
@@ -46,7 +46,7 @@ def test_image_behind_a_pinhole_is_the_reference_image(antialiased, degree):
     np.testing.assert_array_equal(actual.near_threshold, expected.near_threshold)
 
 
-def test_orthographic_image_is_a_pinhole_image_from_afar():
+def test_orthographic_image_is_the_limit_of_distant_pinholes():
     """From 1e6 times as far with a lens 1e6 times as long, all rays are parallel to 1e-6."""
     gaussians, camera = small_scene()
     camera = replace(camera, fx=9.0, fy=8.0, near=1.0)
@@ -70,7 +70,7 @@ def test_orthographic_image_is_a_pinhole_image_from_afar():
 
 
 @pytest.mark.parametrize("lens", [FISHEYE, Orthographic()], ids=str)
-def test_colors_are_seen_along_the_lens_directions(lens):
+def test_colors_use_the_lens_directions(lens):
     gaussians, camera = small_scene()
     colors = effects.sh_colors(gaussians, camera, lens)
     for n in range(12):
@@ -125,7 +125,7 @@ def test_blur_radius_is_half_the_spread_of_the_aperture():
         np.testing.assert_allclose(actual, [expected], atol=1e-12)
 
 
-def test_no_aperture_and_what_is_in_focus_are_not_blurred():
+def test_zero_aperture_and_points_in_focus_are_not_blurred():
     gaussians, camera = small_scene()
     in_focus = effects.project(gaussians, camera)
     for defocus in (ThinLens(0.0, 2.0), ThinLens(0.3, in_focus.depths[3])):
@@ -152,7 +152,7 @@ def test_defocus_keeps_the_integral_of_a_splat(antialiased):
 
 
 @pytest.mark.parametrize("depth", [1.0, 2.0, 5.0])
-def test_defocused_moments_are_those_of_many_pinholes(depth):
+def test_defocused_moments_match_many_pinholes(depth):
     """Law of total variance: mean of the covariances plus the covariance of the means."""
     camera, defocus = camera_at_origin(), ThinLens(0.1, 2.0)
     camera = replace(camera, rotation=rotation_about([1, 2, 3], 0.5), center=np.array([5, 6, -7.0]))
@@ -171,7 +171,7 @@ def test_defocused_moments_are_those_of_many_pinholes(depth):
     assert (depth == 2.0) == np.allclose(splats.cov2d, effects.project(gaussians, camera).cov2d)
 
 
-def test_the_plane_in_focus_is_the_same_from_the_whole_aperture():
+def test_plane_in_focus_is_the_same_from_the_whole_aperture():
     """Flat Gaussians in the plane: neither J's first two columns nor the film points change."""
     camera = Camera(np.eye(3), np.zeros(3), 23.0, 19.0, 13.6, 8.3, 24, 20)
     rng = np.random.default_rng(2)
@@ -242,7 +242,7 @@ def test_lens_points_are_evenly_spread(count):
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.4, -2.0, 3.1, math.pi])
 @pytest.mark.parametrize("t", [0.0, 0.25, 1.0])
-def test_pose_turns_by_a_part_of_the_angle(angle, t):
+def test_pose_rotates_by_a_fraction_of_the_angle(angle, t):
     axis, start = [0.3, -1.0, 0.5], rotation_about([1.0, 0.2, 0.1], 1.3)
     open = start, np.array([1.0, -2.0, 1e6])
     close = rotation_about(axis, angle) @ start, np.array([3.0, -2.0, -1e6])
@@ -261,7 +261,7 @@ def test_pose_takes_the_shortest_arc():
     np.testing.assert_allclose(halfway, rotation_about([0, 0, 1], -0.25 * math.pi), atol=1e-15)
 
 
-def test_pose_backward_in_time_is_the_same():
+def test_pose_is_symmetric_in_time():
     rng = np.random.default_rng(4)
     for _ in range(20):
         poses = [
@@ -289,7 +289,7 @@ def moving_cameras() -> tuple[Camera, Camera]:
 
 
 @pytest.mark.parametrize("lens", [Pinhole(), FISHEYE], ids=str)
-def test_a_still_camera_takes_the_plain_image(lens):
+def test_static_camera_renders_the_plain_image(lens):
     gaussians, camera = small_scene()
     plain = effects.render(gaussians, camera, lens, BACKGROUND)
     blurred = effects.render_motion_blur(gaussians, camera, camera, 3, BACKGROUND, lens)
@@ -299,7 +299,7 @@ def test_a_still_camera_takes_the_plain_image(lens):
     assert_images_agree(rolled, plain, 1e-12)
 
 
-def test_motion_blur_is_the_mean_of_images_on_the_way():
+def test_motion_blur_is_the_mean_of_images_along_the_path():
     gaussians, _ = small_scene()
     open, close = moving_cameras()
     images = [
@@ -351,7 +351,7 @@ def test_motion_blur_widens_by_the_variance_of_the_path():
     np.testing.assert_allclose(variance - focus_variance, length**2 / 12, rtol=1e-3)
 
 
-def test_rows_of_a_rolling_shutter_are_rows_of_images_in_time():
+def test_rows_of_a_rolling_shutter_match_images_at_their_times():
     gaussians, _ = small_scene()
     open, close = moving_cameras()
     rolled = effects.render_rolling_shutter(gaussians, open, close, BACKGROUND)
@@ -418,7 +418,7 @@ def test_smoothing_at_an_infinite_rate_changes_nothing():
     np.testing.assert_allclose(opacities, reference.sigmoid(gaussians.logit_opacities), rtol=1e-15)
 
 
-def test_sampling_rate_is_that_of_the_camera_that_sees_most_detail():
+def test_sampling_rate_is_the_highest_of_all_cameras():
     near, far = camera_at_origin(center=np.array([0, 0, 2.0])), camera_at_origin()
     assert effects.sampling_rates(np.array([[0, 0, 4.0]]), [far, near]) == 230 / 2
     long = replace(far, fy=1000.0)
@@ -453,7 +453,7 @@ def test_sampling_rates_equal_a_loop():
     np.testing.assert_allclose(effects.sampling_rates(means, cameras), expected, rtol=1e-12)
 
 
-def test_sampling_rates_need_a_camera_that_sees_something():
+def test_sampling_rates_without_visible_means_are_an_error():
     behind = np.array([[0, 0, -1.0]])
     with pytest.raises(ValueError, match="none of 1 cameras sees any of the 1 means"):
         effects.sampling_rates(behind, [camera_at_origin()])

@@ -13,8 +13,8 @@ def test_image_agrees_with_gsplat(gsplat):
     errors = np.abs(rendered.image - expected)
     # Single precision: positions of 200 px carry 1e-5 px; measured 6.7e-7 on average.
     assert errors.mean() <= 2e-6
-    # That is 5e-5 relative in an alpha near the cut, which then flips; measured 4 pixels, at
-    # all of which the reference itself is as near to the cut.
+    # An alpha near the cut, off by 5e-5 of itself, may flip: measured at 4 pixels, where the
+    # reference itself is as near to the cut.
     far = errors.max(axis=-1) > 1e-4
     assert far.mean() <= 1e-4
     marked = reference.render(gaussians, camera, np.ones(3), threshold_width=1e-4).near_threshold

@@ -60,7 +60,7 @@ def points_within(lens, camera, count=200, seed=3) -> np.ndarray:
 @pytest.mark.parametrize(
     "lens", [Pinhole(), OpenCV(), BARREL, Fisheye(), FISHEYE, THIN_PRISM, Orthographic()], ids=str
 )
-def test_a_point_on_the_axis_is_at_the_principal_point(lens):
+def test_point_on_the_axis_is_at_the_principal_point(lens):
     camera = camera_at_origin()
     points = np.array([[0, 0, 0.5], [1e-200, 0, 2.0], [0, -1e-12, 1.0]])
     assert lens.is_seen(camera, points).all()
@@ -68,7 +68,7 @@ def test_a_point_on_the_axis_is_at_the_principal_point(lens):
     np.testing.assert_allclose(lens.film_points(camera, points), [[140, 95]] * 3, atol=1e-9)
 
 
-def test_pinhole_points_are_those_of_the_reference():
+def test_pinhole_points_match_the_reference():
     gaussians, camera = small_scene()
     splats = reference.project(gaussians, camera)
     points = (gaussians.means - camera.center) @ camera.rotation.T
@@ -93,7 +93,7 @@ def test_opencv_without_coefficients_is_a_pinhole():
 
 
 @pytest.mark.parametrize("lens", [BARREL, RATIONAL, PINCUSHION], ids=str)
-def test_opencv_is_its_vector_equation(lens):
+def test_opencv_matches_its_vector_equation(lens):
     """s q + r^2 p + 2 (p . s) s with the vector p = (p2, p1); radii by Horner, not powers."""
     camera = camera_at_origin()
     points = points_within(lens, camera)
@@ -138,7 +138,7 @@ KNOWN_FILM = {
 
 
 @pytest.mark.parametrize("lens", KNOWN_FILM, ids=str)
-def test_film_points_are_those_of_opencv_and_colmap(lens):
+def test_film_points_match_opencv_and_colmap(lens):
     actual = lens.film_points(camera_at_origin(), KNOWN_POINTS)
     np.testing.assert_allclose(actual, KNOWN_FILM[lens], rtol=1e-13)
 
@@ -150,7 +150,7 @@ def radial(lens, r) -> float:
     return r * numerator / (1 + lens.k4 * u + lens.k5 * u**2 + lens.k6 * u**3)
 
 
-def test_valid_radius_of_one_coefficient_is_known():
+def test_valid_radius_of_one_coefficient_matches_the_closed_form():
     # d/dr (r + k1 r^3) = 1 + 3 k1 r^2; 1 + k4 r^2 has its zero before the derivative has one.
     assert OpenCV(k1=-0.3).valid_radius == pytest.approx(math.sqrt(1 / 0.9), rel=1e-12)
     assert OpenCV(k1=0.3).valid_radius == math.inf
@@ -172,7 +172,7 @@ def test_tangential_terms_alone_fold_on_one_side(p1, p2):
 
 
 @pytest.mark.parametrize("k1", [-0.3, 0.3])
-def test_within_its_radius_a_lens_with_tangential_terms_is_undone(k1):
+def test_tangential_lens_is_invertible_within_its_radius(k1):
     """In all directions. What a barrel shows is folded just beyond, in that of the terms."""
     lens = OpenCV(k1=k1, p1=0.18, p2=-0.24)
     assert lens.valid_radius < OpenCV(k1=k1).valid_radius
@@ -186,7 +186,7 @@ def test_within_its_radius_a_lens_with_tangential_terms_is_undone(k1):
     assert steps[0] @ toward > 0 and (steps[1] @ toward < 0) == (k1 < 0)
 
 
-def test_lenses_with_tangential_terms_have_no_fold_within_their_radius():
+def test_tangential_lenses_have_no_fold_within_their_radius():
     """The determinants of difference quotients, in a disc of each of 40 lenses, are positive."""
     ended = 0
     for seed in range(40):
@@ -228,7 +228,7 @@ def test_valid_radius_is_where_the_distorted_radius_first_turns(seed):
         assert lens.valid_radius > 5
 
 
-def test_some_random_lenses_turn_and_some_do_not():
+def test_random_lenses_include_bounded_and_unbounded_ones():
     """The test above meets both."""
     radii = []
     for seed in range(8):
@@ -237,7 +237,7 @@ def test_some_random_lenses_turn_and_some_do_not():
     assert min(radii) < 5 and max(radii) > 5
 
 
-def test_points_that_would_fold_back_into_the_image_are_not_seen():
+def test_points_that_fold_back_into_the_image_are_invisible():
     camera, lens = camera_at_origin(), OpenCV(k1=-0.3)
     limit = math.sqrt(1 / 0.9)
     folded = np.array([[1.8, 0, 1.0], [2 * limit, 0, 2.0]])
@@ -251,7 +251,7 @@ def test_points_that_would_fold_back_into_the_image_are_not_seen():
 
 
 @pytest.mark.parametrize("lens", [BARREL, RATIONAL, PINCUSHION], ids=str)
-def test_distortion_is_undone(lens):
+def test_distortion_is_inverted(lens):
     slopes = np.random.default_rng(0).uniform(-0.55, 0.55, (300, 2))
     assert np.linalg.norm(slopes, axis=1).max() < lens.valid_radius
     # Newton stops at rounding; near no fold the inverse is as accurate as the residual.
@@ -296,7 +296,7 @@ def test_fisheye_agrees_with_a_pinhole_that_bends_the_angle():
     )
 
 
-def test_fisheye_sees_up_to_its_first_turn_or_almost_all_around():
+def test_fisheye_is_valid_up_to_its_first_turn_or_almost_all_around():
     assert Fisheye().valid_angle == 0.95 * math.pi
     assert Fisheye(k1=0.1).valid_angle == 0.95 * math.pi
     # d/dtheta (theta + k1 theta^3) = 1 + 3 k1 theta^2
@@ -314,7 +314,7 @@ def test_fisheye_sees_up_to_its_first_turn_or_almost_all_around():
         np.testing.assert_array_equal(lens.is_seen(camera, points), [True, False, False])
 
 
-def test_a_thin_prism_fisheye_is_its_vector_equation():
+def test_thin_prism_fisheye_matches_its_vector_equation():
     """w q + r^2 (p + s) + 2 (p . w) w with p = (p2, p1), s = (sx1, sy1), of a fisheye's w and q."""
     camera, lens = camera_at_origin(), THIN_PRISM
     points = points_within(lens, camera)
@@ -331,7 +331,7 @@ def test_a_thin_prism_fisheye_is_its_vector_equation():
     assert without.valid_angle == FISHEYE.valid_angle
 
 
-def test_a_prism_or_a_tangential_term_alone_folds_on_one_side():
+def test_prism_or_tangential_term_alone_folds_on_one_side():
     """Along -s, w becomes (r - |s| r^2) w / r. Tangential terms turn as those of slopes do."""
     assert ThinPrismFisheye(p1=0.18, p2=-0.24).valid_angle == pytest.approx(1 / 1.8, rel=1e-12)
     lens = ThinPrismFisheye(sx1=0.3, sy1=-0.4)
@@ -371,7 +371,7 @@ def test_thin_prism_fisheyes_have_no_fold_within_their_angle():
     assert ended > 20
 
 
-def test_a_thin_prism_fisheye_is_undone_within_its_angle():
+def test_thin_prism_fisheye_is_invertible_within_its_angle():
     """In all directions, of one that ends by its tilted elements, and of one that is wide."""
     for lens in (ThinPrismFisheye(-0.1, p1=0.06, p2=-0.08, sx1=0.1, sy1=0.05), THIN_PRISM):
         azimuths, parts = np.meshgrid(np.linspace(0, 6.2, 40), [0.1, 0.5, 0.9, 0.999])
@@ -417,7 +417,7 @@ def test_view_directions_end_at_the_means_unless_rays_are_parallel(lens):
 
 @pytest.mark.parametrize("lens", [Pinhole(), OpenCV()], ids=str)
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_splats_behind_a_pinhole_are_those_of_the_reference(lens, antialiased):
+def test_pinhole_splats_match_the_reference(lens, antialiased):
     """Row 9's slopes are clamped in J, row 10 is behind the camera, row 11 is too faint."""
     gaussians, camera = small_scene()
     expected = reference.project(gaussians, camera, antialiased)
@@ -433,7 +433,7 @@ def test_splats_behind_a_pinhole_are_those_of_the_reference(lens, antialiased):
 
 
 @every_lens
-def test_covariances_are_those_of_projected_samples(lens):
+def test_covariances_match_projected_samples(lens):
     """A Gaussian of 1e-5 of its distance leaves samples whose covariance is J's sandwich."""
     camera = replace(small_camera(), width=400, height=400, cx=210.0, cy=190.0, fx=220.0, fy=260.0)
     points = points_within(lens, camera, count=8)
@@ -490,7 +490,7 @@ def test_a_sphere_is_stretched_along_and_across_the_radius(lens):
 
 
 @pytest.mark.parametrize("lens", [Fisheye(), FISHEYE, RATIONAL], ids=str)
-def test_on_the_axis_every_lens_that_bends_rays_is_a_pinhole(lens):
+def test_central_lenses_match_a_pinhole_on_the_axis(lens):
     gaussians = gaussians_at([0, 0, 2.0], [[0.1, 0.2, 0.05]], quats=[0.3, 0.8, -0.5, 0.1])
     actual = effects.project(gaussians, camera_at_origin(), lens)
     expected = reference.project(gaussians, camera_at_origin())
@@ -498,7 +498,7 @@ def test_on_the_axis_every_lens_that_bends_rays_is_a_pinhole(lens):
     np.testing.assert_array_equal(actual.means2d, expected.means2d)
 
 
-def test_low_pass_is_what_was_asked_for():
+def test_low_pass_variance_is_added():
     gaussians, camera = small_scene()
     plain, none = (effects.project(gaussians, camera, low_pass=t) for t in (0.3, 0.0))
     difference = plain.cov2d[:10] - none.cov2d[:10]
@@ -514,7 +514,7 @@ def test_a_singular_splat_is_not_visible():
 
 
 @every_lens
-def test_splats_that_are_not_seen_hold_finite_numbers(lens):
+def test_invisible_splats_have_finite_values(lens):
     means = np.array([[0, 0, 0], [0, 0, -1], [1, 2, 0], [3, 0, 0.011], [0, 0, 2.0], [1e3, 0, 1]])
     gaussians, camera = gaussians_at(means), camera_at_origin()
     with np.errstate(all="raise"):
@@ -529,7 +529,7 @@ def test_splats_that_are_not_seen_hold_finite_numbers(lens):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_slope_bounds_of_a_barrel_are_those_of_its_corners():
+def test_slope_bounds_of_a_barrel_are_at_its_corners():
     """A barrel's film corners are its border's extremes: they are pulled in most."""
     camera, lens = camera_at_origin(), OpenCV(k1=-0.1)
     corners = np.array([[0, 0], [260, 0], [0, 210], [260, 210]])
@@ -553,7 +553,7 @@ def test_slope_bounds_of_a_pincushion_are_on_the_axes_of_the_film():
 
 
 @pytest.mark.parametrize("part", [0.7, 0.71, 0.81, 1.2])
-def test_slopes_are_bounded_while_the_lens_reaches_the_whole_border(part):
+def test_slopes_are_bounded_if_the_lens_covers_the_whole_border(part):
     """Half a side is a part of the largest distorted radius; the corners are sqrt(2) as far."""
     lens = OpenCV(k1=-0.3)
     half = part * radial(lens, lens.valid_radius)
@@ -561,7 +561,7 @@ def test_slopes_are_bounded_while_the_lens_reaches_the_whole_border(part):
     assert (lens.slope_bounds(camera) is None) == (part > math.sqrt(0.5))
 
 
-def test_a_lens_whose_slopes_are_not_bounded_has_the_jacobian_at_the_mean():
+def test_lens_without_slope_bounds_uses_the_jacobian_at_the_mean():
     """The corners of the film are beyond the fold: a mean beside it, below the fold, is not."""
     lens, camera = OpenCV(k1=-0.3), camera_at_origin(fx=230.0, fy=230.0, width=400, height=400)
     assert lens.slope_bounds(camera) is None
@@ -577,7 +577,7 @@ def test_lenses_without_slopes_have_no_bounds():
 
 
 @pytest.mark.parametrize("lens", [Pinhole(), PINCUSHION], ids=str)
-def test_far_outside_the_film_splats_have_the_size_of_the_widened_border(lens):
+def test_splats_far_outside_the_film_use_the_jacobian_of_the_widened_border(lens):
     """The clamped J of one mean is the J of another, on the widened border at the same z."""
     camera = camera_at_origin()
     lower, upper = lens.slope_bounds(camera)

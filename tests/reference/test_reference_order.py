@@ -34,7 +34,7 @@ from drgs.reference.rays import ImageModel
 
 
 @pytest.mark.parametrize("low_pass", [0.0, 0.3])
-def test_depth_of_the_peak_on_the_film_is_that_along_the_ray(low_pass):
+def test_peak_depth_on_the_film_matches_the_ray(low_pass):
     """t = m_z a / D from C, k and w of the film, against Br . Bm / |Br|^2 in three dimensions."""
     gaussians, camera = rotated_splats(), straight_camera()
     exact = ImageModel("exact", "pixel", low_pass=low_pass, alpha_cut=0.0)
@@ -93,7 +93,7 @@ def test_pixel_order_of_two_discs_changes_where_their_planes_cross(projection):
 
 
 @pytest.mark.parametrize("low_pass", [0.0, 0.3])
-def test_entry_lies_on_the_ellipsoid(low_pass):
+def test_entry_point_is_on_the_ellipsoid(low_pass):
     gaussians, camera = rotated_splats(), straight_camera()
     model = ImageModel("exact", "entry", extent=1.7, low_pass=low_pass, alpha_cut=0.0)
     splats = rays._splats(gaussians, camera, model)
@@ -113,7 +113,7 @@ def test_entry_lies_on_the_ellipsoid(low_pass):
         assert offset @ precision @ ray < 0, "this is where the ray leaves"
 
 
-def test_entry_order_puts_a_large_splat_before_a_small_nearer_one():
+def test_entry_order_puts_a_large_splat_before_a_nearer_small_one():
     camera = straight_camera()
     gaussians = scene_of(
         [[0, 0, 2.0], [0, 0, 3.0]],
@@ -133,7 +133,7 @@ def test_entry_order_puts_a_large_splat_before_a_small_nearer_one():
 
 @pytest.mark.parametrize("step", [0.0, 0.3])
 @pytest.mark.parametrize("stop", ["before", "after"])
-def test_a_ray_passes_over_what_it_enters_within_a_step(step, stop):
+def test_ray_skips_splats_entered_within_a_step(step, stop):
     """And a pixel may end behind the splat that is too much. Against the loop over pixels."""
     gaussians, camera = small_scene()
     model = ImageModel(
@@ -146,7 +146,7 @@ def test_a_ray_passes_over_what_it_enters_within_a_step(step, stop):
     assert same == (step == 0 and stop == "before")
 
 
-def test_splat_around_the_camera_does_not_exist_in_entry_order():
+def test_splat_around_the_camera_is_invisible_in_entry_order():
     gaussians, camera = scene_of([[0, 0, 1.0]], np.log(0.4)), straight_camera()
     for extent, exists in [(2.4, True), (2.6, False)]:
         model = ImageModel("exact", "entry", extent=extent, low_pass=0.0)
@@ -157,7 +157,7 @@ def test_splat_around_the_camera_does_not_exist_in_entry_order():
         )
 
 
-def test_splats_whose_peak_is_behind_the_camera_do_not_exist():
+def test_splats_with_their_peak_behind_the_camera_are_invisible():
     """A needle whose line passes the camera: rays to one side meet it in front, others behind."""
     camera = straight_camera(size=9, focal=4.0)
     angle = math.radians(80)
@@ -174,7 +174,7 @@ def test_splats_whose_peak_is_behind_the_camera_do_not_exist():
         model = replace(UNCUT, projection=projection, order=order, low_pass=0.0)
         alpha = rays.render(gaussians, camera, model=model).alpha[4]
         assert not alpha[behind].any() and alpha[~behind].all(), (projection, order)
-    # By its center, EWA does not ask for depths.
+    # EWA does not need depths when sorted by center.
     model = replace(UNCUT, low_pass=0.0)
     assert rays.render(gaussians, camera, model=model).alpha[4].all()
 
@@ -197,14 +197,14 @@ def test_ties_are_composited_by_index():
 # ----------------------------------------------------------------------------------------------
 
 
-ON_BOTH_SIDES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
+MARKED_DISTANCES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
 """(relative distance, whether a width of 1e-6 marks it)"""
 
 
 def test_pixels_near_the_extent_are_marked():
     """At (1, 0) px from the mean of a splat of 1 px^2: rho = 1."""
     gaussians, camera = scene_of([[0, 0, 1.0]], np.log(0.1)), straight_camera(focal=10.0)
-    for relative, marked in ON_BOTH_SIDES:
+    for relative, marked in MARKED_DISTANCES:
         model = ImageModel(extent=math.sqrt(1 / (1 + relative)), low_pass=0.0)
         rendered = rays.render(gaussians, camera, model=model)
         assert rendered.near_threshold[4, 5] == marked, relative
@@ -212,9 +212,9 @@ def test_pixels_near_the_extent_are_marked():
         assert not rendered.near_threshold[4, 4]
 
 
-def test_pixels_where_splats_may_change_order_are_marked():
+def test_pixels_with_ambiguous_order_are_marked():
     camera = straight_camera()
-    for relative, marked in ON_BOTH_SIDES:
+    for relative, marked in MARKED_DISTANCES:
         gaussians = scene_of([[0, 0, 2.0], [0, 0, 2.0 * (1 + relative)]], np.log(0.1))
         for order in ("center", "pixel"):
             model = ImageModel("exact", order)
@@ -222,7 +222,7 @@ def test_pixels_where_splats_may_change_order_are_marked():
             assert near == (marked and order == "pixel"), (relative, order)
 
 
-def test_splats_that_may_change_order_need_not_be_neighbours_by_index():
+def test_ambiguous_order_is_found_among_all_splats():
     gaussians = scene_of([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 2.0 + 1e-7]], np.log(0.1))
     camera, model = straight_camera(), ImageModel("exact", "pixel")
     assert rays.render(gaussians, camera, model=model).near_threshold[4, 4]
@@ -230,7 +230,7 @@ def test_splats_that_may_change_order_need_not_be_neighbours_by_index():
     assert not rays.render(apart, camera, model=model).near_threshold[4, 4]
 
 
-def test_splats_behind_the_stop_mark_nothing():
+def test_splats_behind_the_stop_mark_no_pixels():
     """Two clamped splats finish the pixel; a third, of alpha 0.99, is before or behind them."""
     for third, marked in [(1.0, True), (4.0, False)]:
         gaussians = scene_of(
@@ -245,7 +245,7 @@ def test_splats_behind_the_stop_mark_nothing():
 
 def test_pixels_whose_ray_enters_a_splat_near_the_camera_are_marked():
     camera = straight_camera()
-    for relative, marked in ON_BOTH_SIDES:
+    for relative, marked in MARKED_DISTANCES:
         gaussians = scene_of([[0, 0, 1.0]], np.log(0.5 * (1 + relative)))
         model = ImageModel("exact", "entry", extent=2.0, low_pass=0.0)
         rendered = rays.render(gaussians, camera, model=model)
@@ -253,7 +253,7 @@ def test_pixels_whose_ray_enters_a_splat_near_the_camera_are_marked():
         assert (rendered.alpha[4, 4] > 0) == (relative < 0)
 
 
-def test_nothing_is_near_a_decision_that_is_not_taken():
+def test_disabled_cuts_mark_no_pixels():
     """An alpha that underflows to 0 is not near a cut of 0, nor T = 0 near a stop of 0."""
     gaussians = replace(scene_of([[0, 0, 1]], np.log(1e-3)), logit_opacities=[2.0])
     rendered = rays.render(gaussians, straight_camera(), model=replace(UNCUT, low_pass=0.0))

@@ -32,7 +32,7 @@ from drgs.reference.splatting import Camera
 
 
 @pytest.mark.parametrize("low_pass", [0.0, 0.3])
-def test_exact_response_is_the_largest_density_along_the_ray(low_pass):
+def test_exact_falloff_is_the_largest_density_along_the_ray(low_pass):
     """Dense search of the 3D density on the ray's positive half, then refinement."""
     gaussians, camera = rotated_splats(), straight_camera()
     model = replace(UNCUT, projection="exact", order="pixel", low_pass=low_pass)
@@ -70,7 +70,7 @@ def test_exact_response_is_the_largest_density_along_the_ray(low_pass):
     assert visible >= 10
 
 
-def test_exact_disc_without_thickness_is_where_the_ray_meets_its_plane():
+def test_exact_flat_disc_is_evaluated_at_the_plane_intersection():
     """Thickness zero, and in-plane deviations of 0.2 and 0.1, seen at up to 60 degrees."""
     camera = straight_camera()
     for tilt in (0.0, 0.5, 1.0):
@@ -202,7 +202,7 @@ def test_unscented_transform_tends_to_ewa_far_away():
     assert fine[0] < 0.01 and fine[1] < 1e-3
 
 
-def test_boxes_hold_every_pixel_a_splat_reaches(monkeypatch):
+def test_boxes_contain_every_pixel_a_splat_reaches(monkeypatch):
     """Splats of all shapes, close to the camera and across it; jittered positions."""
     rng = np.random.default_rng(1)
     camera = straight_camera(size=24, focal=15.0)

@@ -55,7 +55,7 @@ def joined(first, second) -> Gaussians:
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("sh_degree", [None, 1])
-def test_default_model_is_the_reference(antialiased, sh_degree):
+def test_default_model_matches_the_reference(antialiased, sh_degree):
     gaussians, camera = small_scene()
     model = ImageModel(antialiased=antialiased, sh_degree=sh_degree)
     # Wide enough that the scene, which keeps 5e-4 clear of thresholds, has marked pixels.
@@ -111,7 +111,7 @@ def test_image_equals_a_loop_over_pixels(model):
     ],
     ids=str,
 )
-def test_each_choice_changes_what_it_says(projection, change):
+def test_each_choice_changes_the_image_as_documented(projection, change):
     """And nothing else, as the loop has the same choices."""
     gaussians, camera = small_scene()
     uncut = replace(UNCUT, projection=projection)
@@ -123,7 +123,7 @@ def test_each_choice_changes_what_it_says(projection, change):
 
 
 @pytest.mark.parametrize("projection", ["ewa", "exact"])
-def test_without_decisions_every_splat_counts(projection):
+def test_without_cuts_every_splat_is_composited(projection):
     """C = sum_i c_i alpha_i prod_{j < i} (1 - alpha_j), over all splats at all pixels."""
     gaussians, camera = small_scene()
     model = replace(UNCUT, projection=projection)
@@ -142,7 +142,7 @@ def test_without_decisions_every_splat_counts(projection):
         np.testing.assert_allclose(rendered.image[row, column], expected, atol=LOOP_ROUNDING)
 
 
-def test_opaque_splat_without_a_clamp_leaves_nothing():
+def test_opaque_splat_without_a_clamp_has_zero_transmittance():
     gaussians = replace(scene_of([[0, 0, 1]], np.log(0.1)), logit_opacities=[50.0])
     assert rays.render(gaussians, straight_camera(), model=UNCUT).transmittance[4, 4] == 0.0
 
@@ -153,7 +153,7 @@ def test_opaque_splat_without_a_clamp_leaves_nothing():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_color_of_a_pixel_is_that_in_its_rays_direction(degree):
+def test_color_of_a_pixel_uses_its_ray_direction(degree):
     """One splat over a wide film; some of its colours are clamped to zero."""
     gaussians, camera = small_scene()
     gaussians = replace(only(gaussians, [5]), shN=only(gaussians, [5]).shN * 4)
@@ -204,7 +204,7 @@ def test_region_is_the_crop_of_the_whole(model):
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.projection)
-def test_image_does_not_depend_on_how_it_is_divided(model, monkeypatch):
+def test_image_does_not_depend_on_tiling(model, monkeypatch):
     gaussians, camera = small_scene()
     expected = rays.render(gaussians, camera, BACKGROUND, model)
     monkeypatch.setattr(rays, "MAX_PAIRS", 7)
@@ -256,7 +256,7 @@ def test_culled_and_degenerate_gaussians_raise_no_warning_and_change_nothing(pro
     assert_images_agree(rendered, alone, atol=1e-13)
 
 
-def test_point_without_extent_is_the_low_pass():
+def test_point_gaussian_renders_as_the_low_pass():
     """In every projection: a round splat of 0.3 px^2."""
     gaussians, camera = scene_of([[0, 0, 1.0]], -np.inf), straight_camera()
     squares = (np.arange(9) - 4.0) ** 2
@@ -266,7 +266,7 @@ def test_point_without_extent_is_the_low_pass():
         np.testing.assert_allclose(rendered.alpha, expected, rtol=0, atol=1e-15)
 
 
-def test_no_gaussians_show_the_background():
+def test_image_without_gaussians_is_background():
     camera = small_camera()
     empty = only(small_scene()[0], [])
     for model in MODELS:

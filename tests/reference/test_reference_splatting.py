@@ -71,7 +71,7 @@ def small_scene_gradients(antialiased: bool, sh_degree: int) -> tuple[dict, dict
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_small_scene_keeps_clear_of_thresholds(antialiased):
+def test_small_scene_is_clear_of_thresholds(antialiased):
     gaussians, camera = small_scene()
     rendered = reference.render(
         gaussians, camera, antialiased=antialiased, threshold_width=CLEARANCE
@@ -281,7 +281,7 @@ def one_splat(opacities, offset=(0.0, 0.0), depths=None) -> reference.RenderedIm
     )
 
 
-def test_one_splat_is_its_gaussian_where_it_reaches_the_cut():
+def test_single_splat_is_its_gaussian_above_the_cut():
     rendered = one_splat([0.5])
     assert rendered.alpha[4, 4] == 0.5
     assert rendered.alpha[4, 6] == pytest.approx(0.5 * math.exp(-2), abs=1e-15)

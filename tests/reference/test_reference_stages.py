@@ -76,7 +76,7 @@ def test_covariance_has_the_squared_scales_as_eigenvalues():
     np.testing.assert_allclose(eigenvalues, expected, rtol=1e-12)
 
 
-def test_projected_covariance_is_the_sandwich_with_a_numeric_jacobian():
+def test_projected_covariance_matches_a_numeric_jacobian():
     gaussians, camera = small_scene()
     splats = reference.project(gaussians, camera)
     sigma = reference.covariances(gaussians.quats, gaussians.log_scales)
@@ -164,7 +164,7 @@ def test_culled_and_degenerate_gaussians_raise_no_warning_and_change_nothing(ant
         assert not gradients[name][12:].any(), name
 
 
-def test_no_gaussians_show_the_background():
+def test_image_without_gaussians_is_background():
     camera = small_camera()
     empty = Gaussians(
         np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 1, 3)),

@@ -9,7 +9,7 @@ from drgs.results import files
 
 NAMES = {files.CONFIG, *files.RESULTS}
 
-KNOWN = {
+ALLOWED_NAMES = {
     "drgs/fit.py": {files.TENSORBOARD},
 }
 """Modules below ``results`` recognise a fit's folder by names that they write out themselves; the
@@ -28,15 +28,15 @@ def strings(source):
     return {node.value for node in nodes if isinstance(node, ast.Constant)} - {None}
 
 
-def test_no_name_is_given_to_two_files():
+def test_file_names_are_unique():
     assert len(NAMES) == len(files.RESULTS) + 1
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(REPOSITORY)))
-def test_no_other_module_writes_a_name_out(path):
-    known = KNOWN.get(path.relative_to(REPOSITORY).as_posix(), set())
+def test_file_names_are_written_in_one_module_only(path):
+    known = ALLOWED_NAMES.get(path.relative_to(REPOSITORY).as_posix(), set())
     assert NAMES & strings(path.read_text()) == known
 
 
-def test_a_name_that_is_written_out_is_found():
+def test_literal_file_name_is_found():
     assert strings('"""A docstring."""\npath = out / "metrics.json"') & NAMES == {"metrics.json"}

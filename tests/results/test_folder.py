@@ -41,21 +41,21 @@ def refusal(function, *arguments):
     return str(error.value)
 
 
-def test_a_missing_folder_is_created_and_holds_the_configuration(tmp_path, config):
+def test_missing_folder_is_created_with_the_configuration(tmp_path, config):
     claim_output_folder(tmp_path / "a" / "b", config)
     assert visible(tmp_path / "a" / "b") == {"config.yml"}
     assert load_config(tmp_path / "a" / "b" / "config.yml") == config
 
 
 @pytest.mark.parametrize("present", [[], [".DS_Store"], ["config.yml"]])
-def test_a_folder_without_results_is_taken(tmp_path, config, present):
+def test_folder_without_results_is_accepted(tmp_path, config, present):
     for name in present:
         (tmp_path / name).write_text("")
     claim_output_folder(tmp_path, config)
     assert load_run_config(tmp_path) == config
 
 
-def test_a_run_of_the_same_configuration_may_go_on_in_its_folder(finished, config):
+def test_run_with_the_same_configuration_may_continue(finished, config):
     before = contents(finished)
     same = FitConfig(data=config.data, output={"history_every": 3})
     claim_output_folder(finished, same, IMAGES)
@@ -64,9 +64,7 @@ def test_a_run_of_the_same_configuration_may_go_on_in_its_folder(finished, confi
     assert {**after, "config.yml": None} == {**before, "config.yml": None}
 
 
-def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_its_own(
-    finished, config
-):
+def test_run_with_its_last_file_and_configuration_is_finished(finished, config):
     assert not is_finished(finished, config)
     (finished / METRICS).write_text("{}")
     assert is_finished(finished, config)
@@ -75,7 +73,7 @@ def test_a_run_is_finished_when_its_last_file_is_there_and_the_configuration_is_
     assert not is_finished(finished, config)
 
 
-def test_what_a_killed_run_was_writing_is_removed_and_nothing_else(finished, config):
+def test_temporary_files_of_a_killed_run_are_removed(finished, config):
     kept = {".DS_Store", ".notes.tmp.txt", "point_cloud.ply", *IMAGES}
     for name in (".checkpoint.4711.tmp.npz", "renders/.r_1.4711.tmp.png", *kept):
         (finished / name).write_text("half")
@@ -83,7 +81,7 @@ def test_what_a_killed_run_was_writing_is_removed_and_nothing_else(finished, con
     assert contents(finished).keys() == {".drgs-fit.json", "config.yml", *kept}
 
 
-def test_another_run_is_named_by_what_differs(finished, config):
+def test_differing_run_is_reported_with_its_differences(finished, config):
     other = FitConfig(
         data=config.data,
         seed=7,
@@ -97,7 +95,7 @@ def test_another_run_is_named_by_what_differs(finished, config):
     ) in refusal(claim_output_folder, finished, other)
 
 
-def test_a_run_whose_configuration_is_broken_is_kept(finished, config):
+def test_run_with_a_broken_configuration_is_kept(finished, config):
     (finished / "config.yml").write_text("[")
     assert "holds another run, with a config.yml that is not readable; choose" in refusal(
         claim_output_folder, finished, config
@@ -106,7 +104,7 @@ def test_a_run_whose_configuration_is_broken_is_kept(finished, config):
     assert (finished / "point_cloud.ply").read_text() == "result"
 
 
-def test_a_folder_with_files_of_others_is_refused(tmp_path, config):
+def test_folder_with_foreign_files_is_refused(tmp_path, config):
     for name in "dbca":
         (tmp_path / name).write_text("")
     assert refusal(claim_output_folder, tmp_path, config) == (
@@ -116,7 +114,7 @@ def test_a_folder_with_files_of_others_is_refused(tmp_path, config):
     assert sorted(os.listdir(tmp_path)) == ["a", "b", "c", "d"]
 
 
-def test_a_file_in_the_folders_place_is_refused(tmp_path, config):
+def test_file_in_place_of_the_folder_is_refused(tmp_path, config):
     (tmp_path / "out").write_text("mine")
     assert refusal(claim_output_folder, tmp_path / "out", config) == (
         f"{tmp_path}/out: cannot be the output folder: File exists; choose another folder: a part "
@@ -127,7 +125,7 @@ def test_a_file_in_the_folders_place_is_refused(tmp_path, config):
 
 
 @pytest.mark.parametrize("function", ["mkdir", "listdir"])
-def test_a_folder_that_is_closed_to_us_is_refused(tmp_path, config, monkeypatch, function):
+def test_folder_without_permission_is_refused(tmp_path, config, monkeypatch, function):
     def refuse(*arguments, **options):
         raise PermissionError(13, "Permission denied")
 
@@ -138,13 +136,13 @@ def test_a_folder_that_is_closed_to_us_is_refused(tmp_path, config, monkeypatch,
     )
 
 
-def test_a_removed_run_makes_room_for_another(finished, config):
+def test_folder_of_a_removed_run_can_be_reused(finished, config):
     remove_run(finished)
     assert os.listdir(finished) == []
     claim_output_folder(finished, config)
 
 
-def test_removing_takes_every_result(tmp_path, config):
+def test_removing_a_run_deletes_every_result(tmp_path, config):
     claim_output_folder(tmp_path, config)
     for name in RESULTS:
         if name in FOLDERS:
@@ -156,14 +154,14 @@ def test_removing_takes_every_result(tmp_path, config):
 
 
 @pytest.mark.parametrize("name", [CAMERAS, COLORS])
-def test_what_effects_write_is_a_result(tmp_path, config, name):
+def test_files_of_effects_are_results(tmp_path, config, name):
     claim_output_folder(tmp_path, config)
     (tmp_path / name).write_text("")
     remove_run(tmp_path)
     assert os.listdir(tmp_path) == []
 
 
-def test_a_folder_in_the_place_of_a_result_is_not_removed(finished):
+def test_folder_in_place_of_a_result_is_not_removed(finished):
     for recorded in (True, False):
         if not recorded:
             (finished / ".drgs-fit.json").unlink()
@@ -173,13 +171,13 @@ def test_a_folder_in_the_place_of_a_result_is_not_removed(finished):
         assert contents(finished) == before
 
 
-def test_removing_what_is_not_there_is_no_error(tmp_path):
+def test_removing_a_missing_run_is_no_error(tmp_path):
     remove_run(tmp_path / "none")
     remove_run(tmp_path)
     assert os.listdir(tmp_path) == []
 
 
-def test_files_of_others_are_never_removed(finished):
+def test_foreign_files_are_never_removed(finished):
     (finished / "notes.txt").write_text("mine")
     before = contents(finished)
     assert refusal(remove_run, finished) == (

@@ -60,7 +60,7 @@ def test_ssim_of_flat_images_is_the_luminance_term():
     assert ssim(x, y) == pytest.approx(expected.mean(), rel=1e-12)
 
 
-def test_ssim_is_that_of_two_dimensional_windows():
+def test_ssim_matches_two_dimensional_windows():
     x, y = images(1)
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * 1.5**2))
@@ -77,7 +77,7 @@ def test_ssim_is_that_of_two_dimensional_windows():
     assert ssim(x, y) == pytest.approx((numerator / denominator).mean(), rel=1e-12)
 
 
-def test_views_weigh_the_same():
+def test_views_have_equal_weight():
     pairs = [images(0), images(1, (5, 9, 3))]
     quality = mean_quality(iter(pairs))
     assert quality.num_views == 2
@@ -85,7 +85,7 @@ def test_views_weigh_the_same():
     assert quality.ssim == pytest.approx(np.mean([ssim(*pair) for pair in pairs]))
 
 
-def test_psnr_of_a_mask_is_that_of_the_pixels_that_count():
+def test_psnr_with_a_mask_uses_kept_pixels():
     x, y = images()
     mask = np.random.default_rng(3).integers(0, 2, x.shape[:2])
     squared = [(x[i, j] - y[i, j]) ** 2 for i, j in np.argwhere(mask)]
@@ -94,7 +94,7 @@ def test_psnr_of_a_mask_is_that_of_the_pixels_that_count():
     assert psnr(x, y, mask.astype(np.float32)) == psnr(x, y, mask)
 
 
-def test_what_a_mask_leaves_out_does_not_matter():
+def test_masked_pixels_do_not_affect_metrics():
     """SSIM's windows see black there."""
     x, y = images()
     mask = np.ones(x.shape[:2])
@@ -106,7 +106,7 @@ def test_what_a_mask_leaves_out_does_not_matter():
     assert ssim(x, y, mask) == ssim(*black, mask) != ssim(*black)
 
 
-def test_ssim_of_a_mask_is_the_mean_of_the_map_over_the_pixels_that_count():
+def test_ssim_with_a_mask_averages_the_map_over_kept_pixels():
     """The expected value uses a window in two dimensions at each pixel of masked images."""
     x, y = images(2, (14, 13, 3))
     mask = np.ones((14, 13))

@@ -67,7 +67,7 @@ CHANGES = [
     DensityRow(iteration=40, num_gaussians=1400, pruned=100, refused=3),
     DensityRow(iteration=60, num_gaussians=2400, num_added=1010, cloned=10, split=1000, pruned=10),
 ]
-"""Of a fit that began with 1000."""
+"""Changes of a fit that began with 1000 Gaussians."""
 
 
 def metrics(**data):
@@ -99,7 +99,7 @@ def out(tmp_path_factory, dataset, scene, images):
     return folder
 
 
-def test_the_page_says_what_viewers_are_to_open():
+def test_page_names_the_file_for_viewers():
     assert report._viewers(metrics()) == "splat viewers read it"
     measured = {"psnr": 29.876, "ssim": 0.9, "num_views": 4, "split": "test"}
     text = report._viewers({**metrics(), "viewers": measured})
@@ -107,7 +107,7 @@ def test_the_page_says_what_viewers_are_to_open():
     assert text.endswith(": they show the test views at 29.88 dB")
 
 
-def test_everything_is_written_and_nothing_temporary(out):
+def test_all_files_are_written_and_none_temporary(out):
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     comparisons = {f"side_by_side/test/r_{i}.png" for i in range(4)}
     pages = {"report.html", "viewer.html"}
@@ -119,7 +119,7 @@ def test_everything_is_written_and_nothing_temporary(out):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_one_image_is_held_at_a_time(tmp_path, dataset):
+def test_one_image_is_in_memory_at_a_time(tmp_path, dataset):
     """Each is written and scored before the next one is rendered; renders only if asked for."""
     rendered = []
 
@@ -140,7 +140,7 @@ def test_one_image_is_held_at_a_time(tmp_path, dataset):
         assert np.abs(written - image).max() < 0.5 / 255 + 1e-6
 
 
-def test_a_comparison_is_fitted_photograph_difference(out, dataset, images):
+def test_comparison_shows_fitted_photograph_and_difference(out, dataset, images):
     pixels = np.asarray(Image.open(out / "side_by_side" / "test" / "r_2.png")) / 255
     step = WIDTH + report.IMAGE_GAP_PX
     fitted, photograph, difference = (pixels[:, k * step : k * step + WIDTH] for k in range(3))
@@ -153,7 +153,7 @@ def test_a_comparison_is_fitted_photograph_difference(out, dataset, images):
     assert (pixels[:, WIDTH : WIDTH + report.IMAGE_GAP_PX] == 1).all()
 
 
-def test_what_a_mask_leaves_out_is_no_difference(dataset, images):
+def test_masked_pixels_show_no_difference(dataset, images):
     mask = np.ones((HEIGHT, WIDTH), np.float32)
     mask[:, : WIDTH // 2] = 0
     view = replace(dataset.test[2], mask=mask)
@@ -165,7 +165,7 @@ def test_what_a_mask_leaves_out_is_no_difference(dataset, images):
     assert report.score(images[2], view).psnr == pytest.approx(-10 * np.log10(np.mean(error**2)))
 
 
-def test_the_orbit_has_the_shape_of_the_photographs_and_shows_the_scene(out, dataset, scene):
+def test_orbit_has_the_aspect_ratio_of_the_photographs_and_shows_the_scene(out, dataset, scene):
     animation = Image.open(out / "orbit.webp")
     assert (animation.n_frames, animation.size) == (report.ORBIT_FRAMES, (WIDTH, HEIGHT))
     fov = field_of_view(dataset.train)
@@ -204,7 +204,7 @@ def test_curves_of_unusual_histories_are_drawn(tmp_path, rows):
         assert image.size[0] > 800
 
 
-def test_the_panels_are_of_the_history():
+def test_panels_show_the_history():
     panels = {panel.title: panel for panel in curves.panels_of(history(12))}
     assert panels["Loss"].y[:5] == pytest.approx([1, 1 / 2, 1 / 3, 1 / 4, 1 / 5])
     assert panels["Gaussians"].y[:5].tolist() == [100, 200, 300, 400, 500]
@@ -212,7 +212,7 @@ def test_the_panels_are_of_the_history():
     assert panels["Iterations per second"].y == pytest.approx([2] * 11)
 
 
-def test_the_time_of_curves_is_that_of_those_tried_out(monkeypatch):
+def test_time_of_curves_is_extrapolated_from_measured_ones(monkeypatch):
     """The first one, of whatever kind, also loads libraries: 9 s here, later ones 1 s, or 0.5 s."""
     drawn = []
 
@@ -229,7 +229,7 @@ def test_the_time_of_curves_is_that_of_those_tried_out(monkeypatch):
     assert report.seconds_of_curves() > 0
 
 
-def test_the_population_is_shown_with_what_was_added_and_removed_so_far(tmp_path):
+def test_population_panel_shows_added_and_removed_gaussians(tmp_path):
     shown = history(90, CHANGES)
     (panel,) = (p for p in curves.panels_of(shown) if p.title == "Gaussians")
     assert set(panel.others) == {"added", "removed"}  # nothing was relocated
@@ -244,7 +244,7 @@ def test_the_population_is_shown_with_what_was_added_and_removed_so_far(tmp_path
     assert not panel.others
 
 
-def test_the_story_names_what_was_done_and_always_what_was_refused():
+def test_density_summary_lists_actions_and_refusals():
     assert summarize_density("adc", []) is None
     assert summarize_density("adc", CHANGES) == (
         "adc: 1,000 \u2192 2,400 Gaussians; 410 cloned, 1,200 split, 210 pruned, 3 refused"
@@ -255,7 +255,7 @@ def test_the_story_names_what_was_done_and_always_what_was_refused():
     )
 
 
-def test_the_psnr_of_test_views_is_shown_over_the_time():
+def test_psnr_is_plotted_over_time():
     (panel,) = (p for p in curves.panels_of(history(12)) if "test views" in p.title)
     assert panel.x_label == "time [min]"
     assert panel.x == pytest.approx([2.5 / 60, 5 / 60])
@@ -263,7 +263,7 @@ def test_the_psnr_of_test_views_is_shown_over_the_time():
 
 
 @pytest.mark.parametrize("count", [1, 7, 50, 333])
-def test_the_running_mean_is_the_mean_of_the_rows_around(count):
+def test_running_mean_averages_neighbouring_rows(count):
     values = np.random.default_rng(0).normal(size=count)
     reach = count // 100
     expected = [values[max(0, i - reach) : i + reach + 1].mean() for i in range(count)]
@@ -312,7 +312,7 @@ def page(out):
     return Page(out / "report.html")
 
 
-def test_the_page_refers_to_nothing_outside(page):
+def test_page_has_no_external_references(page):
     embedded = [reference for reference in page.references if reference.startswith("data:")]
     # The icon, the orbit and its first frame, comparisons, curves for light and dark pages.
     assert len(embedded) == 1 + 2 + 3 * 3 + 6 * 2
@@ -323,7 +323,7 @@ def test_the_page_refers_to_nothing_outside(page):
     assert set(page.tags).isdisjoint({"script", "iframe", "object", "embed"})
 
 
-def test_images_and_curves_lie_one_below_the_other_on_a_phone(page):
+def test_images_and_curves_are_stacked_on_a_phone(page):
     phone = re.search(r"@media \(max-width: 560px\) \{(.*?\}\s*)\}", page.source, re.DOTALL)[1]
     assert ".three, .curves { grid-template-columns: minmax(0, 1fr); }" in phone
     text = " ".join(" ".join(page.text).split())
@@ -346,7 +346,7 @@ def test_the_orbit_can_be_paused_and_honours_reduced_motion(page):
     assert ".orbit .moving, .orbit .pause" in reduced.partition("display: none")[0]
 
 
-def test_images_of_a_renderer_are_no_photographs(tmp_path, dataset, images, out, page):
+def test_rendered_datasets_are_not_called_photographs(tmp_path, dataset, images, out, page):
     path, taken = tmp_path / "report.html", replace(dataset, rendered=False)
     orbit = (out / "orbit.webp").read_bytes()
     report.write_report(path, "a", taken, *scored(images, taken), history(2), metrics(), orbit)
@@ -356,7 +356,7 @@ def test_images_of_a_renderer_are_no_photographs(tmp_path, dataset, images, out,
     assert "Photograph" not in rendered and "Reference" not in photographed
 
 
-def test_the_pages_images_are_whole(page, out, tmp_path):
+def test_images_of_the_page_are_complete(page, out, tmp_path):
     sizes = []
     for index, (kind, data) in enumerate(page.images()):
         path = tmp_path / str(index)
@@ -370,7 +370,7 @@ def test_the_pages_images_are_whole(page, out, tmp_path):
     assert len(page.source) < 3_000_000
 
 
-def test_the_page_states_the_metrics(page):
+def test_page_contains_the_metrics(page):
     text = " ".join(" ".join(page.text).split())
     for stated in (
         "blobs", "noise <small>", "31.23 dB", "mean of 4 test views", "0.9000", "12,345",
@@ -407,7 +407,7 @@ def test_views_are_chosen_by_their_psnr(scores, expected):
     assert report.choose_views(scores) == expected
 
 
-def test_text_from_outside_is_escaped(tmp_path, dataset, images, out):
+def test_external_text_is_escaped(tmp_path, dataset, images, out):
     hostile = "</pre><script>alert(1)</script>"
     test = tuple(replace(view, name=f"<b>{view.name}") for view in dataset.test)
     dataset = replace(dataset, test=test, description=hostile, test_split=hostile)
@@ -425,7 +425,7 @@ def test_text_from_outside_is_escaped(tmp_path, dataset, images, out):
     assert "<b>r_0" in "".join(page.text)
 
 
-def test_an_image_that_equals_its_photograph_is_infinitely_good(tmp_path, dataset, out):
+def test_image_equal_to_its_photograph_has_infinite_psnr(tmp_path, dataset, out):
     equal = replace(dataset, test=dataset.test[:1])
     report.write_report(
         tmp_path / "report.html",

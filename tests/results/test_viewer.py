@@ -28,7 +28,7 @@ from drgs.results.viewer import DisplaySettings, InitialView, viewer_page
 SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
 MANIFEST = json.loads(SHIPPED.joinpath("MANIFEST.json").read_text())
 
-OWN = Approximations(low_pass=0.1, antialiased=True)
+FITTED = Approximations(low_pass=0.1, antialiased=True)
 TITLE = '<i>"ü" & </script>'
 
 
@@ -51,7 +51,7 @@ class Page(HTMLParser):
 
 
 def page_of(gaussians, initial_view, title="title", background=(0.1, 0.2, 0.3)):
-    return viewer_page(title, DisplaySettings(gaussians, OWN), initial_view, background)
+    return viewer_page(title, DisplaySettings(gaussians, FITTED), initial_view, background)
 
 
 @pytest.fixture(scope="module")
@@ -65,18 +65,18 @@ def page(initial_view):
 
 
 # ----------------------------------------------------------------------------------------------
-# What is shipped
+# Shipped files
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_shipped_files_are_those_of_the_manifest():
+def test_shipped_files_match_the_manifest():
     files = {entry.name: entry.read_bytes() for entry in SHIPPED.iterdir()}
     assert files.keys() - {"MANIFEST.json"} == MANIFEST["sha256"].keys()
     for name, digest in MANIFEST["sha256"].items():
         assert hashlib.sha256(files[name]).hexdigest() == digest, name
 
 
-def test_the_viewer_is_of_the_pinned_versions_with_all_changes():
+def test_viewer_has_the_pinned_versions_with_all_changes():
     code = gzip.decompress(SHIPPED.joinpath("viewer.js.gz").read_bytes()).decode()
     for package in MANIFEST["packages"]:
         assert f'"{package["version"]}"' in code
@@ -85,7 +85,7 @@ def test_the_viewer_is_of_the_pinned_versions_with_all_changes():
         assert all(line in code for line in lines) and change["old"] not in code
 
 
-def test_the_licences_come_with_the_files_and_with_each_page(page):
+def test_licences_are_in_the_files_and_on_each_page(page):
     text = SHIPPED.joinpath("LICENSE").read_text()
     for package in MANIFEST["packages"]:
         assert f"{package['name']} {package['version']}\n" in text
@@ -102,7 +102,7 @@ def test_equal_gaussians_give_equal_bytes(page, initial_view):
     assert page_of(blobs(), initial_view, TITLE) == page
 
 
-def test_the_page_refers_to_nothing_and_may_connect_to_nothing(page):
+def test_page_has_no_external_references_and_connects_nowhere(page):
     parsed = Page(page)
     assert parsed.references == ["data:,"]  # the icon
     policy = re.search(rb'Content-Security-Policy" content="([^"]*)"', page)[1].decode()
@@ -113,24 +113,24 @@ def test_the_page_refers_to_nothing_and_may_connect_to_nothing(page):
     }
 
 
-def test_text_from_outside_is_text(page):
+def test_external_text_is_escaped(page):
     parsed = Page(page)
     assert parsed.texts["title"].strip() == f"{TITLE}: Gaussian splats"
     assert parsed.tags.count("script") == 4
 
 
-def test_a_script_element_cannot_be_ended_by_what_it_holds():
+def test_content_cannot_close_a_script_element():
     text = viewer._in_script({"a": "</script><!--"})
     assert "<" not in text and json.loads(text) == {"a": "</script><!--"}
 
 
-def test_the_page_says_what_gaussians_are_shown_with(page):
+def test_page_records_the_approximations(page):
     scene = json.loads(Page(page).texts["scene"])
     assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.1), True)
     assert scene["settings"]["background"]["color"] == [0.1, 0.2, 0.3]
 
 
-def test_the_page_holds_the_gaussians_as_its_first_camera_sees_them(page, initial_view, tmp_path):
+def test_page_contains_gaussians_in_axes_of_the_first_camera(page, initial_view, tmp_path):
     """Their means in the camera's axes: y is up on the page, which turns files by 180 degrees."""
     parsed = Page(page)
     scene = json.loads(parsed.texts["scene"])
@@ -154,7 +154,7 @@ def test_the_page_holds_the_gaussians_as_its_first_camera_sees_them(page, initia
     assert scene["tangents"] == pytest.approx([np.tan(0.35), np.tan(0.35) * 24 / 32])
 
 
-def test_numbers_that_are_not_finite_are_refused(initial_view):
+def test_nonfinite_numbers_are_refused(initial_view):
     wrong = blobs()
     wrong.sh0[3, 0, 1] = np.nan
     with pytest.raises(UserError, match="sh0 of Gaussian 3 is"):
@@ -162,7 +162,7 @@ def test_numbers_that_are_not_finite_are_refused(initial_view):
 
 
 # ----------------------------------------------------------------------------------------------
-# Where one stands
+# Start views
 # ----------------------------------------------------------------------------------------------
 
 
@@ -170,7 +170,7 @@ def cameras(poses):
     return [pinhole(f"{i}", pose, 32, 24, 40.0) for i, pose in enumerate(poses)]
 
 
-def test_one_stands_at_the_camera_next_to_where_orbits_start():
+def test_first_camera_is_nearest_to_the_orbit_start():
     """At their mean height, in the direction that most of them have."""
     azimuths = [(0.9, 0.2), (1.0, 0.6), (1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.4, 0.1)]
     views = cameras([pose_around(*angles) for angles in azimuths])
@@ -181,7 +181,7 @@ def test_one_stands_at_the_camera_next_to_where_orbits_start():
     np.testing.assert_allclose(initial_view.target, FOCUS, atol=1e-6)
 
 
-def test_what_is_walked_around_is_in_front_of_a_camera_that_looks_elsewhere(initial_view):
+def test_target_is_in_front_of_a_camera_that_looks_away(initial_view):
     away = pose_around(0.3, 0.2)
     away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1, -1])
     initial_view = replace(initial_view, camera=cameras([away])[0])
@@ -189,7 +189,7 @@ def test_what_is_walked_around_is_in_front_of_a_camera_that_looks_elsewhere(init
     np.testing.assert_allclose(initial_view.target, expected, rtol=1e-12)
 
 
-def test_of_gaussians_alone_all_are_in_the_window():
+def test_view_without_cameras_shows_all_gaussians():
     up = Rotation.from_euler("xyz", [30, 50, 0], degrees=True).apply([0, 0, 1])
     initial_view = InitialView.from_gaussians(blobs(), up)
     camera = initial_view.camera
@@ -200,43 +200,43 @@ def test_of_gaussians_alone_all_are_in_the_window():
 
 
 # ----------------------------------------------------------------------------------------------
-# Of a fit
+# Pages of fits
 # ----------------------------------------------------------------------------------------------
 
 
-def test_which_approximations_are_shown():
-    assert viewer.shows_as_fitted(Approximations()) and viewer.shows_as_fitted(OWN)
-    assert not viewer.shows_as_fitted(replace(OWN, order="pixel"))
+def test_supported_approximations_are_recognised():
+    assert viewer.shows_as_fitted(Approximations()) and viewer.shows_as_fitted(FITTED)
+    assert not viewer.shows_as_fitted(replace(FITTED, order="pixel"))
 
 
 def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
     folder, dataset = tmp_path / "blobs", make_dataset()
     folder.mkdir()
-    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
+    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
     size = (folder / "viewer.html").stat().st_size
     (folder / "viewer.html").unlink()
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size - 1)
     with pytest.warns(
         UserNote, match=r"blobs/viewer\.html: not written, .*export .* --format html"
     ):
-        viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
+        viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
     assert list(folder.iterdir()) == []
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size)
-    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), OWN))
+    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
     assert (folder / "viewer.html").stat().st_size == size
 
 
-def test_what_is_too_large_by_its_number_alone_is_not_built(tmp_path, monkeypatch):
+def test_page_too_large_by_gaussian_count_is_not_built(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "viewer_page", None)
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.min_page_bytes(30, blobs().sh_degree) - 1)
     with pytest.warns(UserNote, match=r"not written, as it would have at least 0 MB"):
-        viewer.write_viewer(tmp_path, make_dataset(), DisplaySettings(blobs(), OWN))
+        viewer.write_viewer(tmp_path, make_dataset(), DisplaySettings(blobs(), FITTED))
     assert list(tmp_path.iterdir()) == []
     assert viewer.seconds_of_page(30, 1) == 0 < viewer.seconds_of_page(29, 0)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
-def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(initial_view, sh_degree):
+def test_page_size_is_within_the_estimated_bounds(initial_view, sh_degree):
     """All: in base64, of them and of 72 bytes for each group of 256, and 1 % that gzip adds."""
     counts = 256, 256 * 12
     one, twelve = (
@@ -249,11 +249,11 @@ def test_random_gaussians_take_between_the_least_and_all_of_their_bytes(initial_
 def test_a_page_in_the_current_folder_is_named_after_it(tmp_path, monkeypatch):
     (tmp_path / "blobs").mkdir()
     monkeypatch.chdir(tmp_path / "blobs")
-    viewer.write_viewer(Path(), make_dataset(), DisplaySettings(blobs(), OWN))
+    viewer.write_viewer(Path(), make_dataset(), DisplaySettings(blobs(), FITTED))
     assert Page(Path("viewer.html").read_bytes()).texts["title"].strip() == "blobs: Gaussian splats"
 
 
-def test_the_first_view_is_that_of_the_refined_cameras(tmp_path):
+def test_first_view_uses_refined_cameras(tmp_path):
     """All of them twice as far away: what is walked around is half as large on the page."""
     dataset, sizes = make_dataset(), []
     far = [replace(view, camera_to_world=far_pose(view.camera_to_world)) for view in dataset.train]
@@ -262,7 +262,7 @@ def test_the_first_view_is_that_of_the_refined_cameras(tmp_path):
         config = {"data": {"path": "data"}, "cameras": {"optimise": folder == "refined"}}
         (tmp_path / folder / "config.yml").write_text(yaml.safe_dump(config))
         write_views(tmp_path / folder / "cameras.json", replace(dataset, train=far))
-        viewer.write_viewer(tmp_path / folder, dataset, DisplaySettings(blobs(), OWN))
+        viewer.write_viewer(tmp_path / folder, dataset, DisplaySettings(blobs(), FITTED))
         splats = Page((tmp_path / folder / "viewer.html").read_bytes()).texts["splats"]
         (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(splats)))
         sizes.append(np.ptp(Gaussians.load(tmp_path / "a.ply").means, axis=0))

@@ -34,10 +34,10 @@ BUTTONS = """
 [...document.querySelectorAll("button")].map((b) => b.getBoundingClientRect())
   .filter((r) => r.width && r.height).map((r) => [r.left, r.top, r.right, r.bottom])
 """
-"""Those that are shown: the left, upper, right and lower edge of each, px."""
+"""Left, top, right and bottom edge of each visible button, px."""
 
 TURN = Rotation.from_euler("xyz", [40, -70, 25], degrees=True).as_matrix()
-"""Of the world, in which up is thus none of the axes."""
+"""Rotation of the world, so that up is none of its axes."""
 
 UP = TURN[:, 2]
 
@@ -48,7 +48,7 @@ ALIKE = 42.0
 """dB, at least: the browser's image against ours. Measured 45.9: what is left are whole numbers,
 8 bits of opacities and of what is blended, steps of 1/32 of harmonics and of 8 % of scales."""
 
-OTHERWISE = 34.0
+MAX_WRONG_PSNR_DB = 34.0
 """dB, at most: against our image with something left out. Measured 24 to 32."""
 
 
@@ -128,17 +128,17 @@ def assert_shown_as_fitted(rendered, camera, gaussians) -> None:
     }
     assert decibels(rendered, ours(camera, gaussians)) >= ALIKE
     for name, image in left_out.items():
-        assert decibels(rendered, image) <= OTHERWISE, name
+        assert decibels(rendered, image) <= MAX_WRONG_PSNR_DB, name
 
 
-def test_it_opens_from_disk_without_a_request_or_an_error(page, path):
-    assert page.troubles() == []
+def test_page_opens_from_disk_without_requests_or_errors(page, path):
+    assert page.console_errors() == []
     own, *others = page.requests()
     assert own == path.as_uri() + "?noui"
     assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
 
 
-def test_the_first_view_is_that_of_the_training_camera(page, gaussians, initial_view):
+def test_first_view_is_the_training_camera(page, gaussians, initial_view):
     camera = shown_camera(page, initial_view)
     np.testing.assert_allclose(
         camera.camera_to_world, initial_view.camera.camera_to_world, atol=1e-5 * RADIUS
@@ -146,7 +146,7 @@ def test_the_first_view_is_that_of_the_training_camera(page, gaussians, initial_
     assert_shown_as_fitted(page.rendered(), initial_view.camera, gaussians)
 
 
-def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, initial_view):
+def test_dragging_orbits_the_focus_at_the_same_height(page, gaussians, initial_view):
     before, first = shown_camera(page, initial_view), page.rendered()
     page.drag((30, 90), (210, 90))
     settle(page)
@@ -159,14 +159,14 @@ def test_dragging_walks_around_the_focus_at_the_same_height(page, gaussians, ini
     cosine = level[0] @ level[1] / np.prod(np.linalg.norm(level, axis=1))
     assert 15 < np.degrees(np.arccos(cosine)) < 90
     assert abs(after.camera_to_world[:3, 0] @ UP) < 1e-3  # upright
-    assert decibels(first, page.rendered()) < OTHERWISE
+    assert decibels(first, page.rendered()) < MAX_WRONG_PSNR_DB
     assert_shown_as_fitted(page.rendered(), after, gaussians)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_with_its_controls_it_fits_the_window_and_turns(path, size):
+def test_page_with_controls_fits_the_window_and_orbits(path, size):
     width, height = SIZES[size]
-    with browsers.a_page(width, height) as page:
+    with browsers.browser_page(width, height) as page:
         page.cut_off()
         page.open(path.as_uri())
         page.wait_for("window.viewer?.state.loaded")
@@ -178,18 +178,18 @@ def test_with_its_controls_it_fits_the_window_and_turns(path, size):
         page.drag(middle, (middle[0] + 80, middle[1] + 20))
         settle(page)
         shown = np.s_[height // 3 : height // 2, width // 4 : 3 * width // 4]
-        assert decibels(page.rendered()[shown], before[shown]) < OTHERWISE
-        assert page.troubles() == []
+        assert decibels(page.rendered()[shown], before[shown]) < MAX_WRONG_PSNR_DB
+        assert page.console_errors() == []
         own, *others = page.requests()
         assert own == path.as_uri() and all(a.startswith(("blob:", "data:")) for a in others)
 
 
-def test_a_title_is_text(page):
+def test_title_is_escaped(page):
     assert page.evaluate("document.title") == f"{TITLE}: Gaussian splats"
     assert page.evaluate("typeof window.intruder") == "undefined"
 
 
-def test_without_webgl_the_page_says_what_it_needs(path):
+def test_page_without_webgl_explains_what_it_needs(path):
     with browsers.Browser(*browsers.NO_WEBGL) as browser:
         page = browsers.Page(browser, WIDTH, HEIGHT)
         page.cut_off()

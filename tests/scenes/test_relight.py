@@ -38,7 +38,7 @@ def errors(true, found) -> dict[str, float]:
     return {name: float(np.linalg.norm(np.subtract(v, true[name]))) for name, v in found.items()}
 
 
-def from_half_way(relight, monkeypatch, name):
+def start_halfway(relight, monkeypatch, name):
     """A case whose start is half as far away, of more paths: its unknowns by name, at first."""
     case = relight.CASES[name]
     start = {
@@ -51,7 +51,7 @@ def from_half_way(relight, monkeypatch, name):
     return start
 
 
-def found_by(relight, output, name) -> dict[str, list[float]]:
+def printed_unknowns(relight, output, name) -> dict[str, list[float]]:
     """The unknowns in the table that a run has printed."""
     rows = re.findall(r"^\| (.*) \| .* \| .* \| (.*) \|$", output, re.MULTILINE)
     found = {title: [float(x) for x in row.split(", ")] for title, row in rows[2:]}
@@ -62,9 +62,9 @@ def found_by(relight, output, name) -> dict[str, list[float]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["objects", "mirror"])
-def test_what_the_image_was_made_of_is_found(relight, monkeypatch, tmp_path, capsys, name):
+def test_parameters_of_the_target_image_are_recovered(relight, monkeypatch, tmp_path, capsys, name):
     """In 40 steps, from a start that is half as far away."""
-    start = from_half_way(relight, monkeypatch, name)
+    start = start_halfway(relight, monkeypatch, name)
     monkeypatch.setattr(relight, "BALL", [0.9, 0.2, 0.45])  # beside the knot
     out = ["--out", tmp_path]
     run(relight, monkeypatch, MODEL, "--case", name, "--size", 40, "--iterations", 40, *out)
@@ -72,7 +72,7 @@ def test_what_the_image_was_made_of_is_found(relight, monkeypatch, tmp_path, cap
     losses = [float(x) for x in re.findall(r"loss ([\d.e+-]+)", output)]
     assert losses[-1] < losses[0] / 20
     true = relight.CASES[name].true
-    at_start, at_end = errors(true, start), errors(true, found_by(relight, output, name))
+    at_start, at_end = errors(true, start), errors(true, printed_unknowns(relight, output, name))
     for key in start:
         assert at_end[key] < at_start[key] / 3, key
     assert (tmp_path / "parameters.md").read_text() in output
@@ -92,7 +92,7 @@ def test_a_models_smoothing_filter_reaches_the_integrator(relight):
     np.testing.assert_array_equal(np.array(filters[1]), smoothing)
 
 
-def test_harmonics_are_rotated_as_on_the_host(relight):
+def test_sh_rotation_matches_the_host(relight):
     rotation = Rotation.from_rotvec([0.3, -0.7, 0.4]).as_matrix()
     coefficients = np.random.default_rng(0).normal(0, 1, (5, 15, 3)).astype(np.float32)
     matrix = relight.sh_rotation(mi.Matrix3f(rotation), 3)

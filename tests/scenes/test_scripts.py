@@ -56,41 +56,41 @@ def script(monkeypatch, tmp_path):
     return run
 
 
-def test_every_script_is_tried():
+def test_every_script_is_tested():
     files = [path for folder in ("docs", "scenes") for path in (REPOSITORY / folder).glob("*.py")]
     found = {path.stem for path in files if "__main__" in path.read_text()}
     assert found == set(SCRIPTS)
 
 
-def test_images_of_shapes_go_where_the_command_is_run(script):
+def test_shape_images_are_written_to_the_current_folder(script):
     assert script("compare_shapes") == {"out/shapes.png"}
 
 
-def test_the_knot_goes_where_the_command_is_run(script):
+def test_knot_is_written_to_the_current_folder(script):
     assert script("knot") == {"out/knot.ply"}
 
 
-def test_the_image_of_tiles_goes_where_the_command_is_run(script):
+def test_tile_image_is_written_to_the_current_folder(script):
     assert script("draw_tiles") == {"out/tiles.png"}
 
 
-def test_the_table_of_a_flat_mirror_goes_nowhere(script, capsys):
+def test_flat_mirror_table_is_only_printed(script, capsys):
     assert script("flat_mirror", "--size", 8, "--splats", 20) == set()
     assert capsys.readouterr().out.count("\n") == 6
 
 
-def test_the_tables_of_what_is_known_go_nowhere(script, capsys):
+def test_among_surfaces_tables_are_only_printed(script, capsys):
     assert script("among_surfaces") == set()
     assert capsys.readouterr().out.count("\n") == 4
 
 
-def test_what_was_relit_goes_where_the_command_is_run(script):
+def test_relit_images_are_written_to_the_current_folder(script):
     model = SCENES / "shapes" / "knot.ply"
     assert script("relight", model) == {"out/relight/target.png"}
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_no_command_writes_anywhere_else_by_default(module):
+def test_commands_write_to_the_current_folder_by_default(module):
     parser = CommandParser(prog="command")
     importlib.import_module(module).add_arguments(parser)
     for action in parser._actions:
@@ -98,7 +98,7 @@ def test_no_command_writes_anywhere_else_by_default(module):
             assert action.required or action.default is None or not action.default.is_absolute()
 
 
-def test_a_file_that_is_touched_is_found(tmp_path, monkeypatch):
+def test_modified_file_is_found(tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "REPOSITORY", tmp_path)
     path = tmp_path / "docs" / "a.png"
     path.parent.mkdir()

@@ -137,7 +137,7 @@ def _loss_and_gradient(height, width, weight):
 def _check_loss_and_gradient():
     x, y, expected_loss, expected_gradient = _loss_and_gradient(9, 3, 0.2)
     loss, gradient = loss_checks.value_and_gradient(x, y, 0.2)
-    # As in test_losses.
+    # Tolerances of test_losses.
     assert loss == pytest.approx(expected_loss, rel=1e-12)
     np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-5, atol=2e-11)
 
@@ -261,13 +261,13 @@ def outcome():
             patch.setattr(module, "render", cache(helpers.render))
         for name in ("kernel_gradients", "kernel_tangent"):
             function = getattr(rendering_checks, name)
-            patch.setattr(rendering_checks, name, _remembered(board, function))
+            patch.setattr(rendering_checks, name, _memoized(board, function))
         general, special = _detectors(at_thresholds)
         result = find_noticed(board, general, special)
     return result
 
 
-def _remembered(board, function):
+def _memoized(board, function):
     """``function(case, precision, weights)``, whose results without a mutant are remembered for
     the mutants that it does not read.
     """
@@ -359,7 +359,7 @@ def sample_mutants(source):
     return results
 
 
-def test_mutants_are_what_they_say():
+def test_mutants_compute_their_described_change():
     expected = {
         ("x < y", AT_EQUALITY): [15, -9],
         ("x < y", ALWAYS): [15, -9],
@@ -378,7 +378,7 @@ def test_mutants_are_what_they_say():
     assert sample_mutants(SAMPLE) == {key: pytest.approx(value) for key, value in expected.items()}
 
 
-def test_a_partial_that_is_added_has_mutants():
+def test_added_partial_has_mutants():
     added = SAMPLE.replace("1 - g * x]", "dr.fma(g, -x, 2 - x / x)]")
     texts = {text for text, _ in set(sample_mutants(added)) - set(sample_mutants(SAMPLE))}
     assert texts == {
@@ -388,7 +388,7 @@ def test_a_partial_that_is_added_has_mutants():
     }
 
 
-def test_a_mutant_compiles_no_kernel():
+def test_mutants_compile_no_kernel():
     board = Switchboard()
     adjoint = Instrumented(board, SAMPLE, ["adjoint"], ["forward"])["adjoint"]
     arguments = [dr.opaque(Float64, value, 4) for value in (2, 3, 5)]

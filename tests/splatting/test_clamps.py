@@ -105,7 +105,7 @@ CENTER = at_pixel(8, 6)
 
 
 @both_precisions
-def test_a_clamped_alpha_has_no_derivative_and_its_colour_has(precision):
+def test_clamped_alpha_has_no_derivative_but_its_colour_has(precision):
     gaussians = splat(logit_opacities=[6.0])
     gradients = gradients_of(gaussians, precision, CENTER)
     for name in ("logit_opacities", "log_scales", "quats"):
@@ -140,7 +140,7 @@ def test_an_alpha_below_the_cut_has_no_gradient_at_all(precision, factor, is_see
 
 
 @both_precisions
-def test_a_pixel_outside_the_ellipse_has_no_gradient_where_others_have(precision):
+def test_pixel_outside_the_ellipse_has_no_gradient(precision):
     gaussians = splat(log_scales=np.log([[0.02, 0.02, 0.02]]))
     assert not gradients_of(gaussians, precision, at_pixel(14, 6))["means"].any()
     assert gradients_of(gaussians, precision, at_pixel(9, 6))["means"].any()
@@ -228,7 +228,7 @@ def test_a_gaussian_nearer_than_the_near_plane_has_no_gradient(precision, z, is_
 
 
 @both_precisions
-def test_what_lies_behind_the_stop_has_no_gradient(precision):
+def test_splats_behind_the_stop_have_no_gradient(precision):
     """Two clamped splats leave just less than the stop: the second and all behind have none."""
     layers = [
         splat(means=[[0.0, 0.0, z]], logit_opacities=[logit])
@@ -246,7 +246,7 @@ def test_what_lies_behind_the_stop_has_no_gradient(precision):
 
 
 @both_precisions
-def test_a_splat_far_below_a_pixel_moves_but_its_size_does_not_matter(precision):
+def test_subpixel_splat_has_position_gradients_but_no_scale_gradients(precision):
     """The low-pass is added, not clamped: the gradient of the size fades with the size squared."""
     off_center = at_pixel(9, 6)
 

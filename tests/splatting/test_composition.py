@@ -61,12 +61,12 @@ for module, name in [{names}]:
 """
 
 
-NOT_CALLED_FOR_BY_DEGREE_1 = """
+UNUSED_AT_DEGREE_1 = """
     (projection, "compensated_opacity"), (rendering, "depth_feature"), (sh, "C2"), (sh, "C3"),
 """
 
 
-NOT_CALLED_FOR_BY_DEGREE_0 = NOT_CALLED_FOR_BY_DEGREE_1 + '(sh, "C1"),'
+UNUSED_AT_DEGREE_0 = UNUSED_AT_DEGREE_1 + '(sh, "C1"),'
 
 
 def kernels_in_a_new_process(run_python, degree, rule, features, forbidden=None):
@@ -89,10 +89,10 @@ PLAIN = {"rule": "projection.plain_opacity", "features": "(rendering.color_featu
 
 @pytest.mark.parametrize(
     ("degree", "forbidden"),
-    [(0, NOT_CALLED_FOR_BY_DEGREE_0), (1, NOT_CALLED_FOR_BY_DEGREE_1)],
+    [(0, UNUSED_AT_DEGREE_0), (1, UNUSED_AT_DEGREE_1)],
     ids=["degree 0", "degree 1"],
 )
-def test_kernels_are_the_same_when_everything_else_is_removed(run_python, degree, forbidden):
+def test_kernels_are_the_same_without_unused_modules(run_python, degree, forbidden):
     whole = kernels_in_a_new_process(run_python, degree, **PLAIN)
     reduced = kernels_in_a_new_process(run_python, degree, **PLAIN, forbidden=forbidden)
     assert whole == reduced
@@ -108,10 +108,10 @@ def test_kernels_are_the_same_when_everything_else_is_removed(run_python, degree
     ],
     ids=["degree 2", "compensation", "depth"],
 )
-def test_what_was_removed_is_missed_when_it_is_called_for(run_python, degree, change, used):
+def test_missing_module_fails_only_when_its_feature_is_used(run_python, degree, change, used):
     with pytest.raises(RuntimeError, match=used):
         kernels_in_a_new_process(
-            run_python, degree, **{**PLAIN, **change}, forbidden=NOT_CALLED_FOR_BY_DEGREE_1
+            run_python, degree, **{**PLAIN, **change}, forbidden=UNUSED_AT_DEGREE_1
         )
 
 
@@ -140,7 +140,7 @@ def operations(kernels) -> dict[str, int]:
     ],
     ids=["degree 2", "degree 3", "compensation", "depth"],
 )
-def test_what_is_called_for_adds_operations_where_it_belongs(plain_kernels, change, in_compositing):
+def test_options_add_operations_to_their_stage_only(plain_kernels, change, in_compositing):
     more = kernels_of_a_frame(rendering.Pipeline(**{"sh_degree": 1, **change}))
     before, after = operations(plain_kernels), operations(more)
     assert all(after[name] > before[name] for name in before), (before, after)
@@ -150,7 +150,7 @@ def test_what_is_called_for_adds_operations_where_it_belongs(plain_kernels, chan
         assert (loop in more[name]) != in_compositing, (name, loop, more[name])
 
 
-def test_less_is_called_for_at_degree_0(plain_kernels):
+def test_degree_0_needs_fewer_operations(plain_kernels):
     fewer = operations(kernels_of_a_frame(rendering.Pipeline(0)))
     more = operations(plain_kernels)
     assert all(fewer[name] < more[name] for name in more)
@@ -169,7 +169,7 @@ def test_kernels_do_not_depend_on_the_camera_or_the_sizes(plain_kernels):
 
 @pytest.mark.parametrize("float_type", [llvm.Float, llvm.Float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("mode", ["Auto", "Direct", "Local", "NoConflicts", "Expand"])
-def test_the_search_finds_every_way_to_scatter_add_floats(float_type, mode):
+def test_search_finds_every_kind_of_float_scatter_add(float_type, mode):
     def scatter_add():
         target, index = dr.zeros(float_type, 100), dr.arange(llvm.UInt32, 1000) % 7
         dr.scatter_add(target, float_type(index), index, mode=getattr(dr.ReduceMode, mode))
@@ -181,7 +181,7 @@ def test_the_search_finds_every_way_to_scatter_add_floats(float_type, mode):
     assert atomic == (mode in ("Direct", "Local"))
 
 
-def test_the_search_finds_the_derivative_of_a_gather_but_no_integers():
+def test_search_finds_gather_derivatives_but_no_integer_scatter():
     def differentiated_gather():
         source = dr.opaque(llvm.Float, 1.0, 100)
         dr.enable_grad(source)

@@ -28,7 +28,7 @@ def arrays(kind, channels):
 
 
 @pytest.mark.parametrize("size", FEATURES_AT_ONCE)
-def test_many_channels_have_the_bytes_of_few(size):
+def test_grouped_channels_equal_channels_rendered_alone(size):
     """Two whole groups, and a part of one."""
     kind, most = {4: np.float32, 8: np.float64}[size], FEATURES_AT_ONCE[size]
     given = arrays(kind, 2 * most + 3 if size == 8 else most + 3)

@@ -58,7 +58,7 @@ def test_image_and_gradients_are_within_the_bound(precision, name):
     assert max(ratios.values()) <= 1, ratios
 
 
-def test_the_bounds_are_tight():
+def test_error_bounds_are_tight():
     """A bound that allows anything proves nothing: most families have five digits or more."""
     relative = []
     for name in FAMILIES:
@@ -67,7 +67,7 @@ def test_the_bounds_are_tight():
     assert np.median(relative) < 2e-5 and max(relative) < 1e-2, sorted(relative)
 
 
-def test_textbook_formulas_exceed_the_bound_where_the_stable_ones_do_not():
+def test_bound_distinguishes_textbook_from_stable_formulas():
     """The conic by xx yy - xy^2 in float32 loses needles: the bound tells the two apart."""
     case = FAMILIES["needles of ratio 1e6"]
     affine = reference._local_affine(case.gaussians, case.camera)
@@ -132,7 +132,7 @@ def test_reference_gradient_is_the_slope_of_the_reference(name):
     fields, fields_before = moved(1), moved(-1)
     after, before = loss(fields), loss(fields_before)
     slope = np.sum(after - before) / (2 * step)
-    # What the parameters did move by: far from the origin, means cannot move by any amount.
+    # The actual changes of the parameters: far from the origin, means move in coarse steps.
     terms = [gradients[key] * (fields[key] - fields_before[key]) / (2 * step) for key in direction]
     analytic = sum(term.sum() for term in terms)
     size = np.sqrt(sum((term**2).sum() for term in terms))

@@ -45,7 +45,7 @@ ORDINARY = [
 
 
 @pytest.mark.parametrize("case", ORDINARY, ids=lambda case: case.name)
-def test_ten_thousand_ordinary_gaussians_in_float32(case):
+def test_ten_thousand_gaussians_match_the_reference_in_float32(case):
     """Images within 2e-5 of the reference, gradients within 1e-4, cosines above 0.99999.
 
     A mean at 400 px carries 3 roundings of 2.4e-5 px or less, of either sign, and alpha changes by
@@ -73,7 +73,7 @@ def test_ten_thousand_ordinary_gaussians_in_float32(case):
 NOT_FINITE = Case("not finite", 21, 18, 1, count=30)
 
 
-INFINITE_BUT_MEANINGFUL = {
+MEANINGFUL_INFINITIES = {
     ("log_scales", -np.inf): "a scale of 0: a point, which the low-pass makes a pixel wide",
     ("logit_opacities", np.inf): "an opacity of 1",
     ("sh0", -np.inf): "a colour of 0",
@@ -96,7 +96,7 @@ def planes_and_gradients(gaussians, case, precision):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
-def test_a_number_that_is_not_finite_reaches_no_other_row(precision, antialiased, value, name):
+def test_nonfinite_value_affects_no_other_row(precision, antialiased, value, name):
     """The row is dropped: the image and all other gradients are, bit by bit, those without it."""
     case = clear(replace(NOT_FINITE, antialiased=antialiased))
     row = most_important_row(case)
@@ -105,7 +105,7 @@ def test_a_number_that_is_not_finite_reaches_no_other_row(precision, antialiased
     planes, gradients = planes_and_gradients(reference.Gaussians(**spoiled), case, precision)
     assert all(np.isfinite(plane).all() for plane in planes)
     assert all(np.isfinite(gradient).all() for gradient in gradients.values())
-    if (name, value) in INFINITE_BUT_MEANINGFUL:
+    if (name, value) in MEANINGFUL_INFINITIES:
         return
     without = {key: np.delete(array, row, 0) for key, array in vars(case.gaussians).items()}
     expected_planes, expected_gradients = planes_and_gradients(
@@ -132,7 +132,7 @@ def most_important_row(case) -> int:
         ("sh0", -np.inf),
     ],
 )
-def test_infinities_that_mean_something_are_drawn_as_that(precision, name, value):
+def test_meaningful_infinities_are_rendered_as_limits(precision, name, value):
     """The limit of large numbers: the image is that of -1e4 (or 1e4), to the last bit."""
     case = clear(NOT_FINITE)
     row = most_important_row(case)

@@ -82,7 +82,7 @@ def test_an_empty_view_is_the_background_and_has_no_gradient(precision):
 
 
 @both_precisions
-def test_a_million_gaussians_in_one_pixel(precision):
+def test_million_gaussians_in_one_pixel_match_the_reference(precision):
     """The pixel stops after some 2,130 layers of alpha 1.1 / 255: the nearest 3,000 are all.
 
     The others are equally visible, but the pixel is finished: their gradient is zero.

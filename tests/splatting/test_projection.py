@@ -24,9 +24,9 @@ from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.reference import splatting as reference
 from drgs.splatting.projection import compensated_opacity, load_rows, plain_opacity, project
 
-# Of the largest number of each array. Chains of some hundred roundings, 1e-14 in float64 and 1e-5
-# in float32 (2^29 times as much), and factors of a few where the terms of a quaternion's or a
-# mean's gradient cancel. Measured: 1e-14 and 5e-6.
+# Relative to the largest number of each array. Chains of some hundred roundings, 1e-14 in float64
+# and 1e-5 in float32 (2^29 times as much), and factors of a few where the terms of a quaternion's
+# or a mean's gradient cancel. Measured: 1e-14 and 5e-6.
 TOLERANCE = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 CASES = [
@@ -62,7 +62,7 @@ def splats_as_numpy(splats) -> dict[str, np.ndarray]:
     }
 
 
-def test_constants_are_those_of_the_reference():
+def test_constants_match_the_reference():
     assert constants.ALPHA_MAX == reference.ALPHA_MAX
     assert constants.ALPHA_CUT == reference.ALPHA_CUT
     assert constants.TRANSMITTANCE_STOP == reference.TRANSMITTANCE_STOP
@@ -72,7 +72,7 @@ def test_constants_are_those_of_the_reference():
 
 @both_precisions
 @all_cases
-def test_splats_equal_the_reference(precision, case):
+def test_splats_match_the_reference(precision, case):
     expected = reference.project(case.gaussians, case.camera, case.antialiased)
     splats = project_case(case, precision)
     visible = np.array(splats.visible)
@@ -168,7 +168,7 @@ def test_gradients_equal_the_reference(precision, case):
                 assert_arrays_agree(scaled, expected, TOLERANCE[precision])
 
 
-def test_scenes_clamp_the_slope_on_every_side_and_leave_visible_splats():
+def test_scenes_clamp_slopes_on_every_side_and_keep_visible_splats():
     case = CASES[0]
     splats = reference.project(case.gaussians, case.camera)
     affine = reference._local_affine(case.gaussians, case.camera)
@@ -212,7 +212,7 @@ def test_zero_quaternion_is_the_identity_and_has_no_gradient(precision):
 
 
 @both_precisions
-def test_a_mean_on_the_near_plane_is_visible_and_one_before_it_is_not(precision):
+def test_mean_on_the_near_plane_is_visible_and_one_before_it_is_not(precision):
     camera = reference.Camera(np.eye(3), np.zeros(3), 10, 10, 8, 8, 16, 16, near=0.5)
     z = [0.5, 0.5 * (1 - 1e-6), 0.0, -0.5]
     gaussians = reference.Gaussians(
@@ -228,7 +228,7 @@ def test_a_mean_on_the_near_plane_is_visible_and_one_before_it_is_not(precision)
 
 
 @both_precisions
-def test_a_camera_far_from_the_origin_sees_the_same(precision):
+def test_camera_far_from_the_origin_renders_the_same(precision):
     """Coordinates are multiples of 2^-10, so moving them by 4096 is exact."""
     case = CASES[0]
     gaussians, camera = case.scene
@@ -293,7 +293,7 @@ def test_a_splat_without_area_is_invisible_when_compensated(precision):
 @both_precisions
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh0"])
-def test_gaussians_that_are_not_finite_are_invisible(precision, name, value):
+def test_nonfinite_gaussians_are_invisible(precision, name, value):
     case = CASES[0]
     broken = getattr(case.gaussians, name).copy()
     row = int(np.flatnonzero(reference.project(*case.scene).visible)[0])

@@ -86,7 +86,7 @@ TURNED = 8 * 3.3 * 20
 @both_precisions
 @examples
 @given(cases(), seeds)
-def test_rows_may_come_in_any_order(precision, case, seed):
+def test_result_is_invariant_to_row_order(precision, case, seed):
     """Only the depth orders the splats, and each row has its own gradient."""
     assume_decided(case)
     weights = random_weights(case)
@@ -100,9 +100,7 @@ def test_rows_may_come_in_any_order(precision, case, seed):
 @both_precisions
 @examples
 @given(cases(), seeds)
-def test_quaternions_negated_or_scaled_by_powers_of_two_are_the_same_rotations(
-    precision, case, seed
-):
+def test_negated_and_scaled_quaternions_are_the_same_rotations(precision, case, seed):
     """Their gradients are divided by the factor, and nothing else changes."""
     rng = np.random.default_rng(seed)
     signs, exponents = rng.choice([-1.0, 1.0], case.count), rng.integers(-20, 21, case.count)
@@ -117,7 +115,7 @@ def test_quaternions_negated_or_scaled_by_powers_of_two_are_the_same_rotations(
 @both_precisions
 @examples
 @given(cases(), st.floats(-10, 0.99), seeds)
-def test_a_gaussian_nearer_than_the_near_plane_does_not_exist(precision, case, depth, seed):
+def test_gaussian_before_the_near_plane_is_ignored(precision, case, depth, seed):
     """depth: in units of the near plane's; negative ones are behind the camera."""
     rng = np.random.default_rng(seed)
     row = rng.integers(0, case.count + 1)
@@ -134,7 +132,7 @@ def test_a_gaussian_nearer_than_the_near_plane_does_not_exist(precision, case, d
 @both_precisions
 @examples
 @given(cases([(0, False), (3, False)]), st.integers(-20, 20))
-def test_points_and_camera_may_be_scaled_by_powers_of_two(precision, case, exponent):
+def test_image_is_invariant_to_scaling_by_powers_of_two(precision, case, exponent):
     """Depths scale, and the weights of depths inversely: the loss is the same.
 
     Points, since the logarithm of a scaled size would be rounded: e^-1000 is zero.
@@ -167,7 +165,7 @@ def scaled_result(result, factor) -> Result:
 @both_precisions
 @examples
 @given(cases(KINDS[:2]), seeds)
-def test_scene_and_camera_may_be_rotated_and_moved_together(precision, case, seed):
+def test_image_is_invariant_to_rigid_motion(precision, case, seed):
     """Gradients of positions turn with the scene, those of quaternions as quaternions do.
 
     With q' = p q, p of norm 1, quaternions are multiplied by an orthogonal matrix P, and so are
@@ -204,7 +202,7 @@ def hamilton_product(quat) -> np.ndarray:
 @both_precisions
 @examples
 @given(cases(), st.floats(-10, 10))
-def test_scene_and_camera_may_be_scaled_together(precision, case, exponent):
+def test_image_is_invariant_to_scaling(precision, case, exponent):
     """With the near plane; depths scale, and the weights of depths inversely.
 
     Sizes are off by the roundings of their logarithms, of up to 11: less than the positions.

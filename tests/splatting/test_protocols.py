@@ -79,12 +79,12 @@ def missing(protocol, implementation):
 
 
 @pytest.mark.parametrize(("protocol", "implementation"), pairs(CLASSES))
-def test_a_class_has_what_its_protocol_says(protocol, implementation):
+def test_class_implements_its_protocol(protocol, implementation):
     assert len(members(protocol)) >= 3
     assert missing(protocol, implementation) == []
 
 
-def test_what_is_missing_is_found():
+def test_missing_members_are_found():
     assert "view_direction" in missing(lens.Lens, camera.Aperture)
     assert missing(lens.Lens, lens.Perspective) == ["project_point", "projection_jacobian"]
 

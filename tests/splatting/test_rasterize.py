@@ -124,7 +124,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, scene):
 
 
 @both_precisions
-def test_a_pixel_stops_before_the_splat_that_would_take_it_below_the_stop(precision):
+def test_pixel_stops_before_the_splat_that_crosses_the_stop(precision):
     scene = stack([0.9, 0.9, 0.9, 0.95, 0.1])
     planes = scene.kernel_planes(precision)
     expected = 0.9 + 2 * 0.09 + 3 * 0.009
@@ -146,7 +146,7 @@ def test_the_second_clamped_splat_stops_the_pixel(precision):
 
 
 @both_precisions
-def test_a_clamped_alpha_has_no_derivative_but_the_colour_has(precision):
+def test_clamped_alpha_has_no_derivative_but_the_colour_has(precision):
     scene = stack([0.999, 0.5], offset=(0.3, 0.1))
     gradients = scene.kernel_gradients(precision, np.ones((1, 1, 1)), np.ones((1, 1)))
     for name in ("means2d", "conic_factor", "opacities"):
@@ -172,7 +172,7 @@ def test_alpha_is_cut_at_its_threshold(precision, factor, seen):
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65, 200])
-def test_lists_around_a_word_of_32_entries(precision, count):
+def test_lists_around_32_entries_match_the_reference(precision, count):
     """On four tiles, so that three of the lists begin within a word."""
     opacities = np.random.default_rng(count).uniform(0.01, 0.06, count)
     scene = stack(opacities, 20, 20, sigma=9.0)
@@ -190,7 +190,7 @@ def test_lists_around_a_word_of_32_entries(precision, count):
 
 
 @both_precisions
-def test_a_needle_leaves_nothing_where_its_exponent_is_far_below_the_range(precision):
+def test_needle_is_zero_where_its_exponent_underflows(precision):
     """A horizontal needle 0.55 px thick: 3 px away, in the same micro-tile, exp2(-19); with the
     steepest conic, times 100, exponents reach -2000, where a short exp2 returns garbage.
     """
@@ -215,7 +215,7 @@ def test_a_needle_leaves_nothing_where_its_exponent_is_far_below_the_range(preci
 
 
 @both_precisions
-def test_without_a_visible_splat_the_film_is_transparent(precision):
+def test_film_without_visible_splats_is_transparent(precision):
     scene = replace(stack([0.5, 0.5], 20, 10), opacities=np.array([0.001, 0.002]))
     planes = scene.kernel_planes(precision)
     assert (planes["transmittance"] == 1).all() and not planes["features"].any()
@@ -226,7 +226,7 @@ def test_without_a_visible_splat_the_film_is_transparent(precision):
 
 
 @both_precisions
-def test_memory_that_was_never_written_is_never_read(precision):
+def test_uninitialised_memory_is_never_read(precision):
     """Partial derivatives and rows are stored in uninitialised memory: fill it with NaN first."""
     scene = SCENES["opaque"]
     cotangents = scene.random_cotangents()
@@ -278,7 +278,7 @@ def test_lanes_visit_every_micro_tile_once(size):
 
 @both_precisions
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 7])
-def test_records_hold_geometry_and_features_of_each_entry_that_touches(precision, count):
+def test_records_contain_geometry_and_features_of_each_overlapping_entry(precision, count):
     scene = SCENES["37x29"]
     features = np.random.default_rng(0).normal(size=(len(scene.depths), count))
     scene = replace(scene, features=single(features))
@@ -300,7 +300,7 @@ def test_records_hold_geometry_and_features_of_each_entry_that_touches(precision
 
 
 @both_precisions
-def test_slots_are_a_numbering_of_the_composited_pairs(precision):
+def test_composited_pairs_have_unique_contiguous_slots(precision):
     """Every pair that is composited has a slot of its own, and a lane's slots are contiguous."""
     scene = SCENES["opaque"]
     bins, _, layers = scene.composite(precision)
@@ -341,7 +341,7 @@ def test_slots_are_a_numbering_of_the_composited_pairs(precision):
 
 
 @pytest.mark.parametrize("band_slots", [1, 50, 400])
-def test_bands_make_no_difference(band_slots, monkeypatch):
+def test_band_size_does_not_change_the_result(band_slots, monkeypatch):
     """Not even to the last bit, though fewer tiles than there are in a row have slots at a time."""
     scene = SCENES["opaque"]
     bins, records, layers = scene.composite(FLOAT32)

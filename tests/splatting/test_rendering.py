@@ -120,7 +120,7 @@ def test_gradients_equal_the_reference(precision, case):
     ids=["means2d", "conic_factor", "opacities", "features"],
 )
 @both_precisions
-def test_gradients_scaled_by_one_percent_are_noticed(precision, field, first, end, monkeypatch):
+def test_gradient_errors_of_one_percent_are_detected(precision, field, first, end, monkeypatch):
     """A mistake in one output of the hand-written adjoint reaches an array that is compared."""
     case = clear(CASES[0])
     adjoint = rendering.composite_adjoint
@@ -169,7 +169,7 @@ def test_each_output_alone_has_the_right_gradients(precision, output):
     ],
     ids=["color", "depth", "depth color depth"],
 )
-def test_features_are_composited_in_the_order_that_was_asked_for(precision, features):
+def test_features_are_composited_in_the_given_order(precision, features):
     case = clear(CASES[0])
     pipeline = rendering.Pipeline(3, plain_opacity, features)
     gaussians, frame = render(case, precision, pipeline)
@@ -226,7 +226,7 @@ def test_attached_parameters_are_detached(precision):
 
 
 @both_precisions
-def test_visible_are_those_whose_extent_touches_the_film(precision):
+def test_splats_overlapping_the_film_are_visible(precision):
     case = clear(CASES[0])
     gaussians, frame = render(case, precision)
     gradients = frame_adjoint(
@@ -242,7 +242,7 @@ def test_visible_are_those_whose_extent_touches_the_film(precision):
 
 
 @both_precisions
-def test_without_a_visible_splat_there_is_only_the_background(precision):
+def test_image_without_visible_splats_is_background(precision):
     case = Case("hidden", 20, 13, 1, count=5)
     hidden = replace(case.gaussians, logit_opacities=np.full(5, -8.0))
     gaussians = device_gaussians(hidden, precision)
@@ -297,18 +297,18 @@ def test_tangent_equals_central_differences_of_the_reference(precision, case):
 # ----------------------------------------------------------------------------------------------
 
 
-OF_CAMERA = [
+CAMERA_CASES = [
     Case("of the camera", 37, 29, 1),
     Case("of the camera, antialiased", 33, 17, 0, antialiased=True),
 ]
 
 
-@pytest.mark.parametrize("case", OF_CAMERA, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", CAMERA_CASES, ids=lambda case: case.name)
 def test_camera_gradients_of_two_frames_equal_differences_of_the_reference(case):
     check_camera_gradients_of_two_frames_equal_differences_of_the_reference(case)
 
 
-@pytest.mark.parametrize("case", OF_CAMERA, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", CAMERA_CASES, ids=lambda case: case.name)
 def test_camera_tangents_of_two_frames_equal_differences_of_the_reference(case):
     check_camera_tangents_of_two_frames_equal_differences_of_the_reference(case)
 
@@ -320,9 +320,7 @@ def test_camera_tangents_of_two_frames_equal_differences_of_the_reference(case):
 
 @pytest.mark.parametrize("sh_direction", ["mean", "pixel"])
 @both_precisions
-def test_weighted_sums_are_what_a_gaussian_adds_to_the_image_times_the_plane(
-    precision, sh_direction
-):
+def test_weighted_sums_are_image_contributions_times_the_plane(precision, sh_direction):
     """The reference composites each Gaussian alone in white, among the others in black.
 
     Whatever its colour is: two are black, as far as negative colours are.

@@ -69,7 +69,7 @@ def test_every_run_gives_the_same_bytes_on_any_number_of_threads(precision, thre
 
 @both_precisions
 @pytest.mark.parametrize("case", [BUSY, CASES[-2]], ids=lambda case: case.name)
-def test_rows_may_come_in_any_order(precision, case):
+def test_result_is_invariant_to_row_order(precision, case):
     """Depths are distinct, in float32 too: only the depth orders the splats."""
     depths = reference.project(case.gaussians, case.camera).depths.astype(np.float32)
     assert len(np.unique(depths)) == len(depths)

@@ -133,7 +133,7 @@ def test_transmittance_alone_is_rendered_and_differentiated(precision, order):
         assert np.array_equal(got_array, expected_array), name
 
 
-def test_row_that_is_not_finite_has_zero_gradient_and_spoils_no_other():
+def test_nonfinite_row_has_zero_gradient_and_affects_no_other():
     case = clear(Case("not finite", 21, 18, 1))
     good = device_gaussians(case.gaussians, FLOAT32).numpy()
     bad = {}

@@ -172,7 +172,7 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
 
 @both_precisions
 @all_cases
-def test_number_of_entries_is_that_of_the_boxes(precision, case):
+def test_number_of_entries_matches_the_boxes(precision, case):
     """Each visible splat's bounding box, in whole tiles: two computations of the same box."""
     binned = bin_case(case, precision)
     splats = reference.project(case.gaussians, case.camera, case.antialiased)
@@ -240,7 +240,7 @@ def test_tile_start_and_sources_and_padding(precision, case):
 
 @both_precisions
 @all_cases
-def test_words_are_the_masks_transposed(precision, case):
+def test_words_are_transposed_masks(precision, case):
     binned = bin_case(case, precision)
     bits = binned.masks[:, None] >> np.arange(MICROS) & 1
     groups = bits.reshape(-1, WORD, MICROS)
@@ -337,7 +337,7 @@ def test_equal_depths_stay_in_the_order_of_the_gaussians(precision):
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65])
-def test_runs_of_entries_around_a_word(precision, count):
+def test_entry_counts_around_word_boundaries_are_handled(precision, count):
     bins = bin_splats(round_splats(precision, np.full((count, 2), 8.0)), TileGrid(16, 16))
     assert bins.num_entries == count
     words = np.array(bins.words).reshape(-1, MICROS)
@@ -375,7 +375,7 @@ def test_a_needle_touches_only_what_its_ellipse_touches():
     assert diagonal <= micro_tiles <= 3 * diagonal
 
 
-def test_packed_entries_keep_the_largest_numbers():
+def test_packing_preserves_the_largest_numbers():
     numbers = [(1 << 26) - 1, 5, 0], [(1 << 22) - 1, 1 << 16, 0], [(1 << 16) - 1, 0, 9]
     packed = tiles._pack(*(dr.llvm.ad.UInt32(column) for column in numbers))
     assert [np.array(v).tolist() for v in tiles._unpack(*packed)] == [*numbers]

@@ -116,7 +116,7 @@ def window_of(camera, piece, precision):
 @both_precisions
 @examples
 @given(cases(), sizes, sizes)
-def test_windows_together_are_the_whole_image(precision, case, x, y):
+def test_crop_windows_compose_the_whole_image(precision, case, x, y):
     """And their gradients add up to those of the whole image."""
     assume_decided(case)
     undecided = undecided_pixels(case)
@@ -139,7 +139,7 @@ def test_windows_together_are_the_whole_image(precision, case, x, y):
 
 @examples
 @given(plugin_scenes(), sizes, sizes)
-def test_windows_of_a_mitsuba_film_together_are_the_whole_image(scene, x, y):
+def test_crop_windows_of_a_mitsuba_film_compose_the_whole_image(scene, x, y):
     undecided = undecided_pixels(scene)
     loaded = scene.load()
     whole, image = image_of(loaded), np.full((scene.view.height, scene.view.width, 4), np.nan)
@@ -157,7 +157,7 @@ def test_windows_of_a_mitsuba_film_together_are_the_whole_image(scene, x, y):
 
 @examples
 @given(plugin_scenes())
-def test_white_minus_black_is_the_transmittance_and_alpha_the_rest(scene):
+def test_white_minus_black_image_is_the_transmittance(scene):
     """In Mitsuba's film: three channels and alpha."""
     loaded = scene.load()
     black, white = image_of(loaded), image_of(replace(scene, background=(1.0, 1.0, 1.0)).load())
@@ -195,7 +195,7 @@ def test_images_are_linear_in_the_features_and_weights_add_up_to_alpha(precision
 @both_precisions
 @examples
 @given(cases(least=2), seeds)
-def test_a_scene_is_its_front_over_its_back(precision, case, seed):
+def test_scene_is_its_front_composited_over_its_back(precision, case, seed):
     """C = C_front + T_front C_back and T = T_front T_back, if no pixel stops.
 
     60 splats of an opacity of at most sigmoid(-2) leave a transmittance of 5e-4.
@@ -223,7 +223,7 @@ def test_a_scene_is_its_front_over_its_back(precision, case, seed):
 @both_precisions
 @examples
 @given(cases(), seeds)
-def test_a_splat_behind_all_others_takes_its_share_of_the_transmittance(precision, case, seed):
+def test_farthest_splat_is_weighted_by_the_transmittance(precision, case, seed):
     """Nowhere more light comes through; what is lost has the splat's colour and depth."""
     rng = np.random.default_rng(seed)
     camera = case.camera

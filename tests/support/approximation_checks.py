@@ -55,7 +55,7 @@ APPROXIMATIONS = {
 }  # fmt: skip
 
 
-# Those of test_rendering.
+# Tolerances of test_rendering.
 PLANES = {FLOAT64: 1e-12, FLOAT32: 2e-5}
 
 
@@ -187,7 +187,7 @@ def direction(problem, name, seed) -> reference.Gaussians:
 
 
 STEP = 2.0**-24
-"""Of the central differences: their error is STEP^2 times a third derivative of some 1e5, and
+"""Step of central differences: their error is STEP^2 times a third derivative of some 1e5, and
 1e-16 / STEP of each plane's values: 1e-8 in all."""
 
 
@@ -271,7 +271,7 @@ def check_sums_of_products_are_exact_to_twice_the_precision():
     for x, y in zip(a, single(b), strict=True):
         high, low = pixel_order._add_product(high, low, FLOAT32.Float(x), FLOAT32.Float(y))
     expected = math.fsum(a * single(b))
-    # Of doubled single precision, 2^-48 a term.
+    # Doubled single precision: 2^-48 a term.
     assert abs(float(high[0]) + float(low[0]) - expected) < 200 * 2.0**-48 * np.abs(a * b).max()
 
 

@@ -43,7 +43,7 @@ OPTIONS = (
 SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 NO_WEBGL = ("--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis")
 
-PATIENCE = 120.0
+TIMEOUT_SECONDS = 120.0
 """Timeout of an unresponsive browser, seconds, on one of two busy cores."""
 
 SECOND_TO_END = 5.0
@@ -92,7 +92,7 @@ class Browser:
         if session is not None:
             message["sessionId"] = session
         os.write(self._out, json.dumps(message).encode() + b"\0")
-        while (heard := self._heard.get(timeout=PATIENCE)).get("id") != self._count:
+        while (heard := self._heard.get(timeout=TIMEOUT_SECONDS)).get("id") != self._count:
             self.events.append(heard)
         assert "error" not in heard, f"{method}: {heard['error']}"
         return heard["result"]
@@ -144,9 +144,9 @@ class Page:
 
     def wait_for(self, expression: str) -> None:
         """Until it is true."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT_SECONDS
         while not self.evaluate(expression):
-            assert time.monotonic() < end, f"{expression} is not true; {self.troubles()}"
+            assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
             time.sleep(0.05)
 
     def rendered(self) -> np.ndarray:
@@ -183,7 +183,7 @@ class Page:
         """The addresses of all that it has asked for."""
         return [p["request"]["url"] for p in self._events("Network.requestWillBeSent")]
 
-    def troubles(self, levels: Sequence[str] = ("error", "warning")) -> list[str]:
+    def console_errors(self, levels: Sequence[str] = ("error", "warning")) -> list[str]:
         """Exceptions, and what stands in the console at these levels."""
         logged = [p["entry"] for p in self._events("Log.entryAdded")]
         said = self._events("Runtime.consoleAPICalled")
@@ -204,7 +204,7 @@ class Page:
 
 
 @contextmanager
-def a_page(width: int, height: int) -> Iterator[Page]:
+def browser_page(width: int, height: int) -> Iterator[Page]:
     """Yield a page of a new browser, whose images are made by software."""
     with Browser(*SOFTWARE_WEBGL) as browser:
         yield Page(browser, width, height)
@@ -212,7 +212,7 @@ def a_page(width: int, height: int) -> Iterator[Page]:
 
 def wait_until(happens: Callable[[], object], what: str) -> None:
     """Ask until it is true; what: it is that."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT_SECONDS
     while not happens():
         assert time.monotonic() < end, f"there never was {what}"
         time.sleep(0.05)

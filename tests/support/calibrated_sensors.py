@@ -112,7 +112,7 @@ FILM = View("", 37, 29)  # without a crop window
 BARREL = Calibrated("barrel", LENSES["barrel"], FILM, f=(26.0, 26.0), c=(19.0, 14.0))
 
 
-STILL = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM]
+STATIC_SENSORS = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM]
 
 
 by_name = {"ids": lambda sensor: sensor.name}

@@ -19,7 +19,7 @@ def _values(names):
 PARAMETERS = {
     name: _values(names) for name, (_, names) in MODELS.items() if name != "EQUIRECTANGULAR"
 }
-"""Of a camera of each model, 640 x 480 px."""
+"""Parameters of a 640 x 480 px camera, by model."""
 
 
 @dataclass

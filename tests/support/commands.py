@@ -22,7 +22,7 @@ class Outcome:
 def run_in_process(main: Callable[[list[str]], None], *arguments: object) -> Outcome:
     """Call a command's ``main`` as its process would."""
     out, err = StringIO(), StringIO()
-    # As a process begins; a command that Ctrl-C has stopped takes the handler away.
+    # The handler of a new process; a command stopped by Ctrl-C removes it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with redirect_stdout(out), redirect_stderr(err):
         try:

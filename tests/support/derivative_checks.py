@@ -13,7 +13,7 @@ from support.helpers import (
 from support.lens_scenes import directions, moved
 
 STEP = 1e-6
-"""Of the differences of the float64 reference."""
+"""Step of central differences of the float64 reference."""
 
 
 def check_against_differences(case, kernel_gradients, tolerance) -> dict[str, np.ndarray]:

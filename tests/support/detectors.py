@@ -113,16 +113,16 @@ class MutationChecks:
         """Nor does instrumentation change a result."""
         assert outcome.false_alarms == []
 
-    def test_every_mutant_is_noticed(self, outcome):
+    def test_every_mutant_is_detected(self, outcome):
         print(f"\n{outcome.table}")
         survivors = outcome.survivors(self.equivalent)
         assert not survivors, "noticed by nobody:\n" + "\n".join(survivors)
 
-    def test_equivalent_mutants_exist_and_are_noticed_by_nobody(self, outcome):
+    def test_equivalent_mutants_exist_and_are_undetected(self, outcome):
         """Otherwise the reason for leaving them out no longer holds."""
         assert outcome.noticing(self.equivalent) == {key: [] for key in self.equivalent}
 
-    def test_every_detector_notices_a_mutant(self, outcome):
+    def test_every_detector_detects_a_mutant(self, outcome):
         assert outcome.busy_detectors == set(outcome.detectors)
 
     def test_derivatives_have_mutants(self, outcome):

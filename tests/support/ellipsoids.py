@@ -15,15 +15,15 @@ from drgs.reference import splatting as reference
 from support.helpers import assert_arrays_agree, single
 from support.views import Scene, gradient, tensors
 
-# As in test_splats: single precision, relative to the largest value of an array. Scales and
-# opacities are converted with a relative error of 1e-7 each.
+# Tolerances of test_splats: single precision, relative to the largest value of an array. Scales
+# and opacities are converted with a relative error of 1e-7 each.
 IMAGE, GRADIENTS = 1e-5, 1e-4
 
 
-HELD = ("data", "opacities", "sh_coeffs")
+SHAPE_ATTRIBUTES = ("data", "opacities", "sh_coeffs")
 
 
-def held_by(gaussians) -> dict[str, np.ndarray]:
+def float32_attributes(gaussians) -> dict[str, np.ndarray]:
     """Attributes of a shape, (N, ...), float32 values."""
     held = {
         "data": np.concatenate(
@@ -58,14 +58,14 @@ def shape_of(held, kind="ellipsoids", **others) -> dict:
 
 
 @dataclass(frozen=True)
-class Held(Scene):
+class EllipsoidsCase(Scene):
     """A scene whose Gaussians a shape holds; their numbers are what float32 makes of them there."""
 
     kind: str = "ellipsoids"
 
     @property
     def held(self) -> dict[str, np.ndarray]:
-        return held_by(super().gaussians)
+        return float32_attributes(super().gaussians)
 
     @property
     def gaussians(self) -> reference.Gaussians:
@@ -110,7 +110,7 @@ def held_gradients(held, of_gaussians) -> dict[str, np.ndarray]:
 def gradients_held(loaded, weights, prefix="shape") -> dict[str, np.ndarray]:
     """Gradients of sum(weights * image) for what a shape holds, flat."""
     params = mi.traverse(loaded)
-    keys = {name: f"{prefix}.{name}" for name in HELD}
+    keys = {name: f"{prefix}.{name}" for name in SHAPE_ATTRIBUTES}
     for key in keys.values():
         dr.enable_grad(params[key])
     image = mi.render(loaded, params)
@@ -122,7 +122,7 @@ def apart(arrays) -> dict[str, np.ndarray]:
     """With ``data`` in its parts, which differ in size: each has a largest value of its own."""
     data = arrays["data"].reshape(-1, 10)
     parts = {"means": data[:, :3], "scales": data[:, 3:6], "quats": data[:, 6:]}
-    return parts | {name: arrays[name].ravel() for name in HELD if name != "data"}
+    return parts | {name: arrays[name].ravel() for name in SHAPE_ATTRIBUTES if name != "data"}
 
 
 def assert_held_agree(actual, expected):
@@ -163,9 +163,9 @@ class Merged(Scene):
         return replace(self._plain, degree=self.own_degree).gaussians
 
     @property
-    def shapes(self) -> list[Held]:
+    def shapes(self) -> list[EllipsoidsCase]:
         return [
-            Held(self.view, degree=degree, count=count, seed=self.seed + 1000 * (i + 1))
+            EllipsoidsCase(self.view, degree=degree, count=count, seed=self.seed + 1000 * (i + 1))
             for i, (degree, count) in enumerate(zip(self.degrees, (12, 23), strict=True))
         ]
 

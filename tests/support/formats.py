@@ -98,7 +98,7 @@ PRECISION = {
         harmonics=0,
     ),
 }
-"""By name of a format, from its bits."""
+"""Precision of each format, from its bits."""
 
 
 def turned(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:

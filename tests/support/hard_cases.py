@@ -23,7 +23,7 @@ BOUND = 6 * np.sqrt(ROUNDINGS)
 
 
 UNDERFLOW = 1e-15
-"""Of an array's largest value: what is smaller may be lost to products below 1e-38."""
+"""Fraction of an array's largest value below which values may be lost to underflow (1e-38)."""
 
 
 PLANES = ("image", "alpha", "depth", "transmittance")
@@ -503,5 +503,5 @@ SCALES = {FLOAT32: 1.0, FLOAT64: 2 * 2.0**-29}
 
 
 EXACT = 1e-11
-"""Of an array's largest value: what the reference itself may be off by. It evaluates the textbook's
+"""Error of the reference itself, relative to an array's largest value. It evaluates the textbook's
 a dx^2 + 2 b dx dy + c dy^2, which loses as many digits as a needle's squared ratio of axes has."""

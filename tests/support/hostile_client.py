@@ -45,7 +45,7 @@ VALUES = [
 
 PROPERTIES = ["value", "visible", "options", "update_cb", "removed", "props", "uuid", "nonsense"]
 
-SENT_BY_BROWSERS = [
+BROWSER_MESSAGES = [
     *("GuiButtonHoldMessage", "GuiFormSubmitMessage", "GuiFormDirtyMessage"),
     *("FileTransferStartUpload", "FileTransferPart", "CommandTriggerMessage"),
     *("ScenePointerMessage", "SceneNodeDragMessage", "GetRenderResponseMessage"),
@@ -88,7 +88,7 @@ def hostile_messages(seed: int, count: int, uuids: list[str]) -> Iterator[bytes 
 
 def random_fields(pick, uuids: list[str]) -> dict[str, object]:
     """Return a message of a type that browsers send to viser, with arbitrary contents."""
-    name = pick(SENT_BY_BROWSERS)
+    name = pick(BROWSER_MESSAGES)
     fields = dataclasses.fields(getattr(_messages, name))
     values = {field.name: pick([*VALUES, pick(uuids)]) for field in fields if field.init}
     return {"type": name} | values

@@ -20,7 +20,7 @@ from support.lens_scenes import (
     gaussians_at_points,
     lens_camera,
     points_at,
-    points_near_the_end,
+    points_near_lens_limit,
 )
 
 every_lens = pytest.mark.parametrize("name", LENSES)
@@ -64,7 +64,7 @@ def tiny_scene(case, rng):
     film[0], film[1] = (camera.cx, camera.cy), size * [1.5, 0.4]
     distances = rng.uniform(1, 3, case.count)
     points = points_at(case.lens, camera, film, distances)
-    near_the_end = points_near_the_end(case.lens, camera, film, distances)
+    near_the_end = points_near_lens_limit(case.lens, camera, film, distances)
     points = np.where(np.isnan(points), near_the_end, points)
     sizes = rng.uniform(0.7, 3.0, (case.count, 3))
     sizes[1] = 0.5 * max(size)

@@ -208,11 +208,11 @@ def scene_behind(case, rng) -> tuple[reference.Gaussians, reference.Camera]:
         film[7], sizes[7], logits[7] = 0.4 * size, 2.0, 0.0
         film[8] = camera.cx, camera.cy
     points = points_at(case.lens, camera, film, distances)
-    near_the_end = points_near_the_end(case.lens, camera, film, distances)
+    near_the_end = points_near_lens_limit(case.lens, camera, film, distances)
     points = np.where(np.isnan(points), near_the_end, points)
     if special:
         points[0] = [0, 0, -1]
-        beyond = points_beyond(case.lens)
+        beyond = point_beyond_lens_limit(case.lens)
         points[9] = beyond if beyond is not None else points[9]
     gaussians = gaussians_at_points(case, rng, camera, points, sizes, logits)
     if special:
@@ -236,7 +236,7 @@ def gaussians_at_points(case, rng, camera, points, sizes, logits) -> reference.G
     )
 
 
-def points_near_the_end(lens, camera, film, distances) -> np.ndarray:
+def points_near_lens_limit(lens, camera, film, distances) -> np.ndarray:
     """Points (N, 3) seen in the direction of ``film``, close to where the lens model ends."""
     plane = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     radii = np.linalg.norm(plane, axis=1, keepdims=True)
@@ -250,7 +250,7 @@ def points_near_the_end(lens, camera, film, distances) -> np.ndarray:
     return points * distances[:, None]
 
 
-def points_beyond(lens) -> np.ndarray | None:
+def point_beyond_lens_limit(lens) -> np.ndarray | None:
     """A point (3,) that the lens model is not made for; None: it is made for all in front."""
     if isinstance(lens, Fisheye):
         angle = 1.01 * lens.valid_angle

@@ -24,7 +24,7 @@ def gaussians(means, scale=0.3, opacity=0.9, color=1.0, count=None) -> splatting
 
 
 SETTINGS = ("light_samples", "exposure", "probes", "unseen", "shadows", "aovs", "smoothing")
-"""Of the integrator, that :func:`scene_of` takes."""
+"""Integrator settings accepted by :func:`scene_of`."""
 
 
 def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **others):

@@ -125,7 +125,7 @@ DATASETS = {"plain": _plain, "transparent": _transparent, "blurred": _blurred}
 
 
 def fitted(size: int, steps: int, changes: Mapping[str, Any], data: str = "plain") -> list:
-    """Return :func:`found_by` of a small fit on so many processes; data: of DATASETS."""
+    """Return :func:`hashes_and_reports` of a small fit on so many processes; data: of DATASETS."""
     task = json.dumps({"steps": steps, "changes": dict(changes), "data": data})
     status, output, errors = run(size, ["-m", "support.parallel_processes", task])
     assert status == 0, errors
@@ -140,7 +140,7 @@ def state_text(size: int, row: int) -> str:
     return json.loads(output)
 
 
-def found_by(trainer: Any, steps: int) -> list:
+def hashes_and_reports(trainer: Any, steps: int) -> list:
     """After some steps: hashes of the state by name, and what each step has reported."""
     reports = [trainer.step() for _ in range(steps)]
     state = trainer.state()
@@ -168,7 +168,7 @@ def main() -> None:
     if "spoiled" in task:
         found = spoiled(trainer, task["spoiled"])
     else:
-        found = found_by(trainer, task["steps"])
+        found = hashes_and_reports(trainer, task["steps"])
     if comm.is_root:
         print(json.dumps(found))
 

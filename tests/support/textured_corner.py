@@ -8,7 +8,7 @@ from support.datasets import look_at
 
 SIZE, FOCAL = (320, 240), 300.0
 
-PER_UNIT = 64  # texels
+TEXELS_PER_UNIT = 64  # texels
 
 
 def walls(seed=0, side=512):
@@ -29,7 +29,7 @@ def image_of(textures, pose):
     nearest = distances.argmin(axis=0)
     for k in range(3):
         points = center + distances[k][..., None] * rays
-        place = np.delete(points, k, axis=-1) * PER_UNIT
+        place = np.delete(points, k, axis=-1) * TEXELS_PER_UNIT
         for channel in range(3):
             texture = textures[k, :, :, channel]
             seen = map_coordinates(texture, np.moveaxis(place, -1, 0), order=1, mode="wrap")

@@ -12,8 +12,8 @@ from drgs.reference.effects import render_with_surfaces
 from support.helpers import clear
 from support.views import VIEWS, Scene, decode, tensors
 
-# As in test_splats: single precision, relative to the largest value of an array. Conversions to
-# display space multiply errors of dark pixels by up to 13.
+# Tolerances of test_splats: single precision, relative to the largest value of an array.
+# Conversions to display space multiply errors of dark pixels by up to 13.
 IMAGE, GRADIENTS = 2e-5, 1e-4
 
 

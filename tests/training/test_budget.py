@@ -36,7 +36,7 @@ def variant():
     ("text", "seconds"),
     [("90", 90), ("90s", 90), ("5m", 300), ("1h30m", 5400), ("0.5h", 1800), ("1m30s", 90)],
 )
-def test_durations(text, seconds):
+def test_durations_are_parsed(text, seconds):
     assert parse_duration(text) == seconds
 
 
@@ -44,7 +44,7 @@ def test_durations(text, seconds):
     "text",
     ["", "0", "m", "5 minutes", "-3s", "nan", "1m2h", "0s", "1h30", "5m5", "\u0665m", "9" * 400],
 )
-def test_what_is_no_duration_is_refused(text):
+def test_invalid_durations_are_refused(text):
     with pytest.raises(ArgumentTypeError, match="must be a time such as 90s, 5m or 1h30m"):
         parse_duration(text)
 
@@ -58,12 +58,12 @@ POWER = Curve((100, 200, 400), (1000.0, 1000 * 2**1.5, 8000.0), (20.0, 22.0, 24.
 
 
 @pytest.mark.parametrize("n", [50, 100, 150, 200, 333, 400, 3200])
-def test_a_power_law_is_followed_between_and_beyond_the_points(n):
+def test_power_law_is_interpolated_and_extrapolated(n):
     assert POWER.iterations_in(1000 * (n / 100) ** 1.5) == n
     assert POWER.psnr_at(n) == pytest.approx(20 + 2 * np.log2(n / 100))
 
 
-def test_measured_curves_are_those_of_the_strategies():
+def test_every_strategy_has_measured_curves():
     curves = load_curves()
     assert set(curves) == {strategy.name for strategy in plan.STRATEGIES}
     for curve in curves.values():
@@ -91,7 +91,7 @@ def planned(seconds, side=400, start_s=0.1, **curves):
     return make_plan(CONFIG, 50, side, seconds, start_s, curves_of(**curves))
 
 
-def test_the_best_strategy_in_the_time_is_planned():
+def test_best_strategy_within_the_time_is_chosen():
     """A thousand iterations as they are, or two thousand cheaper ones: 30 or 30.5 dB."""
     result = planned(100)
     assert [(c.iterations, c.psnr) for c in result.candidates] == [(1000, 30.0), (2000, 30.5)]
@@ -103,11 +103,11 @@ def test_the_best_strategy_in_the_time_is_planned():
     assert worse.chosen.strategy is plan.STRATEGIES[0] and worse.config.coarse == []
 
 
-def test_a_faster_machine_does_more():
+def test_faster_machine_does_more_iterations():
     assert planned(100, start_s=0.05).config.iterations == 4000
 
 
-def test_reasons_name_all_candidates():
+def test_reasons_list_all_candidates():
     reasons = planned(100).reasons
     assert "100 ms at the start" in reasons and "100 s are enough" in reasons
     assert "1,000 iterations, 30.00 dB there: as shipped" in reasons
@@ -115,7 +115,7 @@ def test_reasons_name_all_candidates():
     assert "1/2 size until iteration 500, then full size" in reasons
 
 
-def test_a_configuration_that_cannot_shrink_is_planned():
+def test_configuration_that_cannot_shrink_gets_a_plan():
     """Stages of its own, which stay, few iterations of changes, revisions of an earlier plan."""
     values = {"coarse": [{"until": 10, "factor": 4}, {"until": 20, "factor": 2}]}
     values |= {"densify.start": 500, "densify.stop": 501}
@@ -128,18 +128,18 @@ def test_a_configuration_that_cannot_shrink_is_planned():
     assert [(s.until, s.factor) for s in result.config.coarse] == [(1, 4)]
 
 
-def test_small_images_do_not_become_smaller():
+def test_small_images_are_not_downscaled():
     assert planned(100, side=50).chosen.strategy is plan.STRATEGIES[0]
 
 
-def test_too_short_a_time_is_refused():
+def test_too_short_time_is_refused():
     with pytest.raises(UserError, match=r"--budget: must leave time for 50 iterations, got 2 s"):
         planned(2)
     with pytest.raises(UserError, match="got 0 s"):
         planned(-3)
 
 
-def test_a_share_of_the_gaussians_is_not_less_than_the_start():
+def test_fraction_of_gaussians_is_at_least_the_start():
     half = Strategy("x", share=0.5)
     growing = with_changes(CONFIG, {"densify.budget.gaussians": 400})
     assert half.apply(growing, 50).densify.budget.gaussians == 200
@@ -153,7 +153,7 @@ def test_a_share_of_the_gaussians_is_not_less_than_the_start():
     assert half.apply(more, 310).densify.mcmc.gaussians == 320
 
 
-def test_a_share_is_planned_only_where_there_is_a_number():
+def test_fraction_is_planned_only_with_a_target_number():
     """The population of adc comes out of a threshold."""
     half = next(strategy for strategy in plan.STRATEGIES if strategy.share == 0.5)
     curves = {plan.STRATEGIES[0].name: SLOW, half.name: replace(FAST, psnr=(31.0, 32.0))}
@@ -214,7 +214,7 @@ def clock(monkeypatch):
 LINEAR = Curve((100, 200), (100.0, 200.0), (20.0, 21.0))
 
 
-def until_the_end(trainer, seconds):
+def run_to_end(trainer, seconds):
     deadline = Deadline(trainer, trainer.clock.now + seconds, LINEAR)
     while deadline.should_continue(trainer):
         trainer.step()
@@ -222,12 +222,12 @@ def until_the_end(trainer, seconds):
 
 
 @pytest.mark.parametrize("second", [0.05, 0.1, 0.2])
-def test_a_fit_ends_in_time_whatever_an_iteration_takes(clock, second):
+def test_fit_ends_in_time_for_any_iteration_cost(clock, second):
     """Planned were 0.1 s. The population changes during six tenths of the iterations.
 
     An iteration or two more or less: the clock is read between them.
     """
-    trainer = until_the_end(FakeTrainer(clock, second), 100)
+    trainer = run_to_end(FakeTrainer(clock, second), 100)
     assert 200 <= clock.now < 200 + 2 * second
     n = trainer.iteration
     assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
@@ -236,7 +236,7 @@ def test_a_fit_ends_in_time_whatever_an_iteration_takes(clock, second):
     assert trainer.rates.means(n) == pytest.approx(trainer.rates.means.final, rel=0.02)
 
 
-def test_a_fit_that_becomes_slower_is_revised(clock):
+def test_plan_of_a_slowing_fit_is_revised(clock):
     trainer = FakeTrainer(clock, 0.05)
     deadline = Deadline(trainer, clock.now + 100, LINEAR)
     rates = []
@@ -261,12 +261,12 @@ def test_the_expected_end_follows_the_clock(clock):
     assert deadline.num_iterations(trainer) == 500
 
 
-def test_the_end_of_changes_is_never_before_their_start(clock):
+def test_density_changes_never_end_before_they_start(clock):
     trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
-    assert until_the_end(trainer, 100).config.densify.stop == 591
+    assert run_to_end(trainer, 100).config.densify.stop == 591
 
 
-def test_a_change_of_what_has_happened_is_refused():
+def test_rescheduling_past_iterations_is_refused():
     trainer = make_trainer(densify={"start": 2, "stop": 5})
     for _ in range(4):
         trainer.step()
@@ -333,7 +333,7 @@ def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
     )
 
 
-def test_a_plan_that_was_revised_since_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
+def test_plan_revised_after_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
     """Whatever ends the process while the next one is written: one of both plans goes on."""
     config = FitConfig(data={"path": tmp_path}, iterations=40_000)
     state = empty_checkpoint()
@@ -373,7 +373,7 @@ def interrupt(*arguments, **others):
 
 
 @pytest.mark.slow
-def test_a_budget_needs_a_folder_of_its_own(fitted, scene, capsys):
+def test_budget_needs_its_own_folder(fitted, scene, capsys):
     with pytest.raises(SystemExit) as stopped:
         fit.main([str(scene / "scene.yml"), "--out", str(fitted.out), "--budget", "30"])
     assert stopped.value.code == 2
@@ -381,7 +381,7 @@ def test_a_budget_needs_a_folder_of_its_own(fitted, scene, capsys):
     assert "must be new or empty for a fit with --budget" in error and "--overwrite" in error
 
 
-def test_too_short_a_budget_leaves_nothing_behind(scene, capsys):
+def test_too_short_budget_leaves_no_files(scene, capsys):
     with pytest.raises(SystemExit) as stopped:
         fit.main([str(scene / "scene.yml"), "--out", str(scene / "short"), "--budget", "1s"])
     assert stopped.value.code == 2 and "--budget: must leave time" in capsys.readouterr().err

@@ -93,7 +93,7 @@ def row_of(numbers, index) -> dict[str, np.ndarray]:
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_sensor_is_the_camera_moved_in_numpy():
+def test_sensor_matches_the_camera_moved_in_numpy():
     """In Mitsuba's axes: x to the left, y up."""
     trainer = with_numbers(make_trainer(**ALL_RATES), **random_numbers())
     trainer.iteration = 1
@@ -130,7 +130,7 @@ def loss_in_numpy(gaussians, view, image) -> float:
 
 
 @pytest.mark.parametrize("index", [1, 4])
-def test_derivatives_of_the_loss_are_differences_in_numpy(index):
+def test_derivatives_of_the_loss_equal_differences_in_numpy(index):
     """Each of the ten numbers of a view, away from the camera's start."""
     numbers = random_numbers()
     start = fits.true_blobs()
@@ -178,7 +178,7 @@ def test_derivatives_of_the_loss_are_differences_in_numpy(index):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_rates_of_zero_leave_the_intrinsics_out():
+def test_intrinsics_with_zero_rates_are_left_out():
     """They have no number, and are not computed."""
     trainer = make_trainer()
     assert set(effect_of(trainer).parameters.numpy()) == {"turns", "moves"}
@@ -191,7 +191,7 @@ def test_rates_of_zero_leave_the_intrinsics_out():
     assert set(effect_of(only_focal).parameters.numpy()) == {"turns", "moves", "log_focals"}
 
 
-def test_only_the_view_that_was_seen_and_what_all_share_move():
+def test_only_the_current_view_and_shared_intrinsics_change():
     """The numbers and the moments of all other views stay, bit by bit."""
     trainer = make_trainer(**ALL_RATES)
     effect, seen = effect_of(trainer), set()
@@ -217,7 +217,7 @@ def test_only_the_view_that_was_seen_and_what_all_share_move():
     assert len(seen) == 6
 
 
-def test_first_steps_are_the_rates():
+def test_first_steps_equal_the_rates():
     """Moves in units of the scene's extent; all rates fall as that of the means does."""
     trainer = make_trainer(**ALL_RATES, iterations=1)  # the means' rate is the last one at once
     trainer.step()
@@ -230,7 +230,7 @@ def test_first_steps_are_the_rates():
         np.testing.assert_allclose(np.abs(values), decay * rate, rtol=1e-4)
 
 
-def test_cameras_stay_until_they_are_to_be_refined():
+def test_cameras_are_unchanged_before_the_start():
     trainer = make_trainer(cameras__start=3)
     effect = effect_of(trainer)
     plain = fits.make_trainer(fits.plain_dataset())
@@ -243,7 +243,7 @@ def test_cameras_stay_until_they_are_to_be_refined():
             assert report.loss == pytest.approx(expected.loss, rel=1e-5)
 
 
-def test_before_the_start_no_derivative_of_a_camera_is_computed():
+def test_camera_derivatives_are_not_computed_before_the_start():
     """Kernels are those of cameras that stay."""
 
     def operations(start):
@@ -259,11 +259,11 @@ def test_before_the_start_no_derivative_of_a_camera_is_computed():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is found
+# Recovered cameras
 # ----------------------------------------------------------------------------------------------
 
-# What a fit leaves as it is when only cameras are to be found.
-STILL = {
+# Rates of a fit that optimises cameras only.
+FROZEN_GAUSSIANS = {
     "optimizer__means_lr": 1e-20,
     "optimizer__means_lr_final": 1e-20,
     **{f"optimizer__{name}_lr": 0.0 for name in ("quats", "scales", "opacities", "sh0", "shN")},
@@ -277,7 +277,7 @@ def errors(view, true) -> tuple[float, float]:
     return float(angle), float(np.linalg.norm(view.center - true.center))
 
 
-def test_a_disturbed_camera_is_found_before_true_blobs():
+def test_disturbed_camera_is_recovered_with_true_gaussians():
     """Two degrees and a fiftieth of its distance away."""
     true = fits.plain_dataset().train[2]
     disturbed = moved(true, turns=(0.02, -0.025, 0.015), moves=(0.05, -0.04, 0.06))
@@ -287,7 +287,7 @@ def test_a_disturbed_camera_is_found_before_true_blobs():
         fits.true_blobs(),
         cameras__rotation_lr=3e-3,
         cameras__translation_lr=1e-2 / dataset.extent,
-        **STILL,
+        **FROZEN_GAUSSIANS,
     )
     start = trainer.step().loss
     end = fits.steps(trainer, 150).step().loss
@@ -297,7 +297,7 @@ def test_a_disturbed_camera_is_found_before_true_blobs():
     assert end < 0.05 * start
 
 
-def test_a_focal_length_and_a_principal_point_that_are_off_are_found():
+def test_wrong_focal_length_and_principal_point_are_recovered():
     true = fits.plain_dataset().train[2]
     disturbed = moved(true, log_focals=(0.04, 0.03), shifts=(0.02, -0.015))
     trainer = make_trainer(
@@ -307,7 +307,7 @@ def test_a_focal_length_and_a_principal_point_that_are_off_are_found():
         cameras__translation_lr=0.0,
         cameras__focal_lr=2e-3,
         cameras__principal_lr=1e-3,
-        **STILL,
+        **FROZEN_GAUSSIANS,
     )
     fits.steps(trainer, 100)
     (found,) = effect_of(trainer).refined_views([disturbed])
@@ -352,7 +352,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_refined_cameras_are_written_as_they_are_read(lens, tmp_path):
+def test_refined_cameras_survive_a_round_trip(lens, tmp_path):
     dataset = fits.with_views(fits.plain_dataset(), lambda v: replace(v, lens=LENSES[lens]))
     trainer = with_numbers(make_trainer(dataset, **ALL_RATES), **random_numbers())
     effect_of(trainer).write(tmp_path, dataset)
@@ -369,7 +369,7 @@ def test_the_refined_cameras_are_written_as_they_are_read(lens, tmp_path):
         assert camera.lens == view.lens
 
 
-def test_other_views_are_measured_through_the_lens_that_was_found():
+def test_views_use_the_refined_intrinsics():
     """Their poses are not changed."""
     trainer = with_numbers(make_trainer(**ALL_RATES), **random_numbers())
     lens = {name: random_numbers()[name][0] for name in ("log_focals", "shifts")}
@@ -384,13 +384,13 @@ def test_other_views_are_measured_through_the_lens_that_was_found():
         np.testing.assert_allclose(rendered, other, atol=1e-5)
 
 
-def test_without_rates_of_the_lens_other_views_are_as_they_were():
+def test_views_are_unchanged_without_intrinsics_rates():
     views = fits.plain_dataset().test
     for view, other in zip(effect_of(make_trainer()).correct_views(views), views, strict=True):
         assert [getattr(view, n) for n in INTRINSICS] == [getattr(other, n) for n in INTRINSICS]
 
 
-def test_a_dataset_is_read_with_the_cameras_that_were_refined(tmp_path):
+def test_dataset_is_read_with_refined_cameras(tmp_path):
     """Also at another size, and with both poses of a camera that moves."""
     dataset = fits.plain_dataset()
     close = moved(dataset.train[1], turns=(0.02, 0.01, 0), moves=(0.1, 0, 0)).camera_to_world
@@ -434,7 +434,7 @@ def test_damaged_cameras_are_refused(text, tmp_path):
         refined_dataset(fits.plain_dataset(), tmp_path)
 
 
-def test_where_no_cameras_were_refined_the_dataset_is_as_it_was(tmp_path):
+def test_dataset_without_refined_cameras_is_unchanged(tmp_path):
     dataset = fits.plain_dataset()
     assert refined_dataset(dataset, tmp_path) is dataset
 
@@ -456,7 +456,7 @@ def test_a_fit_with_smoothing_resumes_to_the_same_bytes():
     fits.assert_resumes_to_the_same_bytes(make, 6, 5)
 
 
-def test_the_filter_of_refined_cameras_is_that_of_where_they_are():
+def test_filter_uses_refined_cameras():
     """Also after a coarse stage, before its views were seen again."""
     trainer = make_trainer(
         cameras__focal_lr=0.1, model__smoothing=True, coarse=[{"until": 5, "factor": 2}]
@@ -473,7 +473,7 @@ def test_the_filter_of_refined_cameras_is_that_of_where_they_are():
     )
 
 
-def test_two_fits_are_the_same_bytes():
+def test_two_fits_have_the_same_bytes():
     """Derivatives of a camera are sums over all splats: in the same order in every run."""
     first, second = (fits.steps(make_trainer(**ALL_RATES), 7) for _ in range(2))
     assert fits.everything_of(first) == fits.everything_of(second)
@@ -481,11 +481,11 @@ def test_two_fits_are_the_same_bytes():
         assert np.array_equal(getattr(first.gaussians(), name), getattr(second.gaussians(), name))
 
 
-def test_no_iteration_compiles_a_kernel_once_all_views_were_seen():
+def test_no_kernel_is_compiled_after_all_views_were_seen():
     fits.assert_no_new_kernels(make_trainer(**ALL_RATES))
 
 
-def test_a_camera_that_moves_while_it_exposes_is_refined_as_well():
+def test_camera_with_motion_blur_is_refined():
     """Both its poses move together."""
     dataset = fits.plain_dataset()
     start = dataset.train[0]
@@ -505,7 +505,7 @@ def test_a_camera_that_moves_while_it_exposes_is_refined_as_well():
     np.testing.assert_allclose(np.linalg.inv(first) @ last, expected, atol=1e-5)
 
 
-def test_moving_cameras_are_written_as_they_are_read(tmp_path):
+def test_moving_cameras_survive_a_round_trip(tmp_path):
     dataset = fits.plain_dataset()
     close = moved(dataset.train[1], turns=(0.02, 0.01, 0), moves=(0.1, 0, 0)).camera_to_world
     view = replace(dataset.train[0], motion=CameraMotion(close, "rolling"))
@@ -517,7 +517,7 @@ def test_moving_cameras_are_written_as_they_are_read(tmp_path):
     assert frame["shutter"] == "rolling"
 
 
-def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
+def test_static_camera_has_the_derivatives_of_a_moving_one_with_equal_poses():
     """Its two poses being the same; both depend on the numbers."""
     found = []
     for shutter in (None, "rolling", "global"):
@@ -538,5 +538,5 @@ def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
         np.testing.assert_allclose(other, found[0], atol=5e-4 * np.abs(found[0]).max())
 
 
-def test_without_being_asked_for_there_is_no_effect():
+def test_refinement_is_off_by_default():
     assert training_effects(fits.config_of(), fits.plain_dataset()) == []

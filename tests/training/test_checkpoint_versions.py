@@ -14,7 +14,7 @@ from drgs.datasets.fingerprint import fingerprint_of
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from drgs.training.loop import History
 
-DECIDED = {"data.background": "white", "model.near": 0.2}
+RESOLVED_DEFAULTS = {"data.background": "white", "model.near": 0.2}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,7 +31,8 @@ def folder(tmp_path):
 @pytest.fixture
 def config(tmp_path):
     return with_changes(
-        FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000), DECIDED
+        FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000),
+        RESOLVED_DEFAULTS,
     )
 
 
@@ -49,7 +50,7 @@ def saved_as(folder, config, change):
     np.savez(folder / "checkpoint.npz", **arrays)
 
 
-def without_what_is_new(values):
+def remove_new_keys(values):
     del values["data"]["ignore_points"], values["init"]["start"], values["init"]["scale"]
     for name in ("decay", "decay_from", "views", "views_from"):
         del values["optimizer"][name]
@@ -58,8 +59,8 @@ def without_what_is_new(values):
     values["densify"] = {name: densify[name] for name in kept}
 
 
-def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
-    saved_as(folder, config, without_what_is_new)
+def test_checkpoint_of_an_earlier_version_is_continued(folder, config):
+    saved_as(folder, config, remove_new_keys)
     assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
 
 
@@ -67,9 +68,9 @@ def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
     ("section", "key", "value"),
     [("model", "near", 0.1), ("data", "background", "black"), ("densify", "stop", 15_000)],
 )
-def test_one_of_other_values_does_not(folder, config, section, key, value):
+def test_checkpoint_with_different_values_is_refused(folder, config, section, key, value):
     def change(values):
-        without_what_is_new(values)
+        remove_new_keys(values)
         values[section][key] = value
 
     saved_as(folder, config, change)

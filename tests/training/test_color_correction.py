@@ -51,8 +51,8 @@ def random_matrices(count=6, seed=1) -> np.ndarray:
     return IDENTITY + changes - changes.mean(axis=0)
 
 
-# What a fit leaves as it is when only colours are to be found.
-STILL = {
+# Rates of a fit that optimises colours only.
+FROZEN_GAUSSIANS = {
     "optimizer__means_lr": 1e-20,
     "optimizer__means_lr_final": 1e-20,
     **{f"optimizer__{name}_lr": 0.0 for name in ("quats", "scales", "opacities", "sh0", "shN")},
@@ -64,7 +64,7 @@ STILL = {
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_identity_gives_the_plain_loss_and_gradients_to_the_last_bit():
+def test_identity_transform_gives_the_same_loss_and_gradient_bits():
     plain, corrected = fits.make_trainer(fits.plain_dataset()), make_trainer()
     for trainer in (plain, corrected):
         trainer.iteration = 1
@@ -81,11 +81,11 @@ def test_the_identity_gives_the_plain_loss_and_gradients_to_the_last_bit():
     np.testing.assert_array_equal(corrected.gaussians().means, plain.gaussians().means)
 
 
-def test_every_view_starts_with_the_identity():
+def test_every_transform_starts_as_the_identity():
     np.testing.assert_array_equal(matrices_of(make_trainer()), np.tile(IDENTITY, (6, 1, 1)))
 
 
-def test_without_a_rate_there_is_no_effect():
+def test_colour_correction_is_off_by_default():
     assert training_effects(fits.config_of(), fits.plain_dataset()) == []
 
 
@@ -106,7 +106,7 @@ def small_image(seed=3) -> np.ndarray:
     return single(np.random.default_rng(seed).uniform(0.3, 0.6, (24, 32, 3)))
 
 
-def test_loss_and_derivatives_of_a_transform_are_those_of_numpy():
+def test_loss_and_derivatives_of_a_transform_match_numpy():
     weight = 0.3
     trainer = with_matrices(make_trainer(colors__identity_weight=weight), random_matrices())
     (effect,) = trainer.effects
@@ -133,9 +133,9 @@ def test_loss_and_derivatives_of_a_transform_are_those_of_numpy():
     assert np.abs(penalty).max() > 0.01 * np.abs(expected).max()
 
 
-def test_the_penalty_pulls_to_the_identity():
+def test_penalty_pulls_towards_the_identity():
     """Adam's steps by the penalty alone end there, and have its sign from the start."""
-    trainer = with_matrices(make_trainer(colors__lr=0.01, **STILL), random_matrices())
+    trainer = with_matrices(make_trainer(colors__lr=0.01, **FROZEN_GAUSSIANS), random_matrices())
     (effect,) = trainer.effects
     view, start = trainer.views[1], random_matrices()[1]
     for iteration in range(60):
@@ -160,7 +160,7 @@ def test_the_penalty_pulls_to_the_identity():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_only_the_view_that_was_seen_moves():
+def test_only_the_transform_of_the_current_view_changes():
     """But for what all have in common; the moments of all others stay, bit by bit."""
     trainer = make_trainer()
     (effect,) = trainer.effects
@@ -180,7 +180,7 @@ def test_only_the_view_that_was_seen_moves():
     assert len(seen) == 6
 
 
-def test_the_first_step_is_the_rate_which_falls_as_that_of_the_means():
+def test_first_step_is_the_rate_which_decays_like_that_of_the_means():
     for iterations, share in ((1, 0.01), (2, 0.1)):
         trainer = make_trainer(colors__lr=3e-2, iterations=iterations)
         trainer.step()
@@ -190,7 +190,7 @@ def test_the_first_step_is_the_rate_which_falls_as_that_of_the_means():
         np.testing.assert_allclose(moved[:5], 1 / 6 * share * 3e-2, atol=2e-7)
 
 
-def test_a_view_that_is_seen_later_starts_with_the_rate_too():
+def test_view_seen_later_starts_with_the_full_rate():
     """Its optimizer counts its own steps. The rate stays, as that of the means does here."""
     rates = {"optimizer__means_lr": 1e-4, "optimizer__means_lr_final": 1e-4}
     trainer = make_trainer(colors__lr=3e-2, **rates)
@@ -212,7 +212,7 @@ def test_the_mean_of_all_transforms_is_the_identity():
     assert np.abs(matrices - IDENTITY).max() > 0.02
 
 
-def test_what_all_photographs_have_in_common_stays_with_the_splats():
+def test_common_colour_change_is_attributed_to_the_splats():
     """Photographs that are all darker by the same factor change no transform.
 
     Each photograph's own pull is down, by some 7 steps of the rate.
@@ -227,7 +227,7 @@ def test_what_all_photographs_have_in_common_stays_with_the_splats():
     assert (np.array(effect.common)[[0, 5, 10]] < -0.03).all()
 
 
-def test_where_a_photograph_is_transparent_the_background_stays():
+def test_background_is_untransformed_in_transparent_pixels():
     """No camera saw it. Between, the change is as large as the photograph is opaque."""
     dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
     trainer = with_matrices(make_trainer(dataset), random_matrices())
@@ -243,7 +243,7 @@ def test_where_a_photograph_is_transparent_the_background_stays():
 
 
 # ----------------------------------------------------------------------------------------------
-# What is found
+# Recovered transforms
 # ----------------------------------------------------------------------------------------------
 
 WARM = np.array([[1.2, 0.05, 0.0, 0.02], [0.0, 0.9, 0.1, -0.03], [0.05, 0.0, 0.7, 0.05]])
@@ -254,7 +254,7 @@ def transformed(image, matrix) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_the_color_change_of_a_photograph_is_found():
+def test_color_change_of_a_photograph_is_recovered():
     """Before true blobs that stay. Few colours are all that tell of its 12 numbers.
 
     The mean of the two transforms is the identity.
@@ -270,7 +270,7 @@ def test_the_color_change_of_a_photograph_is_found():
         fits.true_blobs(),
         colors__lr=6e-3,
         colors__identity_weight=0.0,
-        **STILL,
+        **FROZEN_GAUSSIANS,
     )
     fits.steps(trainer, 500)
     for photo, target, matrix in zip(photos, changed, matrices_of(trainer), strict=True):
@@ -294,7 +294,7 @@ def exposed_dataset():
     return replace(dataset, train=tuple(views))
 
 
-def test_exposures_that_differ_spoil_a_fit_less_with_transforms():
+def test_transforms_improve_fits_with_varying_exposure():
     """Measured on held-out photographs of one exposure, without a transform."""
     quality = {}
     for lr in (None, 1e-2):
@@ -308,7 +308,7 @@ def test_exposures_that_differ_spoil_a_fit_less_with_transforms():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_the_transforms_are_written_by_name(tmp_path):
+def test_transforms_are_written_by_view_name(tmp_path):
     trainer = fits.steps(make_trainer(), 9)
     (effect,) = trainer.effects
     dataset = fits.plain_dataset()
@@ -331,5 +331,5 @@ def test_transforms_are_part_of_the_state():
     np.testing.assert_array_equal(values, matrices_of(trainer))
 
 
-def test_no_iteration_compiles_a_kernel_once_all_views_were_seen():
+def test_no_kernel_is_compiled_after_all_views_were_seen():
     fits.assert_no_new_kernels(make_trainer())

@@ -151,7 +151,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize(("damage", "message"), DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
+def test_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
     damage(checkpoint)
     kept = checkpoint.read_bytes() if checkpoint.is_file() else None
     before = sorted(os.listdir(checkpoint.parent))
@@ -164,7 +164,7 @@ def test_a_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
     assert kept is None or checkpoint.read_bytes() == kept
 
 
-def test_a_checkpoint_that_is_whole_is_continued(checkpoint, monkeypatch):
+def test_intact_checkpoint_is_continued(checkpoint, monkeypatch):
     monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
     outcome = run_in_process(fit.main, "--resume", checkpoint.parent)
     assert outcome.returncode == 0, outcome.stderr

@@ -92,7 +92,7 @@ def assert_agree(out):
 
 
 @needs_tensorboardx
-def test_the_curves_are_those_of_the_history_and_the_splats_those_of_a_fit_without(tmp_path):
+def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path):
     config = write_project(tmp_path)
     assert_fits(config, "--out", tmp_path / "with", "--tensorboard")
     assert_fits(config, "--out", tmp_path / "without")
@@ -104,7 +104,7 @@ def test_the_curves_are_those_of_the_history_and_the_splats_those_of_a_fit_witho
 
 
 @needs_tensorboardx
-def test_a_resumed_fit_is_one_curve_and_another_fit_takes_its_place(tmp_path, monkeypatch):
+def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(tmp_path, monkeypatch):
     config, out = write_project(tmp_path), tmp_path / "out"
     with monkeypatch.context() as patch:
         without_images(patch)
@@ -119,7 +119,7 @@ def test_a_resumed_fit_is_one_curve_and_another_fit_takes_its_place(tmp_path, mo
 
 
 @needs_tensorboardx
-def test_a_stranger_in_the_folder_is_left_alone(tmp_path):
+def test_foreign_file_in_the_folder_is_kept(tmp_path):
     config, out = write_project(tmp_path), tmp_path / "out"
     assert_fits(config, "--out", out, "--tensorboard")
     (out / TENSORBOARD / "mine.txt").write_text("mine")
@@ -127,7 +127,7 @@ def test_a_stranger_in_the_folder_is_left_alone(tmp_path):
     assert_fit_refused(*arguments, folder=tmp_path, message="tensorboard/mine.txt")
 
 
-def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):
     config = write_project(tmp_path)
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     assert_fit_refused(

@@ -55,7 +55,7 @@ def configured(**changes):
     return config_from(values, "x.yml")
 
 
-def test_the_pages_show_the_examples():
+def test_documented_examples_are_the_files():
     text = (EXAMPLES.parent.parent / "docs" / "developing.md").read_text()
     for name in NAMES:
         source = (EXAMPLES / f"{name}.py").read_text()
@@ -97,7 +97,7 @@ def test_an_unknown_strategy_lists_the_installed_ones():
         config_from({"data": {"path": "."}, "densify": {"strategy": "halvin"}}, "x.yml")
 
 
-def test_a_strategy_provides_the_shares_of_its_schedule(examples, monkeypatch):
+def test_strategy_provides_the_defaults_of_its_schedule(examples, monkeypatch):
     values = {"data": {"path": "."}, "iterations": 1000, "densify": {"strategy": "halving"}}
     densify = config_from(values, "x.yml").densify
     assert (densify.start, densify.stop) == (50, 500)
@@ -120,7 +120,7 @@ def test_a_trainer_takes_a_density_strategy(examples):
     assert trainer.num_gaussians == start.num_gaussians - start.num_gaussians // 2
 
 
-def test_a_fit_uses_what_its_configuration_names():
+def test_fit_uses_configured_extensions():
     result = drgs.train(configured(), fits.plain_dataset())
     trainer = result.trainer
     (effect,) = trainer.effects
@@ -134,7 +134,7 @@ def test_a_fit_uses_what_its_configuration_names():
     assert float(effect.state()["strength.value"][0, 0]) != 0
 
 
-def test_an_effect_decides_by_the_dataset_whether_it_takes_part(examples, monkeypatch):
+def test_effect_applies_depending_on_the_dataset(examples, monkeypatch):
     """Return whether its section is present."""
     needs = lambda config, dataset: any(view.depth is not None for view in dataset.train)  # noqa: E731
     monkeypatch.setattr(examples["vignetting"].Vignetting, "is_used", needs)
@@ -143,7 +143,7 @@ def test_an_effect_decides_by_the_dataset_whether_it_takes_part(examples, monkey
         assert [effect.name for effect in effects if effect.name != "depth"] == used
 
 
-def test_objects_give_the_bytes_of_names(examples):
+def test_objects_and_names_give_the_same_bytes(examples):
     """Objects: an effect, a strategy and a loss."""
     config = configured()
     named = drgs.train(config, fits.plain_dataset()).gaussians
@@ -161,7 +161,7 @@ def test_objects_give_the_bytes_of_names(examples):
         np.testing.assert_array_equal(getattr(given, name), getattr(named, name))
 
 
-def test_a_fit_goes_on_from_a_checkpoint_to_the_same_bytes():
+def test_fit_resumes_from_a_checkpoint_to_the_same_bytes():
     def trainer():
         return fits.Trainer(configured(), fits.plain_dataset(), fits.disturbed_blobs())
 
@@ -175,7 +175,7 @@ def test_a_fit_goes_on_from_a_checkpoint_to_the_same_bytes():
     assert fits.everything_of(second) == fits.everything_of(whole)
 
 
-def test_the_loss_and_its_term_are_those_of_numpy(examples):
+def test_loss_and_its_term_match_numpy(examples):
     rng = np.random.default_rng(0)
     image, photograph = rng.uniform(size=(2, 5, 7, 3)).astype(np.float32)
     loss = examples["charbonnier"].Charbonnier(examples["charbonnier"].CharbonnierSection())
@@ -200,7 +200,7 @@ def fit_inputs():
     return fits.plain_dataset(), fits.disturbed_blobs()
 
 
-def test_what_an_extension_raises_is_reported_with_its_name(examples, monkeypatch):
+def test_errors_of_an_extension_are_reported_with_its_name(examples, monkeypatch):
     module = examples["vignetting"]
     exec("def adjust(self, image, view):\n    raise KeyError('oh')\n", vars(module))
     monkeypatch.setattr(module.Vignetting, "adjust", module.adjust)
@@ -208,7 +208,7 @@ def test_what_an_extension_raises_is_reported_with_its_name(examples, monkeypatc
         drgs.train(configured(), fits.plain_dataset())
 
 
-def test_the_summary_and_the_help_name_extensions():
+def test_summary_and_help_list_extensions():
     from drgs.fit import add_arguments
     from drgs.integrator.summary import format_effects
     from drgs.training.summary import summary_of_fit

@@ -85,7 +85,7 @@ DEGREE_1_AT_ONCE = {"sh_degree": 1, "sh_increase_every": 1}
 
 
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
-def test_gradient_that_is_not_finite_is_named_though_noticed_later(monkeypatch, name):
+def test_nonfinite_gradient_is_named_although_detected_later(monkeypatch, name):
     trainer = make_trainer(model=DEGREE_1_AT_ONCE)
     poison_gradient(monkeypatch, trainer, name, iteration=3)
     for _ in range(6):
@@ -100,7 +100,7 @@ def test_gradient_that_is_not_finite_is_named_though_noticed_later(monkeypatch, 
     # Adam squares gradients: 1e20 squared is beyond float32 (3.4e38), 1e18 squared is not.
     [(np.inf, True), (-np.inf, True), (1e20, True), (-1e20, True), (1e18, False)],
 )
-def test_gradient_is_at_fault_where_its_square_overflows(monkeypatch, value, is_fault):
+def test_gradient_whose_square_overflows_is_nonfinite(monkeypatch, value, is_fault):
     trainer = make_trainer()
     poison_gradient(monkeypatch, trainer, "log_scales", iteration=2, value=value)
     trainer.step()
@@ -112,7 +112,7 @@ def test_gradient_is_at_fault_where_its_square_overflows(monkeypatch, value, is_
         trainer.check()
 
 
-def test_first_row_is_named_and_in_it_the_first_parameter(monkeypatch):
+def test_first_row_and_its_first_parameter_are_named(monkeypatch):
     trainer = make_trainer()
     for name, row in (("means", 30), ("sh0", 20), ("quats", 20), ("logit_opacities", 25)):
         poison_gradient(monkeypatch, trainer, name, iteration=1, row=row)
@@ -124,7 +124,7 @@ def test_first_row_is_named_and_in_it_the_first_parameter(monkeypatch):
 @pytest.mark.parametrize(
     ("dssim_weight", "gradient"), [(0.0, ""), (0.2, r" and the gradient of \w+ in row \d+ .*")]
 )
-def test_loss_that_is_not_finite_names_iteration_and_view(dssim_weight, gradient):
+def test_nonfinite_loss_names_iteration_and_view(dssim_weight, gradient):
     """SSIM's gradient tells as well; that of L1 is 0 at a NaN."""
     from drgs.training.losses import prepare_target
 
@@ -167,7 +167,7 @@ def test_nothing_is_saved_returned_or_edited_after_a_fault(monkeypatch, event):
             attempt(trainer)
 
 
-def test_restored_trainer_has_left_the_fault_behind(monkeypatch):
+def test_restored_trainer_has_no_fault(monkeypatch):
     trainer = make_trainer()
     trainer.step()
     good = trainer.state()
@@ -186,7 +186,7 @@ def test_restored_trainer_has_left_the_fault_behind(monkeypatch):
 
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
-def test_value_that_is_not_finite_is_named(name, value):
+def test_nonfinite_value_is_named(name, value):
     trainer = make_trainer(model=DEGREE_1_AT_ONCE)
     trainer.step()
     poison_value(trainer, name, value)
@@ -196,7 +196,7 @@ def test_value_that_is_not_finite_is_named(name, value):
         trainer.check()
 
 
-def test_value_that_is_not_finite_is_noticed_though_no_gradient_tells():
+def test_nonfinite_value_is_detected_without_a_nonfinite_gradient():
     """Such a Gaussian is invisible; densification would have removed it without a word."""
     trainer = make_trainer(densify={"start": 1, "every": 5})
     trainer.step()
@@ -210,7 +210,7 @@ def test_value_that_is_not_finite_is_noticed_though_no_gradient_tells():
         trainer.step()
 
 
-def test_statistics_that_are_not_finite_are_named():
+def test_nonfinite_statistics_are_named():
     """A gradient of positions on the film that overflows may leave all parameters' gradients."""
     trainer = make_trainer(densify={"strategy": "adc"})
     trainer.step()
@@ -242,7 +242,7 @@ def poison_effect(trainer, name, index, value, part="value"):
 
 @pytest.mark.parametrize("part", ["value", "m", "v"])
 @pytest.mark.parametrize("name", EFFECTS)
-def test_what_an_effect_optimises_is_named_where_it_is_not_finite(name, part):
+def test_nonfinite_parameters_of_an_effect_are_named(name, part):
     """And so are its moments."""
     trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
     trainer.check()
@@ -255,7 +255,7 @@ def test_what_an_effect_optimises_is_named_where_it_is_not_finite(name, part):
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_an_iteration_that_is_not_finite_names_the_effect_that_made_it_so(name):
+def test_nonfinite_iteration_names_the_effect_that_caused_it(name):
     trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
     index = view_of(3, len(trainer.views), trainer.config.seed)
     poison_effect(trainer, name, index, np.nan)
@@ -273,11 +273,11 @@ def test_check_values_names_the_first_row_of_any_shape():
 
 
 # ----------------------------------------------------------------------------------------------
-# What the guards cost a good fit
+# Cost of the guards in a good fit
 # ----------------------------------------------------------------------------------------------
 
 
-def test_bytes_of_a_good_fit_are_those_without_guards(monkeypatch):
+def test_guards_do_not_change_the_bytes_of_a_fit(monkeypatch):
     """Across changes of the population and an opacity reset."""
     changes = {
         "densify": {
@@ -313,7 +313,7 @@ def history_of(act):
     return [(entry["type"], entry["size"]) for entry in dr.kernel_history()]
 
 
-def test_guards_cost_an_iteration_two_reductions_and_no_wait(monkeypatch):
+def test_guards_add_two_reductions_and_no_synchronisation(monkeypatch):
     trainer = make_trainer()
     for _ in range(5):
         trainer.step()
@@ -329,7 +329,7 @@ def test_guards_cost_an_iteration_two_reductions_and_no_wait(monkeypatch):
     assert guarded[dr.KernelType.Memcpy] == 2
 
 
-def test_watching_launches_nothing_larger_than_one_value():
+def test_finite_checks_launch_only_small_kernels():
     trainer = make_trainer()
     for _ in range(5):
         trainer.step()
@@ -409,7 +409,7 @@ def fails(capsys, *arguments):
 
 
 @pytest.mark.parametrize("spoil", [spoil_photograph, spoil_value])
-def test_fit_stops_keeps_the_last_good_checkpoint_and_resumes(
+def test_stopped_fit_keeps_the_last_good_checkpoint_and_resumes(
     monkeypatch, capsys, tmp_path, configuration, saved, spoil
 ):
     out = tmp_path / "out"
@@ -438,7 +438,7 @@ def test_fit_stops_at_the_next_row_of_its_history(monkeypatch, capsys, tmp_path,
     assert len(steps) == 6  # history_every is 3
 
 
-def test_fault_of_the_last_iteration_leaves_no_results(
+def test_fault_in_the_last_iteration_leaves_no_results(
     monkeypatch, capsys, tmp_path, configuration
 ):
     out = tmp_path / "out"

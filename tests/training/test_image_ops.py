@@ -38,7 +38,7 @@ def to_numpy(value) -> np.ndarray:
 
 
 # ----------------------------------------------------------------------------------------------
-# What is computed, twice
+# Operations, computed twice
 # ----------------------------------------------------------------------------------------------
 
 
@@ -177,7 +177,7 @@ def random_directions(operation):
 
 @both_precisions
 @all_operations
-def test_values_are_those_of_numpy(name, precision):
+def test_values_match_numpy(name, precision):
     operation = OPERATIONS[name]()
     actual = operation.outputs(operation.device(precision))
     expected = operation.expected(operation.inputs)
@@ -190,7 +190,7 @@ def test_values_are_those_of_numpy(name, precision):
 
 @both_precisions
 @all_operations
-def test_backward_derivatives_are_the_formulas(name, precision):
+def test_backward_derivatives_match_the_formulas(name, precision):
     operation = OPERATIONS[name]()
     cotangents = cotangents_of(operation)
     actual = gradients(operation, precision, cotangents)
@@ -198,7 +198,7 @@ def test_backward_derivatives_are_the_formulas(name, precision):
 
 
 @all_operations
-def test_backward_derivatives_are_central_differences(name):
+def test_backward_derivatives_equal_central_differences(name):
     """Differences of the value by numpy, at some of the numbers. At a kink of |x| both slopes
     average to 0."""
     operation = OPERATIONS[name]()
@@ -225,7 +225,7 @@ def test_backward_derivatives_are_central_differences(name):
 
 @both_precisions
 @all_operations
-def test_forward_derivatives_are_central_differences(name, precision):
+def test_forward_derivatives_equal_central_differences(name, precision):
     operation = OPERATIONS[name]()
     directions = random_directions(operation)
     actual = tangents(operation, precision, directions)
@@ -262,7 +262,7 @@ def test_forward_and_backward_derivatives_are_transposed(name, precision):
     assert abs(sum(left)) > 1e-3 * size  # not two zeros
 
 
-def test_the_comparisons_notice_one_percent(monkeypatch):
+def test_comparisons_detect_one_percent_errors(monkeypatch):
     """Adjoints and tangents are scaled."""
     scale = 1.01
     for method in ("set_grad_in", "set_grad_out"):
@@ -278,21 +278,21 @@ def test_the_comparisons_notice_one_percent(monkeypatch):
             monkeypatch.setattr(kind, method, scaled)
     for name in OPERATIONS:
         for check in (
-            partial(test_backward_derivatives_are_the_formulas, name, FLOAT32),
-            partial(test_backward_derivatives_are_central_differences, name),
-            partial(test_forward_derivatives_are_central_differences, name, FLOAT32),
+            partial(test_backward_derivatives_match_the_formulas, name, FLOAT32),
+            partial(test_backward_derivatives_equal_central_differences, name),
+            partial(test_forward_derivatives_equal_central_differences, name, FLOAT32),
         ):
             with pytest.raises(AssertionError):
                 check()
 
 
 # ----------------------------------------------------------------------------------------------
-# What is not asked for
+# Unused inputs
 # ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("used", [0, 1])
-def test_the_half_of_a_split_that_nothing_depends_on_has_no_derivative(used):
+def test_unused_half_of_a_split_has_no_derivative(used):
     operation = split_operation()
     image = operation.device(FLOAT32, grad=True)["image"]
     halves = depth.split(image, 3)
@@ -304,7 +304,7 @@ def test_the_half_of_a_split_that_nothing_depends_on_has_no_derivative(used):
 
 
 @pytest.mark.parametrize("attached", ["image", "matrix"])
-def test_colors_may_be_transformed_with_one_derivative_alone(attached):
+def test_color_transform_supports_derivatives_of_one_input(attached):
     operation = transform_operation()
     everything = gradients(operation, FLOAT32, cotangents_of(operation))
     inputs = operation.device(FLOAT32)
@@ -349,7 +349,7 @@ def test_derivatives_are_the_same_bytes_in_two_runs(name):
 
 @both_precisions
 @all_operations
-def test_no_derivative_is_added_in_memory(name, precision):
+def test_derivatives_use_no_float_atomics(name, precision):
     """Dr.Jit's derivative of a gather would be."""
     operation = OPERATIONS[name]()
     results = {}
@@ -359,7 +359,7 @@ def test_no_derivative_is_added_in_memory(name, precision):
     assert results and not found and count >= 1
 
 
-def test_the_matrix_is_not_compiled_into_the_kernels():
+def test_matrix_is_no_kernel_literal():
     """Each step of its optimizer would compile its own."""
     operation = transform_operation()
 

@@ -38,7 +38,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_bytes_are_those_of_the_command(folder):
+def test_train_gives_the_bytes_of_the_command(folder):
     """From a file, from nested mappings, and from a configuration with its dataset."""
     fit.main([str(folder / "a.yml"), "--out", str(folder / "out")])
     expected = (folder / "out" / "point_cloud.ply").read_bytes()
@@ -53,7 +53,7 @@ def test_the_bytes_are_those_of_the_command(folder):
         assert [iteration for iteration, _ in rows] == [3, 6, 7]
 
 
-def test_a_callback_sees_each_iteration_and_may_end_the_fit(folder):
+def test_callback_receives_each_iteration_and_may_end_the_fit(folder):
     reports = []
     result = drgs.train(CONFIG, callback=reports.append)
     assert [report.iteration for report in reports] == [1, 2, 3, 4, 5, 6, 7]
@@ -87,7 +87,7 @@ class Squares(Loss):
         return dr.mean(dr.square(image.array - target.image.array))
 
 
-def test_objects_take_the_place_of_what_a_configuration_names(folder):
+def test_objects_override_configured_names(folder):
     reports = []
     plain = drgs.train(CONFIG)
     assert plain.gaussians.num_gaussians != 40
@@ -102,7 +102,7 @@ def test_objects_take_the_place_of_what_a_configuration_names(folder):
     assert float(loss[0]) == pytest.approx(np.square(expected).mean(), rel=1e-5)
 
 
-def test_a_folder_is_fitted_as_the_command_does(folder):
+def test_folder_is_fitted_like_by_the_command(folder):
     few = ["--set", "iterations=2", "--set", "output.save_renders=false"]
     fit.main(["data", *few, "--out", "out"])
     config = load_config("out/config.yml")
@@ -110,7 +110,7 @@ def test_a_folder_is_fitted_as_the_command_does(folder):
     assert given.data == config.data and given.iterations == 4500
 
 
-def test_images_of_what_was_fitted(folder):
+def test_trainer_renders_test_views(folder):
     result = drgs.train(CONFIG)
     (view,) = drgs.load_dataset("data").test
     (rendered,) = result.trainer.images((view,))
@@ -126,7 +126,7 @@ def test_images_of_what_was_fitted(folder):
         ("b.yml", "b.yml: "),
     ],
 )
-def test_wrong_configurations_are_refused_as_by_the_command(folder, config, message):
+def test_wrong_configurations_are_refused_like_by_the_command(folder, config, message):
     with pytest.raises(UserError) as error:
         drgs.train(config)
     assert str(error.value).startswith(message)

@@ -23,7 +23,7 @@ SIZES = [(1, 1), (5, 3), (3, 17), (8, 8), (21, 34)]
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_loss_is_the_naive_formula(height, width):
+def test_loss_matches_the_naive_formula(height, width):
     x, y = images(height, width)
     for weight in (0, 0.2, 1):
         loss, _ = value_and_gradient(x, y, weight)
@@ -31,7 +31,7 @@ def test_loss_is_the_naive_formula(height, width):
         assert loss == pytest.approx(reference(x, y, weight), rel=1e-12)
 
 
-def test_single_precision_loss_is_the_naive_formula():
+def test_single_precision_loss_matches_the_naive_formula():
     x, y = images(21, 34, levels=255)
     loss, _ = value_and_gradient(x, y, tensor_type=TensorXf)
     # Variances cancel to about 1e-7 of E[x^2] <= 1, relative to C2 = 9e-4 that is 1e-4 in a
@@ -39,7 +39,7 @@ def test_single_precision_loss_is_the_naive_formula():
     assert loss == pytest.approx(reference(x, y, 0.2), rel=2e-6)
 
 
-def test_window_is_the_one_of_the_target():
+def test_window_matches_the_target():
     x, y = images(19, 22)
     for window, sigma in ((1, 1.0), (5, 0.7), (17, 3.0)):
         loss, _ = value_and_gradient(x, y, window=window, sigma=sigma)
@@ -48,7 +48,7 @@ def test_window_is_the_one_of_the_target():
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 @pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_gradient_is_the_central_difference(height, width, weight):
+def test_gradient_equals_central_differences(height, width, weight):
     x, y = images(height, width, seed=1)
     _, gradient = value_and_gradient(x, y, weight)
     target, loss = prepare_target(TensorXf64(y)), PhotometricLoss(weight)
@@ -102,7 +102,7 @@ def test_single_precision_gradient_agrees_with_double():
     np.testing.assert_allclose(single, double, atol=5e-6 * np.abs(double).max())
 
 
-def test_overexposed_images_do_not_blow_up_the_gradient():
+def test_overexposed_images_have_bounded_gradients():
     check_overexposed_images_do_not_blow_up_the_gradient()
 
 

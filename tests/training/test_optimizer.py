@@ -88,7 +88,7 @@ def adam_and_ours(num):
     return plain, make_optimizer(values, RATES, PREFIX)
 
 
-def test_steps_are_those_of_adam_and_use_large_gradients_up():
+def test_steps_match_adam_and_free_large_gradients():
     num = 25_000
     plain, ours = adam_and_ours(num)
     for seed in range(2):
@@ -102,7 +102,7 @@ def test_steps_are_those_of_adam_and_use_large_gradients_up():
     assert left == set(ours) - {PREFIX + "shN"}
 
 
-def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
+def test_in_place_moments_equal_out_of_place_ones(monkeypatch):
     """Also after they were assigned, and while somebody else holds them."""
     num, key = 25_000, PREFIX + "shN"
     results = []
@@ -124,7 +124,7 @@ def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
             np.testing.assert_array_equal(array, other)
 
 
-def test_a_step_waits_for_nothing(monkeypatch):
+def test_step_does_not_synchronise(monkeypatch):
     """Once it has large moments, it asks for no memory of theirs again."""
     optimizer = make_optimizer(parameters(25_000), RATES, PREFIX)
     asked = []
@@ -137,7 +137,7 @@ def test_a_step_waits_for_nothing(monkeypatch):
         assert len(asked) == 2
 
 
-def test_a_step_takes_two_blocks_of_harmonics_less_than_that_of_adam():
+def test_step_uses_less_memory_than_adam_by_two_sh_arrays():
     num = 25_000
     peaks = []
     for optimizer in adam_and_ours(num):
@@ -229,7 +229,7 @@ def test_edit_keeps_step_counts_rates_order_and_gradients():
         assert t[0] == 2
         assert promoted is False
         assert dr.grad_enabled(value)
-    # What does not start with the prefix is not a row of anything.
+    # Parameters without the prefix have no rows.
     np.testing.assert_array_equal(optimizer["exposure"].numpy(), [1, 2, 3])
 
 
@@ -245,7 +245,7 @@ def test_edit_without_appending_and_without_keeping():
     step(optimizer, 0, np.arange(3))
 
 
-def test_edit_refuses_what_would_misalign_rows():
+def test_edit_refuses_misaligned_rows():
     optimizer = make_optimizer(parameters(4), RATES, PREFIX)
     with pytest.raises(ValueError, match="row numbers below 4"):
         edit_rows(optimizer, UInt32(0, 4), prefix=PREFIX)
@@ -279,7 +279,7 @@ def test_later_edits_of_other_sizes_compile_no_kernel():
     assert kernels(70, 41, 22) == first
 
 
-def test_taken_rows_are_detached_copies():
+def test_take_rows_returns_detached_copies():
     values = parameters(5)
     optimizer = make_optimizer(values, RATES, PREFIX)
     rows = take_rows(optimizer, UInt32(4, 4, 1), PREFIX)
@@ -306,7 +306,7 @@ def test_replaced_values_keep_step_count_and_rate_but_not_moments():
         replace_values(optimizer, "logit_opacities", Float(1, 2, 3), PREFIX)
 
 
-def test_decay_is_a_straight_line_in_the_logarithm():
+def test_decay_is_linear_in_the_logarithm():
     rate = ExponentialDecay(1.6e-4, 1.6e-6, ((0, 30_000),))
     assert rate(0) == pytest.approx(1.6e-4)
     assert rate(15_000) == pytest.approx(1.6e-5)
@@ -317,7 +317,7 @@ def test_decay_is_a_straight_line_in_the_logarithm():
         ExponentialDecay(1e-3, 0.0, ((0, 10),))
 
 
-def test_a_decay_that_is_revised_spreads_what_is_left():
+def test_revised_decay_covers_the_remaining_iterations():
     """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
     rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
     once = ExponentialDecay(1.0, 1e-4, ((0, 100),))

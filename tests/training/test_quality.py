@@ -34,12 +34,12 @@ def test_a_fit_is_measured_ten_times_or_every_hundred_iterations(iterations, eve
 
 
 @pytest.mark.parametrize(("count", "expected"), [(1, [0]), (8, list(range(8))), (25, None)])
-def test_a_few_views_stand_for_all(count, expected):
+def test_few_evenly_spaced_views_are_measured(count, expected):
     chosen = quality.measured_views(range(count))
     assert list(chosen) == (expected or [0, 3, 7, 10, 14, 17, 21, 24])
 
 
-def test_measuring_changes_nothing_that_comes():
+def test_measuring_does_not_change_the_fit():
     """With densification, a filter that follows the means, and random backgrounds."""
     changes = {
         "model__smoothing": True,
@@ -65,7 +65,7 @@ def test_measuring_changes_nothing_that_comes():
     assert len({row.test_psnr for row in history.rows}) == 4
 
 
-def test_measuring_is_no_part_of_the_fits_time(monkeypatch):
+def test_measuring_does_not_count_as_training_time(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("drgs.training.loop.time.perf_counter", lambda: now[0])
     history = History()
@@ -86,7 +86,7 @@ def test_the_history_is_kept_with_and_without_measurements(tmp_path):
     assert [line.split(",")[-1] for line in lines] == ["test_psnr", "", "21.5", "inf"]
 
 
-def test_changes_of_the_population_are_kept(tmp_path):
+def test_population_changes_are_recorded(tmp_path):
     history = History()
     write_density(tmp_path / "density.csv", history.density)
     assert not list(tmp_path.iterdir())

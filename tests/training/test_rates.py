@@ -16,7 +16,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-STILL = {"start": 1, "stop": 2}
+FIXED_POPULATION = {"start": 1, "stop": 2}
 """The population does not change."""
 
 
@@ -27,8 +27,8 @@ def rates_of(trainer):
     }
 
 
-def test_rates_fall_to_a_part_of_themselves_behind_a_share_of_the_fit():
-    trainer = make_trainer(optimizer={"decay": 0.1, "decay_from": 0.4}, densify=STILL)
+def test_rates_decay_to_a_fraction_after_a_share_of_the_fit():
+    trainer = make_trainer(optimizer={"decay": 0.1, "decay_from": 0.4}, densify=FIXED_POPULATION)
     rates = []
     for _ in range(50):
         trainer.step()
@@ -46,8 +46,8 @@ def test_rates_fall_to_a_part_of_themselves_behind_a_share_of_the_fit():
     )
 
 
-def test_rates_stay_without_a_decay():
-    trainer = make_trainer(densify=STILL, optimizer={"decay": 1.0})
+def test_rates_are_constant_without_a_decay():
+    trainer = make_trainer(densify=FIXED_POPULATION, optimizer={"decay": 1.0})
     before = rates_of(trainer)
     for _ in range(50):
         trainer.step()
@@ -57,8 +57,8 @@ def test_rates_stay_without_a_decay():
     }
 
 
-def test_a_revised_plan_keeps_the_rates_of_the_past():
-    changes = {"optimizer": {"decay": 0.1, "decay_from": 0.2}, "densify": STILL}
+def test_revised_plan_keeps_past_rates():
+    changes = {"optimizer": {"decay": 0.1, "decay_from": 0.2}, "densify": FIXED_POPULATION}
     trainer = make_trainer(**changes)
     past = []
     for _ in range(30):
@@ -72,12 +72,12 @@ def test_a_revised_plan_keeps_the_rates_of_the_past():
     assert trainer.rates(40)["sh0"] == pytest.approx(0.1 * trainer.config.optimizer.sh0_lr)
 
 
-LATE = {"views": 3, "views_from": 0.5, "decay": 1.0}
+AVERAGED_VIEWS = {"views": 3, "views_from": 0.5, "decay": 1.0}
 
 
-def test_a_step_of_several_views_is_one_of_their_mean_gradient():
+def test_step_of_several_views_uses_their_mean_gradient():
     """Iterations 27, 28, 29 -> a step at 30: Adam by hand, from gradients of single views."""
-    trainer = make_trainer(optimizer=LATE, densify=STILL)
+    trainer = make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION)
     while trainer.iteration < 27:
         trainer.step()
     name = PREFIX + "log_scales"
@@ -87,7 +87,7 @@ def test_a_step_of_several_views_is_one_of_their_mean_gradient():
 
     gradients = []
     for k in range(3):
-        alone = make_trainer(densify=STILL)
+        alone = make_trainer(densify=FIXED_POPULATION)
         alone.restore(trainer.state())
         alone.iteration += k
         parameters = alone.params[name]
@@ -111,12 +111,14 @@ def test_a_step_of_several_views_is_one_of_their_mean_gradient():
 
 
 @pytest.mark.parametrize("stopped", [26, 27, 28, 29])
-def test_a_fit_that_is_resumed_within_a_step_continues_to_the_same_bytes(stopped):
-    uninterrupted, first = (make_trainer(optimizer=LATE, densify=STILL) for _ in range(2))
+def test_fit_resumed_within_a_step_continues_to_the_same_bytes(stopped):
+    uninterrupted, first = (
+        make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION) for _ in range(2)
+    )
     for _ in range(stopped):
         uninterrupted.step()
         first.step()
-    second = make_trainer(optimizer=LATE, densify=STILL)
+    second = make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION)
     second.restore(first.state())
     for _ in range(5):
         uninterrupted.step()
@@ -126,7 +128,7 @@ def test_a_fit_that_is_resumed_within_a_step_continues_to_the_same_bytes(stopped
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
 
 
-def test_views_are_put_together_only_when_the_population_is_what_it_will_be():
+def test_views_are_averaged_only_after_the_last_density_change():
     trainer = make_trainer(optimizer={"views": 4, "views_from": 0.2}, densify={"stop": 30})
     counts = []
     for iteration in range(1, 51):

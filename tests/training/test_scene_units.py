@@ -27,9 +27,9 @@ CASES = {
 }
 """Sections of a configuration: strategies, starts and effects that have lengths of their own."""
 
-SAME_DB = 40.0
-"""Of images that differ by rounding alone, 45 to 71 dB were measured; where a length of the program
-was not in proportion to the scene, 10 to 20 dB."""
+MIN_EQUAL_PSNR_DB = 40.0
+"""Measured: 45 to 71 dB for images that differ by rounding alone, 10 to 20 dB if a length of the
+program is not in proportion to the scene."""
 
 
 @cache
@@ -79,24 +79,24 @@ def images_and_result(case: str, dataset: Dataset):
 
 
 @cache
-def in_units_of_one(case: str):
+def fit_at_unit_scale(case: str):
     return images_and_result(case, photographed())
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 @pytest.mark.parametrize("case", CASES)
-def test_a_fit_is_the_same_in_other_units(case, unit):
-    expected, gaussians = in_units_of_one(case)
+def test_fit_is_invariant_to_units(case, unit):
+    expected, gaussians = fit_at_unit_scale(case)
     images, found = images_and_result(case, scaled(unit))
     assert found.num_gaussians == gaussians.num_gaussians
-    assert capture.decibels(images, expected) > SAME_DB
+    assert capture.decibels(images, expected) > MIN_EQUAL_PSNR_DB
     np.testing.assert_allclose(
         np.median(found.scales), unit * np.median(gaussians.scales), rtol=0.02
     )
 
 
 @pytest.mark.parametrize("case", ["budget", "refined cameras", "visual hull"])
-def test_a_fit_is_the_same_far_from_the_origin(case, tmp_path):
+def test_fit_is_invariant_to_the_origin(case, tmp_path):
     """From files, whose cameras are in Earth-centred coordinates."""
     place = np.array([4.2e6, 1.7e5, -4.78e6])
     dataset = photographed()
@@ -107,7 +107,7 @@ def test_a_fit_is_the_same_far_from_the_origin(case, tmp_path):
     assert "far from the origin: coordinates are relative to (42" in far.description
     expected, gaussians = images_and_result(case, near)
     images, found = images_and_result(case, far)
-    assert capture.decibels(images, expected) > SAME_DB
+    assert capture.decibels(images, expected) > MIN_EQUAL_PSNR_DB
     assert found.origin == far.origin
     middle = np.median(found.means.astype(np.float64) + found.origin - place, axis=0)
     np.testing.assert_allclose(middle, np.median(gaussians.means, axis=0), atol=0.1)
@@ -131,7 +131,7 @@ def write_and_load(folder, dataset: Dataset) -> Dataset:
     return loaded
 
 
-def test_the_extent_of_one_training_camera_is_that_of_all():
+def test_extent_with_one_training_camera_uses_all_cameras():
     dataset = photographed()
     one = replace(dataset, train=dataset.train[:1])
     centers = np.stack([v.center for v in (*one.train, *one.test)])

@@ -26,7 +26,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def test_a_session_without_a_folder_runs_to_its_end_and_writes_and_prints_nothing(tmp_path, capsys):
+def test_session_without_a_folder_writes_and_prints_nothing(tmp_path, capsys):
     config = load_config(write_project(tmp_path))
     before, session = contents(tmp_path), FitSession(config)
     assert session.run()
@@ -36,7 +36,7 @@ def test_a_session_without_a_folder_runs_to_its_end_and_writes_and_prints_nothin
     np.testing.assert_array_equal(session.trainer.gaussians().means, fitted.means)
 
 
-def test_a_time_that_is_too_short_is_refused_before_the_trainer_is_made(tmp_path):
+def test_budget_too_short_is_refused_before_creating_the_trainer(tmp_path):
     config = load_config(write_project(tmp_path))
     session = FitSession(config, budget=Budget(seconds=1.0, end=0.0))
     with pytest.warns(), pytest.raises(UserError, match="--budget: must leave time for 50"):
@@ -101,7 +101,7 @@ class Revises:
         return trainer.config.iterations
 
 
-def test_other_ranks_end_and_revise_a_fit_as_rank_0_does():
+def test_other_ranks_end_and_revise_a_fit_like_rank_0():
     told = []
 
     def ask(numbers):

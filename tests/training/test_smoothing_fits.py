@@ -68,7 +68,7 @@ def expected_filter(means, views) -> np.ndarray:
     return np.sqrt(0.2) / rates
 
 
-def test_a_fit_keeps_one_filter_for_each_gaussian():
+def test_fit_keeps_one_filter_per_gaussian():
     """Through changes of the population and resets; in the end it is that of the final means."""
     trainer = make_trainer()
     counts = set()
@@ -83,7 +83,7 @@ def test_a_fit_keeps_one_filter_for_each_gaussian():
     assert len(counts) == 4  # at 4, 8 and 12
 
 
-def test_a_fit_renders_with_the_filter_that_it_found():
+def test_fit_renders_with_its_filter():
     """The loss of the first iteration is that of the widened Gaussians."""
     from drgs.training.steps import view_of
 
@@ -115,7 +115,7 @@ def test_coarse_stages_have_wider_filters():
 
 
 @pytest.mark.parametrize("pause", [3, 4, 5, 11])
-def test_a_fit_that_is_resumed_ends_in_the_same_bytes(pause):
+def test_resumed_fit_ends_with_the_same_bytes(pause):
     """Just before a change of the population, at it, after it, and later."""
     uninterrupted, first = make_trainer(), make_trainer()
     for _ in range(pause):
@@ -155,7 +155,7 @@ for name, *options in {runs!r}:
 
 
 @pytest.mark.slow
-def test_a_fit_writes_the_filter_or_what_it_makes_of_the_gaussians(run_python, tmp_path):
+def test_fit_writes_the_filter_or_baked_gaussians(run_python, tmp_path):
     """And imports nothing of it where it is not asked for: the first of three."""
     capture.write_dataset(tmp_path / "data", capture.make_dataset(3, 1))
     config = tmp_path / "small.yml"

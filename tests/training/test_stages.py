@@ -18,7 +18,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def made(trainer):
+def indices_on_device(trainer):
     """Indices of the views whose targets are on the device, by stage."""
     return [
         {view.index for view in stage.views if "photograph" in vars(view)}
@@ -26,26 +26,26 @@ def made(trainer):
     ]
 
 
-def test_nothing_is_made_before_it_is_needed():
+def test_targets_are_created_on_demand():
     trainer = make_trainer()
-    assert made(trainer) == [set()]
+    assert indices_on_device(trainer) == [set()]
     view = fits.steps(trainer, 1).last_step.views[-1].view
-    assert made(trainer) == [{view.index}]
+    assert indices_on_device(trainer) == [{view.index}]
     target = view.photograph
     assert view.photograph is target is view.target
 
 
-def test_targets_stay_while_there_is_room(monkeypatch):
+def test_targets_are_cached_within_the_memory_limit(monkeypatch):
     monkeypatch.setattr(trainer_module, "KEPT_BYTES", 2 * PIXELS * TARGET_BYTES + 7)
     trainer, seen = make_trainer(), []
     for _ in range(8):  # two rounds of four views
         trainer.step()
         seen += [trainer.last_step.views[-1].view.index]
-        assert made(trainer) == [set(seen[:2])]
+        assert indices_on_device(trainer) == [set(seen[:2])]
 
 
 @pytest.mark.parametrize("effects", [{}, {"data__random_background": True, "colors__lr": 0.02}])
-def test_a_fit_does_not_depend_on_what_stays(monkeypatch, effects):
+def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
     """Nor on effects that upload something of a view."""
 
     def result():
@@ -55,12 +55,12 @@ def test_a_fit_does_not_depend_on_what_stays(monkeypatch, effects):
     _, kept = result()
     monkeypatch.setattr(trainer_module, "KEPT_BYTES", 0)
     trainer, made_again = result()
-    assert made(trainer) == [set()]
+    assert indices_on_device(trainer) == [set()]
     assert not any(view.uploads for view in trainer.views)
     assert made_again == kept
 
 
-def test_what_a_view_takes_is_counted():
+def test_device_memory_of_a_view_is_counted():
     """Effects say what they upload of a pixel."""
     changes = {"loss__depth_weight": 0.2, "data__random_background": True, "colors__lr": 0.02}
     trainer = fits.make_trainer(fits.true_dataset(), **changes)
@@ -72,12 +72,12 @@ def test_what_a_view_takes_is_counted():
     assert count == view.width * view.height * training_steps.bytes_on_device(trainer.effects)
 
 
-def test_a_stage_that_ends_leaves_nothing_on_the_device():
+def test_finished_stage_leaves_no_arrays_on_the_device():
     trainer = make_trainer(coarse=[{"until": 3, "factor": 2}])
     fits.steps(trainer, 3)
-    coarse, full = made(trainer)
+    coarse, full = indices_on_device(trainer)
     assert len(coarse) == 3 and not full
     fits.steps(trainer, 1)
-    coarse, full = made(trainer)
+    coarse, full = indices_on_device(trainer)
     assert not coarse and len(full) == 1
     assert np.shape(trainer.last_step.views[-1].view.photograph.image) == (16, 20, 3)

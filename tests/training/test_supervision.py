@@ -70,7 +70,7 @@ def masked_dataset(spoiled=True, masks=True):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
-def test_the_loss_is_that_of_the_masked_images(weight):
+def test_loss_is_computed_on_masked_images(weight):
     trainer = fits.make_trainer(masked_dataset(), loss__dssim_weight=weight)
     for index in (0, 3):
         view, photo = trainer.views[index], masked_dataset().train[index]
@@ -86,7 +86,7 @@ def test_the_loss_is_that_of_the_masked_images(weight):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
-def test_pixels_that_are_left_out_have_no_derivative(weight):
+def test_masked_pixels_have_no_derivative(weight):
     """Though SSIM's windows reach into them; all others have one."""
     trainer = fits.make_trainer(masked_dataset(), loss__dssim_weight=weight)
     for index in (0, 3):
@@ -100,7 +100,7 @@ def test_pixels_that_are_left_out_have_no_derivative(weight):
         assert left_out.any() == (index > 0)
 
 
-def test_derivatives_of_a_masked_loss_are_central_differences():
+def test_derivatives_of_a_masked_loss_equal_central_differences():
     trainer = fits.make_trainer(masked_dataset())
     view, photo, mask = trainer.views[2], masked_dataset().train[2], mask_of(2)[..., None]
     values = random_image(2, HEIGHT, WIDTH, 3)
@@ -120,7 +120,7 @@ def test_derivatives_of_a_masked_loss_are_central_differences():
         assert gradient.flat[flat] == pytest.approx(difference, abs=1e-4 * np.abs(gradient).max())
 
 
-def test_the_psnr_of_an_iteration_is_that_of_the_pixels_that_count():
+def test_psnr_of_an_iteration_uses_kept_pixels():
     trainer, views = fits.make_trainer(masked_dataset()), set()
     for iteration in range(1, 4):
         index = view_of(iteration, len(trainer.views), trainer.config.seed)
@@ -133,7 +133,7 @@ def test_the_psnr_of_an_iteration_is_that_of_the_pixels_that_count():
     assert views - {0}
 
 
-def test_what_a_mask_leaves_out_does_not_matter_to_a_fit():
+def test_masked_pixels_do_not_affect_a_fit():
     """To the last bit, whatever is there."""
     states = [
         fits.everything_of(fits.steps(fits.make_trainer(masked_dataset(spoiled)), 6))
@@ -142,7 +142,7 @@ def test_what_a_mask_leaves_out_does_not_matter_to_a_fit():
     assert states[0] == states[1]
 
 
-def test_masks_keep_what_is_wrong_in_photographs_out_of_new_views():
+def test_masks_keep_distractors_out_of_test_views():
     """With the masks, held-out views are about as good as from unspoiled photographs."""
     quality = {}
     for name, dataset in {
@@ -163,7 +163,7 @@ def test_a_dataset_without_masks_has_no_effect():
     assert effect.name == "masks" and effect.state() == {}
 
 
-def test_masks_of_coarse_stages_leave_out_what_they_touch():
+def test_coarse_masks_drop_partially_masked_pixels():
     """A large pixel counts where all small ones do."""
     coarse = [{"until": 2, "factor": 4}]
     trainer = fits.make_trainer(masked_dataset(), coarse=coarse)
@@ -211,7 +211,7 @@ def rendered(trainer, view):
     return mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
 
 
-def test_the_penalty_is_that_of_the_integrators_depth_and_alpha():
+def test_depth_penalty_matches_rendered_depth_and_alpha():
     trainer, dataset = depth_trainer(), depth_dataset()
     for index in (0, 4):
         view, photo = trainer.views[index], dataset.train[index]
@@ -238,7 +238,7 @@ def clear_view(dataset):
     raise AssertionError("no clear view")
 
 
-def test_the_penaltys_gradient_is_a_difference_of_the_reference():
+def test_gradient_of_the_depth_penalty_equals_differences_of_the_reference():
     """Along a direction of each parameter."""
     dataset = depth_dataset()
     trainer = depth_trainer()
@@ -277,7 +277,7 @@ def test_the_penaltys_gradient_is_a_difference_of_the_reference():
     [(depth_dataset, 0.0), (fits.plain_dataset, DEPTH_WEIGHT)],
     ids=["no weight", "no depth"],
 )
-def test_without_a_weight_or_depths_nothing_is_put_out(dataset, weight):
+def test_depth_channels_are_rendered_only_with_a_weight_and_depths(dataset, weight):
     trainer = fits.make_trainer(dataset(), loss__depth_weight=weight)
     assert trainer.effects == [] and trainer.integrator.state.aovs == {}
     image = rendered(trainer, trainer.views[0])
@@ -300,7 +300,7 @@ def test_a_view_without_depths_has_the_loss_of_its_colors():
     assert np.abs(other["means"] - plain_other["means"]).max() > 0
 
 
-def test_a_view_whose_depths_are_all_unknown_has_no_penalty():
+def test_view_with_unknown_depths_only_has_no_penalty():
     dataset = depth_dataset()
     unknown = np.zeros((HEIGHT, WIDTH), np.float32)
     views = (replace(dataset.train[0], depth=unknown), *dataset.train[1:])
@@ -322,7 +322,7 @@ def masked_depth_dataset(spoiled=True):
     return replace(depth_dataset(), train=tuple(views))
 
 
-def test_the_penalty_is_that_of_the_pixels_that_a_mask_keeps():
+def test_depth_penalty_uses_kept_pixels():
     dataset = masked_depth_dataset()
     trainer = depth_trainer(dataset)
     effect = next(e for e in trainer.effects if e.name == "depth")
@@ -339,7 +339,7 @@ def test_the_penalty_is_that_of_the_pixels_that_a_mask_keeps():
         assert known.any() and (index == 0 or known.sum() < (photo.depth > 0).sum())
 
 
-def test_depths_that_a_mask_leaves_out_do_not_matter_to_a_fit():
+def test_masked_depths_do_not_affect_a_fit():
     """To the last bit, whatever they say."""
     states = [
         fits.everything_of(fits.steps(depth_trainer(masked_depth_dataset(spoiled)), 6))
@@ -348,7 +348,7 @@ def test_depths_that_a_mask_leaves_out_do_not_matter_to_a_fit():
     assert states[0] == states[1]
 
 
-def test_a_view_whose_mask_leaves_out_all_known_depths_has_no_penalty():
+def test_view_with_all_known_depths_masked_has_no_penalty():
     dataset = depth_dataset()
     first = replace(dataset.train[0], mask=(dataset.train[0].depth == 0).astype(np.float32))
     trainer = depth_trainer(replace(dataset, train=(first, *dataset.train[1:])))
@@ -356,7 +356,7 @@ def test_a_view_whose_mask_leaves_out_all_known_depths_has_no_penalty():
     assert trainer.views[1].uploads["depth"] is not None
 
 
-def test_depth_supervision_puts_blobs_at_their_depths():
+def test_depth_supervision_recovers_depths():
     """From few views that are close to each other, where colours say little about depth."""
     errors = {}
     for weight in (0.0, 2.0):
@@ -380,7 +380,7 @@ def test_a_fit_with_depths_and_masks_resumes_to_the_same_bytes():
 
 
 @pytest.mark.parametrize("dataset", [masked_dataset, depth_dataset], ids=["masks", "depth"])
-def test_no_iteration_compiles_a_kernel_once_all_views_were_seen(dataset):
+def test_no_kernel_is_compiled_after_all_views_were_seen(dataset):
     fits.assert_no_new_kernels(fits.make_trainer(dataset()))
 
 
@@ -420,7 +420,7 @@ def colors(trainer, count):
     return np.array(found)
 
 
-def test_colors_are_functions_of_seed_and_iteration():
+def test_random_colors_depend_on_seed_and_iteration_only():
     first, again, other = (colors(random_trainer(seed=seed), 5) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(np.concatenate([first, other]), axis=0)) == 10
@@ -429,7 +429,7 @@ def test_colors_are_functions_of_seed_and_iteration():
     np.testing.assert_array_equal(colors(begun, 2), first[3:])
 
 
-def test_colors_fill_the_cube():
+def test_random_colors_are_uniform_in_the_cube():
     """Their means and variances are those of uniform numbers: 1/2 and 1/12."""
     trainer = random_trainer()
     (effect,) = trainer.effects
@@ -450,7 +450,7 @@ def target_of(view) -> np.ndarray:
     return np.array(view.target.image)
 
 
-def test_the_target_is_the_transparent_image_over_the_color():
+def test_target_is_the_transparent_image_over_the_random_color():
     """The image was composited over the dataset's background; its colours are unknown here."""
     trainer, dataset = random_trainer(), transparent_dataset()
     (effect,) = trainer.effects
@@ -469,7 +469,7 @@ def test_the_target_is_the_transparent_image_over_the_color():
         fits.end_view(effect, trainer, view)
 
 
-def test_the_rendering_is_over_the_same_color():
+def test_rendering_is_over_the_same_random_color():
     """True blobs look like the true photographs, whatever is behind them."""
     trainer = fits.make_trainer(
         transparent_dataset(), fits.true_blobs(), data__random_background=True
@@ -480,7 +480,7 @@ def test_the_rendering_is_over_the_same_color():
             assert report.psnr > 60
 
 
-def test_the_datasets_background_is_put_back():
+def test_background_of_the_dataset_is_restored():
     trainer = random_trainer()
     photographs = [np.array(view.photograph.image) for view in trainer.views]
     for _ in range(4):
@@ -500,7 +500,7 @@ def test_opaque_photographs_are_refused():
     )
 
 
-def test_what_masks_leave_out_stays_black_over_any_color():
+def test_masked_pixels_are_black_over_any_color():
     """SSIM's windows that reach into it see the same black in both images."""
     dataset = transparent_dataset()
     views = [replace(view, mask=mask_of(index)) for index, view in enumerate(dataset.train)]
@@ -521,11 +521,11 @@ def test_a_fit_resumes_to_the_same_bytes():
     fits.assert_resumes_to_the_same_bytes(lambda: random_trainer(coarse=coarse), 2, 4)
 
 
-def test_no_iteration_compiles_a_kernel_for_its_color():
+def test_random_color_needs_no_new_kernel():
     fits.assert_no_new_kernels(random_trainer())
 
 
-def test_splats_of_the_backgrounds_color_have_to_be_opaque():
+def test_random_background_makes_background_coloured_splats_opaque():
     """White before white: only another background tells how opaque they are."""
     start = replace(
         fits.true_blobs(), logit_opacities=fits.true_blobs().logit_opacities - np.float32(3)

@@ -20,7 +20,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def test_views_come_in_a_new_random_order_every_round():
+def test_views_are_shuffled_every_round():
     from drgs.training.steps import view_of
 
     rounds = np.array([view_of(i, 10, seed=3) for i in range(1, 51)]).reshape(5, 10)
@@ -29,7 +29,7 @@ def test_views_come_in_a_new_random_order_every_round():
     assert [view_of(i, 10, seed=4) for i in range(1, 51)] != rounds.ravel().tolist()
 
 
-def test_sh_degree_rises_by_one_every_so_many_iterations():
+def test_sh_degree_increases_by_one_at_fixed_intervals():
     trainer = make_trainer(model={"sh_degree": 2, "sh_increase_every": 3})
     degrees = []
     for _ in range(10):
@@ -90,7 +90,7 @@ def test_each_parameter_moves_by_its_rate_in_the_first_step():
     assert np.array_equal(after.shN, before.shN)  # degree 0 is in use
 
 
-def test_reported_loss_and_psnr_are_those_of_the_view_before_the_step():
+def test_reported_loss_and_psnr_are_measured_before_the_step():
     from drgs.training.steps import view_of
 
     trainer = make_trainer(loss={"dssim_weight": 0.0})
@@ -113,7 +113,7 @@ def test_gaussians_are_returned_as_plain_numpy_arrays():
         assert len(getattr(gaussians, name)) == 40
 
 
-def test_first_frame_comes_within_15_seconds_cold_and_3_seconds_warm(run_python, tmp_path):
+def test_first_frame_takes_15_seconds_cold_and_3_seconds_warm_at_most(run_python, tmp_path):
     """Without and with a kernel cache (it lives in the home folder), import included."""
     points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
     config = FitConfig.model_validate({"data": {"path": "."}, "init": {"opacity": 0.5}})
@@ -175,7 +175,7 @@ def test_restored_trainer_continues_to_the_same_bytes():
 COARSE = [{"until": 2, "factor": 4}, {"until": 5, "factor": 2}]
 
 
-def test_coarse_stages_come_first_and_end_where_they_say():
+def test_coarse_stages_come_first_and_end_as_configured():
     trainer = make_trainer(coarse=COARSE)
     sizes, names = [], []
     for iteration in range(1, 9):
@@ -187,7 +187,7 @@ def test_coarse_stages_come_first_and_end_where_they_say():
     assert sorted(names[:4]) == sorted(names[4:]) == ["v0", "v1", "v2", "v3"]
 
 
-def test_a_smaller_view_is_the_same_camera_with_larger_pixels():
+def test_smaller_view_is_the_same_camera_with_larger_pixels():
     view = small_view("v", 1.0)
     smaller = smaller_view(view, 4)
     blocks = view.image.reshape(4, 4, 5, 4, 3).mean(axis=(1, 3))
@@ -215,7 +215,7 @@ def test_a_trainer_restored_within_the_coarse_stages_continues_to_the_same_bytes
 
 
 @pytest.mark.parametrize("model", [{"sh_degree": 0}, {"sh_degree": 1, "antialiased": True}])
-def test_other_models_learn_as_well(model):
+def test_other_models_reduce_the_loss(model):
     """Degree 0 has no shN parameter at all; antialiasing changes the opacities' gradient."""
     trainer = make_trainer(model=model)
     losses = [trainer.step().loss for _ in range(40)]
@@ -224,7 +224,7 @@ def test_other_models_learn_as_well(model):
     assert trainer.gaussians().sh_degree == model["sh_degree"]
 
 
-def test_without_higher_degrees_the_population_may_change():
+def test_population_may_change_without_higher_degrees():
     """shN, which has no numbers then, is in no optimizer: its rows follow."""
     densify = {
         "start": 2,

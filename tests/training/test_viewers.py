@@ -15,7 +15,7 @@ from drgs.training import viewers
 from drgs.training.trainer import Trainer
 from drgs.training.viewers import for_viewers, num_iterations, tuning
 
-OTHERWISE = {"model.antialiased": True, "model.low_pass": 0.02}
+NON_VIEWER_SETTINGS = {"model.antialiased": True, "model.low_pass": 0.02}
 
 
 @pytest.fixture(autouse=True)
@@ -26,20 +26,20 @@ def variant():
 def ended_fit(iterations=20, **changes):
     """A trainer that has done all of its iterations, its dataset, and its Gaussians."""
     dataset = fits.plain_dataset()
-    config = with_changes(fits.config_of(iterations=iterations), {**OTHERWISE, **changes})
+    config = with_changes(fits.config_of(iterations=iterations), {**NON_VIEWER_SETTINGS, **changes})
     trainer = Trainer(config, dataset, fits.disturbed_blobs())
     for _ in range(iterations):
         trainer.step()
     return trainer, dataset, trainer.gaussians()
 
 
-def shown_by_viewers(gaussians, dataset):
+def psnr_in_viewers(gaussians, dataset):
     scene = make_scene(gaussians, ModelConfig(near=0.2, **VIEWER_RENDERING), dataset.background)
     pairs = zip(render_views(scene, dataset.test), dataset.test, strict=True)
     return np.mean([decibels(image, view.image) for image, view in pairs])
 
 
-def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
+def test_iterations_improve_images_of_viewers(monkeypatch):
     monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 1.0)
     trainer, dataset, gaussians = ended_fit()
     before = list(trainer.images(dataset.test))
@@ -48,10 +48,10 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
     found = for_viewers(trainer, gaussians, counted.append)
     assert counted == list(range(1, 21))
     as_it_is, in_closed_form, tuned = (
-        shown_by_viewers(g, dataset) for g in (gaussians, closed, found.gaussians)
+        psnr_in_viewers(g, dataset) for g in (gaussians, closed, found.gaussians)
     )
     assert tuned > max(as_it_is, in_closed_form) + 0.2
-    # What the fit itself has found is shown as before.
+    # The fit itself renders the same images as before.
     for image, again in zip(before, trainer.images(dataset.test), strict=True):
         np.testing.assert_array_equal(image, again)
     pairs = zip(found.images(dataset.test), dataset.test, strict=True)
@@ -62,14 +62,14 @@ def test_iterations_bring_viewers_nearer_to_the_photographs(monkeypatch):
     assert found.gaussians.rendered_with == usual
 
 
-def test_the_same_fit_gives_the_same_bytes(tmp_path):
+def test_repeated_tuning_gives_the_same_bytes(tmp_path):
     for name in ("a.ply", "b.ply"):
         trainer, _, gaussians = ended_fit(8)
         for_viewers(trainer, gaussians).gaussians.save(tmp_path / name)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_what_a_fit_found_out_of_cameras_and_colours_stays():
+def test_refined_cameras_and_colours_are_kept():
     """Its rates are next to nothing; the views to measure are those of the refined cameras."""
     changes = {"cameras.optimise": True, "cameras.rotation_lr": 1e-3, "colors.lr": 0.02}
     trainer, _, gaussians = ended_fit(8, **changes)
@@ -84,7 +84,7 @@ def test_what_a_fit_found_out_of_cameras_and_colours_stays():
     assert config.colors.lr == viewers.NEGLIGIBLE_RATE and config.cameras.rotation_lr == 0
 
 
-def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
+def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
     trainer, _, gaussians = ended_fit(8)
     expected = viewers._closed_form(trainer, gaussians)
     monkeypatch.setitem(viewers.RATES, "scales_lr", 10.0)
@@ -102,8 +102,10 @@ def test_numbers_that_are_not_finite_leave_the_closed_form(monkeypatch):
     np.testing.assert_array_equal(found.gaussians.log_scales, expected.log_scales)
 
 
-def test_the_population_and_the_schedule_stay():
-    config = with_changes(fits.config_of(iterations=400), {**OTHERWISE, "model.order": "pixel"})
+def test_population_and_schedule_are_unchanged():
+    config = with_changes(
+        fits.config_of(iterations=400), {**NON_VIEWER_SETTINGS, "model.order": "pixel"}
+    )
     further = tuning(config)
     assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
     assert further.model.approximations.is_default and not config.model.approximations.is_default

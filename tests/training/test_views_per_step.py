@@ -25,7 +25,7 @@ def make_trainer(views_per_step, dataset=None, **changes):
     return fits.make_trainer(dataset, optimizer__views_per_step=views_per_step, **changes)
 
 
-def test_steps_follow_one_another_and_the_last_may_be_shorter():
+def test_steps_are_consecutive_and_the_last_may_be_shorter():
     steps, done = [], 0
     while done < 11:
         steps.append(step_of(done + 1, 4, 11))
@@ -36,7 +36,7 @@ def test_steps_follow_one_another_and_the_last_may_be_shorter():
 
 
 @pytest.mark.parametrize(("num_views", "views_per_step"), [(10, 4), (12, 3), (3, 4)])
-def test_each_place_of_a_step_draws_from_views_of_its_own(num_views, views_per_step):
+def test_each_place_of_a_step_has_its_own_views(num_views, views_per_step):
     count = 60 * views_per_step
     drawn = np.array([view_of(i, num_views, 3, views_per_step) for i in range(1, count + 1)])
     for place, views in enumerate(drawn.reshape(-1, views_per_step).T):
@@ -47,7 +47,7 @@ def test_each_place_of_a_step_draws_from_views_of_its_own(num_views, views_per_s
     assert set(drawn) == set(range(num_views))
 
 
-def test_a_step_is_adams_along_the_mean_gradient_with_scaled_rates_and_decays():
+def test_step_is_adam_on_the_mean_gradient_with_scaled_rates_and_decays():
     """Two steps by hand, in double precision, from gradients of single views."""
     views_per_step = 3
     trainer = make_trainer(views_per_step, iterations=8)
@@ -85,7 +85,7 @@ def test_a_step_is_adams_along_the_mean_gradient_with_scaled_rates_and_decays():
             change = m[name] / (1 - b1**t) / (np.sqrt(v[name] / (1 - b2**t)) + 1e-15)
             rate = np.sqrt(views_per_step) * expected_rates[name]
             rate *= 1 if name == "means" else falls
-            # Where a gradient is rounding noise, a step of Adam is as long as any.
+            # Gradients that are rounding noise still make full steps of Adam.
             is_sure = np.abs(g) > 1e-4 * np.abs(g).max()
             got, expected = (after[name] - value)[is_sure], -(rate * change)[is_sure]
             # Sums of float32 are off by some 1e-6 of the largest gradient: by 1e-2 of a small one.
@@ -93,7 +93,7 @@ def test_a_step_is_adams_along_the_mean_gradient_with_scaled_rates_and_decays():
             assert np.abs(got - expected).mean() < 1e-3 * np.abs(expected).mean(), name
 
 
-def test_what_is_reported_is_the_mean_of_the_views():
+def test_report_is_the_mean_over_the_views():
     trainer, alone = make_trainer(3), make_trainer(1)
     losses, psnrs = [], []
     for index in (view_of(i, 6, 0, 3) for i in (1, 2, 3)):
@@ -110,7 +110,7 @@ def test_what_is_reported_is_the_mean_of_the_views():
     assert len({alone.step().loss for _ in range(2)}) == 2
 
 
-def test_statistics_of_density_are_those_of_single_views():
+def test_density_statistics_are_those_of_single_views():
     """The same after a step of three views as of each of them alone, and not a third."""
     settings = {"densify__start": 1, "densify__stop": 100, "densify__every": 50}
     trainer = make_trainer(3, **settings)
@@ -126,7 +126,7 @@ def test_statistics_of_density_are_those_of_single_views():
     assert norms.max() > 0
 
 
-def test_a_change_that_falls_into_a_step_comes_behind_it():
+def test_density_change_due_within_a_step_follows_the_step():
     trainer = make_trainer(
         4, densify__strategy="budget", densify__start=3, densify__stop=20, densify__every=6
     )
@@ -138,7 +138,7 @@ def test_a_change_that_falls_into_a_step_comes_behind_it():
     assert changes == [8, 12, 20]  # of iterations 6, 12, 18 and 20
 
 
-def test_images_change_their_size_with_the_first_step_behind_a_stage():
+def test_image_size_changes_with_the_first_step_after_a_stage():
     trainer = make_trainer(4, coarse=[{"until": 6, "factor": 2}])
     widths, begun = [], []
     for _ in range(4):
@@ -174,7 +174,7 @@ EFFECTS = {
     + [EFFECTS, {"coarse": [{"until": 6, "factor": 2}], "optimizer__views": 8}],
     ids=["adc", "budget", "mcmc", "effects", "coarse"],
 )
-def test_a_fit_that_is_resumed_continues_to_the_same_bytes(changes):
+def test_resumed_fit_continues_to_the_same_bytes(changes):
     dataset = fits.true_dataset() if changes is EFFECTS else None
 
     def make():
@@ -183,7 +183,7 @@ def test_a_fit_that_is_resumed_continues_to_the_same_bytes(changes):
     fits.assert_resumes_to_the_same_bytes(make, 3, 4)
 
 
-def test_effects_of_all_views_of_a_step_begin_with_the_same_numbers():
+def test_effects_use_the_same_parameters_for_all_views_of_a_step():
     """Focal lengths, which all share, move once the last view of the step was rendered."""
     trainer = make_trainer(3, cameras__optimise=True, cameras__focal_lr=1e-3)
     fits.steps(trainer, 2)
@@ -203,7 +203,7 @@ def test_effects_of_all_views_of_a_step_begin_with_the_same_numbers():
     assert turns.sum() == 9  # each view has taken a step when it was seen
 
 
-def test_late_steps_are_made_of_whole_ones():
+def test_late_steps_consist_of_whole_steps():
     trainer = make_trainer(
         2, optimizer__views=6, optimizer__views_from=0.5, densify__start=1, densify__stop=2
     )
@@ -216,6 +216,6 @@ def test_late_steps_are_made_of_whole_ones():
     assert counts == [6] * 6 and steps == [306, 312]
 
 
-def test_late_steps_that_are_no_multiple_are_refused():
+def test_late_steps_must_be_a_multiple():
     with pytest.raises(ValidationError, match=r"views must be a multiple .*\(4\).*, got 6"):
         make_trainer(4, optimizer__views=6)

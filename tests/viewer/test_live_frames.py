@@ -42,14 +42,14 @@ def reference_image(**approximations):
     return rendered
 
 
-def test_colors_are_those_of_the_usual_rendering_in_eight_bits(scene):
+def test_colors_match_the_rendering_in_eight_bits(scene):
     frame = scene.frame(REQUEST)
     assert frame.pixels.dtype == np.uint8 and frame.seconds > 0
     assert np.array_equal(frame.pixels, np.round(255 * reference_image()))
 
 
 @pytest.mark.parametrize("others", [{"projection": "exact"}, {"order": "pixel"}, {"low_pass": 0.0}])
-def test_approximations_are_switched_and_switched_back(scene, others):
+def test_approximations_can_be_changed_and_restored(scene, others):
     first = scene.frame(REQUEST).pixels
     values = {**vars(scene.approximations), **others}
     switched = scene.frame(replace(REQUEST, approximations=Approximations(**values))).pixels
@@ -58,7 +58,7 @@ def test_approximations_are_switched_and_switched_back(scene, others):
     assert np.array_equal(scene.frame(REQUEST).pixels, first)
 
 
-def test_smaller_images_show_the_same(scene):
+def test_smaller_images_are_downscaled_ones(scene):
     small = scene.frame(REQUEST.smaller(2)).pixels
     assert small.shape == (16, 24, 3)
     means = scene.frame(REQUEST).pixels.reshape(16, 2, 24, 2, 3).mean(axis=(1, 3))
@@ -99,7 +99,7 @@ def test_the_error_is_the_difference_from_the_most_accurate_image(scene):
     assert (frame.pixels == 128).all() and "the same as" in frame.note
 
 
-def test_what_no_kernel_can_do_is_refused_in_words(scene):
+def test_unsupported_combination_is_refused_in_one_line(scene):
     values = Approximations(**{**vars(scene.approximations), "projection": "exact"})
     with pytest.raises(UserError, match="exact"):
         scene.frame(replace(REQUEST, lens="fisheye", approximations=values))
@@ -109,7 +109,7 @@ NUMBERS = {"opencv": {"k1": 0.1}, "fisheye": {"k1": 0.1}, "thin lens": {"apertur
 
 
 @pytest.mark.parametrize("lens", VIEWER_LENSES)
-def test_everything_is_shown_through_every_lens(scene, lens):
+def test_every_content_is_rendered_through_every_lens(scene, lens):
     """But for the projection ``exact``, which only pinholes and thin lenses have."""
     numbers, refused = NUMBERS.get(lens, {}), set()
     for projection, order in (("ewa", "center"), ("unscented", "pixel"), ("exact", "pixel")):
@@ -123,7 +123,7 @@ def test_everything_is_shown_through_every_lens(scene, lens):
     assert refused == ({"exact"} if lens in ("opencv", "fisheye", "orthographic") else set())
 
 
-def test_the_error_through_parallel_rays_is_that_of_the_order():
+def test_error_of_orthographic_views_comes_from_the_order_only():
     """``ewa`` is exact there: with the most accurate order there is none."""
     scene = LiveScene(blobs(), ModelConfig(**MOST_ACCURATE), WHITE)
     parallel = replace(REQUEST, lens="orthographic", content="error")
@@ -131,7 +131,7 @@ def test_the_error_through_parallel_rays_is_that_of_the_order():
     assert (scene.frame(replace(parallel, lens="pinhole")).pixels != 128).any()
 
 
-def test_nothing_to_see_has_no_depth(scene):
+def test_empty_view_has_no_depth(scene):
     away = ViewerCamera(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
     frame = scene.frame(replace(REQUEST, camera=away, content="depth"))
     assert frame.note == "nothing is seen" and np.ptp(frame.pixels) == 0

@@ -65,7 +65,7 @@ def controls_of(server):
     return server.gui._gui_input_handle_from_uuid
 
 
-def uuids_that_stop_nothing(server):
+def uuids_of_harmless_controls(server):
     controls = controls_of(server).items()
     return [uuid for uuid, control in controls if getattr(control, "label", "") not in STOPPING]
 
@@ -86,13 +86,13 @@ def wait_until(condition, seconds=10):
         ({"value": True}, [True, False], [1, 0.0, "True", "evil"]),
     ],
 )
-def test_a_control_has_the_values_that_it_offers(control, accepted, rejected):
+def test_control_accepts_only_offered_values(control, accepted, rejected):
     control = SimpleNamespace(**control)
     assert all(accepts_value(control, value) for value in accepted)
     assert not any(accepts_value(control, value) for value in rejected)
 
 
-def test_a_camera_has_finite_numbers_and_a_direction():
+def test_camera_message_must_be_finite_with_a_direction():
     def valid(message, **changes):
         return is_valid(msgspec.msgpack.encode(message | changes), {}.get)
 
@@ -107,11 +107,11 @@ def test_a_camera_has_finite_numbers_and_a_direction():
     assert not valid(CAMERA, type="ShareUrlRequest")
 
 
-def test_a_thousand_invalid_messages_change_nothing_and_print_nothing(server, capfd):
+def test_invalid_messages_have_no_effect_and_print_nothing(server, capfd):
     TrainingPage(
         server, RenderRequests(), StartView.from_views(true_dataset().train), Approximations()
     )
-    uuids = uuids_that_stop_nothing(server)
+    uuids = uuids_of_harmless_controls(server)
     before = {uuid: control.value for uuid, control in controls_of(server).items()}
     callbacks = {uuid: len(c._impl.update_cb) for uuid, c in controls_of(server).items()}
     send_all(server.get_port(), hostile_messages(1, 1000, uuids))
@@ -136,7 +136,7 @@ def test_a_thousand_invalid_messages_change_nothing_and_print_nothing(server, ca
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_message_that_is_too_long_ends_its_connection_only(server, capfd):
+def test_oversized_message_ends_its_connection_only(server, capfd):
     with connect_to(server.get_port()) as connection, connect_to(server.get_port()) as other:
         connection.send(bytes(MAX_MESSAGE_BYTES + 1))
         with pytest.raises(ConnectionClosed):
@@ -156,7 +156,7 @@ def is_closed(connection):
         return True
 
 
-def test_a_flood_of_connections_leaves_room_for_files_and_for_clients(server, capfd):
+def test_flood_of_connections_leaves_room_for_files_and_clients(server, capfd):
     address = "127.0.0.1", server.get_port()
     flood = [socket.create_connection(address) for _ in range(3 * MAX_CONNECTIONS)]
     for connection in flood:
@@ -183,7 +183,7 @@ def test_a_flood_of_connections_leaves_room_for_files_and_for_clients(server, ca
         *("//etc/passwd", "/C:/Windows/win.ini", "/C%3A/x", "/%00", "/x" * 3000, "/assets"),
     ],
 )
-def test_nothing_but_the_page_is_read(server, path, capfd):
+def test_server_reads_no_files_but_the_page(server, path, capfd):
     connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=5)
     connection.request("GET", path)
     assert connection.getresponse().status >= 400
@@ -203,7 +203,7 @@ def test_nothing_but_the_page_is_read(server, path, capfd):
         b"",
     ],
 )
-def test_requests_that_are_none_print_nothing(server, request_bytes, capfd):
+def test_malformed_requests_print_nothing(server, request_bytes, capfd):
     with socket.create_connection(("127.0.0.1", server.get_port()), timeout=5) as connection:
         connection.sendall(request_bytes)
         connection.shutdown(socket.SHUT_WR)
@@ -216,13 +216,13 @@ def test_requests_that_are_none_print_nothing(server, request_bytes, capfd):
 
 
 @pytest.mark.parametrize("protocol", ["viser-v0.0.1", "chat"])
-def test_a_page_of_another_version_is_refused_without_a_word(server, protocol, capfd):
+def test_page_of_another_version_is_refused_silently(server, protocol, capfd):
     with pytest.raises(InvalidStatus, match="403"):
         connect_to(server.get_port(), protocol)
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
+def test_fit_with_hostile_clients_has_the_same_bytes(server, capfd):
     settings = {"iterations": 40, "densify__start": 2, "densify__stop": 30, "densify__every": 5}
     dataset = true_dataset()
     alone, watched = (make_trainer(dataset, **settings) for _ in range(2))
@@ -232,7 +232,7 @@ def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
     served, history = [], History()
     show = watching._scheduler.show
     watching._scheduler.show = lambda *frame: (served.append(frame), show(*frame))
-    uuids, is_over = uuids_that_stop_nothing(server), threading.Event()
+    uuids, is_over = uuids_of_harmless_controls(server), threading.Event()
 
     def attack():
         seed = 0
@@ -260,7 +260,7 @@ def test_a_fit_among_hostile_clients_has_the_bytes_of_one_alone(server, capfd):
 
 
 @pytest.mark.slow
-def test_the_command_writes_the_same_bytes_among_hostile_clients(tmp_path):
+def test_command_with_hostile_clients_writes_the_same_bytes(tmp_path):
     config = write_scene(tmp_path, iterations=150, densify={"start": 1, "stop": 100})
     words = [sys.executable, "-m", "drgs", "fit", config, "--set", "output.report=false"]
     alone, watched, log = tmp_path / "alone", tmp_path / "watched", tmp_path / "log"

@@ -55,7 +55,7 @@ def viewpoint(focal=FOCAL, lens=None):
     ],
     ids=["pinhole", "opencv", "fisheye"],
 )
-def test_images_are_those_of_the_same_camera_in_a_dataset(lens, numbers, view):
+def test_image_matches_the_same_camera_in_a_dataset(lens, numbers, view):
     scene = make_scene(blobs(), ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     (expected,) = render_views(scene, [view])
     rendered = np.clip(seen(blobs(), lens, **numbers), 0, 1)
@@ -90,7 +90,7 @@ def place(rendered):
 
 
 @pytest.mark.parametrize("depth", [RADIUS, 1.5 * RADIUS])
-def test_parallel_rays_show_a_thing_where_the_pinhole_does_at_the_distance_of_the_focus(depth):
+def test_orthographic_view_matches_the_pinhole_at_the_focus_distance(depth):
     x, y, _ = place(seen(speck(0.8, -0.5, depth), "orthographic"))
     # The middle of a speck that is cut off at a small alpha is within a tenth of a pixel.
     assert x == pytest.approx(WIDTH / 2 + FOCAL * 0.8 / RADIUS, abs=0.1)
@@ -104,7 +104,7 @@ def test_a_closed_aperture_is_a_pinhole(capfd):
     assert "aperture" not in "".join(capfd.readouterr())
 
 
-def test_a_thin_lens_is_sharp_at_its_focus_and_nowhere_else():
+def test_thin_lens_is_sharp_at_its_focus_only():
     for focus, depth in ((1.0, RADIUS), (1.5, 1.5 * RADIUS)):
         dot = speck(0.8, -0.5, depth)
         sharp = seen(dot)

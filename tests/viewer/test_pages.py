@@ -60,13 +60,13 @@ def client(width=1600, height=900, pose=None):
     return SimpleNamespace(client_id=7, camera=camera)
 
 
-def asked(page, **camera):
+def pending_request(page, **camera):
     page.controls._angle.value = 50
     page._follow(client(**camera))
     return page.requests.pending[7].request
 
 
-def test_the_first_look_is_that_of_the_first_training_camera_at_what_all_look_at():
+def test_start_view_is_the_first_training_camera_at_the_common_focus():
     views = make_dataset().train
     start = StartView.from_views(views)
     assert start.camera.camera_to_world is views[0].camera_to_world
@@ -82,21 +82,21 @@ def test_the_first_look_is_that_of_the_first_training_camera_at_what_all_look_at
     assert alone.camera.distance > 0
 
 
-def test_a_browsers_camera_becomes_a_request(page):
-    request = asked(page)
+def test_browser_camera_becomes_a_request(page):
+    request = pending_request(page)
     assert request.camera.camera_to_world == pytest.approx(pose_around(0.7, 0.2))
     assert request.camera.fov == pytest.approx(50) and request.camera.distance == pytest.approx(2.5)
     assert (request.width, request.height) == (1280, 720)  # of 1600 x 900, at most 1280
     assert request.content == "color" and request.lens == "pinhole"
     assert request.approximations == FITTED
-    request = asked(page, width=300, height=200)
+    request = pending_request(page, width=300, height=200)
     assert (request.width, request.height) == (300, 200)
 
 
 def test_every_control_is_in_the_request(page):
     controls = page.controls
     controls._content.value, controls._side.value = "depth", "640"
-    request = asked(page)
+    request = pending_request(page)
     assert request.content == "depth" and (request.width, request.height) == (640, 360)
     controls._lens_sliders["k1"].value = -0.2
     lenses = {
@@ -109,7 +109,7 @@ def test_every_control_is_in_the_request(page):
     assert lenses.keys() == VIEWER_LENSES.keys()
     for name, numbers in lenses.items():
         controls._lens.value = name
-        request = asked(page)
+        request = pending_request(page)
         assert (request.lens, request.lens_parameters) == (name, numbers)
         assert request.camera.fov == pytest.approx(90 if name == "fisheye" else 50)
     for name in ADJUSTABLE_APPROXIMATIONS:
@@ -118,17 +118,17 @@ def test_every_control_is_in_the_request(page):
         other = next((word for word in declared.words if word != value), other)
         other = 0.5 if name in ("alpha_cut", "transmittance_stop") else other
         controls._values[name].value = other
-        assert getattr(asked(page).approximations, name) == other, name
-    assert asked(page).approximations.extent == 3.5  # has no control
+        assert getattr(pending_request(page).approximations, name) == other, name
+    assert pending_request(page).approximations.extent == 3.5  # has no control
 
 
-def test_times_are_compared_with_those_of_the_same_image_as_fitted(page):
+def test_frame_times_are_compared_with_the_fitted_settings(page):
     page._texts[7] = SimpleNamespace(content="")
     switched = Approximations(order="pixel")
     frames = [
         ViewerFrame(np.zeros((2, 2, 3), np.uint8), s, note) for s, note in ((0.02, ""), (0.05, "x"))
     ]
-    request = asked(page)
+    request = pending_request(page)
     other = replace(request, approximations=switched)
     assert page._describe(7, request, frames[0]) == "**20 ms** for 1280×720"
     assert page._describe(7, other, frames[1]).startswith("**50 ms** for 1280×720; as fitted 20 ms")
@@ -138,7 +138,7 @@ def test_times_are_compared_with_those_of_the_same_image_as_fitted(page):
         assert "as fitted" not in page._describe(7, changed, frames[1])
 
 
-def test_a_number_beyond_its_limits_is_said_and_asked_for_by_nobody(page):
+def test_number_beyond_its_limits_is_reported_and_not_rendered(page):
     page._texts[7] = SimpleNamespace(content="")
     page.controls._values["alpha_cut"].value = 1.0
     page._follow(client())
@@ -146,7 +146,7 @@ def test_a_number_beyond_its_limits_is_said_and_asked_for_by_nobody(page):
     assert not page.requests.pending
 
 
-def test_the_server_is_at_the_address_that_is_printed_and_prints_nothing(server, capfd):
+def test_server_uses_the_printed_address_and_prints_nothing(server, capfd):
     assert url(server) == f"http://127.0.0.1:{server.get_port()}"
     second = free_port("127.0.0.1", None, ("", ""))
     assert second != server.get_port()
@@ -170,12 +170,12 @@ def test_the_server_is_at_the_address_that_is_printed_and_prints_nothing(server,
         ("machine:8080", "http://elsewhere.org", "0.0.0.0", False),
     ],
 )
-def test_only_the_page_itself_is_served(host, origin, address, expected):
+def test_only_same_origin_requests_are_served(host, origin, address, expected):
     headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
     assert is_same_origin(headers, address) == expected
 
 
-def test_a_page_from_elsewhere_cannot_connect(server):
+def test_page_of_another_origin_cannot_connect(server):
     protocol, place = f"viser-v{version('viser')}", f"ws://127.0.0.1:{server.get_port()}"
     with connect(place, subprotocols=[protocol], origin=url(server)) as connection:
         assert connection.recv(timeout=5)
@@ -183,7 +183,7 @@ def test_a_page_from_elsewhere_cannot_connect(server):
         connect(place, subprotocols=[protocol], origin="https://elsewhere.org")
 
 
-def test_nothing_is_said_of_images_for_a_browser_that_was_closed():
+def test_images_for_a_closed_browser_give_no_warning():
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         with run_server("127.0.0.1", None, ("", "")) as server:
@@ -219,7 +219,7 @@ def test_the_page_of_a_fit_follows_its_history(server):
     assert page._pause.disabled and page._end.disabled
 
 
-def test_curves_have_few_points_their_ends_and_the_measurements():
+def test_curves_have_few_points_including_ends_and_measurements():
     rows = [
         HistoryRow(k, 0.1, 20.0, 25, 1e-3, 0.1, 25.0 if k % 400 == 0 else None)
         for k in range(1, 1001)
@@ -233,5 +233,5 @@ def test_curves_have_few_points_their_ends_and_the_measurements():
     assert [len(curve[0]) for curve in psnr_curves(rows[:3])] == [3, 0]
 
 
-def test_everything_that_can_be_shown_is_offered(page):
+def test_every_content_is_offered(page):
     assert tuple(page.controls._content.options) == tuple(FRAME_CONTENTS)

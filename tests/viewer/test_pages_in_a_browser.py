@@ -36,7 +36,7 @@ ENDLESS = 100_000
 """Iterations."""
 
 FADE_SECONDS = 3
-"""That a page takes to appear, and to say where a fit is."""
+"""Time until a page appears and shows the progress of a fit."""
 
 
 @contextmanager
@@ -80,17 +80,17 @@ def seen(page) -> np.ndarray:
 def wait_for_an_image(page) -> np.ndarray:
     """Splats on white, once the page has ceased to fade in."""
 
-    def is_there() -> bool:
+    def has_appeared() -> bool:
         rendered = 255 * page.rendered()
         return rendered[-20:, :20].min() > 250 and np.ptp(shown(rendered)) > 100
 
-    browsers.wait_until(is_there, "an image")
+    browsers.wait_until(has_appeared, "an image")
     return seen(page)
 
 
 def assert_clean(page, address: str) -> None:
     """No error, and nothing from anywhere else."""
-    assert page.troubles(["error"]) == []
+    assert page.console_errors(["error"]) == []
     hosts = {urlsplit(request).netloc for request in page.requests() if request[:4] == "http"}
     assert hosts == {urlsplit(address).netloc}
 
@@ -101,7 +101,7 @@ def expected_view(run: Path, width: int, height: int) -> np.ndarray:
     args = argparse.Namespace(what=run, up=None)
     model = load_model(run)
     (camera,) = view.cameras_of(args, model)
-    # As wide as high, at least: on a phone the window is narrower than the camera's image.
+    # The field of view spans the smaller side: a phone's window is narrower than high.
     focal = 0.5 * min(width, height) / math.tan(math.radians(FIELD_OF_VIEW) / 2)
     size = {"cx": width / 2, "cy": height / 2, "width": width, "height": height}
     (rendered,) = render_views(model.scene(), [replace(camera, fx=focal, fy=focal, **size)])
@@ -109,11 +109,11 @@ def expected_view(run: Path, width: int, height: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_gaussians_are_seen_as_they_are_and_turn_under_the_mouse(fit, size, tmp_path):
+def test_page_shows_gaussians_and_orbits_with_the_mouse(fit, size, tmp_path):
     width, height = SIZES[size]
     with (
         command("drgs.view", fit, log=tmp_path / "log") as (process, address),
-        browsers.a_page(width, height) as page,
+        browsers.browser_page(width, height) as page,
     ):
         page.open(address)
         wait_for_an_image(page)
@@ -131,11 +131,14 @@ def test_gaussians_are_seen_as_they_are_and_turn_under_the_mouse(fit, size, tmp_
         assert process.wait(30) == 0
 
 
-def test_a_fit_is_seen_paused_and_ended(tmp_path):
+def test_page_of_a_fit_shows_pauses_and_ends_it(tmp_path):
     config = write_scene(tmp_path, iterations=ENDLESS, densify={"start": 1, "stop": 2})
     out, log = tmp_path / "out", tmp_path / "log"
     words = ("drgs.fit", config, "--out", out, "--view", "--set", "output.report=false")
-    with command(*words, log=log) as (process, address), browsers.a_page(*SIZES["desktop"]) as page:
+    with (
+        command(*words, log=log) as (process, address),
+        browsers.browser_page(*SIZES["desktop"]) as page,
+    ):
 
         def iteration() -> int:
             text = page.evaluate("document.body.innerText")

@@ -66,7 +66,7 @@ def served(them, stage):
     return them.serve(lambda: stage)
 
 
-def test_a_moving_camera_gets_small_images_and_a_still_one_the_whole(clock):
+def test_moving_camera_gets_small_images_and_static_one_full_size(clock):
     stage, left, them = make(clock)
     assert not served(them, stage)
     left.put(1, REQUEST)
@@ -79,7 +79,7 @@ def test_a_moving_camera_gets_small_images_and_a_still_one_the_whole(clock):
     assert not served(them, stage)  # nothing has changed
 
 
-def test_images_of_a_moving_camera_keep_to_their_time(clock):
+def test_images_of_a_moving_camera_meet_their_time_limit(clock):
     """At 1 microsecond a pixel the whole takes 0.48 s: a third of either side is in time."""
     stage, left, them = make(clock, 1e-6)
     for _ in range(8):
@@ -95,7 +95,7 @@ def test_images_of_a_moving_camera_keep_to_their_time(clock):
     assert [width for _, width, _ in stage.shown][-2:] == [400, 800]
 
 
-def test_a_still_camera_gets_larger_images_step_by_step_until_it_moves(clock):
+def test_static_camera_gets_progressively_larger_images(clock):
     stage, left, them = make(clock, 3e-6)
     for _ in range(6):
         left.put(1, REQUEST)
@@ -110,7 +110,7 @@ def test_a_still_camera_gets_larger_images_step_by_step_until_it_moves(clock):
     assert [width for _, width, _ in stage.shown[-2:]] == [267, 800]
 
 
-def test_small_windows_are_not_made_smaller_than_one_can_see():
+def test_small_windows_keep_a_minimum_resolution():
     resolution = AdaptiveResolution()
     for _ in range(9):
         resolution.update(1, 10.0)
@@ -119,7 +119,7 @@ def test_small_windows_are_not_made_smaller_than_one_can_see():
     assert resolution.divisor(FrameRequest(REQUEST.camera, 300, 20)) == 1
 
 
-def test_what_changes_by_itself_is_rendered_again_after_a_while(clock):
+def test_changing_content_is_rendered_again_after_a_while(clock):
     stage, left, them = make(clock, 1e-6, lambda seconds: 10 * seconds)
     left.put(1, REQUEST)
     served(them, stage)
@@ -132,7 +132,7 @@ def test_what_changes_by_itself_is_rendered_again_after_a_while(clock):
     assert [whole for *_, whole in stage.shown] == [False, True, True]
 
 
-def test_everybody_is_served_in_turn_and_who_has_left_is_not(clock):
+def test_clients_are_served_in_turn_and_disconnected_ones_skipped(clock):
     stage, left, them = make(clock, 1e-7)
     for client in (3, 1, 2):
         left.put(client, REQUEST)
@@ -145,7 +145,7 @@ def test_everybody_is_served_in_turn_and_who_has_left_is_not(clock):
     assert sorted(client for client, *_ in stage.shown[3:]) == [1, 3]
 
 
-def test_what_cannot_be_rendered_is_said_once(clock):
+def test_request_that_fails_is_reported_once(clock):
     stage, left, them = make(clock)
     left.put(1, FrameRequest(REQUEST.camera, 800, 600, content="nonsense"))
     assert served(them, stage)
@@ -154,7 +154,7 @@ def test_what_cannot_be_rendered_is_said_once(clock):
     assert stage.refused == [(1, "that cannot be seen")] and not stage.shown
 
 
-def test_a_request_that_cannot_be_rendered_is_a_line_on_its_page_and_others_are_served(clock):
+def test_failing_request_is_reported_on_its_page_and_others_are_served(clock):
     """Mitsuba, for one, wraps what a plugin refuses as RuntimeError."""
     stage, left, them = make(clock)
     frame = stage.frame

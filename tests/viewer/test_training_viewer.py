@@ -39,7 +39,7 @@ EVERYTHING = {
     "densify__adc__grad_threshold": 1e-7,
     "densify__every": 2,
 }
-"""What a fit can have: effects, a population that changes, harmonics that grow."""
+"""Settings of a fit with effects, density control and a growing SH degree."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -90,7 +90,7 @@ def requests():
         yield FrameRequest(eye, 40, 30, content=content, approximations=approximations, **lens)
 
 
-def test_a_watched_fit_has_the_bytes_of_one_that_is_not():
+def test_fit_with_a_viewer_has_the_same_bytes():
     dataset, queue, asked = true_dataset(), RenderRequests(), requests()
     alone = make_trainer(dataset, **EVERYTHING)
     run(alone)
@@ -104,7 +104,7 @@ def test_a_watched_fit_has_the_bytes_of_one_that_is_not():
     assert not [name for name, value in expected.items() if got[name] != value]
 
 
-def test_what_is_shown_is_the_fit_as_it_is_after_the_iteration():
+def test_viewer_shows_the_fit_after_the_current_iteration():
     dataset, queue, stale = plain_dataset(), RenderRequests(), []
     trainer, view = make_trainer(dataset, iterations=5), EYE.viewpoint(WIDTH, HEIGHT)
 
@@ -124,7 +124,7 @@ def make_scene_of(trainer):
 
 
 @pytest.mark.parametrize("end_at", [1, 5, 8])
-def test_an_early_end_is_a_fit_of_so_many_iterations(end_at):
+def test_fit_ended_early_equals_a_fit_of_fewer_iterations(end_at):
     """And its configuration, fitted again from the start, gives its bytes."""
     dataset, queue = true_dataset(), RenderRequests()
     trainer = make_trainer(dataset, **EVERYTHING)
@@ -141,7 +141,7 @@ def test_an_early_end_is_a_fit_of_so_many_iterations(end_at):
     assert not [name for name, value in expected.items() if got[name] != value]
 
 
-def test_an_end_asked_for_too_early_or_too_late_changes_nothing():
+def test_ending_before_the_start_or_after_the_end_has_no_effect():
     dataset, queue = plain_dataset(), RenderRequests()
     queue.end()
     trainer = make_trainer(dataset, iterations=3)
@@ -152,7 +152,7 @@ def test_an_end_asked_for_too_early_or_too_late_changes_nothing():
     assert trainer.iteration == 3 and trainer.config.iterations == config.iterations
 
 
-def test_a_pause_holds_the_fit_and_its_clock_and_shows_what_is_asked_for():
+def test_pause_stops_fit_and_clock_and_serves_requests():
     dataset, queue, during = plain_dataset(), RenderRequests(), []
     trainer = make_trainer(dataset, iterations=4)
 
@@ -182,7 +182,7 @@ def test_a_pause_holds_the_fit_and_its_clock_and_shows_what_is_asked_for():
     assert trainer.iteration == 4
 
 
-def test_ctrl_c_and_an_early_end_are_heard_in_a_pause():
+def test_ctrl_c_and_ending_early_work_during_a_pause():
     dataset = plain_dataset()
     for end in (False, True):
         queue, trainer = RenderRequests(), make_trainer(dataset, iterations=3)

@@ -149,7 +149,7 @@ def write_inputs(folder: Path) -> None:
 
 
 @contextmanager
-def standing_in(folder: Path) -> Iterator[None]:
+def current_folder(folder: Path) -> Iterator[None]:
     """The current folder within the block."""
     before = Path.cwd()
     os.chdir(folder)
@@ -160,7 +160,7 @@ def standing_in(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def sketched_results() -> Iterator[None]:
+def stub_results() -> Iterator[None]:
     """Within the block a fit writes its drawings, but does not draw: that takes seconds."""
 
     def write(out: Path, *others: object) -> None:
@@ -181,7 +181,7 @@ class AttackFolder:
         self.folder.mkdir(parents=True)
         write_inputs(self.folder)
         if with_results:
-            with standing_in(self.folder), sketched_results():
+            with current_folder(self.folder), stub_results():
                 self._run_commands()
         shutil.copytree(self.folder, self._kept)
         self._pristine = contents(self.folder)
@@ -200,7 +200,7 @@ class AttackFolder:
         outcome = run_in_process(capture.main, *words)
         assert outcome.returncode == 0, outcome
 
-    def put_back(self) -> None:
+    def restore_files(self) -> None:
         """Undo what an attack did."""
         now = contents(self.folder)
         for path in sorted(now.keys() - self._pristine.keys(), reverse=True):
@@ -238,11 +238,11 @@ def contents(folder: Path) -> dict[str, str]:
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
             path = os.path.join(parent, name)
-            found[path[start:]] = what_it_is(path)
+            found[path[start:]] = digest_or_kind(path)
     return found
 
 
-def what_it_is(path: str) -> str:
+def digest_or_kind(path: str) -> str:
     """A digest, the target of a link, or the kind."""
     mode = os.lstat(path).st_mode
     if stat.S_ISDIR(mode):

@@ -20,7 +20,7 @@ from support.attacks.scenes import object_attacks, property_attacks
 from support.attacks.values import option_attacks, schema_attacks
 
 DAMAGED = 40
-"""Of each kind, for each file."""
+"""Number of damaged versions of each file, by kind."""
 
 FAMILIES: dict[str, Callable[[AttackFolder], Iterable[Attack]]] = {
     "schema": lambda attack_folder: schema_attacks(),
@@ -37,14 +37,13 @@ FAMILIES: dict[str, Callable[[AttackFolder], Iterable[Attack]]] = {
     "property": lambda attack_folder: property_attacks(),
     "object": lambda attack_folder: object_attacks(),
 }
-"""By the first part of an attack's name."""
+"""Attacks by the first part of their name."""
 
 
 KNOWN_FAILURES: dict[str, str] = {
     "schema/densify.budget.prune_opacity=half": "known once the fit has begun: its folder stays",
 }
-"""By name of an attack that does what it must not: why, until it is mended. A test fails when one
-of them does so no more."""
+"""Reasons of known failures, by attack. A test fails when one of them passes."""
 
 
 def attacks(family: str, attack_folder: AttackFolder) -> list[Attack]:

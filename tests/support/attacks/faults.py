@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from support.attacks.attack import Attack
-from support.attacks.attack_folder import CAPTURE, AttackFolder, capture_size, standing_in
+from support.attacks.attack_folder import CAPTURE, AttackFolder, capture_size, current_folder
 from support.attacks.observer import KINDS, SMALL_FILES, Fault
 from support.attacks.trial import run
 
@@ -55,15 +55,15 @@ WORKS = {
         ("points3d.ply", "transforms_train.json", "train/r_0.png", "test/r_0.png", "capture.json"),
     ),
 }
-"""By name. What a fit draws takes seconds, and is sketched."""
+"""Commands by name. Images of a fit take seconds, and are replaced by stubs."""
 
 
 def count_changes(work: Work, attack_folder: AttackFolder) -> int:
     """How often the command changes a file, when nothing happens."""
     attack = Attack("rehearsal", work.command, work.words)
-    with standing_in(attack_folder.folder):
+    with current_folder(attack_folder.folder):
         outcome = run(attack, work.words)
-    attack_folder.put_back()
+    attack_folder.restore_files()
     assert outcome.status == 0, outcome.err
     return len(outcome.changes.inside)
 

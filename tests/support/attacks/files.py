@@ -52,7 +52,7 @@ READERS = {
         ("ball.xml", *CAPTURE, *capture_size(6), "--out", "captured"),
     ),
 }
-"""By file: a command that reads it, and its words."""
+"""Command that reads a file, with its arguments."""
 
 REWRITTEN = ("captured/capture.json",)
 """Files without which a command begins anew."""
@@ -94,7 +94,7 @@ def _grown(size: int, path: Path) -> None:
         file.truncate(size)
 
 
-OTHERS = {
+REPLACEMENTS = {
     "nothing": lambda path: path.unlink(),
     "an empty file": lambda path: path.write_bytes(b""),
     "a null byte": lambda path: path.write_bytes(b"\0"),
@@ -124,7 +124,7 @@ OTHERS = {
     "itself twice": lambda path: path.write_bytes(path.read_bytes() * 2),
     "itself and a line": lambda path: path.write_bytes(path.read_bytes() + b"\nmore"),
 }
-"""By name: what is put in the place of a file."""
+"""Replacements of a file, by name."""
 
 HARMLESS = (
     "itself and a line",
@@ -156,7 +156,7 @@ LEFT_OUT = [
 ]
 """One of several files that are named: the others are fitted."""
 
-MAY_BE_READ = [
+MAY_BE_ACCEPTED = [
     *MAY_BE_MISSING,
     *LEFT_OUT,
     ("gaussians.splat", "its first half"),
@@ -176,9 +176,9 @@ def _archive() -> bytes:
 def other_file_attacks() -> Iterator[Attack]:
     """Each of the files that commands read, with each of the above in its place."""
     for file in READERS:
-        for name, change in OTHERS.items():
+        for name, change in REPLACEMENTS.items():
             may_be_read = name in HARMLESS or file in REWRITTEN
-            may_be_read |= (file, name) in MAY_BE_READ
+            may_be_read |= (file, name) in MAY_BE_ACCEPTED
             yield _attack(f"instead/{file}/{name}", file, change, must_refuse=not may_be_read)
 
 
@@ -299,7 +299,7 @@ MUTATIONS = {
     "splats.xml": {"bytes": mutate_bytes, "values": _xml_numbers},
     "ball.xml": {"bytes": mutate_bytes, "values": _xml_numbers},
 }
-"""By file: kinds of damage, functions of a generator of random numbers and the content."""
+"""Kinds of damage by file: functions of a random generator and the content."""
 
 
 def damage_attacks(count: int) -> Iterator[Attack]:
@@ -359,7 +359,7 @@ def _gzip_bomb(path: Path) -> None:
     path.write_bytes(gzip.compress(bytes(content) + bytes(1 << 30), 1))
 
 
-def _honest_gzip_bomb(path: Path) -> None:
+def _valid_gzip_bomb(path: Path) -> None:
     """1 GB of zeros, which are as many Gaussians as the header says."""
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, (1 << 30) // 20, 0, 12, 0, 0)
     path.write_bytes(gzip.compress(header + bytes((1 << 30) // 20 * 20), 1))
@@ -424,7 +424,7 @@ SPECIAL = {
         "far": _far_points,
     },
     "gaussians.ply": {"lists": _ply_of_lists, "elements": _ply_of_elements},
-    "gaussians.spz": {"bomb": _gzip_bomb, "larger bomb": _honest_gzip_bomb},
+    "gaussians.spz": {"bomb": _gzip_bomb, "larger bomb": _valid_gzip_bomb},
     "gaussians.glb": {"deep": _deep_glb},
     "lego/transforms_train.json": {"deep": _deep, "object": _deep_object},
     "photos/transforms.json": {"deep": _deep, "object": _deep_object},
@@ -441,7 +441,7 @@ SPECIAL = {
     "photos/mask.png": {"bomb": _png_bomb, "animated": _animated},
     "photos/depth.png": {"bomb": _png_bomb},
 }
-"""By file: what it is replaced with."""
+"""Special replacements, by file."""
 
 FORMATS = {
     "JPEG": "RGB",

@@ -33,8 +33,7 @@ CHANGES = {
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 KINDS = ("full", "denied", "kill", "interrupt")
-"""Of faults at a change: no space is left; nothing may be removed or replaced any more; SIGKILL;
-Ctrl-C."""
+"""Faults at a change: no space left; no permission to remove or replace; SIGKILL; Ctrl-C."""
 
 SMALL_FILES = "small files"
 """A fault of another kind: no file may become larger than ``at`` bytes, and writing stops there."""

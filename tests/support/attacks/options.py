@@ -48,7 +48,7 @@ OPTIONS = {
         "--variant": ("--variant", "scalar_rgb"),
     },
 }
-"""By command and name, words that are right by themselves."""
+"""Options that are valid on their own, by command and name."""
 
 SUBJECTS = ("run", "gaussians.ply", "splats.xml", "stopped", "photos")
 """Inputs of ``render``."""
@@ -265,7 +265,7 @@ def name_attacks() -> Iterator[Attack]:
 
 
 # ----------------------------------------------------------------------------------------------
-# What a fit draws
+# Images of a fit
 # ----------------------------------------------------------------------------------------------
 
 

@@ -17,7 +17,7 @@ NUMBERS = {
     "integer": ("0", "-1", "1", "3", "17", "1000000000", "2147483647", "9223372036854775807"),
 }
 
-OTHERS = {
+PROPERTY_VALUES = {
     "string": (
         "",
         "x",
@@ -34,9 +34,9 @@ OTHERS = {
     "spectrum": ("0.5", "400:1, 700:0"),
     "point": ("0, 0, 0", "nan, 0, 0"),
 }
-"""By tag of a property, values."""
+"""Property values, by XML tag."""
 
-OWN = (
+SPLATS_PROPERTIES = (
     "filename",
     "to_world",
     "shapes_to_world",
@@ -63,7 +63,7 @@ CALIBRATED = (
 )
 """Properties of ``calibrated``."""
 
-AROUND = (
+SENSOR_PROPERTIES = (
     *("near_clip", "far_clip", "principal_point_offset_x", "aperture_radius", "focus_distance"),
     *("shutter_open", "shutter_close", "fov_axis", "focal_length"),
 )
@@ -106,16 +106,16 @@ def _change(place: str, text: str, folder: Path) -> None:
 def property_attacks() -> Iterator[Attack]:
     """Every property of the plugins, of sensors, films and samplers, with values of every type."""
     places = {
-        "splats": OWN,
+        "splats": SPLATS_PROPERTIES,
         "calibrated": CALIBRATED,
-        "sensor": AROUND,
-        "lens": AROUND,
+        "sensor": SENSOR_PROPERTIES,
+        "lens": SENSOR_PROPERTIES,
         "film": FILM,
         "sampler": ("sample_count", "seed"),
     }
     for place, names in places.items():
         for name in names:
-            for tag, values in (NUMBERS | OTHERS).items():
+            for tag, values in (NUMBERS | PROPERTY_VALUES).items():
                 for number, value in enumerate(values):
                     text = f'<{tag} name="{name}" value="{value}"/>'
                     label = value if len(value) < 30 else f"long {number}"

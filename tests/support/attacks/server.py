@@ -11,7 +11,7 @@ from pathlib import Path
 
 from conftest import REPOSITORY, TESTS
 
-GRACE = 40.0
+GRACE_SECONDS = 40.0
 """Seconds beyond an attack's own, after which its process is ended: more than it takes to start."""
 
 
@@ -38,7 +38,7 @@ class Server:
         process = self._process
         process.stdin.write(f"{json.dumps(name)}\n")
         process.stdin.flush()
-        ready, _, _ = select.select([process.stdout], [], [], seconds + GRACE)
+        ready, _, _ = select.select([process.stdout], [], [], seconds + GRACE_SECONDS)
         answer = process.stdout.readline() if ready else ""
         if answer:
             return json.loads(answer)

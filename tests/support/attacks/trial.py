@@ -19,14 +19,14 @@ from pathlib import Path
 
 from drgs.__main__ import COMMANDS
 from support.attacks.attack import Attack
-from support.attacks.attack_folder import AttackFolder, contents, sketched_results, standing_in
+from support.attacks.attack_folder import AttackFolder, contents, current_folder, stub_results
 from support.attacks.observer import Changes, Killed, observed
 
-KILLED = 137
-INTERRUPTED = 130
+KILLED_STATUS = 137
+INTERRUPTED_STATUS = 130
 
 PIPE_BYTES = 1 << 20
-"""Of what a command prints."""
+"""Limit of a command's output."""
 
 CACHES = re.compile(
     r"/(\.drjit|\.cache|__pycache__|\.nv|\.config/matplotlib)(/|$)|^/dev/(null|tty)$|^/proc/self/"
@@ -35,7 +35,7 @@ CACHES = re.compile(
 
 TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
 
-MOST_LINE = 2000
+MAX_REFUSAL_CHARS = 2000
 """Characters in a refusal, beside what the user wrote."""
 
 ADDRESS_SPACE = 4 << 30
@@ -47,10 +47,10 @@ MAY_CHANGE = {
     "render": {"out"},
     "capture": {"out", "captured"},
 }
-"""By command, folders in which files that were there before may be its own."""
+"""Folders in which a command may change existing files."""
 
 
-class TooLong(BaseException):
+class TimeLimitExceeded(BaseException):
     """The trial's time is up."""
 
 
@@ -69,7 +69,7 @@ class Outcome:
 def trial(attack: Attack, attack_folder: AttackFolder) -> list[str]:
     """Run an attack and put the attack folder back; what is wrong, in a line each."""
     try:
-        with standing_in(attack_folder.folder):
+        with current_folder(attack_folder.folder):
             attack.change(attack_folder.folder)
             before = contents(attack_folder.folder)
             outcome = run(attack, attack.words)
@@ -78,14 +78,14 @@ def trial(attack: Attack, attack_folder: AttackFolder) -> list[str]:
                 wrong += recovery(attack, attack_folder)
         return wrong
     finally:
-        attack_folder.put_back()
+        attack_folder.restore_files()
 
 
 def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outcome:
     """Call the command as its process would be; in the current folder."""
     main = import_module(COMMANDS[attack.command].module).main
     outcome, fault = Outcome(), attack.fault if with_fault else None
-    drawings = nullcontext() if attack.draws else sketched_results()
+    drawings = nullcontext() if attack.draws else stub_results()
     with (
         drawings,
         _captured(attack.encoding, outcome),
@@ -98,8 +98,8 @@ def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outc
         except SystemExit as end:
             outcome.status = end.code if isinstance(end.code, int) else 0 if not end.code else 1
         except Killed:
-            outcome.status = KILLED
-        except TooLong:
+            outcome.status = KILLED_STATUS
+        except TimeLimitExceeded:
             print(f"did not end within {attack.seconds:g} s", file=sys.stderr)
             traceback.print_exc()
         except BaseException:  # as Python itself ends a process
@@ -108,7 +108,7 @@ def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outc
 
 
 # ----------------------------------------------------------------------------------------------
-# What is wrong
+# Violations
 # ----------------------------------------------------------------------------------------------
 
 
@@ -117,7 +117,7 @@ def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
     wrong = []
     expected = {0, 2}
     if attack.fault is not None:
-        own = {"kill": KILLED, "interrupt": INTERRUPTED}.get(attack.fault.kind, 2)
+        own = {"kill": KILLED_STATUS, "interrupt": INTERRUPTED_STATUS}.get(attack.fault.kind, 2)
         expected = {0, own}
     if outcome.status not in expected:
         reached = "an exception" if outcome.status is None else f"status {outcome.status}"
@@ -149,7 +149,7 @@ def _wrong_refusal(attack: Attack, err: str) -> list[str]:
         wrong.append(f"a refusal of {len(lines)} lines: {_last_lines(err)}")
     elif "error: " not in lines[0]:
         wrong.append(f"a refusal that is none: {lines[0]}")
-    if max(map(len, lines), default=0) > MOST_LINE + sum(map(len, attack.words)):
+    if max(map(len, lines), default=0) > MAX_REFUSAL_CHARS + sum(map(len, attack.words)):
         wrong.append(f"a line of {max(map(len, lines))} characters")
     if attack.named and attack.named not in err:
         wrong.append(f"does not name {attack.named}: {_last_lines(err)}")
@@ -175,14 +175,14 @@ def damage(
             wrong.append(f"{'changed' if path in after else 'removed'} {path}")
     for path in after.keys() - before.keys():
         if TEMPORARY.search(path):
-            if not _cannot_tidy(attack):
+            if not _cannot_clean_up(attack):
                 wrong.append(f"left {path}")
         elif not (kept and (is_own(path) or own.startswith(f"{path}/"))):
             wrong.append(f"made {path}")
     return sorted(wrong)
 
 
-def _cannot_tidy(attack: Attack) -> bool:
+def _cannot_clean_up(attack: Attack) -> bool:
     """Whether its fault leaves no chance to remove what is temporary."""
     return attack.fault is not None and attack.fault.kind in ("kill", "denied")
 
@@ -194,7 +194,7 @@ def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
         return [f"again: ended with {outcome.status}: {_last_lines(outcome.err)}"]
     found = contents(attack_folder.folder / attack.out)
     wrong = [f"again: left {path}" for path in found if TEMPORARY.search(path)]
-    expected = undisturbed(attack, attack_folder)
+    expected = files_without_faults(attack, attack_folder)
     wrong += [f"again: {n} is missing" for n in expected.keys() - found.keys()]
     wrong += [f"again: {n} is too much" for n in found.keys() - expected.keys()]
     return wrong + [
@@ -207,11 +207,11 @@ def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
 _undisturbed: dict[tuple, dict[str, str]] = {}
 
 
-def undisturbed(attack: Attack, attack_folder: AttackFolder) -> dict[str, str]:
+def files_without_faults(attack: Attack, attack_folder: AttackFolder) -> dict[str, str]:
     """Return the command's files when nothing happens; puts the attack folder back."""
     key = str(attack_folder.folder), attack.command, attack.words
     if key not in _undisturbed:
-        attack_folder.put_back()
+        attack_folder.restore_files()
         attack.change(attack_folder.folder)
         outcome = run(attack, attack.words, with_fault=False)
         assert outcome.status == 0, outcome.err
@@ -284,10 +284,10 @@ def _show_warning(message: object, category: type, *others: object, **more: obje
 
 @contextmanager
 def _measured(outcome: Outcome, seconds: float) -> Iterator[None]:
-    """Ends the block by :class:`TooLong`; bounds and measures memory."""
+    """Ends the block by :class:`TimeLimitExceeded`; bounds and measures memory."""
 
     def ring(number: int, frame: object) -> None:
-        raise TooLong
+        raise TimeLimitExceeded
 
     previous, interrupt = signal.signal(signal.SIGALRM, ring), signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGINT, signal.default_int_handler)

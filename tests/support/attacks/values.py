@@ -46,9 +46,9 @@ NUMBERS = {
     "2^63": "9223372036854775808",
     "10^400": "1" + "0" * 400,
 }
-"""By name, in YAML."""
+"""Numbers in YAML, by name."""
 
-THINGS = {
+OTHER_VALUES = {
     "true": "true",
     "null": "null",
     "nothing": "",
@@ -78,7 +78,7 @@ THINGS = {
     "aims": "[{after: 0, end: 1}, {after: 1, end: 2147483647}]",
 }
 
-SELDOM_RIGHT = ("nan", "inf", "-inf", "-1", "2^63", "10^400")
+RARELY_VALID = ("nan", "inf", "-inf", "-1", "2^63", "10^400")
 """Numbers that hardly any value may be: the others often begin a fit."""
 
 LONG_WORK = {
@@ -87,9 +87,9 @@ LONG_WORK = {
     "init.num_points": (),
     "densify.adc.split_count": (),
 }
-"""By key, values that are right and mean work without end."""
+"""Valid values that mean endless work, by key."""
 
-NEEDED = {
+ENABLING_SETTINGS = {
     "init.num_points": ("init.point_cloud=null", "densify.max_gaussians=100000000"),
     "init.half_extent": ("init.point_cloud=null", "init.num_points=20"),
     "densify": ("densify.start=0", "densify.every=1", "densify.stop=9"),
@@ -97,7 +97,7 @@ NEEDED = {
     "colors": ("colors.lr=0.01",),
     "coarse": (),
 }
-"""By key or section: other values with which it has an effect."""
+"""Further values that make a key or section take effect."""
 
 
 def leaves() -> list[str]:
@@ -121,9 +121,9 @@ def schema_attacks() -> Iterator[Attack]:
     for key in leaves():
         of_data = key.partition(".")[0] in ("data", "cameras", "loss")
         config = "photos.yml" if of_data else "fit.yml"
-        others = NEEDED.get(key, NEEDED.get(key.partition(".")[0], ()))
+        others = ENABLING_SETTINGS.get(key, ENABLING_SETTINGS.get(key.partition(".")[0], ()))
         others = [word for word in others if not word.startswith(f"{key}=")]
-        for name, text in (NUMBERS | THINGS).items():
+        for name, text in (NUMBERS | OTHER_VALUES).items():
             if name in LONG_WORK.get(key, ()):
                 continue
             sets = [word for other in (*others, f"{key}={text}") for word in ("--set", other)]
@@ -133,7 +133,7 @@ def schema_attacks() -> Iterator[Attack]:
                 "fit",
                 (config, *out, *sets),
                 out=_out(key, text),
-                is_long=name in NUMBERS and name not in SELDOM_RIGHT,
+                is_long=name in NUMBERS and name not in RARELY_VALID,
             )
 
 
@@ -211,14 +211,14 @@ WORDS = {
     "dash": "-",
     "dashes": "--",
 }
-"""By name, what stands after an option."""
+"""Option arguments, by name."""
 
 BASES = {
     "fit": ("fit.yml",),
     "render": ("gaussians.ply", "--origin", "3", "0", "1", "--size", "8", "6"),
     "capture": ("ball.xml", *CAPTURE, *capture_size(4)),
 }
-"""By command, words that are right; ``--out out`` is added."""
+"""Valid arguments by command; ``--out out`` is added."""
 
 OTHER_BASES = {
     "split": ("run", "--split", "test"),
@@ -226,7 +226,7 @@ OTHER_BASES = {
     "camera": ("gaussians.ply", "--camera", "camera.json"),
     "scene": ("splats.xml",),
 }
-"""Of ``render``."""
+"""Further valid arguments of ``render``, by name."""
 
 COSTLY = {
     ("fit", ""): ("photographs",),
@@ -241,7 +241,7 @@ COSTLY = {
     ("fit", "--threads"): ("10^4", "10^5"),
     ("render", "--threads"): ("10^4", "10^5"),
 }
-"""By command and option, values that are right and mean a lot of work."""
+"""Valid values that mean a lot of work, by command and option."""
 
 
 def options_of(command: str) -> list[argparse.Action]:

@@ -67,7 +67,7 @@ def test_invisible_gradients_are_ignored_even_if_they_are_nan():
 
 # ---- schedule
 @pytest.mark.parametrize("white", [False, True])
-def test_schedule_is_that_of_the_reference_training_loop(white):
+def test_schedule_matches_the_reference_training_loop(white):
     config = DensifyConfig(
         start=20, stop=200, every=10, adc={"reset_every": 60, "white_background_reset": 20}
     )
@@ -83,7 +83,7 @@ def test_schedule_is_that_of_the_reference_training_loop(white):
         assert strategy.needs_statistics(i) == (i < 200), i
 
 
-def test_extra_reset_can_be_off():
+def test_extra_reset_can_be_disabled():
     strategy = AdaptiveDensityControl(config_of(white_background_reset=None), True)
     assert not any(strategy.resets(i) for i in range(1, 3000))
 
@@ -137,7 +137,7 @@ def test_samples_have_the_mean_and_covariance_of_their_parent():
     assert np.abs(np.cov(normal.T) - np.eye(3)).max() < 5 * math.sqrt(2 / count)
 
 
-def test_thresholds_belong_to_the_side_of_the_reference():
+def test_thresholds_compare_like_in_the_reference():
     # Gradient >= threshold, scale <= clone_scale x extent, opacity < prune_opacity. Powers of
     # two, so that all are exact.
     config = {"grad_threshold": 2**-12, "clone_scale": 2**-7, "prune_opacity": 0.25}
@@ -165,7 +165,7 @@ def test_huge_gaussians_are_pruned_only_after_the_first_reset():
         assert run(optimizer, [0, 0], iteration=iteration).pruned == pruned
 
 
-def test_clones_do_not_escape_the_size_limit():
+def test_clones_are_subject_to_the_size_limit():
     # Only where clone_scale exceeds prune_scale can a Gaussian be small and too large.
     optimizer = make([HUGE, SMALL], 0.5)
     report = run(optimizer, [HIGH, 0], iteration=LATE, clone_scale=0.2)
@@ -181,13 +181,13 @@ def test_just_added_rows_are_not_pruned_in_the_same_step():
     assert run(optimizer, [0, 0, 0], iteration=LATE + 100).pruned == 2
 
 
-def test_not_a_number_is_pruned_and_never_copied():
+def test_nan_gaussians_are_pruned_and_never_copied():
     optimizer = make([SMALL, SMALL, SMALL], [0.5, np.nan, 0.5])
     report = run(optimizer, [np.nan, HIGH, 0])
     assert report == DensityReport(pruned=1, num_gaussians=2)
 
 
-def test_nothing_to_do_changes_nothing():
+def test_refine_without_candidates_changes_nothing():
     optimizer = make([SMALL, LARGE], 0.5)
     before = dict(optimizer.state)
     report = run(optimizer, [0, 0], iteration=LATE)
@@ -243,7 +243,7 @@ def test_cap_counts_a_clone_as_one_and_a_split_as_its_samples_less_the_parent():
     assert report == DensityReport(num_added=3, cloned=1, split=1, refused=1, num_gaussians=8)
 
 
-def test_pruned_rows_make_room():
+def test_pruned_rows_can_be_reused():
     optimizer = make([SMALL] * 5, [0.001, 0.001, 0.5, 0.5, 0.5])
     assert run(optimizer, [0, 0, HIGH, HIGH, HIGH], max_gaussians=5).num_gaussians == 5
 
@@ -282,7 +282,7 @@ def naive_decisions(norms, scales, opacities, large_is_pruned, config):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_random_populations_follow_the_rules_and_the_cap(seed):
+def test_random_populations_follow_rules_and_cap(seed):
     random = np.random.default_rng(seed)
     num = 60
     # float32, as in the statistics; coarse steps make ties.
@@ -330,7 +330,7 @@ def test_equal_seeds_give_equal_bytes():
 
 
 # ---- opacity reset
-def test_reset_lowers_opacities_and_forgets_their_moments_only():
+def test_reset_lowers_opacities_and_clears_only_their_moments():
     config = DensifyConfig()
     optimizer = make([SMALL] * 3, [0.9, 0.01001, 0.007])
     before, (means_m, _) = values(optimizer), moments(optimizer, "means")

@@ -9,7 +9,7 @@ from scipy import stats
 from drgs.training.density.mcmc import normals, pcg4d, sample_in_proportion
 
 
-def test_rows_are_drawn_as_often_as_their_weights_call_for():
+def test_rows_are_sampled_in_proportion_to_weights():
     random = np.random.default_rng(0)
     weights = random.random(500) * (random.random(500) < 0.8)
     expected = 3000 * weights / weights.sum()
@@ -20,7 +20,7 @@ def test_rows_are_drawn_as_often_as_their_weights_call_for():
         assert not counts[weights == 0].any()
 
 
-def test_over_many_keys_the_mean_is_the_weight():
+def test_mean_count_over_many_keys_is_the_weight():
     # Fewer draws than rows: each row is drawn once or not at all, with probability 20 w. Of 4000
     # keys, six standard deviations of the mean of such a variable.
     weights = np.arange(1, 41) / np.arange(1, 41).sum()
@@ -33,7 +33,7 @@ def test_over_many_keys_the_mean_is_the_weight():
     assert (np.abs(np.mean(drawn, axis=0) - shares) <= 6 * deviation + 1e-12).all()
 
 
-def test_equal_keys_draw_the_same_and_others_do_not():
+def test_equal_keys_give_equal_samples_and_other_keys_differ():
     weights = np.random.default_rng(1).random(1000)
     first = sample_in_proportion(weights, 100, [0, 5])
     np.testing.assert_array_equal(sample_in_proportion(weights, 100, [0, 5]), first)
@@ -41,7 +41,7 @@ def test_equal_keys_draw_the_same_and_others_do_not():
     assert (sample_in_proportion(weights, 100, [1, 5]) != first).any()
 
 
-def test_weights_that_are_no_numbers_are_none():
+def test_nan_weights_count_as_zero():
     weights = np.array([np.nan, 0.0, 1e-300, -1.0, np.nan])
     np.testing.assert_array_equal(sample_in_proportion(weights, 3, [0, 0]), [2, 2, 2])
     with pytest.raises(ValueError, match="must be positive and finite"):
@@ -49,7 +49,7 @@ def test_weights_that_are_no_numbers_are_none():
     assert sample_in_proportion(weights, 0, [0, 0]).size == 0
 
 
-def test_the_hash_is_that_of_the_paper():
+def test_hash_matches_the_paper():
     random = np.random.default_rng(2)
     words = random.integers(0, 2**32, (4, 50), dtype=np.uint64)
     x, y, z, w = ([int(v) for v in row] for row in words)
@@ -82,14 +82,14 @@ def test_normals_are_independent_standard_normal_numbers(float_type):
     for column in columns.T:
         # Kolmogorov and Smirnov; one in 10,000 would fail.
         assert stats.kstest(column, "norm").pvalue > 1e-4
-    # Of independent numbers, a correlation has the standard deviation 1 / sqrt(count).
+    # Correlations of independent numbers have the standard deviation 1 / sqrt(count).
     correlations = np.corrcoef(columns.T) - np.eye(9)
     assert np.abs(correlations).max() < 5 / np.sqrt(count)
     lagged = [np.corrcoef(column[1:], column[:-1])[0, 1] for column in columns.T]
     assert np.abs(lagged).max() < 5 / np.sqrt(count)
 
 
-def test_normals_repeat_to_the_last_bit_with_any_number_of_threads():
+def test_normals_have_the_same_bits_with_any_number_of_threads():
     def bytes_of(threads):
         before = dr.thread_count()
         dr.set_thread_count(threads)

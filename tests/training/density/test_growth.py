@@ -34,7 +34,7 @@ def values(optimizer):
     return {name: np.array(dr.detach(value), np.float64) for name, value in optimizer.items()}
 
 
-def test_room_is_given_to_those_that_see_most_of_the_errors():
+def test_gaussians_with_the_largest_errors_are_split():
     optimizer = make([0.1] * 6, [0.5] * 6)
     before = values(optimizer)
     # Half of the way from 6 to 9 after a quarter of the time: 6 + 3 sqrt(1 / 4) = 7.5, even: 8.
@@ -47,7 +47,7 @@ def test_room_is_given_to_those_that_see_most_of_the_errors():
     assert np.array(growth.errors).tolist() == [0] * 8  # and starts again
 
 
-def test_equal_errors_are_split_by_index_and_none_without_errors():
+def test_equal_errors_are_split_by_index_and_zero_errors_never():
     optimizer = make([0.1] * 5, [0.5] * 5)
     before = values(optimizer)["sh0"]
     growth = strategy(optimizer, [0, 2, 2, 2, 0], budget={"gaussians": 7})
@@ -58,7 +58,7 @@ def test_equal_errors_are_split_by_index_and_none_without_errors():
     assert growth.refine(rows_of(optimizer), 1000).num_gaussians == 5
 
 
-def test_the_transparent_are_removed_and_their_room_is_used():
+def test_transparent_gaussians_are_removed_and_replaced():
     scales, opacities = [0.1, 0.1, 0.1, 4.1, 0.1], [0.5, 0.0049, np.nan, 0.5, 0.0051]
     optimizer = make(scales, opacities)
     before = values(optimizer)["sh0"]
@@ -70,7 +70,7 @@ def test_the_transparent_are_removed_and_their_room_is_used():
 
 
 @pytest.mark.parametrize("tensor_type", [TensorXf, TensorXf64])
-def test_halves_lie_on_both_sides_along_the_longest_axis(tensor_type):
+def test_halves_are_on_both_sides_along_the_longest_axis(tensor_type):
     optimizer = make([0.1, 0.2, 0.05], [0.5, 0.9, 0.01], tensor_type=tensor_type)
     before, rows = values(optimizer), np.array([0, 2])
     got = {k: np.array(v, np.float64) for k, v in halves(rows_of(optimizer), rows).items()}
@@ -93,7 +93,7 @@ def test_halves_lie_on_both_sides_along_the_longest_axis(tensor_type):
             assert np.array_equal(got[name][k], before[name][row])
 
 
-def test_survivors_keep_their_moments_and_halves_start_without():
+def test_survivors_keep_their_moments_and_halves_start_at_zero():
     optimizer = make([0.1] * 4, [0.5] * 4)
     moments = {name: np.array(optimizer.state[name][3][1]) for name in PARAMETER_NAMES}
     steps = {name: np.array(optimizer.state[name][3][0]) for name in PARAMETER_NAMES}
@@ -114,7 +114,7 @@ def test_survivors_keep_their_moments_and_halves_start_without():
     cap=st.integers(4, 60),
     iteration=st.integers(101, 1000),
 )
-def test_neither_the_curve_nor_the_cap_is_exceeded(seed, num, target, cap, iteration):
+def test_growth_exceeds_neither_curve_nor_cap(seed, num, target, cap, iteration):
     random = np.random.default_rng(seed)
     optimizer = make(random.uniform(0.01, 0.5, num), random.uniform(0.001, 0.9, num))
     growth = strategy(
@@ -135,7 +135,7 @@ def test_neither_the_curve_nor_the_cap_is_exceeded(seed, num, target, cap, itera
     assert growth.max_num_gaussians(num, 1000) >= report.num_gaussians
 
 
-def test_the_last_change_is_at_the_end_of_growth_and_reaches_the_number():
+def test_last_change_is_at_the_end_of_growth_and_reaches_the_target():
     """Wherever the intervals between the others lead."""
     optimizer = make([0.1] * 6, [0.5] * 6)
     growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9}, stop=325)
@@ -164,7 +164,7 @@ GROWING = {
 }
 
 
-def test_errors_are_gathered_in_the_iterations_that_say_so(variant):
+def test_errors_are_accumulated_in_scheduled_iterations(variant):
     trainer = make_trainer(densify=GROWING)
     gathered = []
     original = trainer.density.update_statistics
@@ -178,7 +178,7 @@ def test_errors_are_gathered_in_the_iterations_that_say_so(variant):
 
 
 @pytest.mark.parametrize(("every", "stop", "error_every"), [(4, 26, 10), (2, 12, 5), (100, 30, 7)])
-def test_each_change_has_seen_errors(every, stop, error_every):
+def test_each_change_has_accumulated_errors(every, stop, error_every):
     """If there were none since the last change, errors of its own view are used."""
     budget = {"gaussians": 70, "error_every": error_every}
     config = DensifyConfig(start=1, stop=stop, every=every, budget=budget)
@@ -191,7 +191,7 @@ def test_each_change_has_seen_errors(every, stop, error_every):
     assert seen == 0
 
 
-def test_a_fit_grows_along_the_curve_and_is_resumed_to_the_same_bytes(variant):
+def test_fit_grows_along_the_curve_and_resumes_to_the_same_bytes(variant):
     uninterrupted, first = make_trainer(densify=GROWING), make_trainer(densify=GROWING)
     counts = []
     for iteration in range(1, 31):
@@ -209,7 +209,7 @@ def test_a_fit_grows_along_the_curve_and_is_resumed_to_the_same_bytes(variant):
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
 
 
-def test_the_number_is_reached_where_images_are_coarse_until_the_end_of_growth():
+def test_target_is_reached_with_coarse_images_until_the_end_of_growth():
     coarse = [CoarseStage(until=1000, factor=2)]
     config = DensifyConfig(start=100, stop=1000, every=100, budget={"gaussians": 90})
     growth = GrowthToNumber(config, coarse, first=50)
@@ -219,7 +219,7 @@ def test_the_number_is_reached_where_images_are_coarse_until_the_end_of_growth()
     ]
 
 
-def test_coarse_images_have_fewer_gaussians_and_the_means_rate_waits_for_their_end(variant):
+def test_coarse_images_have_fewer_gaussians_and_a_constant_means_rate(variant):
     coarse = [{"until": 9, "factor": 4}, {"until": 17, "factor": 2}]
     trainer, counts, rates = make_trainer(densify=GROWING, coarse=coarse), [], []
     for _ in range(50):
@@ -236,7 +236,7 @@ def test_coarse_images_have_fewer_gaussians_and_the_means_rate_waits_for_their_e
     assert rates[17:] == pytest.approx([first * 100 ** (-k / 33) for k in range(1, 34)])
 
 
-def test_the_number_follows_from_the_images_where_it_is_not_given(variant):
+def test_default_number_follows_from_the_image_size(variant):
     trainer = make_trainer(densify={"strategy": "budget"})
     assert trainer.config.densify.budget.gaussians == round(250 * math.sqrt(20 * 16))
 

@@ -35,7 +35,7 @@ def act(optimizer, iteration=600, seed=0, **config):
 # ---- what copies look like
 @pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
-def test_copies_composite_to_what_they_are_copies_of(opacity, count):
+def test_copies_composite_to_the_original_opacity(opacity, count):
     (copies,), (factor,) = correct_copies(np.array([opacity]), np.array([count]))
     assert 1 - (1 - copies) ** count == pytest.approx(opacity, rel=1e-12)
     # Along a line through the centre, x in standard deviations of the copies: as much in all.
@@ -45,12 +45,12 @@ def test_copies_composite_to_what_they_are_copies_of(opacity, count):
     assert factor * composited == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-9)
 
 
-def test_more_copies_count_as_many_as_are_exact():
+def test_copies_beyond_the_maximum_count_as_the_maximum():
     for numbers in correct_copies(np.array([0.7] * 2), np.array([1000, MAX_COPIES])):
         assert numbers[0] == numbers[1]
 
 
-def test_an_opacity_that_has_no_logit_has_copies():
+def test_opacity_of_one_has_finite_copies():
     copies, factors = correct_copies(np.array([1.0]), np.array([2]))
     assert 0.99 < copies[0] < 1
     assert 0 < factors[0] < 1
@@ -92,7 +92,7 @@ def test_transparent_gaussians_become_copies_of_opaque_ones():
         np.testing.assert_array_equal(moment[: len(untouched)], former[untouched])
 
 
-def test_the_image_before_and_after_is_nearly_the_same():
+def test_relocation_nearly_preserves_the_image():
     # Seen from far away, whatever the direction: a splat and its copies.
     camera = reference.Camera(np.eye(3), np.array([0.0, 0, -4]), 40.0, 40.0, 12.0, 12.0, 24, 24)
     optimizer = make([0.3, 0.3], [DEAD, 0.8], tensor_type=TensorXf64, seed=3)
@@ -104,12 +104,12 @@ def test_the_image_before_and_after_is_nearly_the_same():
 
     before = rendered()
     assert act(optimizer, growth=0.0).relocated == 1
-    # As much light in all along lines through the centre; the profile itself is not Gaussian.
+    # The same integral along lines through the centre; the profile itself is not Gaussian.
     assert np.abs(before - 1).max() > 0.3
     assert np.abs(rendered() - before).max() < 0.06 * np.abs(before - 1).max()
 
 
-def test_copies_are_spread_over_what_they_are_copies_of():
+def test_copies_are_sampled_from_the_covariance_of_their_original():
     num, opacity = 4000, 0.7
     optimizer = make(np.full(num, 0.3), opacity, tensor_type=TensorXf64)
     before = values(optimizer)
@@ -125,39 +125,39 @@ def test_copies_are_spread_over_what_they_are_copies_of():
     assert np.abs(np.cov(normal.T) - np.eye(3)).max() < 5 * math.sqrt(2 / num)
 
 
-def test_what_is_nearly_transparent_stays_transparent_when_it_is_copied():
+def test_nearly_transparent_gaussians_stay_transparent_when_copied():
     optimizer = make([SIZE] * 3, [DEAD, DEAD, 0.006])
     act(optimizer, growth=0.0)
     np.testing.assert_allclose(expit(values(optimizer)["logit_opacities"]), 0.005, rtol=1e-5)
 
 
-def test_none_that_is_opaque_is_refused_in_words():
+def test_population_without_opaque_gaussians_is_an_error():
     optimizer = make([SIZE] * 3, DEAD)
     with pytest.raises(UserError, match="iteration 600: no Gaussian is more opaque than"):
         act(optimizer)
 
 
-def test_a_value_that_is_no_number_is_moved_as_well():
+def test_nan_gaussians_are_relocated():
     optimizer = make([SIZE] * 3, [0.5, np.nan, 0.5])
     assert act(optimizer, growth=0.0).relocated == 1
     assert np.isfinite(values(optimizer)["logit_opacities"]).all()
 
 
 # ---- growth
-def test_the_population_grows_by_a_share_until_its_cap():
+def test_population_grows_by_a_fraction_up_to_its_cap():
     optimizer = make([SIZE] * 100, 0.5)
     sizes = [act(optimizer, 100 * i, gaussians=117).num_gaussians for i in range(6, 11)]
     assert sizes == [105, 110, 115, 117, 117]
 
 
-def test_a_small_population_grows_as_well():
+def test_small_population_grows():
     """5 % of 6 are less than one."""
     optimizer = make([SIZE] * 6, 0.5)
     sizes = [act(optimizer, 100 * i, gaussians=8).num_gaussians for i in range(6, 9)]
     assert sizes == [7, 8, 8]
 
 
-def test_with_more_than_the_cap_at_the_start_transparent_ones_go():
+def test_population_above_the_cap_loses_transparent_gaussians():
     optimizer = make([SIZE] * 10, [0.5] * 6 + [DEAD] * 4)
     report = act(optimizer, gaussians=8)
     assert (report.pruned, report.relocated, report.num_added) == (2, 2, 0)
@@ -168,7 +168,7 @@ def test_with_more_than_the_cap_at_the_start_transparent_ones_go():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_random_populations_keep_to_both_caps(seed):
+def test_random_populations_respect_both_caps(seed):
     random = np.random.default_rng(seed)
     num = int(random.integers(1, 60))
     opacities = np.where(random.random(num) < 0.4, DEAD, random.uniform(0.01, 0.99, num))
@@ -202,14 +202,14 @@ def test_equal_seeds_give_equal_bytes():
     assert population(3, 700) != first
 
 
-def test_it_acts_between_start_and_stop():
+def test_refine_is_due_between_start_and_stop():
     chain = strategy()
     acting = [i for i in range(1, 20_000) if chain.is_due(i)]
     assert acting == list(range(600, 15_000, 100))
 
 
 # ---- noise
-def test_noise_is_along_the_covariance_of_what_is_transparent():
+def test_noise_follows_the_covariance_of_transparent_gaussians():
     num, rate, seed, iteration = 4000, 1e-3, 7, 12
     optimizer = make(np.full(num, 0.3), 0.02, tensor_type=TensorXf64)
     before = values(optimizer)
@@ -250,7 +250,7 @@ def test_noise_is_a_function_of_seed_and_iteration():
     assert means(0, 1) != means(1, 1)
 
 
-def test_gaussians_of_any_size_stay_numbers():
+def test_perturbed_gaussians_of_any_size_stay_finite():
     optimizer = make([1e30, SIZE], 0.001)
     strategy().perturb(rows_of(optimizer), 1, 1e-3)
     assert np.isfinite(values(optimizer)["means"]).all()
@@ -286,6 +286,6 @@ def test_penalties_are_mean_opacity_and_mean_scale():
     np.testing.assert_allclose(d_scales, 0.7 * scales / EXTENT / 9, rtol=1e-12)
 
 
-def test_without_weight_there_are_no_terms():
+def test_penalties_without_weight_are_omitted():
     parameters = dict(make([SIZE], 0.5).items())
     assert not list(strategy(opacity_weight=0.0, scale_weight=0.0).penalties(parameters, 3))

@@ -30,7 +30,7 @@ def trainer_with(monkeypatch, strategy, **changes):
 
 
 # ----------------------------------------------------------------------------------------------
-# What the trainer asks
+# Calls by the trainer
 # ----------------------------------------------------------------------------------------------
 
 
@@ -69,7 +69,7 @@ class Recorded(DensityStrategy):
         self.calls.append(("act", iteration))
 
 
-def test_an_iteration_gathers_perturbs_and_acts_in_this_order(monkeypatch):
+def test_iteration_updates_statistics_then_perturbs_then_refines(monkeypatch):
     strategy = Recorded()
     trainer = trainer_with(monkeypatch, strategy)
     rates = []
@@ -114,7 +114,7 @@ class Quick(DensityStrategy):
         return dict.fromkeys(("means", "sh0"), 2.0 if iteration == 1 else 1.0)
 
 
-def test_rates_are_multiplied_in_the_iterations_that_say_so(monkeypatch):
+def test_learning_rates_are_scaled_in_the_given_iterations(monkeypatch):
     fits = [make_trainer(), trainer_with(monkeypatch, Quick())]
     before = fits[0].gaussians()
     for fit in fits:
@@ -137,7 +137,7 @@ def test_rates_are_multiplied_in_the_iterations_that_say_so(monkeypatch):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_values_that_are_set_leave_moments_and_the_step_count():
+def test_setting_values_keeps_moments_and_step_count():
     optimizer = make([0.1, 0.2, 0.3], 0.5)
     before = {name: entry[1:] for name, entry in optimizer.state.items()}
     rows = rows_of(optimizer)
@@ -202,7 +202,7 @@ class Seen:
     iteration: int
 
 
-def test_phases_are_one_strategy_and_begin_anew_where_others_change_rows():
+def test_phases_act_as_one_strategy_and_restart_after_row_changes():
     first, last = Phase("first", {2, 4}), Phase("last", {4, 6}, num=7)
     phases = Phases((first, last))
     assert [i for i in range(1, 9) if phases.is_due(i)] == [2, 4, 6]
@@ -228,7 +228,7 @@ def test_phases_are_one_strategy_and_begin_anew_where_others_change_rows():
 # ----------------------------------------------------------------------------------------------
 
 
-def test_each_strategy_of_the_configuration_is_made():
+def test_every_configured_strategy_is_created():
     made = set()
     for name in GROWTH:
         config = FitConfig(data={"path": "."}, densify={"strategy": name})
@@ -244,7 +244,7 @@ def test_each_strategy_of_the_configuration_is_made():
     ],
     ids=lambda densify: densify["strategy"],
 )
-def test_a_plan_that_was_revised_is_one_from_the_start(densify):
+def test_revised_plan_equals_the_same_plan_from_the_start(densify):
     """Growth ends later, then earlier; with the statistics of the views in between."""
     densify = {"start": 2, "stop": 20, "every": 4, **densify}
     revised = make_trainer(densify=densify, iterations=40)
@@ -261,7 +261,7 @@ def test_a_plan_that_was_revised_is_one_from_the_start(densify):
     }
 
 
-def test_stops_that_a_plan_had_are_kept_for_the_iterations_that_saw_them():
+def test_earlier_stops_of_a_plan_are_kept_for_past_iterations():
     config = FitConfig(data={"path": "."}, densify={"start": 2, "stop": 20})
     assert revised_stops(config, 0, 30) == []
     assert revised_stops(config, 6, 20) == []

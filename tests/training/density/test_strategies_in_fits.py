@@ -68,7 +68,7 @@ def pauses():
 
 
 @pytest.mark.parametrize(("name", "pause"), list(pauses()))
-def test_a_fit_resumes_to_the_same_bytes_wherever_it_ends(name, pause):
+def test_fit_resumes_to_the_same_bytes_from_any_iteration(name, pause):
     whole = make_trainer(name)
     sizes = []
     for iteration in range(1, 28):
@@ -97,7 +97,7 @@ def test_mcmc_learns():
     assert fits.test_psnr(trainer, dataset) > before + 2
 
 
-def test_a_revised_plan_leaves_a_phase_that_has_begun_where_it_was():
+def test_revised_plan_keeps_a_phase_that_has_begun():
     trainer = fits.steps(make_trainer("selection", densify__prune__stop=None), 17)
     assert trainer.config.densify.prune_window(30) == (14, 22)
     trainer.reschedule(60, 14)
@@ -108,7 +108,7 @@ def test_a_revised_plan_leaves_a_phase_that_has_begun_where_it_was():
     assert early.config.densify.prune_window(60) == (30, 48)
 
 
-def test_a_revised_plan_is_one_from_the_start_with_a_phase_ahead():
+def test_revised_plan_with_a_future_phase_equals_a_plan_from_the_start():
     """The phase would have begun before the revision, had it been planned so."""
     window = {"densify__prune__start": 20, "densify__prune__stop": 26}
     revised = make_trainer("selection", **window)
@@ -123,7 +123,7 @@ def test_a_revised_plan_is_one_from_the_start_with_a_phase_ahead():
     }
 
 
-def test_a_phase_for_which_there_is_no_time_does_not_take_place():
+def test_phase_without_time_is_skipped():
     trainer = fits.steps(make_trainer("selection", densify__prune__start=20), 16)
     trainer.reschedule(16, 14)
     again = fits.steps(replanned(trainer), 16)
@@ -135,7 +135,7 @@ def replanned(trainer):
     return Trainer(trainer.config, fits.plain_dataset(), many_blobs())
 
 
-def test_what_is_not_chosen_is_not_imported(monkeypatch):
+def test_unused_strategies_are_not_imported(monkeypatch):
     from drgs.config.extensions import STRATEGIES
     from drgs.training.density.registry import density_strategy
 
@@ -153,7 +153,7 @@ def test_what_is_not_chosen_is_not_imported(monkeypatch):
         assert imported == expected
 
 
-def test_steps_of_several_views_come_when_rows_do_not_change_any_more():
+def test_steps_of_several_views_begin_after_the_last_density_change():
     trainer = make_trainer("selection", optimizer__views=5, optimizer__views_from=0.0)
     views = []
     for _ in range(27):

@@ -62,7 +62,7 @@ def fitted(copies, out, size=2):
     return parallel_processes.run(size, words, cwd=copies[0], on_second=f"cd {copies[1]}")
 
 
-def test_another_photograph_of_one_process_is_refused(copies, tmp_path):
+def test_differing_photograph_of_one_process_is_refused(copies, tmp_path):
     shutil.copy(copies[1] / "train" / "r_0.png", copies[1] / "train" / "r_1.png")
     status, _, errors = fitted(copies, tmp_path / "out")
     assert (status, errors.count("error: ")) == (2, 1), errors
@@ -91,9 +91,7 @@ def test_photographs_that_another_process_reads_may_differ(copies, tmp_path):
         (lambda frames: frames.reverse(), "training views are in another order"),
     ],
 )
-def test_views_are_compared_with_those_of_the_first_process(
-    agreement, copies, monkeypatch, change, message
-):
+def test_views_are_compared_with_rank_0(agreement, copies, monkeypatch, change, message):
     monkeypatch.chdir(copies[0])
     first = fingerprint_of(load(copies[0])).model_copy(update={"test": []})
     comm = SimpleNamespace(broadcast_text=lambda text: first.to_bytes().decode())
@@ -106,7 +104,7 @@ def test_views_are_compared_with_those_of_the_first_process(
         check()
 
 
-def test_images_of_other_files_are_refused(tmp_path):
+def test_images_of_different_files_are_refused(tmp_path):
     """A different background is refused; then a different model with the same background."""
     here, there, out = (tmp_path / name for name in ("first", "second", "out"))
     knot = Gaussians.load(parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply")

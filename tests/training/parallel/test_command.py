@@ -56,7 +56,7 @@ def assert_all_end(word):
         time.sleep(0.05)
 
 
-def test_a_fit_that_is_shared_is_the_same(config, tmp_path):
+def test_distributed_fit_is_the_same(config, tmp_path):
     path = config()
     status, output, errors = parallel_processes.run(2, command(path, "--out", tmp_path / "two"))
     assert status == 0, errors
@@ -67,7 +67,7 @@ def test_a_fit_that_is_shared_is_the_same(config, tmp_path):
     assert metrics["config"]["optimizer"]["views_per_step"] == 4
 
 
-def test_too_many_processes_are_refused_once(config, tmp_path):
+def test_too_many_processes_are_reported_once(config, tmp_path):
     status, _, errors = parallel_processes.run(
         3, command(config(views=2), "--out", tmp_path / "out")
     )
@@ -88,7 +88,7 @@ def test_too_many_processes_are_refused_once(config, tmp_path):
         (["--set", "densify.budget.prune_opacity=0.999"], "every Gaussian would be pruned"),
     ],
 )
-def test_what_cannot_be_shared_or_done_is_refused_once(config, tmp_path, words, message):
+def test_unsupported_options_are_reported_once(config, tmp_path, words, message):
     status, _, errors = parallel_processes.run(
         2, command(config(), "--out", tmp_path / "out", *words)
     )
@@ -96,7 +96,7 @@ def test_what_cannot_be_shared_or_done_is_refused_once(config, tmp_path, words, 
     assert message in errors
 
 
-def test_a_wrong_command_line_is_refused_once(tmp_path):
+def test_wrong_command_line_is_reported_once(tmp_path):
     status, _, errors = parallel_processes.run(2, command("nothing.yml", "--out", tmp_path / "out"))
     assert status == 2 and errors.count("error: ") == 1
 
@@ -112,9 +112,7 @@ MISSING = "ModuleNotFoundError('No module named mpi4py', name='mpi4py')"
     ],
     ids=["behind the start", "before the start"],
 )
-def test_a_process_that_fails_alone_is_heard_once_and_ends_all(
-    config, tmp_path, on_second, message
-):
+def test_failure_of_one_process_is_reported_once_and_ends_all(config, tmp_path, on_second, message):
     if on_second is MISSING:
         on_second = parallel_processes.failing_import(tmp_path, "mpi4py", MISSING)
     words, start = command(config(), "--out", tmp_path / "out"), time.monotonic()
@@ -126,7 +124,7 @@ def test_a_process_that_fails_alone_is_heard_once_and_ends_all(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unexpected_error_of_one_process_is_traced_once_and_ends_all(config, tmp_path):
+def test_unexpected_error_of_one_process_prints_one_traceback_and_ends_all(config, tmp_path):
     failing = parallel_processes.failing_import(
         tmp_path, "drgs.training.parallel.exchange", "RuntimeError('a bug')"
     )
@@ -137,7 +135,7 @@ def test_an_unexpected_error_of_one_process_is_traced_once_and_ends_all(config, 
     assert errors.endswith("RuntimeError: a bug\n")
 
 
-def test_a_command_of_one_process_is_refused_once(tmp_path):
+def test_single_process_command_is_refused_once(tmp_path):
     model = parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply"
     words = ["-m", "drgs.export", model, "--out", tmp_path / "a.spz"]
     status, _, errors = parallel_processes.run(2, words)
@@ -148,7 +146,7 @@ def test_a_command_of_one_process_is_refused_once(tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_everybody_is_busy_with_something_else_ends_all(config, tmp_path):
+def test_ctrl_c_during_a_rehearsal_ends_all_processes(config, tmp_path):
     """In a rehearsal: nothing is to be saved, and nobody is left behind."""
     path, out = config(iterations=100_000), tmp_path / "out"
     process = parallel_processes.start(2, command(path, "--out", out, "--budget", "1h"))
@@ -175,7 +173,7 @@ def started(path, out, size=2):
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_and_another_number_goes_on(config, tmp_path):
+def test_fit_stopped_by_ctrl_c_resumes_on_another_number_of_processes(config, tmp_path):
     path = config(iterations=800)
     process = started(path, tmp_path / "out")
     process.send_signal(signal.SIGINT)
@@ -188,7 +186,7 @@ def test_ctrl_c_saves_and_another_number_goes_on(config, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
+def test_death_of_a_process_ends_all_and_the_fit_resumes(config, tmp_path, seed):
     """At any moment; the checkpoint is whole, and others go on with it."""
     out, rng = tmp_path / "out", random.Random(seed)
     process = started(config(iterations=800), out, 3)
@@ -203,7 +201,7 @@ def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
     assert (out / "metrics.json").exists()
 
 
-ON_A_SMALL_DISK = """
+SMALL_DISK_SCRIPT = """
 disk=$1 kept=$2
 shift 2
 mount -t tmpfs -o size=600k none "$disk" || exit 77
@@ -215,7 +213,7 @@ exit $status
 
 
 @pytest.mark.slow
-def test_a_full_disk_ends_all_and_others_go_on(config, tmp_path):
+def test_full_disk_ends_all_processes_and_the_fit_resumes(config, tmp_path):
     """One checkpoint has room, and not another one beside it, as it is written."""
     if os.geteuid() != 0 or shutil.which("unshare") is None:
         pytest.skip("only root can mount a small disk")
@@ -229,7 +227,7 @@ def test_a_full_disk_ends_all_and_others_go_on(config, tmp_path):
         *command(path, "--out", disk / "out"),
     ]
     done = subprocess.run(
-        ["unshare", "--mount", "sh", "-c", ON_A_SMALL_DISK, "-", disk, kept, *words],
+        ["unshare", "--mount", "sh", "-c", SMALL_DISK_SCRIPT, "-", disk, kept, *words],
         cwd=parallel_processes.REPOSITORY,
         env=parallel_processes.environment(),
         capture_output=True,

@@ -9,7 +9,7 @@ from drgs.training.steps import view_of
 
 
 @pytest.mark.parametrize(("total", "size"), [(10, 3), (7, 7), (100_000, 4), (5, 1)])
-def test_every_row_has_one_owner_and_intervals_are_alike(total, size):
+def test_every_row_has_one_owner_and_shards_are_of_equal_size(total, size):
     shards = [population.Shard(total, rank, size) for rank in range(size)]
     rows = np.arange(total)
     owned = np.concatenate([rows[shard.local] for shard in shards])
@@ -21,7 +21,7 @@ def test_every_row_has_one_owner_and_intervals_are_alike(total, size):
 
 
 @pytest.mark.parametrize(("count", "views_per_step", "size"), [(10, 4, 3), (3, 4, 2), (25, 6, 6)])
-def test_a_process_has_the_photographs_that_it_will_see(count, views_per_step, size):
+def test_process_reads_only_the_photographs_it_uses(count, views_per_step, size):
     seen = [set() for _ in range(size)]
     for iteration in range(1, 40 * views_per_step + 1):
         place = (iteration - 1) % views_per_step
@@ -31,7 +31,7 @@ def test_a_process_has_the_photographs_that_it_will_see(count, views_per_step, s
     assert seen == expected
 
 
-def test_launchers_tell_a_process_its_number(monkeypatch):
+def test_rank_is_read_from_launcher_variables(monkeypatch):
     for name in (name for names in LAUNCHERS for name in names):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "4")  # of a batch script, which is no process of MPI
@@ -44,7 +44,7 @@ def test_launchers_tell_a_process_its_number(monkeypatch):
     assert process_number() == 2
 
 
-def test_one_process_imports_nothing_of_it(run_python, tmp_path):
+def test_single_process_does_not_import_the_parallel_package(run_python, tmp_path):
     code = (
         "import sys; sys.modules['mpi4py'] = None\n"
         "from drgs import fit\n"
@@ -54,7 +54,7 @@ def test_one_process_imports_nothing_of_it(run_python, tmp_path):
     assert run_python(code).stdout.strip() == "[]"
 
 
-def test_without_the_extra_mpiexec_is_refused(run_python):
+def test_mpiexec_without_the_extra_is_refused(run_python):
     code = (
         "import sys; sys.modules['mpi4py'] = None\n"
         "from drgs.fit import main\n"
@@ -65,7 +65,7 @@ def test_without_the_extra_mpiexec_is_refused(run_python):
     assert "mpiexec: needs mpi4py" in result.stderr and "drgs[mpi]" in result.stderr
 
 
-def test_the_launcher_of_another_mpi_is_refused(run_python):
+def test_launcher_of_another_mpi_is_refused(run_python):
     """Each of its processes would fit alone, into the same folder."""
     pytest.importorskip("mpi4py", reason="the extra mpi is not installed")
     code = "from drgs.fit import main; main(['scenes/lego_mini.yml'])"

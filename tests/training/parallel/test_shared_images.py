@@ -10,7 +10,7 @@ def rendered(size, out, *words):
     return parallel_processes.run(size, command)
 
 
-def test_a_scene_of_mitsuba_is_refused(tmp_path):
+def test_mitsuba_scene_is_refused(tmp_path):
     scene = parallel_processes.REPOSITORY / "scenes" / "hybrid.xml"
     status, _, errors = parallel_processes.run(
         2, ["-m", "drgs.render", scene, "--out", tmp_path / "a.png"]
@@ -34,7 +34,7 @@ def test_processes_share_the_frames_of_an_orbit(tmp_path):
     assert one == three and len(one) == 7  # frames, and two animations
 
 
-def test_what_is_refused_is_refused_once(tmp_path):
+def test_errors_are_reported_by_one_process(tmp_path):
     (tmp_path / "orbit_002.png").write_text("mine")
     status, _, errors = rendered(2, tmp_path)
     assert status == 2 and errors.count("error: ") == 1
