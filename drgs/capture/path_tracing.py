@@ -124,7 +124,10 @@ class CaptureView:
 
 
 def load_scene(path: Path) -> mi.Scene:
-    """Load a scene from an XML file, or from a Python file with a function ``scene()``."""
+    """Load a scene from an XML file, or from a Python file with a function ``scene()``.
+
+    Raises :class:`UserError` for a missing file, and for one of another variant.
+    """
     try:
         if path.suffix == ".py":
             scene = load_scene_dictionary(_scene_dictionary(path), path)

@@ -99,6 +99,8 @@ def fingerprint_of(dataset: Dataset, reads: ViewFilter = all_views) -> Fingerpri
     """Return the fingerprint of a dataset, for which the files of its views are read.
 
     reads: accepts views by name; the files of others have empty digests.
+
+    Raises :class:`UserError` for a missing file.
     """
     views = [view for view in (*dataset.train, *dataset.test) if reads(view.name)]
     files = sorted({path for view in views for path in view.files.values()})

@@ -42,7 +42,10 @@ GUIDE = 'docs/guide.md, "From photographs to a dataset"'
 def find_reader(
     config: DataConfig, sections: Mapping[str, BaseModel | None] = MappingProxyType({})
 ) -> tuple[str, DatasetReader]:
-    """Return name and reader of ``data.type``, or of the first that recognizes the folder."""
+    """Return name and reader of ``data.type``, or of the first that recognizes the folder.
+
+    Raises :class:`UserError` for a folder that no reader recognizes, with a remedy.
+    """
     try:
         os.listdir(config.path)
     except FileNotFoundError:
@@ -70,6 +73,8 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     """Return a configuration for the dataset in ``folder``, and the reasons for it, as text.
 
     overrides: given values, as for :func:`drgs.config.load.load_config`.
+
+    Raises :class:`UserError` for a folder that is no dataset, with a remedy.
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)

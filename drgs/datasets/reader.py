@@ -145,6 +145,8 @@ def load_views(
     """Return the views of frames; images that ``keeps`` does not accept by name are not read.
 
     intrinsics: takes a frame, the shape of its photograph (H, W, C) and the size W, H of the view.
+
+    Raises :class:`UserError` for images that do not fit into memory or cannot be read.
     """
     names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]

@@ -257,7 +257,10 @@ class TransformsFile:
 
 
 def read_transforms(path: Path) -> TransformsFile:
-    """Read and check a transforms file."""
+    """Read and check a transforms file.
+
+    Raises :class:`UserError` naming the file, the key, the expected and the actual value.
+    """
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     try:
         meta = Transforms.model_validate(json.loads(text))

@@ -168,6 +168,8 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
     """Return the content of a file in the format ``name``, as :meth:`FileFormat.encode`.
 
     Values of ``rendered_with`` that the format cannot hold are left out.
+
+    Raises :class:`UserError` for Gaussians that the format cannot hold.
     """
     extension = FORMATS.get(name)
     if "smoothing" in gaussians and not extension.value.has_smoothing:
@@ -210,7 +212,10 @@ def _check_finite(gaussians: Arrays, start: str) -> None:
 
 
 def pop_origin(path: str | Path, rendered_with: dict[str, Scalar]) -> Origin:
-    """Remove the coordinates of the origin from ``rendered_with``, and return them."""
+    """Remove the coordinates of the origin from ``rendered_with``, and return them.
+
+    Raises :class:`UserError` for missing or invalid ones.
+    """
     values = [rendered_with.pop(name, None) for name in ORIGIN]
     if values == [None, None, None]:
         return WORLD

@@ -182,6 +182,8 @@ def read_pixels(path: Path) -> np.ndarray:
     """Return (H, W, C) as stored (EXIF orientation is not applied), uint8 or 16 bits in an integer.
 
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
+
+    Raises :class:`UserError` for any other file.
     """
     with _open_image(path) as image:
         _check_supported(path, image)  # before memory is allocated for it

@@ -153,7 +153,10 @@ def encode_elements(
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None."""
+    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None.
+
+    Raises :class:`UserError` as :func:`read_elements`.
+    """
     rows, statements = read_elements(path, ["vertex"])
     vertex = rows["vertex"]
     _require(path, vertex, POSITION, "points")
@@ -172,7 +175,10 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def has_packed_vertices(path: str | Path) -> bool:
-    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`."""
+    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`.
+
+    Raises :class:`UserError` for an invalid header.
+    """
     with _open_after_header(path) as (_, header):
         names = [p.name for each in header.elements for p in each.properties]
         return "chunk" in header.counts and "packed_position" in names
@@ -184,6 +190,9 @@ def read_elements(
     """Return rows of elements as structured arrays, and the values in the header's comments.
 
     Elements of ``names`` other than ``vertex`` may be missing; they must have no lists.
+
+    Raises :class:`UserError` naming the file and what it lacks: it must be complete, and
+    elements must have numbers only.
     """
     with _open_after_header(path) as (file, header):
         wanted = [each for each in header.elements if each.name in names]
