@@ -68,8 +68,6 @@ from drgs.training.steps import (
 )
 from drgs.training.views import TrainingView
 
-PREFIX = "integrator."  # precedes a parameter's name when the scene is traversed
-
 DENSITY = "density/"
 """Precedes the names of the strategy's state: a row for each Gaussian, or single numbers."""
 
@@ -134,12 +132,11 @@ class Trainer:
             **integrator_settings(self.effects),
         )
         self.integrator = cast(SplatsPlugin, self.scene.integrator())
-        self.params = mi.traverse(self.scene)
-        self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
+        self.params = mi.traverse(self.integrator)
+        self.params.keep(list(PARAMETER_NAMES))
         self.optimizer = make_optimizer(
-            {key.removeprefix(PREFIX): value for key, value in self.params.items()},
+            dict(self.params.items()),
             learning_rates(config.optimizer, self.extent),
-            prefix=PREFIX,
             beta_1=config.optimizer.beta_1**views_per_step,
             beta_2=config.optimizer.beta_2**views_per_step,
             epsilon=config.optimizer.epsilon,
@@ -152,11 +149,10 @@ class Trainer:
         if views_per_step > 1:
             from drgs.training.parallel.exchange import ViewExchange
 
-            self.gradients = ViewExchange(
-                comm, self.integrator, self.params, PREFIX, views_per_step
-            )
-        population = self.optimizer, PREFIX, self.extent, config.seed
-        self.population = make_population(*population, comm, gaussians.num_gaussians)
+            self.gradients = ViewExchange(comm, self.integrator, self.params, views_per_step)
+        self.population = make_population(
+            self.optimizer, self.extent, config.seed, comm, gaussians.num_gaussians
+        )
         self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0  # the last one that is done
@@ -290,8 +286,7 @@ class Trainer:
         for name, factor in self.density.rate_factors(step.last_iteration).items():
             rates[name] = factor * (rates[name] if name in rates else initial[name])
         state = self.optimizer.state  # shN is not in it, where the degree is 0
-        rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in state}
-        self.optimizer.set_learning_rate(rates)
+        self.optimizer.set_learning_rate({n: rate for n, rate in rates.items() if n in state})
 
     def _update_effects(self, step: Step) -> None:
         """Let effects take their own steps."""
@@ -337,7 +332,7 @@ class Trainer:
             begins_stage=step.begins_stage,
             rate_decay=self.rates.means(iteration) / self.rates.means.initial,
             integrator=self.integrator,
-            means=cast(TensorXf, self.optimizer[PREFIX + "means"]),
+            means=cast(TensorXf, self.optimizer["means"]),
             views=step.stage.views,
             effects=self.effects,
         )
@@ -345,7 +340,7 @@ class Trainer:
     @property
     def parameters(self) -> dict[str, dr.ArrayBase]:
         """Raw values by name, as the optimizer has them: the rows of this process."""
-        return {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
+        return dict(self.optimizer.items())
 
     @property
     def num_gaussians(self) -> int:
@@ -479,8 +474,8 @@ class Trainer:
         state = {
             "iteration": np.array(self.iteration),
             **{f"{DENSITY}{name}": values for name, values in self.density.state().items()},
-            **optimizer_state(self.optimizer, PREFIX),
-            **({} if is_update else pending_gradients(self.optimizer, PREFIX)),
+            **optimizer_state(self.optimizer),
+            **({} if is_update else pending_gradients(self.optimizer)),
             **{f"{e.name}/{k}": v for e in self.effects for k, v in e.state().items()},
         }
         return self.population.gather_state(state, self._is_by_row)
@@ -493,7 +488,7 @@ class Trainer:
         state = self.population.scatter_state(state, self._is_by_row)
         self.iteration = int(state["iteration"])
         self.integrator.sh_degree = self.sh_degree
-        restore_optimizer(self.optimizer, state, PREFIX)
+        restore_optimizer(self.optimizer, state)
         self.density = self._density_from(_part(state, DENSITY))
         self._restore_effects(state)
         self.watch = GradientWatch()

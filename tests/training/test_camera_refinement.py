@@ -467,7 +467,7 @@ def test_the_filter_of_refined_cameras_is_that_of_where_they_are():
         replace(fits.plain_dataset(), train=tuple(refined)), model__smoothing=True
     )
     plain.step()  # with the cameras where they are
-    plain.optimizer["integrator.means"] = mi.TensorXf(trainer.gaussians().means)
+    plain.optimizer["means"] = mi.TensorXf(trainer.gaussians().means)
     np.testing.assert_allclose(
         trainer.gaussians().smoothing, plain.gaussians().smoothing, rtol=1e-4
     )

@@ -12,8 +12,6 @@ from support import small_fits as fits
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training.steps import step_of, view_of
 
-PREFIX = "integrator."
-
 
 @pytest.fixture(scope="module", autouse=True)
 def variant():

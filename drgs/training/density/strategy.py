@@ -18,19 +18,11 @@ import numpy as np
 from drgs.config.density import DEFAULT_SCHEDULE
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
-from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
+from drgs.core.types import Array2f, Bool, Float, TensorXf
 from drgs.datasets.types import Dataset
-from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.results.history import DensityReport
-from drgs.training.optimizer import (
-    LeanAdam,
-    edit_rows,
-    num_rows,
-    replace_values,
-    set_values,
-    take_rows,
-)
+from drgs.training.optimizer import Population
 
 
 @dataclass(frozen=True)
@@ -58,109 +50,6 @@ display space."""
 def absolute_errors(image: TensorXf, photograph: TensorXf) -> Float:
     """Return the mean absolute difference of each pixel's channels: Float (H W,)."""
     return dr.mean(dr.abs(image - photograph), axis=2).array
-
-
-@dataclass(frozen=True)
-class Population:
-    """The rows of a fit, which a strategy may read and change.
-
-    A row is a Gaussian: its parameters, named as in ``gaussians.PARAMETER_NAMES``, and the moments
-    that Adam keeps of them. Everything is detached. Where several processes fit, each has some rows
-    (:class:`drgs.training.parallel.population.ShardedPopulation`).
-    """
-
-    optimizer: LeanAdam
-    prefix: str  # what precedes a parameter's name in the optimizer
-    extent: float  # of the scene, world units
-    seed: int
-
-    @property
-    def num_rows(self) -> int:
-        """The number of Gaussians at the moment."""
-        return num_rows(self.optimizer, self.prefix)
-
-    @property
-    def num_local_rows(self) -> int:
-        """The number of rows of :meth:`value`."""
-        return num_rows(self.optimizer, self.prefix)
-
-    @property
-    def first_row(self) -> int:
-        """The number of the first row of this process."""
-        return 0
-
-    def value(self, name: str) -> dr.ArrayBase:
-        """Return a parameter as it is at the moment, on the device: the rows of this process."""
-        return dr.detach(self.optimizer[self.prefix + name])
-
-    def host(self, name: str) -> np.ndarray:
-        """Return a parameter of all rows on the host, float64; waits for the device."""
-        return self.gather(self.value(name))
-
-    def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
-        """Return the values of all rows from those of this process: on the host, float64."""
-        return np.array(values, dtype=np.float64)
-
-    def local(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the rows of this process from those of all rows."""
-        return values
-
-    def rows(self, numbers: np.ndarray) -> UInt32:
-        """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
-        return from_host(self._index_type, numbers.astype(np.uint32))
-
-    def row_numbers(self) -> UInt32:
-        """Return the numbers of the rows of this process: UInt32."""
-        return dr.arange(self._index_type, self.num_local_rows)
-
-    @property
-    def _index_type(self) -> type:
-        return dr.uint32_array_t(type(self.value("means").array))
-
-    def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
-        """Return copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
-        return take_rows(self.optimizer, rows, self.prefix)
-
-    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
-        """Keep some rows in the order given and append others.
-
-        keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Kept rows
-        take their moments along, appended ones start with moments of zero.
-        """
-        edit_rows(self.optimizer, keep, append, self.prefix)
-
-    def replace(self, name: str, value: dr.ArrayBase) -> None:
-        """Give a parameter new values of the same shape, and moments of zero."""
-        replace_values(self.optimizer, name, value, self.prefix)
-
-    def set_values(self, name: str, value: dr.ArrayBase) -> None:
-        """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
-        set_values(self.optimizer, name, value, self.prefix)
-
-    def gather_terms(
-        self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
-    ) -> list[Float] | list[np.ndarray]:
-        """Return terms of the loss over all rows, detached.
-
-        terms: over the rows of this process; compute: computes them from parameters by name.
-        """
-        return [dr.detach(term) for term in terms]
-
-    def gather_gaussians(self, local: Gaussians) -> Gaussians:
-        """Return all Gaussians, from those of this process."""
-        return local
-
-    def gather_state(
-        self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
-    ) -> dict[str, np.ndarray]:
-        """Return a trainer's state with all rows, from that of this process."""
-        return state
-
-    def scatter_state(
-        self, state: Mapping[str, np.ndarray], is_by_row: Callable[[str], bool]
-    ) -> Mapping[str, np.ndarray]:
-        """Return the part of a whole state that this process has."""
-        return state
 
 
 def displace_means(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> TensorXf:

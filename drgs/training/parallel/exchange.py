@@ -238,11 +238,10 @@ class ViewExchange:
         comm: Communicator,
         integrator: SplatsPlugin,
         params: mi.SceneParameters,
-        prefix: str,
         views_per_step: int,
     ) -> None:
-        """params: hold those of the Gaussians, after ``prefix``."""
-        self.comm, self.integrator, self.params, self.prefix = comm, integrator, params, prefix
+        """params: the parameters of the Gaussians."""
+        self.comm, self.integrator, self.params = comm, integrator, params
         self.views_per_step, self.messages = views_per_step, ViewMessages(comm)
         self._views: list[_View] = []
         self._current: _View | None = None  # is rendered now; None: between two steps
@@ -492,5 +491,5 @@ class ViewExchange:
             accumulate_in_sensor(self.integrator.ignore, state, of_cameras)
 
     def _accumulate(self, gradients: Gaussians) -> None:
-        for key, parameter in self.params.items():
-            dr.accum_grad(parameter, getattr(gradients, key.removeprefix(self.prefix)))
+        for name, parameter in self.params.items():
+            dr.accum_grad(parameter, getattr(gradients, name))
