@@ -36,12 +36,13 @@ from drgs.training.density.strategy import (
 from drgs.training.effects.base import (
     FitState,
     TrainingEffect,
+    TrainingView,
     integrator_settings,
     training_effects,
 )
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
-from drgs.training.memory import Share, room_for_targets
+from drgs.training.memory import room_for_targets
 from drgs.training.optimizer import (
     make_optimizer,
     optimizer_state,
@@ -56,17 +57,15 @@ from drgs.training.parallel.population import (
 )
 from drgs.training.rates import learning_rates, rates_over_time, revised_plan
 from drgs.training.steps import (
-    KEPT_BYTES,
     Step,
     StepView,
     ViewGradients,
     ViewLoss,
     WholeGradients,
-    bytes_on_device,
+    bytes_per_pixel,
     make_stages,
     plan_step,
 )
-from drgs.training.views import TrainingView
 
 DENSITY = "density/"
 """Precedes the names of the strategy's state: a row for each Gaussian, or single numbers."""
@@ -122,9 +121,10 @@ class Trainer:
         check_shardable(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset, effects)
         self._given_density, self._given_effects, self._given_loss = density, effects, loss
-        share = Share(comm.size, comm.num_on_machine)
-        limits = bytes_on_device(self.effects), KEPT_BYTES, share
-        room = comm.collective(lambda: room_for_targets(config, dataset, gaussians, *limits))
+        pixel_bytes = bytes_per_pixel(self.effects)
+        room = comm.collective(
+            lambda: room_for_targets(config, dataset, gaussians, pixel_bytes, comm)
+        )
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,

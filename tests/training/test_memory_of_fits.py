@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from functools import cache
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +24,7 @@ from drgs.integrator.scene import make_scene, make_sensors
 from drgs.splatting import rasterize
 from drgs.training import memory
 from drgs.training.losses import TARGET_BYTES
+from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer
 
 GB = 10**9
@@ -54,9 +56,9 @@ def start_of(count):
     return initial_gaussians(config_of(count, count), dataset_of(4, 4, 1))
 
 
-def estimated(config, dataset, view_bytes=TARGET_BYTES, scale=1.0):
+def estimated(config, dataset, scale=1.0):
     gaussians = start_of(config.init.num_points)
-    return memory.estimate(config, dataset, gaussians, view_bytes, scale)
+    return memory.estimate(config, dataset, gaussians, TARGET_BYTES, scale)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -162,33 +164,34 @@ def available(monkeypatch):
     return set_to
 
 
-def room(config, dataset, most=GB):
+def room(config, dataset):
     gaussians = start_of(config.init.num_points)
-    return memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, most)
+    return memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, Communicator())
 
 
-def test_targets_get_what_is_left(available):
+def test_targets_get_what_is_left(available, monkeypatch):
     config, dataset = config_of(1000, 1000), dataset_of(100, 100, 20)
     peak = estimated(config, dataset)
     assert peak.targets == 7_200_000
     for left, expected in ((0, 0), (10**6, 10**6), (GB, 7_200_000)):
         available(1.15 * peak.required_bytes + left)
         assert room(config, dataset) == pytest.approx(expected, abs=10)
-    assert room(config, dataset, most=3) == 3
+    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 3)
+    assert room(config, dataset) == 3
 
 
 def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
     """Four of them, on two machines: a quarter of the Gaussians, in half of a machine."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
-    gaussians, share = start_of(10_000), memory.Share(processes=4, on_machine=2)
+    gaussians, comm = start_of(10_000), Mock(size=4, num_on_machine=2)
     alone = estimated(config, dataset)
-    shared = memory.estimate(config, dataset, gaussians, TARGET_BYTES, share=share)
+    shared = memory.estimate(config, dataset, gaussians, TARGET_BYTES, processes=4)
     assert shared.gaussians == pytest.approx(alone.gaussians / 4, abs=1)
     assert (shared.splats, shared.pixels) == (alone.splats, alone.pixels)
     assert shared.required_bytes < alone.required_bytes / 1.5
     for factor, fits in ((2.1, True), (1.9, False)):
         available(factor * shared.required_bytes)
-        arguments = config, dataset, gaussians, TARGET_BYTES, GB, share
+        arguments = config, dataset, gaussians, TARGET_BYTES, comm
         if fits:
             memory.room_for_targets(*arguments)
             continue
@@ -248,11 +251,10 @@ MEASURED = """
 import sys
 from drgs import fit
 from drgs.training import memory
-from drgs.training.steps import KEPT_BYTES
 peaks, estimate = [], memory.estimate
 memory.estimate = lambda *a, **k: peaks.append(estimate(*a, **k)) or peaks[-1]
 fit.main(sys.argv[1:])
-expected = peaks[0].required_bytes + min(peaks[0].targets, KEPT_BYTES)
+expected = peaks[0].required_bytes + min(peaks[0].targets, memory.MAX_TARGET_BYTES)
 # What getrusage says may be the peak of the process that started this one.
 status = dict(line.split(":") for line in open("/proc/self/status"))
 print("peak", expected, 1024 * int(status["VmHWM"].split()[0]))

@@ -28,9 +28,8 @@ from drgs.core.types import Array3f, Float
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
-from drgs.training.effects.base import FitState
+from drgs.training.effects.base import FitState, TrainingView
 from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
-from drgs.training.views import TrainingView
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 

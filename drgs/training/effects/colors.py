@@ -26,9 +26,8 @@ from drgs.core.files import atomic_path
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
-from drgs.training.effects.base import FitState, as_numbers, as_tensor
+from drgs.training.effects.base import FitState, TrainingView, as_numbers, as_tensor
 from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
-from drgs.training.views import TrainingView
 
 IDENTITY = np.eye(3, 4).reshape(1, 12)  # the identity, row by row
 

@@ -18,8 +18,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.arrays import image_of, planes_of
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
-from drgs.training.effects.base import TrainingEffect, as_numbers
-from drgs.training.views import TrainingView
+from drgs.training.effects.base import TrainingEffect, TrainingView, as_numbers
 
 
 @EFFECTS.register("depth")

@@ -12,9 +12,8 @@ from drjit.opt import Adam
 from typing_extensions import override
 
 from drgs.core.types import Float
-from drgs.training.effects.base import TrainingEffect
+from drgs.training.effects.base import TrainingEffect, TrainingView
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
-from drgs.training.views import TrainingView
 
 
 class ViewParameters:
