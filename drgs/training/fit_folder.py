@@ -48,7 +48,6 @@ from drgs.results.history import write_density, write_history
 from drgs.results.metrics import (
     Circumstances,
     FitMetrics,
-    Quality,
     SplitMetrics,
     mean_of,
     mean_quality,
@@ -152,7 +151,7 @@ class FitFolder:
             "iterations": config.iterations,
             "num_gaussians": gaussians.num_gaussians,
             "wall_s": round(wall_s, 2),
-            "test": _split_metrics(mean_of(scores), split),
+            "test": SplitMetrics(**vars(mean_of(scores)), split=split),
             "seed": config.seed,
             **_circumstances(),
             "command": self.command,
@@ -164,7 +163,7 @@ class FitFolder:
             other.save(out / GAUSSIANS_FOR_VIEWERS)
             images = zip(for_viewers.images(dataset.test), dataset.test, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
-            metrics["viewers"] = _split_metrics(quality, split)
+            metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
         if output.report:
             shown = gaussians_on_page(gaussians, approximations, other)
             scene = trainer.full_scene()
@@ -228,15 +227,6 @@ def _remove_filter(gaussians: Gaussians) -> Gaussians:
     from drgs.effects.smoothing import bake_smoothing  # imported where there is a filter
 
     return bake_smoothing(gaussians)
-
-
-def _split_metrics(quality: Quality, split: str) -> SplitMetrics:
-    return {
-        "psnr": quality.psnr,
-        "ssim": quality.ssim,
-        "num_views": quality.num_views,
-        "split": split,
-    }
 
 
 def _circumstances() -> Circumstances:

@@ -101,27 +101,15 @@ def exponential_mean(values: Iterable[float]) -> np.ndarray:
     return np.fromiter(accumulate(values, smoother), np.float64)
 
 
-class StopCriterion(Protocol):
-    """Decides when a fit ends."""
+class StopCriterion:
+    """Ends a fit after the iterations of its configuration; subclasses decide otherwise."""
 
     def should_continue(self, trainer: Trainer) -> bool:
         """Return whether to run another iteration; may revise the trainer's configuration."""
-        ...
+        return trainer.iteration < trainer.config.iterations
 
     def num_iterations(self, trainer: Trainer) -> int:
         """Return the number of iterations of the whole fit, as expected now."""
-        ...
-
-
-class AllIterations(StopCriterion):
-    """Ends a fit after the number of iterations of its configuration."""
-
-    @override
-    def should_continue(self, trainer: Trainer) -> bool:
-        return trainer.iteration < trainer.config.iterations
-
-    @override
-    def num_iterations(self, trainer: Trainer) -> int:
         return trainer.config.iterations
 
 
