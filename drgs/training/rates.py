@@ -73,12 +73,8 @@ class LearningRates:
 def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
     """Return the rates of all parameters; extent: world units."""
     optimizer, others = config.optimizer, learning_rates(config.optimizer, extent)
-    others.pop("means")
-    longer = math.sqrt(optimizer.views_per_step)
-    first, last = (
-        longer * rate * extent for rate in (optimizer.means_lr, optimizer.means_lr_final)
-    )
-    means = ExponentialDecay(first, last, tuple(_rate_aims(config)))
+    last = math.sqrt(optimizer.views_per_step) * optimizer.means_lr_final * extent
+    means = ExponentialDecay(others.pop("means"), last, tuple(_rate_aims(config)))
     return LearningRates(means, others, optimizer.decay, optimizer.decay_from)
 
 

@@ -67,8 +67,7 @@ from drgs.training.steps import (
     plan_step,
 )
 
-DENSITY = "density/"
-"""Precedes the names of the strategy's state: a row for each Gaussian, or single numbers."""
+DENSITY = "density/"  # precedes the names of the strategy's state
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ class Trainer:
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
     ) -> None:
-        """gaussians: all, on each process; comm: the processes; None: this one.
+        """gaussians: all, on each process; comm: None: this process alone.
 
         density, loss: None: those of the configuration; effects: besides the configuration's.
         """
@@ -159,11 +158,7 @@ class Trainer:
         self._full_scene: tuple[int, mi.Scene | None] | None = None  # with its iteration
 
     def step(self) -> StepReport:
-        """Render the views of a step, and change the Gaussians along their mean gradient.
-
-        An iteration renders one view. All views of a step (``views_per_step``) see the same
-        Gaussians. With several processes, each renders some of the views.
-        """
+        """Render the views of a step, one per iteration, and step along their mean gradient."""
         step = self._begin_step()
         penalties = self._differentiate_penalties(step)
         losses: dict[int, ViewLoss] = {}
@@ -177,7 +172,13 @@ class Trainer:
         self._update_effects(step)
         for view, gradients in zip(step.views, found, strict=True):
             if self.density.needs_statistics(view.iteration):
-                self.density.update_statistics(_step_info(step, view, gradients))
+                means2d_grad = gradients.means2d_grad
+                if step.num_averaged > 1:  # it is a part of a mean
+                    means2d_grad = means2d_grad * step.num_averaged
+                size = view.view.width, view.view.height
+                sums = gradients.visible, gradients.weighted_sums
+                info = StepInfo(view.iteration, *size, means2d_grad, *sums)
+                self.density.update_statistics(info)
         report = self._control_density(step)
         for place in losses:
             step.stage.keep_or_free(step.views[place].view)
@@ -192,7 +193,9 @@ class Trainer:
         rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
         image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
         dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
-        self.gradients.end_view(self._weight_planes(view, dr.detach(image)))
+        image, photograph = dr.detach(image), view.view.target.image
+        weights = self._pixel_weights(view.iteration)
+        self.gradients.end_view({name: weigh(image, photograph) for name, weigh in weights.items()})
         return ViewLoss(dr.detach(loss), error, view.view.counted_share)
 
     def _begin_step(self) -> Step:
@@ -244,11 +247,6 @@ class Trainer:
                 loss = loss + term
         return image, loss, error
 
-    def _weight_planes(self, view: StepView, image: TensorXf) -> dict[str, Float]:
-        """Evaluate the strategy's pixel weights of an image, by name."""
-        weights = self._pixel_weights(view.iteration)
-        return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
-
     def _pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
         needs_statistics = self.density.needs_statistics(iteration)
         return self.density.pixel_weights(iteration) if needs_statistics else {}
@@ -267,16 +265,14 @@ class Trainer:
             total = cast(Float, sum(penalties, loss.loss))
             fault = gradients.first_nonfinite
             if first_row:
-                fault = dr.select(
-                    fault == NO_FAULT, fault, fault + dr.opaque(type(fault), first_row)
-                )
+                shifted = fault + dr.opaque(type(fault), first_row)
+                fault = dr.select(fault == NO_FAULT, fault, shifted)
             numbers = {
                 f"{effect.name}.{name}": values
                 for effect in self.effects
                 for name, values in effect.numbers_of(view.view).items()
             }
-            watched = view.iteration, view.view.name, total, fault, numbers
-            self.watch.add(WatchedIteration(*watched))
+            self.watch.add(WatchedIteration(view.iteration, view.view.name, total, fault, numbers))
             results.append(replace(loss, loss=total))
         return results
 
@@ -301,11 +297,9 @@ class Trainer:
 
     def _control_density(self, step: Step) -> DensityReport | None:
         """Let the strategy change the rows; returns the last report of a step."""
-        density, report = self.density, None
+        density, report, last = self.density, None, step.last_iteration
         if step.is_update:
-            density.perturb(
-                self.population, step.last_iteration, self.rates.means(step.last_iteration)
-            )
+            density.perturb(self.population, last, self.rates.means(last))
         for iteration in filter(density.is_due, step.iterations):
             self.check()
             found = density.refine(self.population, iteration)
@@ -359,7 +353,7 @@ class Trainer:
 
     @property
     def sh_degree(self) -> int:
-        """The degree in use."""
+        """The degree of the spherical harmonics in use."""
         return self.sh_degree_at(self.iteration)
 
     def sh_degree_at(self, iteration: int) -> int:
@@ -403,10 +397,6 @@ class Trainer:
         scene = self.full_scene()
         return iter(()) if scene is None else render_views(scene, views)
 
-    def sensors(self) -> list[mi.Sensor]:
-        """Return the sensors of the training views, where effects have them now."""
-        return self.fit_state().sensors()
-
     def check_iterations(self) -> None:
         """Raise ``NonFiniteError`` if a loss or a gradient of an iteration so far is not finite.
 
@@ -416,15 +406,16 @@ class Trainer:
 
     def check(self) -> None:
         """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for it."""
-        self.comm.collective(self._check_own)
 
-    def _check_own(self) -> None:
-        self.watch.check()
-        first_row = self.population.first_row
-        check_values(self.iteration, self.parameters, first_row)
-        check_values(self.iteration, self.density.state(), first_row)
-        of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
-        check_values(self.iteration, of_views, views=[view.name for view in self.views])
+        def check_own() -> None:
+            self.watch.check()
+            first_row = self.population.first_row
+            check_values(self.iteration, self.parameters, first_row)
+            check_values(self.iteration, self.density.state(), first_row)
+            of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
+            check_values(self.iteration, of_views, views=[view.name for view in self.views])
+
+        self.comm.collective(check_own)
 
     def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
         """Return a trainer with the same photographs, and copies of the given effects and loss.
@@ -438,8 +429,7 @@ class Trainer:
         """Begin after the iterations of another trainer, with the state of its effects."""
         before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
         self.iteration = -(-before // views_per_step) * views_per_step  # a step begins after it
-        found = {effect.name: effect.state() for effect in former.effects}
-        self._restore_effects({f"{name}/{k}": v for name in found for k, v in found[name].items()})
+        self._restore_effects({effect.name: effect.state() for effect in former.effects})
 
     def release(self) -> None:
         """Free memory that only iterations need; the scene still renders the fit's Gaussians."""
@@ -490,15 +480,15 @@ class Trainer:
         self.integrator.sh_degree = self.sh_degree
         restore_optimizer(self.optimizer, state)
         self.density = self._density_from(_part(state, DENSITY))
-        self._restore_effects(state)
+        self._restore_effects({e.name: _part(state, f"{e.name}/") for e in self.effects})
         self.watch = GradientWatch()
         self.params.update(self.optimizer)
 
-    def _restore_effects(self, state: Mapping[str, np.ndarray]) -> None:
+    def _restore_effects(self, states: Mapping[str, Mapping[str, np.ndarray]]) -> None:
         fit = self.fit_state()
         for effect in self.effects:
             effect.on_population_change(fit)
-            effect.restore(_part(state, f"{effect.name}/"))
+            effect.restore(states[effect.name])
 
     def _is_by_row(self, name: str) -> bool:
         """Return whether an array of the state has a row for each Gaussian."""
@@ -514,16 +504,6 @@ class Trainer:
         if state:
             density.restore(state)
         return density
-
-
-def _step_info(step: Step, view: StepView, gradients: ViewGradients) -> StepInfo:
-    """Return the statistics of a view for the strategy of density."""
-    means2d_grad = gradients.means2d_grad
-    if step.num_averaged > 1:  # it is a part of a mean
-        means2d_grad = means2d_grad * step.num_averaged
-    size = view.view.width, view.view.height
-    found = means2d_grad, gradients.visible, gradients.weighted_sums
-    return StepInfo(view.iteration, *size, *found)
 
 
 def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -105,7 +105,9 @@ def for_viewers(
 
 def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
     """Return Gaussians in closed form, by the training cameras as the fit has them."""
-    states = (read_sensor(sensor, trainer.integrator.near) for sensor in trainer.sensors())
+    states = (
+        read_sensor(sensor, trainer.integrator.near) for sensor in trainer.fit_state().sensors()
+    )
     on_device = bake_smoothing(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
         cameras = map(camera_from_sensor, states)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import add, or_
-from typing import cast
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +52,7 @@ from drgs.splatting.rendering import (
     weighted_sums,
 )
 from drgs.splatting.tiles import Footprints
-from drgs.training.parallel.communicator import Communicator, Request, wait
+from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.population import renderer_of
 from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
@@ -76,12 +76,6 @@ class LocalProjection:
     num_stored: int  # numbers of a splat: geometry, features, keys
     num_features: int
     num_keys: int
-
-    @staticmethod
-    def from_footprints(camera: Camera, pipeline: Pipeline, found: Footprints) -> LocalProjection:
-        """Keep the inputs of the derivatives of projected splats."""
-        counts = found.rows.width, found.num_features, found.num_keys
-        return LocalProjection(camera, pipeline, found.boxes, *counts)
 
     @property
     def num_rows(self) -> int:
@@ -174,50 +168,19 @@ def _concatenate(parts: Sequence[Footprints]) -> Footprints:
     return Footprints(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)
 
 
-class ViewMessages:
-    """Messages between ranks about the views of a step, identified by place in the step and time.
-
-    Messages about the same view and time arrive in the order in which they are sent.
-    """
-
-    def __init__(self, comm: Communicator) -> None:
-        self.comm = comm
-        self._sending: list[tuple[list[Request], Blocks]] = []  # requests, and what they send
-
-    def send(self, blocks: Blocks, to: int, place: int, time: int) -> None:
-        """Begin to send rows to a rank."""
-        tag = place * MAX_SHUTTER_SAMPLES + time
-        self._sending.append(([self.comm.send(block, to, tag) for block in blocks], blocks))
-
-    def receive(self, into: Blocks, source: int, place: int, time: int) -> None:
-        """Wait for the next rows that a rank sends."""
-        tag = place * MAX_SHUTTER_SAMPLES + time
-        wait(*(self.comm.receive(block, source, tag) for block in into))
-
-    def finish(self) -> None:
-        """Wait until all has been sent."""
-        wait(*(request for requests, _ in self._sending for request in requests))
-        self._sending.clear()
-
-
 @dataclass(eq=False)
 class _View:
-    """A view of the step, with this rank's results."""
+    """A view of the step, with this rank's results; lists are by time."""
 
     view: StepView
     renderer: int  # the rank that renders it
-    counts: np.ndarray = field(
-        init=False
-    )  # (ranks, times): splats that each rank sends to the renderer
-    packed: list[PackedProjection] = field(default_factory=list)  # by time, for another renderer
-    local: list[LocalProjection] = field(default_factory=list)  # by time
-    frames: list[Frame] = field(default_factory=list)  # by time, until the backward pass has ended
-    gradients: list[SplatGradients] = field(default_factory=list)  # by time, of own rows; until
-    # they are added
+    counts: np.ndarray = field(init=False)  # (ranks, times): splats sent to the renderer
+    packed: list[PackedProjection] = field(default_factory=list)  # for another renderer
+    local: list[LocalProjection] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)  # until the backward pass has ended
+    gradients: list[SplatGradients] = field(default_factory=list)  # own rows, until they are added
     means2d: Array2f = field(init=False)  # derivatives with respect to own rows' places on the film
-    sums: dict[str, Float] = field(
-        default_factory=dict
-    )  # by name: see DensityStrategy.pixel_weights
+    sums: dict[str, Float] = field(default_factory=dict)  # see DensityStrategy.pixel_weights
     needs_camera: bool = False
     first_nonfinite: UInt32 = field(init=False)
 
@@ -242,7 +205,8 @@ class ViewExchange:
     ) -> None:
         """params: the parameters of the Gaussians."""
         self.comm, self.integrator, self.params = comm, integrator, params
-        self.views_per_step, self.messages = views_per_step, ViewMessages(comm)
+        self.views_per_step = views_per_step
+        self._sending: list[tuple[Any, np.ndarray]] = []  # requests, and what they send
         self._views: list[_View] = []
         self._current: _View | None = None  # is rendered now; None: between two steps
         self._num_added = 0  # views whose derivatives are in the parameters
@@ -273,7 +237,7 @@ class ViewExchange:
             for time, packed in enumerate(each.packed):
                 blocks = packed.blocks[:]
                 packed.blocks.clear()
-                self.messages.send(blocks, each.renderer, each.view.place, time)
+                self._send(blocks, each.renderer, each, time)
 
     def own_views(self) -> Iterator[StepView]:
         """Yield the views that this rank renders; each is rendered before the next is requested."""
@@ -304,18 +268,15 @@ class ViewExchange:
         """
         for each, weights in zip(self._views, names, strict=True):
             if each.renderer != self.comm.rank:
-                self._receive(each, weights)
+                self._receive_results(each, weights)
         self._add_ready_views(is_end=True)
-        self.messages.finish()
-        return [
-            ViewGradients(
-                each.means2d,
-                reduce(or_, (local.visible for local in each.local)),
-                each.sums,
-                each.first_nonfinite,
-            )
-            for each in self._views
-        ]
+        wait(*(request for request, _ in self._sending))
+        self._sending.clear()
+        results = []
+        for each in self._views:
+            visible = reduce(or_, (local.visible for local in each.local))
+            results.append(ViewGradients(each.means2d, visible, each.sums, each.first_nonfinite))
+        return results
 
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
         """Return the losses of all views, by place in the step; losses: of views rendered here."""
@@ -345,7 +306,8 @@ class ViewExchange:
             return project_footprints(gaussians, camera, pipeline)
         time = len(each.local)
         own = project_footprints(gaussians, camera, pipeline)
-        local = LocalProjection.from_footprints(camera, pipeline, own)
+        counts = own.rows.width, own.num_features, own.num_keys
+        local = LocalProjection(camera, pipeline, own.boxes, *counts)
         each.local.append(local)
         parts = []
         for rank in range(self.comm.size):
@@ -353,7 +315,7 @@ class ViewExchange:
                 parts.append(own)
             elif (count := int(each.counts[rank, time])) > 0:
                 blocks = _empty_blocks(count, local.widths, own.rows.Float)
-                self.messages.receive(blocks, rank, each.view.place, time)
+                self._receive(blocks, rank, each, time)
                 parts.append(local.footprints(blocks))
         return _concatenate(parts)
 
@@ -385,8 +347,10 @@ class ViewExchange:
             for camera in cameras:
                 of_camera = with_effects(pipeline, gaussians, camera)
                 found = project_footprints(gaussians, camera, of_camera)
-                each.local.append(LocalProjection.from_footprints(camera, of_camera, found))
-                each.packed.append(PackedProjection.from_footprints(each.local[-1], found))
+                counts = found.rows.width, found.num_features, found.num_keys
+                local = LocalProjection(camera, of_camera, found.boxes, *counts)
+                each.local.append(local)
+                each.packed.append(PackedProjection.from_footprints(local, found))
 
     def _divide(self, each: _View, time: int, columns: list[Float]) -> list[Float]:
         """Send numbers of a rendered view's splats to their ranks; return those of this rank."""
@@ -402,32 +366,37 @@ class ViewExchange:
         for rank, start, end in zip(ranks, starts, ends, strict=True):
             if rank != self.comm.rank and end > start:
                 part = [block[start:end] for block in blocks]
-                self.messages.send(part, rank, each.view.place, time)
+                self._send(part, rank, each, time)
         index_type = types_of(rows.Float).UInt32
         first = dr.opaque(index_type, int(starts[self.comm.rank]))
         return rows.load(dr.arange(index_type, each.local[time].num_rows) + first)
 
-    def _receive(self, each: _View, weights: Sequence[str]) -> None:
+    def _receive_results(self, each: _View, weights: Sequence[str]) -> None:
         """Receive derivatives and weighted sums of this rank's rows from the view's renderer."""
-        place, source = each.view.place, each.renderer
-        for time, packed in enumerate(each.packed):
-            width = packed.local.num_gradients
-            columns = self._receive_columns(packed, source, place, time, width)
-            each.gradients.append(packed.local.gradients(columns))
+
+        def receive_columns(time: int, width: int) -> list[Float]:
+            packed = each.packed[time]
+            blocks = _empty_blocks(packed.count, block_widths(width), packed.local.boxes.Float)
+            if packed.count > 0:
+                self._receive(blocks, each.renderer, each, time)
+            return packed.unpack(blocks, width)
+
+        times = range(len(each.packed))
+        for time in times:
+            local = each.local[time]
+            each.gradients.append(local.gradients(receive_columns(time, local.num_gradients)))
         for name in weights:
-            sums = [
-                self._receive_columns(packed, source, place, time, 1)[0]
-                for time, packed in enumerate(each.packed)
-            ]
+            sums = [receive_columns(time, 1)[0] for time in times]
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
 
-    def _receive_columns(
-        self, packed: PackedProjection, source: int, place: int, time: int, width: int
-    ) -> list[Float]:
-        blocks = _empty_blocks(packed.count, block_widths(width), packed.local.boxes.Float)
-        if packed.count > 0:
-            self.messages.receive(blocks, source, place, time)
-        return packed.unpack(blocks, width)
+    def _send(self, blocks: Blocks, to: int, each: _View, time: int) -> None:
+        """Begin to send rows of a view; those of one view and time arrive in their order."""
+        tag = each.view.place * MAX_SHUTTER_SAMPLES + time
+        self._sending += [(self.comm.send(block, to, tag), block) for block in blocks]
+
+    def _receive(self, into: Blocks, source: int, each: _View, time: int) -> None:
+        tag = each.view.place * MAX_SHUTTER_SAMPLES + time
+        wait(*(self.comm.receive(block, source, tag) for block in into))
 
     def _add_ready_views(self, is_end: bool) -> None:
         """Add the derivatives of the next groups of views whose derivatives are all here.
@@ -473,9 +442,8 @@ class ViewExchange:
         with dr.suspend_grad():
             gaussians, found, of_cameras = dr.detach(self.integrator.gaussians), [], []
             for local, gradients in zip(each.local, each.gradients, strict=True):
-                of_view, of_rows = gradients_by_row(
-                    gaussians, local.camera, local.pipeline, gradients, of_camera=True
-                )
+                seen = local.camera, local.pipeline, gradients
+                of_view, of_rows = gradients_by_row(gaussians, *seen, of_camera=True)
                 found.append(of_view)
                 rows = np.stack([np.array(column) for column in of_rows], axis=1)
                 rows = self.comm.gather_rows(rows, each.renderer)
