@@ -52,23 +52,16 @@ class WatchedIteration:
             yield f"the gradient of {name} in row {row} is not finite, or too large to be squared"
 
 
-class GradientWatch:
+class GradientWatch(list[WatchedIteration]):
     """The losses and gradients of the iterations that are not checked yet."""
-
-    def __init__(self) -> None:
-        self._iterations: list[WatchedIteration] = []
-
-    def add(self, iteration: WatchedIteration) -> None:
-        """Add an iteration; waits for nothing."""
-        self._iterations.append(iteration)
 
     def check(self) -> None:
         """Raise :class:`NonFiniteError` for the first iteration at fault; waits for the device."""
-        for iteration in self._iterations:
+        for iteration in self:
             if faults := list(iteration.faults()):
                 where = f"iteration {iteration.number}, view {iteration.view}"
                 raise NonFiniteError(f"{where}: {' and '.join(faults)}", iteration.number)
-        self._iterations.clear()
+        self.clear()
 
 
 def check_values(

@@ -21,29 +21,7 @@ from drgs.core.files import atomic_path
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.results.files import (
-    BUDGET_PLAN,
-    CHECKPOINT,
-    DENSITY,
-    GAUSSIANS,
-    GAUSSIANS_FOR_VIEWERS,
-    HISTORY,
-    METRICS,
-    REPORT,
-    VIEWS,
-)
-from drgs.results.folder import (
-    check_output_folder,
-    claim_output_folder,
-    continue_run,
-    has_results,
-    image_names,
-    is_finished,
-    remove_run,
-    require_no_run,
-    seal_run,
-    write_run_config,
-)
+from drgs.results import files, folder
 from drgs.results.history import write_density, write_history
 from drgs.results.metrics import (
     Circumstances,
@@ -83,7 +61,9 @@ class FitFolder:
         """Return whether the folder holds all results of the fit already."""
         if self.overwrites:
             return False
-        return has_results(self.path) if self.resumes else is_finished(self.path, config)
+        return (
+            folder.has_results(self.path) if self.resumes else folder.is_finished(self.path, config)
+        )
 
     def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
         """Return the checkpoint to continue from, if there is one.
@@ -93,31 +73,31 @@ class FitFolder:
         if self.overwrites:
             return None
         if has_budget:
-            require_no_run(self.path)
+            folder.require_no_run(self.path)
         elif not self.resumes:
-            check_output_folder(self.path, config)
+            folder.check_output_folder(self.path, config)
         return load_checkpoint(self.path, config)
 
     def take(self, config: FitConfig, dataset: Dataset) -> None:
         """Make the folder that of the fit, or raise ``UserError`` and leave it as it is."""
         self._keep()
-        images = image_names(dataset.test_split, [view.name for view in dataset.test])
+        images = folder.image_names(dataset.test_split, [view.name for view in dataset.test])
         if self.overwrites:
-            remove_run(self.path, images)
+            folder.remove_run(self.path, images)
         if self.resumes:
-            continue_run(self.path, config, images)
+            folder.continue_run(self.path, config, images)
         else:
-            claim_output_folder(self.path, config, images)
+            folder.claim_output_folder(self.path, config, images)
 
     def write_plan(self, text: str) -> None:
         """Write the plan and its reasons."""
-        with atomic_path(self.path / BUDGET_PLAN) as temporary:
+        with atomic_path(self.path / files.BUDGET_PLAN) as temporary:
             temporary.write_text(text)
 
     @property
     def remedy(self) -> str:
         """Advice after numbers that are not finite."""
-        has_checkpoint = (self.path / CHECKPOINT).exists()
+        has_checkpoint = (self.path / files.CHECKPOINT).exists()
         kept = "the last checkpoint is kept" if has_checkpoint else "nothing was saved yet"
         return (
             f"{kept}. --resume {self.path} --debug repeats this with range checks; lower learning "
@@ -138,13 +118,13 @@ class FitFolder:
         time of iterations.
         """
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
-        saved_gaussians(gaussians, config).save(out / GAUSSIANS)
+        saved_gaussians(gaussians, config).save(out / files.GAUSSIANS)
         for effect in trainer.effects:
             effect.write(out, dataset)
-        write_history(out / HISTORY, history.rows)
-        write_density(out / DENSITY, history.density)
-        write_views(out / VIEWS, dataset)
-        write_run_config(out, config)
+        write_history(out / files.HISTORY, history.rows)
+        write_density(out / files.DENSITY, history.density)
+        write_views(out / files.VIEWS, dataset)
+        folder.write_run_config(out, config)
         output, split = config.output, dataset.test_split
         scores = write_images(out, dataset, render, output.save_renders, output.report)
         metrics: FitMetrics = {
@@ -160,7 +140,7 @@ class FitFolder:
         other, approximations = None, config.model.approximations
         if for_viewers is not None:
             other = for_viewers.gaussians
-            other.save(out / GAUSSIANS_FOR_VIEWERS)
+            other.save(out / files.GAUSSIANS_FOR_VIEWERS)
             images = zip(for_viewers.images(dataset.test), dataset.test, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
@@ -182,20 +162,20 @@ class FitFolder:
             f"{metrics['iterations']} iterations in {metrics['wall_s']:.0f} s"
         ]
         if viewers is not None:
-            path = self.path / GAUSSIANS_FOR_VIEWERS
+            path = self.path / files.GAUSSIANS_FOR_VIEWERS
             lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
         lines.append(f"written: {self.path}")
         if cast("dict[str, object]", metrics["config"]["output"])["report"]:
-            lines.append(f"open {self.path / REPORT}")
+            lines.append(f"open {self.path / files.REPORT}")
         return "\n".join(lines)
 
     def finish(self, metrics: FitMetrics | None = None) -> None:
         """Write ``metrics.json`` (None: it is there), and end the run: no checkpoint is left."""
         if metrics is not None:
-            with atomic_path(self.path / METRICS) as temporary:
+            with atomic_path(self.path / files.METRICS) as temporary:
                 temporary.write_text(json.dumps(metrics, indent=2) + "\n")
         remove_checkpoint(self.path)
-        seal_run(self.path)
+        folder.seal_run(self.path)
 
 
 def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:

@@ -22,7 +22,7 @@ from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.reduction import BAND_SLOTS
-from drgs.training.density.registry import density_strategy
+from drgs.training.density.strategy import density_strategy
 from drgs.training.parallel.communicator import Communicator
 
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results

@@ -44,12 +44,6 @@ class _Moments:
     indices: Sequence[int]  # of the arrays: an array has another one if it was assigned to
     former: tuple[dr.ArrayBase, dr.ArrayBase]  # of the same memory
 
-    @staticmethod
-    def from_arrays(first: dr.ArrayBase, second: dr.ArrayBase) -> _Moments:
-        """Wait for the device, and take other names for the memory of arrays."""
-        former = same_memory(first), same_memory(second)
-        return _Moments((first, second), (first.index, second.index), former)
-
     def match(self, *arrays: dr.ArrayBase) -> bool:
         """Return whether these are the moments still."""
         pairs = zip(self.arrays, self.indices, arrays, strict=True)
@@ -103,7 +97,9 @@ class LeanAdam(Adam):
         if is_large:
             known = self._moments.get(key)
             if known is None or not known.match(first, second):
-                self._moments[key] = known = _Moments.from_arrays(first, second)
+                former = same_memory(first), same_memory(second)  # waits for the device
+                known = _Moments((first, second), (first.index, second.index), former)
+                self._moments[key] = known
             former = known.former
         rate_in_use = self.lr if rate is None else rate
         flat, gradient = dr.detach(value).array, value.grad.array

@@ -26,12 +26,12 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
-from drgs.training.density.registry import density_strategy
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
     PixelWeight,
     StepInfo,
+    density_strategy,
 )
 from drgs.training.effects.base import (
     FitState,
@@ -272,7 +272,9 @@ class Trainer:
                 for effect in self.effects
                 for name, values in effect.numbers_of(view.view).items()
             }
-            self.watch.add(WatchedIteration(view.iteration, view.view.name, total, fault, numbers))
+            self.watch.append(
+                WatchedIteration(view.iteration, view.view.name, total, fault, numbers)
+            )
             results.append(replace(loss, loss=total))
         return results
 

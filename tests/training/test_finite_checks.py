@@ -298,7 +298,7 @@ def test_bytes_of_a_good_fit_are_those_without_guards(monkeypatch):
 
     guarded = result()
     monkeypatch.setattr(rendering, "_nonfinite_flags", lambda d_rows, visible: mi.UInt32(0))
-    monkeypatch.setattr(GradientWatch, "add", lambda *arguments: None)
+    monkeypatch.setattr(GradientWatch, "append", lambda *arguments: None)
     assert result() == guarded
 
 

@@ -190,14 +190,14 @@ def test_effects_of_all_views_of_a_step_begin_with_the_same_numbers():
 
     def watched(fit, view):
         before(fit, view)
-        shared.append(effect.parameters.numpy()["log_focals"].copy())
+        shared.append(effect.numpy()["log_focals"].copy())
 
     effect.before_render = watched
-    start = effect.parameters.numpy()["log_focals"].copy()
+    start = effect.numpy()["log_focals"].copy()
     trainer.step()
     assert len(shared) == 3 and all(np.array_equal(s, start) for s in shared)
-    assert not np.array_equal(effect.parameters.numpy()["log_focals"], start)
-    turns = effect.parameters.state()["turns.t"]
+    assert not np.array_equal(effect.numpy()["log_focals"], start)
+    turns = effect.state()["turns.t"]
     assert turns.sum() == 9  # each view has taken a step when it was seen
 
 

@@ -29,7 +29,7 @@ from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
 from drgs.training.effects.base import FitState, TrainingView
-from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
+from drgs.training.effects.view_parameters import OptimisedEffect
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
@@ -68,7 +68,7 @@ class CameraRefinement(OptimisedEffect):
         # A rate of 0 leaves out what it belongs to.
         shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
         values = {name: np.zeros(shape) for name, shape in shapes.items()}
-        self.parameters = ViewParameters(values, rates | shared)
+        super().__init__(values, rates | shared)
         self.numbers: dict[int, dict[str, dr.ArrayBase]] = {}  # of the step's sensors, by view
 
     @override
@@ -119,10 +119,10 @@ class CameraRefinement(OptimisedEffect):
                 dr.accum_grad(value, derivatives[name])
                 dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        self.parameters.step(view.index, fit.rate_decay)
+        self.step(view, fit.rate_decay)
 
     def _camera_of(self, view: TrainingView) -> dict[str, dr.ArrayBase]:
-        return self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
+        return self._camera(view.uploads[self.name], self.parameters(view))
 
     @staticmethod
     def _camera(start: _Start, leaves: Mapping[str, Float]) -> dict[str, dr.ArrayBase]:
@@ -146,7 +146,7 @@ class CameraRefinement(OptimisedEffect):
 
     def refined_views(self, views: Sequence[View]) -> list[View]:
         """Return the training views with their cameras as they are now."""
-        numbers, result = self.parameters.numpy(), []
+        numbers, result = self.numpy(), []
         for index, view in enumerate(views):
             row = {
                 name: cast(Float, mi.Float(v[min(index, len(v) - 1)]))
@@ -166,8 +166,8 @@ class CameraRefinement(OptimisedEffect):
 
         Raises :class:`UserError` for focal lengths that no camera has.
         """
-        shared = self.parameters.optimizers.keys() & {"log_focals", "shifts"}
-        found = self.parameters.numpy()
+        shared = self.optimizers.keys() & {"log_focals", "shifts"}
+        found = self.numpy()
         numbers, changes = {name: found[name][0].astype(np.float64) for name in shared}, {}
         if "log_focals" in numbers:
             if np.abs(numbers["log_focals"]).max() > np.log(MAX_FOCAL_FACTOR):

@@ -27,7 +27,7 @@ from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
 from drgs.training.effects.base import FitState, TrainingView, as_numbers, as_tensor
-from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
+from drgs.training.effects.view_parameters import OptimisedEffect
 
 IDENTITY = np.eye(3, 4).reshape(1, 12)  # the identity, row by row
 
@@ -49,7 +49,7 @@ class ColorCorrection(OptimisedEffect):
         self.weight = config.identity_weight
         assert config.lr is not None, "the effect is used where it is given"
         values = {"matrices": np.repeat(IDENTITY, num_views, axis=0)}
-        self.parameters = ViewParameters(values, {"matrices": config.lr})
+        super().__init__(values, {"matrices": config.lr})
         # What all have in common, and do without: not differentiated.
         self.common = cast(Float, dr.opaque(mi.Float, 0, IDENTITY.size))
         self.share = 1 / num_views
@@ -64,7 +64,7 @@ class ColorCorrection(OptimisedEffect):
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
-        self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
+        self.matrix = self.parameters(view)["matrices"] - self.common
 
     @override
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
@@ -86,14 +86,14 @@ class ColorCorrection(OptimisedEffect):
         """Step the view's transform, and all a little back: their mean stays."""
         dr.set_grad(self.leaves(view), derivatives)
         before = self.numbers_of(view)["matrices"]
-        self.parameters.step(view.index, fit.rate_decay)
+        self.step(view, fit.rate_decay)
         after = self.numbers_of(view)["matrices"]
         self.common = self.common + (after - before) * self.share
         dr.eval(self.common)
 
     def transforms(self) -> np.ndarray:
         """Return the transforms of all training views, (V, 3, 4)."""
-        matrices = self.parameters.numpy()["matrices"] - np.array(self.common)
+        matrices = self.numpy()["matrices"] - np.array(self.common)
         return matrices.reshape(-1, 3, 4)
 
     @override

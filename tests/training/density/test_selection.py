@@ -13,7 +13,6 @@ from drgs.training.density.pruning import (
     MAX_PRESSURE,
     Importance,
     NaturalSelection,
-    PruneSchedule,
     keep_best,
 )
 
@@ -35,10 +34,10 @@ class Step:
 
 # ---- schedule
 def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
-    schedule = PruneSchedule.from_config(config_of(to=100))
+    schedule = Importance(config_of(to=100))
     assert (schedule.start, schedule.stop) == (2000, 3000)
     config = FitConfig(data={"path": "."}, densify={"prune": {"to": 9}})
-    reference = PruneSchedule.from_config(config)
+    reference = Importance(config)
     assert (reference.start, reference.stop) == (15_000, 22_500)
     acting = [i for i in range(5000) if schedule.is_due(i)]
     assert acting == list(range(2050, 3001, 50))
@@ -46,18 +45,18 @@ def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
 
 def test_the_phase_can_be_named_and_comes_after_growth_wherever_that_ends():
     config = config_of(to=100, start=2500, stop=2730, every=100)
-    schedule = PruneSchedule.from_config(config)
+    schedule = Importance(config)
     assert [i for i in range(5000) if schedule.is_due(i)] == [2600, 2700, 2730]
-    later = PruneSchedule.from_config(with_changes(config, {"densify.stop": 2600}))
+    later = Importance(with_changes(config, {"densify.stop": 2600}))
     assert (later.start, later.stop) == (2600, 2730)
 
 
 def test_each_change_leaves_the_same_share_and_the_last_one_the_number():
-    schedule = PruneSchedule(start=1000, stop=1400, every=100, to=100)
-    wanted = [schedule.num_left(i, 1600) for i in (1100, 1200, 1300, 1400)]
+    schedule = Importance(config_of(to=100, start=1000, stop=1400, grows_until=900))
+    wanted = [schedule.goal(i, 1600) for i in (1100, 1200, 1300, 1400)]
     assert wanted == [800, 400, 200, 100]
-    assert schedule.num_left(1100, 100) == 100
-    assert schedule.num_left(1100, 50) == 100
+    assert schedule.goal(1100, 100) == 100
+    assert schedule.goal(1100, 50) == 100
 
 
 def test_the_best_stay_in_their_order_with_their_moments():

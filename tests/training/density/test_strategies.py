@@ -13,8 +13,12 @@ from drgs.config.density import DensifyConfig
 from drgs.config.extensions import GROWTH
 from drgs.config.schema import FitConfig
 from drgs.training import trainer as trainer_module
-from drgs.training.density.registry import Phases, density_strategy
-from drgs.training.density.strategy import DensityReport, DensityStrategy
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    Phases,
+    density_strategy,
+)
 from drgs.training.rates import revised_stops
 
 
