@@ -55,7 +55,7 @@ from drgs.training.parallel.population import (
     local_gaussians,
     make_population,
 )
-from drgs.training.rates import learning_rates, rates_over_time, revised_plan
+from drgs.training.rates import rates_over_time, revised_plan
 from drgs.training.steps import (
     Step,
     StepView,
@@ -133,14 +133,14 @@ class Trainer:
         self.integrator = cast(SplatsPlugin, self.scene.integrator())
         self.params = mi.traverse(self.integrator)
         self.params.keep(list(PARAMETER_NAMES))
+        self.rates = rates_over_time(config, self.extent)
         self.optimizer = make_optimizer(
             dict(self.params.items()),
-            learning_rates(config.optimizer, self.extent),
+            self.rates(0),
             beta_1=config.optimizer.beta_1**views_per_step,
             beta_2=config.optimizer.beta_2**views_per_step,
             epsilon=config.optimizer.epsilon,
         )
-        self.rates = rates_over_time(config, self.extent)
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
         self.stages = make_stages(dataset.train, config, self.effects, room)
@@ -280,9 +280,9 @@ class Trainer:
 
     def _set_learning_rates(self, step: Step) -> None:
         """Set the rates of a step, times the factors of the strategy."""
-        rates, initial = self.rates(step.last_iteration), self.rates.others
+        rates = self.rates(step.last_iteration)
         for name, factor in self.density.rate_factors(step.last_iteration).items():
-            rates[name] = factor * (rates[name] if name in rates else initial[name])
+            rates[name] *= factor
         state = self.optimizer.state  # shN is not in it, where the degree is 0
         self.optimizer.set_learning_rate({n: rate for n, rate in rates.items() if n in state})
 

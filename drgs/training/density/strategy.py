@@ -125,10 +125,7 @@ class DensityStrategy(Protocol):
         yield from ()
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
-        """Return factors of the learning rates of this iteration, by parameter.
-
-        A parameter that is named in one iteration is named in all.
-        """
+        """Return factors of the learning rates of this iteration, by parameter."""
         return {}
 
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:

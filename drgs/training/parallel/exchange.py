@@ -89,11 +89,6 @@ class LocalProjection:
         return self.boxes.load(dr.arange(t.UInt32, self.num_rows))[-1] > 0
 
     @property
-    def num_gradients(self) -> int:
-        """Numbers of the derivatives with respect to geometry and features."""
-        return self.num_stored - self.num_keys
-
-    @property
     def widths(self) -> tuple[int, ...]:
         """Columns of the blocks of a splat: its box, its stored numbers, its depth."""
         return (BOX_NUMBERS, *block_widths(self.num_stored), 1)
@@ -109,44 +104,28 @@ class LocalProjection:
         num_geometry = len(columns) - self.num_features
         return SplatGradients(columns[:num_geometry], columns[num_geometry:])
 
-
-@dataclass(frozen=True, eq=False)
-class PackedProjection:
-    """This rank's rows that are on the film of a view that another rank renders."""
-
-    local: LocalProjection
-    rows: UInt32  # (M,), ascending
-    count: int  # M
-    blocks: Blocks  # of these rows; empty once they are sent
-
-    @staticmethod
-    def from_footprints(local: LocalProjection, found: Footprints) -> PackedProjection:
-        """Pack the splats on the film. The host reads their number."""
-        rows = cast(UInt32, dr.compress(local.visible))
+    def pack(self, found: Footprints, rows: UInt32) -> Blocks:
+        """Return the projected splats of some rows of this rank, (M,), on the host."""
         count, float_type = dr.width(rows), found.rows.Float
-        blocks = _empty_blocks(0, local.widths, float_type)
-        if count > 0:
-            boxes, stored = (
-                Rows.from_columns(each.load(rows)) for each in (found.boxes, found.rows)
-            )
-            depths = dr.gather(float_type, found.depths, rows)
-            dr.eval(boxes, stored, depths)
-            flat = [*boxes.blocks, *stored.blocks, depths]
-            blocks = [each.numpy().reshape(count, -1) for each in flat]
-        return PackedProjection(local, rows, count, blocks)
+        if count == 0:
+            return _empty_blocks(0, self.widths, float_type)
+        boxes, stored = (Rows.from_columns(each.load(rows)) for each in (found.boxes, found.rows))
+        depths = dr.gather(float_type, found.depths, rows)
+        dr.eval(boxes, stored, depths)
+        flat = [*boxes.blocks, *stored.blocks, depths]
+        return [each.numpy().reshape(count, -1) for each in flat]
 
-    def unpack(self, blocks: Blocks, width: int) -> list[Float]:
-        """Return columns for all rows of this rank: numbers of those on the film, 0 for others."""
-        t = types_of(self.local.boxes.Float)
-        num_rows = self.local.num_rows
-        if self.count == 0:
-            return [dr.zeros(t.Float, num_rows) for _ in range(width)]
+    def unpack(self, rows: UInt32, blocks: Blocks, width: int) -> list[Float]:
+        """Return columns for all rows of this rank: the blocks' numbers of ``rows``, else 0."""
+        t, count = types_of(self.boxes.Float), dr.width(rows)
+        if count == 0:
+            return [dr.zeros(t.Float, self.num_rows) for _ in range(width)]
         nowhere = 0xFFFFFFFF
-        place = dr.full(t.UInt32, nowhere, num_rows)
-        dr.scatter(place, dr.arange(t.UInt32, self.count), self.rows)
+        place = dr.full(t.UInt32, nowhere, self.num_rows)
+        dr.scatter(place, dr.arange(t.UInt32, count), rows)
         dr.eval(place)
-        rows = Rows(tuple(wrap_numpy(t.Float, block) for block in blocks), width)
-        return rows.load(place, place != nowhere)
+        received = Rows(tuple(wrap_numpy(t.Float, block) for block in blocks), width)
+        return received.load(place, place != nowhere)
 
 
 def _empty_blocks(count: int, widths: Sequence[int], float_type: type) -> Blocks:
@@ -175,19 +154,14 @@ class _View:
     view: StepView
     renderer: int  # the rank that renders it
     counts: np.ndarray = field(init=False)  # (ranks, times): splats sent to the renderer
-    packed: list[PackedProjection] = field(default_factory=list)  # for another renderer
     local: list[LocalProjection] = field(default_factory=list)
+    rows: list[UInt32] = field(default_factory=list)  # sent to another renderer, ascending
     frames: list[Frame] = field(default_factory=list)  # until the backward pass has ended
     gradients: list[SplatGradients] = field(default_factory=list)  # own rows, until they are added
     means2d: Array2f = field(init=False)  # derivatives with respect to own rows' places on the film
     sums: dict[str, Float] = field(default_factory=dict)  # see DensityStrategy.pixel_weights
     needs_camera: bool = False
     first_nonfinite: UInt32 = field(init=False)
-
-    def num_splats(self, rank: int, time: int) -> int:
-        """Return the number of splats that a rank contributes to the rendered view."""
-        own = self.local[time].num_rows if time < len(self.local) else 0
-        return own if rank == self.renderer else int(self.counts[rank, time])
 
 
 class ViewExchange:
@@ -226,17 +200,17 @@ class ViewExchange:
             if each.renderer != self.comm.rank:
                 place(each.view)
         cameras = [self._cameras(each.view) for each in self._views]
+        packed, own = [], []
         for each, in_time in zip(self._views, cameras, strict=True):
-            if each.renderer != self.comm.rank:
-                self._project(each, in_time)
-        own = [[p.count for p in v.packed] or [0] * len(t) for v, t in zip(self._views, cameras)]  # noqa: B905
-        counts = self.comm.all_gather(np.array([count for of_view in own for count in of_view]))
+            is_sent = each.renderer != self.comm.rank
+            packed.append(self._project(each, in_time) if is_sent else [])
+            own.append([dr.width(rows) for rows in each.rows] if is_sent else [0] * len(in_time))
+        counts = self.comm.all_gather(np.concatenate(own))
         ends = np.cumsum([len(of_view) for of_view in own])
-        for each, of_view in zip(self._views, np.split(counts, ends[:-1], axis=1), strict=True):
+        split = np.split(counts, ends[:-1], axis=1)
+        for each, of_view, blocks_in_time in zip(self._views, split, packed, strict=True):
             each.counts = of_view
-            for time, packed in enumerate(each.packed):
-                blocks = packed.blocks[:]
-                packed.blocks.clear()
+            for time, blocks in enumerate(blocks_in_time):
                 self._send(blocks, each.renderer, each, time)
 
     def own_views(self) -> Iterator[StepView]:
@@ -339,8 +313,12 @@ class ViewExchange:
         camera = without_effects(camera_from_sensor(state.detach()), self.integrator.ignore)
         return cameras_in_time(camera)
 
-    def _project(self, each: _View, cameras: Sequence[Camera]) -> None:
-        """Project the rows of this rank for a view that another renders."""
+    def _project(self, each: _View, cameras: Sequence[Camera]) -> list[Blocks]:
+        """Project the rows of this rank for a view that another renders.
+
+        Returns those on its film, by time. The host reads their number.
+        """
+        packed = []
         each.needs_camera = read_sensor(each.view.view.sensor, self.integrator.near).is_attached
         with dr.suspend_grad():
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
@@ -349,15 +327,20 @@ class ViewExchange:
                 found = project_footprints(gaussians, camera, of_camera)
                 counts = found.rows.width, found.num_features, found.num_keys
                 local = LocalProjection(camera, of_camera, found.boxes, *counts)
+                rows = cast(UInt32, dr.compress(local.visible))
                 each.local.append(local)
-                each.packed.append(PackedProjection.from_footprints(local, found))
+                each.rows.append(rows)
+                packed.append(local.pack(found, rows))
+        return packed
 
     def _divide(self, each: _View, time: int, columns: list[Float]) -> list[Float]:
         """Send numbers of a rendered view's splats to their ranks; return those of this rank."""
         if self.comm.size == 1:
             return columns
         ranks = range(self.comm.size)
-        ends = np.cumsum([each.num_splats(rank, time) for rank in ranks])
+        counts = each.counts[:, time].copy()
+        counts[self.comm.rank] = each.local[time].num_rows
+        ends = np.cumsum(counts)
         rows = Rows.from_columns(columns)
         dr.eval(rows)
         widths = block_widths(rows.width)
@@ -375,16 +358,17 @@ class ViewExchange:
         """Receive derivatives and weighted sums of this rank's rows from the view's renderer."""
 
         def receive_columns(time: int, width: int) -> list[Float]:
-            packed = each.packed[time]
-            blocks = _empty_blocks(packed.count, block_widths(width), packed.local.boxes.Float)
-            if packed.count > 0:
+            local, rows = each.local[time], each.rows[time]
+            count = dr.width(rows)
+            blocks = _empty_blocks(count, block_widths(width), local.boxes.Float)
+            if count > 0:
                 self._receive(blocks, each.renderer, each, time)
-            return packed.unpack(blocks, width)
+            return local.unpack(rows, blocks, width)
 
-        times = range(len(each.packed))
-        for time in times:
-            local = each.local[time]
-            each.gradients.append(local.gradients(receive_columns(time, local.num_gradients)))
+        times = range(len(each.local))
+        for time, local in enumerate(each.local):
+            columns = receive_columns(time, local.num_stored - local.num_keys)
+            each.gradients.append(local.gradients(columns))
         for name in weights:
             sums = [receive_columns(time, 1)[0] for time in times]
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
