@@ -24,7 +24,6 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.results import files, folder
 from drgs.results.history import write_density, write_history
 from drgs.results.metrics import (
-    Circumstances,
     FitMetrics,
     SplitMetrics,
     mean_of,
@@ -127,16 +126,8 @@ class FitFolder:
         folder.write_run_config(out, config)
         output, split = config.output, dataset.test_split
         scores = write_images(out, dataset, render, output.save_renders, output.report)
-        metrics: FitMetrics = {
-            "iterations": config.iterations,
-            "num_gaussians": gaussians.num_gaussians,
-            "wall_s": round(wall_s, 2),
-            "test": SplitMetrics(**vars(mean_of(scores)), split=split),
-            "seed": config.seed,
-            **_circumstances(),
-            "command": self.command,
-            "config": config.model_dump(mode="json"),
-        }
+        test = SplitMetrics(**vars(mean_of(scores)), split=split)
+        metrics = self._metrics(config, gaussians.num_gaussians, wall_s, test)
         other, approximations = None, config.model.approximations
         if for_viewers is not None:
             other = for_viewers.gaussians
@@ -152,6 +143,32 @@ class FitFolder:
             write_results(out, dataset, fitted, scores, history, metrics)
         self.finish(metrics)
         return metrics
+
+    def _metrics(
+        self, config: FitConfig, num_gaussians: int, wall_s: float, test: SplitMetrics
+    ) -> FitMetrics:
+        known = versions()
+        return {
+            "iterations": config.iterations,
+            "num_gaussians": num_gaussians,
+            "wall_s": round(wall_s, 2),
+            "test": test,
+            "seed": config.seed,
+            "versions": {
+                "drgs": known["drgs"],
+                "mitsuba": known["Mitsuba"],
+                "drjit": known["Dr.Jit"],
+                "numpy": known["numpy"],
+                "python": platform.python_version(),
+                "llvm": known["LLVM"],
+            },
+            "variant": mi.variant() or "",
+            "threads": dr.thread_count(),
+            "processor": processor(),
+            "date": datetime.now().astimezone().isoformat(timespec="minutes"),
+            "command": self.command,
+            "config": config.model_dump(mode="json"),
+        }
 
     def describe(self, metrics: FitMetrics) -> str:
         """Return the results in a few lines, and where they are."""
@@ -207,21 +224,3 @@ def _remove_filter(gaussians: Gaussians) -> Gaussians:
     from drgs.effects.smoothing import bake_smoothing  # imported where there is a filter
 
     return bake_smoothing(gaussians)
-
-
-def _circumstances() -> Circumstances:
-    known = versions()
-    return {
-        "versions": {
-            "drgs": known["drgs"],
-            "mitsuba": known["Mitsuba"],
-            "drjit": known["Dr.Jit"],
-            "numpy": known["numpy"],
-            "python": platform.python_version(),
-            "llvm": known["LLVM"],
-        },
-        "variant": mi.variant() or "",
-        "threads": dr.thread_count(),
-        "processor": processor(),
-        "date": datetime.now().astimezone().isoformat(timespec="minutes"),
-    }

@@ -147,7 +147,7 @@ class Iteration:
 
 
 class Observer(Protocol):
-    """Follows a fit as it runs; the result has the same bytes without it."""
+    """Follows a fit as it runs, whose bytes do not depend on it."""
 
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
@@ -162,9 +162,8 @@ def iterations(trainer: Trainer, history: History, criterion: StopCriterion) -> 
     """Run the remaining iterations: a generator, one step an item.
 
     Rows are added to ``history`` every ``output.history_every`` iterations, and for the last one.
-
-    Raises ``NonFiniteError``, at a row of the history or at a change of the population, if a loss,
-    a gradient or a value is not finite.
+    There, and at changes of the population, ``NonFiniteError`` is raised if a loss, a gradient or a
+    value is not finite.
     """
     continues = criterion.should_continue(trainer)
     while continues:
@@ -200,9 +199,8 @@ class HeldOutQuality(Observer):
         trainer.sync_scene()
         pairs = zip(trainer.images(self._views), self._views, strict=True)
         scores = [psnr(image, view.image, view.mask) for image, view in pairs]
-        history.add_test_psnr(
-            float(trainer.comm.broadcast_numbers(np.mean(scores) if scores else np.nan))
-        )
+        mean = np.mean(scores) if scores else np.nan
+        history.add_test_psnr(float(trainer.comm.broadcast_numbers(mean)))
         history.leave_out(time.perf_counter() - start)
 
 

@@ -164,22 +164,13 @@ class Trainer:
         losses: dict[int, ViewLoss] = {}
         for view in self.gradients.own_views():
             losses[view.place] = self._differentiate(step, view)
-        found = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
-        views = self._total_losses(step, found, losses, penalties)
+        gradients = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
+        views = self._total_losses(step, gradients, losses, penalties)
         if step.is_update:
             self._set_learning_rates(step)
             self.optimizer.step()
         self._update_effects(step)
-        for view, gradients in zip(step.views, found, strict=True):
-            if self.density.needs_statistics(view.iteration):
-                means2d_grad = gradients.means2d_grad
-                if step.num_averaged > 1:  # it is a part of a mean
-                    means2d_grad = means2d_grad * step.num_averaged
-                size = view.view.width, view.view.height
-                sums = gradients.visible, gradients.weighted_sums
-                info = StepInfo(view.iteration, *size, means2d_grad, *sums)
-                self.density.update_statistics(info)
-        report = self._control_density(step)
+        report = self._control_density(step, gradients)
         for place in losses:
             step.stage.keep_or_free(step.views[place].view)
         means_lr = self.rates.means(step.last_iteration)
@@ -254,16 +245,16 @@ class Trainer:
     def _total_losses(
         self,
         step: Step,
-        found: Sequence[ViewGradients],
+        gradients: Sequence[ViewGradients],
         losses: Mapping[int, ViewLoss],
         penalties: Sequence[Float | np.ndarray],
     ) -> list[ViewLoss]:
         """Return the losses of all views with the strategy's terms, and remember to check them."""
         shared, results = self.gradients.share_losses(losses), []
         first_row = self.population.first_row * len(PARAMETER_NAMES)
-        for view, gradients, loss in zip(step.views, found, shared, strict=True):
+        for view, own, loss in zip(step.views, gradients, shared, strict=True):
             total = cast(Float, sum(penalties, loss.loss))
-            fault = gradients.first_nonfinite
+            fault = own.first_nonfinite
             if first_row:
                 shifted = fault + dr.opaque(type(fault), first_row)
                 fault = dr.select(fault == NO_FAULT, fault, shifted)
@@ -297,16 +288,26 @@ class Trainer:
                 }
                 effect.after_backward(fit, view.view, derivatives)
 
-    def _control_density(self, step: Step) -> DensityReport | None:
-        """Let the strategy change the rows; returns the last report of a step."""
+    def _control_density(
+        self, step: Step, gradients: Sequence[ViewGradients]
+    ) -> DensityReport | None:
+        """Update the strategy's statistics, and let it change the rows; return the last report."""
         density, report, last = self.density, None, step.last_iteration
+        for view, own in zip(step.views, gradients, strict=True):
+            if density.needs_statistics(view.iteration):
+                means2d_grad = own.means2d_grad
+                if step.num_averaged > 1:  # it is a part of a mean
+                    means2d_grad = means2d_grad * step.num_averaged
+                size = view.view.width, view.view.height
+                sums = own.visible, own.weighted_sums
+                density.update_statistics(StepInfo(view.iteration, *size, means2d_grad, *sums))
         if step.is_update:
             density.perturb(self.population, last, self.rates.means(last))
         for iteration in filter(density.is_due, step.iterations):
             self.check()
-            found = density.refine(self.population, iteration)
-            if found is not None:
-                report = found
+            change = density.refine(self.population, iteration)
+            if change is not None:
+                report = change
                 for effect in self.effects:
                     effect.on_population_change(self._fit_state(step, iteration))
                 # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
@@ -440,7 +441,7 @@ class Trainer:
         release_unused_memory()
 
     def reschedule(self, iterations: int, densify_stop: int) -> None:
-        """End the fit, and changes of the population, at other iterations that are ahead.
+        """Move the end of the fit, and that of changes of the population, to other iterations.
 
         The configuration becomes one which would have given the fit so far. Raises ValueError where
         there is none.

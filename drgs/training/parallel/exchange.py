@@ -104,13 +104,13 @@ class LocalProjection:
         num_geometry = len(columns) - self.num_features
         return SplatGradients(columns[:num_geometry], columns[num_geometry:])
 
-    def pack(self, found: Footprints, rows: UInt32) -> Blocks:
+    def pack(self, splats: Footprints, rows: UInt32) -> Blocks:
         """Return the projected splats of some rows of this rank, (M,), on the host."""
-        count, float_type = dr.width(rows), found.rows.Float
+        count, float_type = dr.width(rows), splats.rows.Float
         if count == 0:
             return _empty_blocks(0, self.widths, float_type)
-        boxes, stored = (Rows.from_columns(each.load(rows)) for each in (found.boxes, found.rows))
-        depths = dr.gather(float_type, found.depths, rows)
+        boxes, stored = (Rows.from_columns(each.load(rows)) for each in (splats.boxes, splats.rows))
+        depths = dr.gather(float_type, splats.depths, rows)
         dr.eval(boxes, stored, depths)
         flat = [*boxes.blocks, *stored.blocks, depths]
         return [each.numpy().reshape(count, -1) for each in flat]
@@ -324,13 +324,13 @@ class ViewExchange:
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             for camera in cameras:
                 of_camera = with_effects(pipeline, gaussians, camera)
-                found = project_footprints(gaussians, camera, of_camera)
-                counts = found.rows.width, found.num_features, found.num_keys
-                local = LocalProjection(camera, of_camera, found.boxes, *counts)
+                splats = project_footprints(gaussians, camera, of_camera)
+                counts = splats.rows.width, splats.num_features, splats.num_keys
+                local = LocalProjection(camera, of_camera, splats.boxes, *counts)
                 rows = cast(UInt32, dr.compress(local.visible))
                 each.local.append(local)
                 each.rows.append(rows)
-                packed.append(local.pack(found, rows))
+                packed.append(local.pack(splats, rows))
         return packed
 
     def _divide(self, each: _View, time: int, columns: list[Float]) -> list[Float]:
