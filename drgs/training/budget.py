@@ -112,8 +112,7 @@ STRATEGIES = (
 class Curve:
     """Measured points of one strategy, by ascending number of iterations.
 
-    Interpolated and extrapolated: time as a power of the number of iterations, PSNR in its
-    logarithm.
+    Time is interpolated as a power of the number of iterations, PSNR in its logarithm.
     """
 
     iterations: tuple[int, ...]
@@ -310,9 +309,8 @@ def plan_fit(
 class Deadline(StopCriterion):
     """Ends a fit when its time is up.
 
-    Ten times during the fit, the curve is scaled to the time taken so far, and the trainer's
-    configuration gets new last iterations of the fit and of changes of the population, which keep
-    their share of the fit.
+    Ten times during the fit, the curve is scaled to the time taken so far, and the fit gets another
+    number of iterations, and changes of the population the same share of it.
     """
 
     def __init__(self, trainer: Trainer, end: float, curve: Curve) -> None:
@@ -339,7 +337,6 @@ class Deadline(StopCriterion):
 
     @override
     def num_iterations(self, trainer: Trainer) -> int:
-        """Return the iterations in all: as planned, later by the curve and the time so far."""
         now, done = time.perf_counter(), trainer.iteration
         if done == 0:
             return trainer.config.iterations
@@ -354,10 +351,7 @@ _DURATION = re.compile(f"(?:{_NUMBER}h)?(?:{_NUMBER}m)?(?:{_NUMBER}s)?|{_NUMBER}
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``.
-
-    Raises ``argparse.ArgumentTypeError`` for anything else, such as ``1h30``.
-    """
+    """Return the seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``; ``1h30`` is none."""
     match = _DURATION.fullmatch(text.strip())
     parts = match.groups(default="0") if match else ()
     seconds = sum(scale * float(part) for scale, part in zip((3600, 60, 1, 1), parts, strict=False))

@@ -1,8 +1,7 @@
 """Errors for a fit whose numbers are no longer finite, before it saves them.
 
 A check waits for the device. So the trainer keeps the results of every iteration, and checks them
-when the host waits in any case: before the state is saved, returned or changed row by row, and when
-a row of the history is read. Errors name the first iteration with such a number.
+when the host waits in any case. Errors name the first iteration with such a number.
 """
 
 from __future__ import annotations

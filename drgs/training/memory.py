@@ -54,9 +54,8 @@ USABLE_SHARE = 0.9  # share of the available memory that is used: estimates are 
 MIN_WIDTH_PX = 16  # no smaller images are advised
 
 MAX_TARGET_BYTES = 1 << 30
-"""Memory of targets and effects' uploads that stay on the device until their view is drawn again:
-those of 180 images of 400 x 400 px. Without room, they are made anew, which takes a tenth of an
-iteration."""
+"""Most memory of targets and effects' uploads that stay on the device until their view is drawn
+again: those of 180 images of 400 x 400 px. To make them anew takes a tenth of an iteration."""
 
 
 @dataclass(frozen=True)
@@ -167,9 +166,7 @@ def room_for_targets(
     pixel_bytes: int,
     comm: Communicator,
 ) -> int:
-    """Return the bytes of targets that may stay on the device, at most :data:`MAX_TARGET_BYTES`.
-
-    pixel_bytes: see :func:`estimate`; comm: the processes of the fit.
+    """Return the bytes of targets that may stay on the device; pixel_bytes: see :func:`estimate`.
 
     Raises :class:`UserError` where the fit would not fit into memory.
     """

@@ -36,8 +36,8 @@ LARGE_WIDTH = 1 << 20  # entries of an array from which on memory is worth savin
 class _Moments:
     """The moments of a parameter, and aliases by which they are read while they are overwritten.
 
-    Dr.Jit copies an array before it scatters to it, if anything else refers to it, and the new
-    moments do. The former ones are therefore read under a name that Dr.Jit takes for other memory.
+    Dr.Jit copies an array before it scatters to it, if anything else refers to it, as the new
+    moments do: they refer to aliases, which Dr.Jit takes for other memory.
     """
 
     arrays: Sequence[dr.ArrayBase]  # as in the optimizer's state
@@ -74,9 +74,8 @@ class LeanAdam(Adam):
     ) -> None:
         """Take a step, and clear the gradients of large arrays.
 
-        Waits for nothing, but in the first step after large moments were assigned. A step that is
-        scaled, masked or not evaluated, and one with more than two moments, is that of
-        ``drjit.opt.Adam``, where the arguments are documented.
+        Waits only in the first step after large moments were assigned. A step that is scaled,
+        masked or not evaluated, or has more than two moments, is that of ``drjit.opt.Adam``.
         """
         is_plain = eval and grad_scale is None and active is None
         if not is_plain or self.mask_updates or self.amsgrad:
@@ -189,6 +188,10 @@ class Population:
     def local(self, values: np.ndarray) -> np.ndarray:
         """Return the values of the rows of this process from those of all rows."""
         return values
+
+    def zeros(self) -> Float:
+        """Return a number 0 for each row of this process: Float."""
+        return dr.zeros(type(self.value("means").array), self.num_local_rows)
 
     def rows(self, numbers: np.ndarray) -> UInt32:
         """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""

@@ -1,8 +1,6 @@
 """Stages and steps of a fit: the views of an iteration, their size, and their gradients.
 
-A stage trains on images of one size. A step ends with one change of the Gaussians. With a single
-view, ``dr.backward`` leaves its gradients in the parameters; several views use
-``drgs.training.parallel.exchange``.
+A stage trains on images of one size. A step ends with one change of the Gaussians.
 """
 
 from __future__ import annotations
@@ -38,8 +36,7 @@ class Stage:
     def keep_or_free(self, view: TrainingView) -> None:
         """Keep targets and uploads of a rendered view while there is room, else free them.
 
-        The first views are kept: each round draws all views in another order, so recent views are
-        no more likely to be drawn next.
+        Recent views are no more likely to be drawn next than the first ones.
         """
         if view.index in self.kept:
             return
@@ -149,9 +146,7 @@ def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) 
     """Return the view of an iteration: every round visits all views in an order of its own.
 
     With B views a step, the b-th iteration of each step draws from the views b, b + B, ... alone,
-    in rounds of these: who computes it needs no other photographs.
-
-    A function of its arguments alone, so that a fit can be resumed at any iteration.
+    in rounds of these: its process needs no other photographs.
     """
     which_step, place = divmod(iteration - 1, views_per_step)
     own = range(place % num_views, num_views, views_per_step)
@@ -181,7 +176,10 @@ class ViewLoss:
 
 
 class WholeGradients:
-    """Steps of one view: see :class:`drgs.training.parallel.exchange.ViewExchange`."""
+    """Steps of one view, whose gradients ``dr.backward`` leaves in the parameters.
+
+    Steps of several views use :class:`drgs.training.parallel.exchange.ViewExchange`.
+    """
 
     def __init__(self, integrator: SplatsPlugin) -> None:
         self.integrator = integrator

@@ -1,8 +1,4 @@
-"""The last phase of a fit's population: down to a number of Gaussians, a few at a time.
-
-It comes after the strategy that lets the population grow. ``densify.prune.method`` chooses between
-the two strategies below.
-"""
+"""The phase after growth, ``densify.prune``: down to a number of Gaussians, a few at a time."""
 
 from __future__ import annotations
 
@@ -84,8 +80,7 @@ class Importance(Pruning):
 
     @override
     def begin(self, population: Population) -> None:
-        float_type = type(population.value("means").array)
-        self.scores = dr.zeros(float_type, population.num_local_rows)
+        self.scores = population.zeros()
 
     @override
     def needs_statistics(self, iteration: int) -> bool:

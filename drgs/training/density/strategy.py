@@ -1,9 +1,9 @@
 """The interface of strategies that change the population, and the rows that they change.
 
 Each iteration, :class:`drgs.training.trainer.Trainer` passes statistics (:class:`StepInfo`) to the
-strategy and lets it act on the rows of the optimizer (:class:`Population`). Iterations are counted
-from 1. A strategy is a function of the configuration and of :meth:`DensityStrategy.state`: where a
-plan is revised, another one is made and given the state.
+strategy and lets it act on the rows of the optimizer
+(:class:`drgs.training.optimizer.Population`). Iterations are counted from 1. Where a plan is
+revised, another strategy is made and given :meth:`DensityStrategy.state`.
 """
 
 from __future__ import annotations
@@ -46,8 +46,7 @@ class StepInfo:
 NOT_BEGUN: Any = None  # statistics before :meth:`DensityStrategy.begin`
 
 PixelWeight = Callable[[TensorXf, TensorXf], Float]
-"""Computes a plane, Float (H W,), from the rendered image and the photograph: tensors (H, W, 3) in
-display space."""
+"""Computes a plane, Float (H W,), of an image and its photograph (H, W, 3), display space."""
 
 
 def absolute_errors(image: TensorXf, photograph: TensorXf) -> Float:
@@ -97,10 +96,7 @@ class DensityStrategy(Protocol):
     first (and half of stop), ``densify.stop`` at most the second; and ``optimizer.decay``."""
 
     def begin(self, population: Population) -> None:
-        """Start with the statistics of no views.
-
-        Called before the first iteration, and when others have changed the rows.
-        """
+        """Reset the statistics: before the first iteration, and when others change the rows."""
 
     def needs_statistics(self, iteration: int) -> bool:
         """Return whether :meth:`update_statistics` is called for this iteration."""
@@ -135,10 +131,9 @@ class DensityStrategy(Protocol):
         """
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether :meth:`refine` is called after this iteration.
+        """Return whether :meth:`refine` is called after this iteration, and after the other calls.
 
-        It is called after :meth:`update_statistics` and :meth:`perturb`, when all is known to be
-        finite.
+        All numbers are known to be finite then.
         """
         return False
 
@@ -180,10 +175,7 @@ def density_strategy(
 
 
 class Phases(DensityStrategy):
-    """Strategies that follow one another; names in their states differ.
-
-    Where one of them changes rows, the others begin anew, without statistics.
-    """
+    """Strategies that follow one another; where one changes rows, the others begin anew."""
 
     def __init__(self, phases: Sequence[DensityStrategy]) -> None:
         self.phases = phases

@@ -28,10 +28,6 @@ NO_ITERATION = 2**62  # iteration of an error that did not occur
 T = TypeVar("T")
 
 
-Buffers = np.ndarray | list[np.ndarray]
-"""An array, or a list that begins with one and describes its parts."""
-
-
 class SingleProcess:
     """The used part of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
 
@@ -46,8 +42,8 @@ class SingleProcess:
     def Ibcast(self, array: np.ndarray, root: int) -> None:
         """Leave the array as it is."""
 
-    def Iallgather(self, sent: Buffers, received: Buffers, root: int = 0) -> None:
-        """Copy the numbers."""
+    def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
+        """Copy the numbers; each an array, or a list that begins with one: see :func:`_parts`."""
         sent, received = (b[0] if isinstance(b, list) else b for b in (sent, received))
         received[:] = sent
 
@@ -178,10 +174,7 @@ class Communicator:
         raise NonFiniteError(text, int(iteration)) if is_non_finite else UserError(text)
 
     def send(self, array: np.ndarray, to: int, tag: int) -> Any:
-        """Begin to send an array, which must not change until the request is done.
-
-        Returns an ``mpi4py.MPI.Request``; see :func:`wait`.
-        """
+        """Begin to send an array, which must not change until the returned request is done."""
         return self.comm.Isend(_bytes(array), dest=to, tag=tag)
 
     def receive(self, into: np.ndarray, source: int, tag: int) -> Any:
