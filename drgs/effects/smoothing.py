@@ -38,7 +38,7 @@ FILTER_VARIANCE = 0.2
 """Variance of the filter, in squared distances between samples (Mip-Splatting, equation 9)."""
 
 FILM_MARGIN = 0.15
-"""Parts of the film's size by which a camera is taken to see beyond it (Mip-Splatting's code)."""
+"""Share of the film's size by which a camera is taken to see beyond it (Mip-Splatting's code)."""
 
 
 def apply_smoothing(rows: GaussianRows) -> GaussianRows:
@@ -99,8 +99,8 @@ def _finite_logits(opacities: np.ndarray) -> np.ndarray:
     return (np.log(opacities) - np.log1p(-opacities)).astype(np.float32)
 
 
-KEPT_VARIANCE = 0.04
-"""Parts of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
+MIN_VARIANCE_SHARE = 0.04
+"""Share of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
 derivatives by their scales."""
 
 VIEWER_APPROXIMATIONS = Approximations()  # approximations of viewers
@@ -128,7 +128,7 @@ def bake_for_viewers(
     added = VIEWER_APPROXIMATIONS.low_pass - fitted.low_pass
     taken = added * np.square(nyquist) / FILTER_VARIANCE
     variances = np.exp(2 * host.log_scales.astype(np.float64))
-    left = np.maximum(variances - taken[:, None], KEPT_VARIANCE * variances)
+    left = np.maximum(variances - taken[:, None], MIN_VARIANCE_SHARE * variances)
     baked = replace(host, log_scales=(np.log(left) / 2).astype(np.float32))
     before = _integrals(gaussians, cameras, fitted)
     after = _integrals(baked.to(type(gaussians.means)), cameras, VIEWER_APPROXIMATIONS)

@@ -164,34 +164,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Plan:
-    """A resolved configuration, and where it comes from."""
+    """A configuration without open values, and where it comes from."""
 
-    config: FitConfig  # completed
+    config: FitConfig
     chosen: Candidate
     candidates: tuple[Candidate, ...]
-    seconds: float  # for the iterations
-    start_s: float  # of an iteration at the start
-    most: int  # Gaussians
+    reasons: str  # as text
     end: float = math.inf  # of the iterations, by time.perf_counter
-
-    @property
-    def reasons(self) -> str:
-        """The choice and its reasons, as text."""
-        coarse = self.config.coarse
-        stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in coarse]
-        sizes = ", ".join([*stages, "then full size"]) if stages else "full size"
-        lines = [
-            f"An iteration takes {1e3 * self.start_s:.0f} ms at the start here.",
-            f"By the curves of the shipped scene, {self.seconds:.0f} s are enough for",
-            *(
-                f"  {c.iterations:7,} iterations, {c.psnr:.2f} dB there: {c.strategy.name}"
-                + (" (chosen)" if c == self.chosen else "")
-                for c in self.candidates
-            ),
-            f"Planned: {self.config.iterations:,} iterations; {sizes}; at most {self.most:,} "
-            f"Gaussians; the population changes until iteration {self.config.densify.stop:,}.",
-        ]
-        return "\n".join(lines)
 
 
 def make_plan(
@@ -228,7 +207,20 @@ def make_plan(
     planned = with_iterations(config, chosen.iterations)
     planned = chosen.strategy.apply(planned, num_points)
     most = max(num_points, target_of(planned) or planned.densify.max_gaussians)
-    return Plan(planned, chosen, tuple(candidates), seconds, start_s, most)
+    stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in planned.coarse]
+    sizes = ", ".join([*stages, "then full size"]) if stages else "full size"
+    reasons = [
+        f"An iteration takes {1e3 * start_s:.0f} ms at the start here.",
+        f"By the curves of the shipped scene, {seconds:.0f} s are enough for",
+        *(
+            f"  {c.iterations:7,} iterations, {c.psnr:.2f} dB there: {c.strategy.name}"
+            + (" (chosen)" if c == chosen else "")
+            for c in candidates
+        ),
+        f"Planned: {planned.iterations:,} iterations; {sizes}; at most {most:,} "
+        f"Gaussians; the population changes until iteration {planned.densify.stop:,}.",
+    ]
+    return Plan(planned, chosen, tuple(candidates), "\n".join(reasons))
 
 
 def rehearse(

@@ -105,11 +105,29 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
 def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndarray]) -> None:
     """Raise UserError if a trainer cannot continue from the checkpoint in ``folder``.
 
-    start: ``Trainer.state()`` of that trainer before its first iteration.
+    start: ``Trainer.state()`` of that trainer before its first iteration; names, types and shapes
+    of arrays must be the same, but for the number of Gaussians.
     """
-    assert checkpoint.config is not None, "it was read from a file"
+    state, config = checkpoint.trainer, checkpoint.config
+    assert config is not None, "it was read from a file"
     try:
-        _check_state(checkpoint.trainer, start, checkpoint.config)
+        if missing := [name for name in start if name not in state]:
+            raise ValueError(f"{format_names(missing)} missing")
+        num, most = len(np.atleast_1d(state[MEANS_ARRAY])), config.densify.max_gaussians
+        if not 1 <= num <= most:
+            raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")
+        expected = {name: (_shape(name, start, num), array.dtype) for name, array in start.items()}
+        expected[SMOOTHING_ARRAY] = (num,), np.dtype(np.float32)
+        values = [name for name in start if name.endswith(".value")]
+        expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
+        for name in filter(expected.__contains__, state):
+            _check_shape(name, state[name], *expected[name])
+            _check_finite(name, state[name])
+        iteration = int(state["iteration"])
+        if not 0 <= iteration <= config.iterations:
+            raise ValueError(
+                f"iteration must be between 0 and {config.iterations:,}, got {iteration:,}"
+            )
     except ValueError as error:
         raise _damaged_error(folder / CHECKPOINT, error) from None
 
@@ -158,34 +176,6 @@ def _match_leaves(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
         places[key] = getattr(getattr(config, section), name)
     output = config.output.model_dump()
     return with_changes(FitConfig.model_validate({**values, "output": output}), places)
-
-
-# ----------------------------------------------------------------------------------------------
-# Arrays of a file that may be damaged
-# ----------------------------------------------------------------------------------------------
-
-
-def _check_state(
-    state: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray], config: FitConfig
-) -> None:
-    """Raise ValueError unless arrays are those of a trainer's start, but for the number of rows."""
-    if missing := [name for name in start if name not in state]:
-        raise ValueError(f"{format_names(missing)} missing")
-    num, most = len(np.atleast_1d(state[MEANS_ARRAY])), config.densify.max_gaussians
-    if not 1 <= num <= most:
-        raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")
-    expected = {name: (_shape(name, start, num), array.dtype) for name, array in start.items()}
-    expected[SMOOTHING_ARRAY] = (num,), np.dtype(np.float32)
-    values = [name for name in start if name.endswith(".value")]
-    expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
-    for name in filter(expected.__contains__, state):
-        _check_shape(name, state[name], *expected[name])
-        _check_finite(name, state[name])
-    iteration = int(state["iteration"])
-    if not 0 <= iteration <= config.iterations:
-        raise ValueError(
-            f"iteration must be between 0 and {config.iterations:,}, got {iteration:,}"
-        )
 
 
 def _shape(name: str, start: Mapping[str, np.ndarray], num: int) -> tuple[int, ...]:

@@ -1,6 +1,6 @@
 """The history of a fit as TensorBoard reads it, written as the fit goes.
 
-Imported with ``--tensorboard``. tensorboardX's ``SummaryWriter`` names files after the time and the
+tensorboardX's ``SummaryWriter`` names files after the time and the
 host, and writes them from a thread; the file of a fit has one name, and is complete after each row.
 """
 

@@ -113,8 +113,7 @@ class FitFolder:
     ) -> FitMetrics:
         """Write the results of a finished fit, and measure them; return ``metrics.json``.
 
-        gaussians: the trainer's; for_viewers: None if other viewers render as the fit does; wall_s:
-        time of iterations.
+        for_viewers: None if other viewers render as the fit does; wall_s: time of iterations.
         """
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
         saved_gaussians(gaussians, config).save(out / files.GAUSSIANS)
@@ -196,10 +195,10 @@ class FitFolder:
 
 
 def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
-    """Return the Gaussians of ``point_cloud.ply``: with ``output.bake_smoothing``, without a
-    filter.
+    """Return the Gaussians of ``point_cloud.ply`` from the trainer's.
 
-    Its header records approximations that are not the default. gaussians: the trainer's.
+    Its header records approximations that are not the default. It has no smoothing filter with
+    ``output.bake_smoothing``.
     """
     others = config.model.approximations.non_default
     gaussians = replace(gaussians, rendered_with=others or None)
@@ -209,10 +208,7 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
 def gaussians_on_page(
     gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
 ) -> DisplaySettings:
-    """Return the Gaussians of ``viewer.html``: the fit's own, if it renders their approximations.
-
-    for_viewers: the alternative, or None.
-    """
+    """Return the Gaussians of ``viewer.html``: those for viewers if it cannot render the fit's."""
     if for_viewers is not None and not shows_as_fitted(approximations):
         return DisplaySettings(for_viewers, Approximations())
     return DisplaySettings(_remove_filter(gaussians), approximations)
@@ -221,6 +217,6 @@ def gaussians_on_page(
 def _remove_filter(gaussians: Gaussians) -> Gaussians:
     if gaussians.smoothing is None:
         return gaussians
-    from drgs.effects.smoothing import bake_smoothing  # imported where there is a filter
+    from drgs.effects.smoothing import bake_smoothing
 
     return bake_smoothing(gaussians)

@@ -24,8 +24,7 @@ from drgs.results.metrics import psnr
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
 
-PSNR_SMOOTHING = 0.9
-"""Weight of the past in the PSNR of training views, each of which is another photograph."""
+PSNR_SMOOTHING = 0.9  # weight of the past in the PSNR of training views
 
 MAX_MEASURED_VIEWS = 8  # test views that are measured on the way, spread over all of them
 
@@ -152,7 +151,7 @@ class Observer(Protocol):
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Called after an iteration, by the thread that fits; history: with its row, if it has one.
+        """Called after an iteration, by the thread that fits; history: with its row, if any.
 
         stops: whether the fit is to stop at once; an observer that waits has to call it.
         """

@@ -120,9 +120,8 @@ class LossTerm:
     def of_gaussians(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Float | None:
         """Return a ``Float`` of one value, or None.
 
-        parameters: raw values by name, attached, of ``num_rows`` Gaussians in all. If several
-        processes fit, each has some of the rows: a sum over them, divided by ``num_rows``, is
-        right for any number of processes.
+        parameters: raw values by name, attached, of ``num_rows`` Gaussians in all, of which each
+        process has some: terms are sums over these, divided by ``num_rows``.
         """
 
 
@@ -133,8 +132,7 @@ class PhotometricLoss(Loss):
 
     SSIM's window is the one that the target was prepared with. Windows reach beyond the image
     into zeros, as in the 3DGS reference implementation. The derivative of |x - y| at x = y is
-    taken as 0. Differentiable in the image; not differentiated: the target. Films of one size
-    share their kernels; nothing waits for the device.
+    taken as 0. Differentiable in the image; not differentiated: the target.
     """
 
     dssim_weight: float = 0.2  # w, in [0, 1]
@@ -304,7 +302,7 @@ def _assemble_gradient(
 
 
 def _variance(mean: Float, mean_square: Float) -> Float:
-    """Return E[x^2] - E[x]^2, which only rounding can make negative (it would, for x >> 1)."""
+    """Return E[x^2] - E[x]^2, which rounding would make negative for x >> 1."""
     variance = mean_square - mean * mean
     return dr.select(variance < 0, 0, variance)
 

@@ -110,7 +110,6 @@ class FitSession:
 
     @property
     def _inputs(self) -> tuple[FitConfig, Dataset]:
-        """Configuration and dataset: of rank 0, once they are loaded; later of each rank."""
         assert self.config is not None and self.dataset is not None, "they are loaded"
         return self.config, self.dataset
 
@@ -153,7 +152,7 @@ class FitSession:
     def prepare(self) -> Plan | None:
         """Load the data, initialize the Gaussians, make the trainer; return the plan, if any.
 
-        Input that cannot be used raises ``UserError`` here; nothing is written.
+        Raises ``UserError`` for input that cannot be used. Nothing is written.
         """
         comm, checkpoint, gaussians, plan = self.comm, None, None, None
         if comm.is_root:
@@ -234,8 +233,7 @@ class FitSession:
     def iterate(self) -> bool:
         """Run the iterations that are left, with checkpoints; False if Ctrl-C stopped them.
 
-        The state is saved then, and after the last iteration: from then on the configuration
-        specifies what was done, which half-written results belong to.
+        The state is saved then, and after the last iteration, before results are written.
         """
         trainer, comm = self.trainer, self.comm
         criterion, stop = RootDecides(self.criterion, comm), StopRequest()
@@ -288,10 +286,7 @@ class FitSession:
             self._print(self.folder.describe(metrics))
 
     def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
-        """Return Gaussians for other viewers.
-
-        The trainer is released, and continues to render the fit's own.
-        """
+        """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
         from drgs.training.viewers import for_viewers, num_iterations
 
         if not self.uses_terminal:

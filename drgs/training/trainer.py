@@ -178,7 +178,7 @@ class Trainer:
 
     def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
         """Render a view, and add the derivatives of its loss to those of the step."""
-        fit = self._fit_state(step, view.iteration)
+        fit = self.fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before_render(fit, view.view)
         rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
@@ -197,7 +197,7 @@ class Trainer:
         self.iteration = step.last_iteration
         self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
         self.params.update(self.optimizer)
-        fit = self._fit_state(step, step.iterations[0])
+        fit = self.fit_state(step, step.iterations[0])
         for effect in self.effects:
             effect.begin(fit)
 
@@ -279,7 +279,7 @@ class Trainer:
 
     def _update_effects(self, step: Step) -> None:
         """Let effects take their own steps."""
-        fit = self._fit_state(step, step.last_iteration)
+        fit = self.fit_state(step, step.last_iteration)
         for view in step.views:
             for effect in self.effects:
                 derivatives = {
@@ -309,7 +309,7 @@ class Trainer:
             if change is not None:
                 report = change
                 for effect in self.effects:
-                    effect.on_population_change(self._fit_state(step, iteration))
+                    effect.on_population_change(self.fit_state(step, iteration))
                 # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
                 dr.flush_malloc_cache()
         return report
@@ -318,11 +318,10 @@ class Trainer:
         """Return the step that an iteration is part of."""
         return plan_step(iteration, self.config, self.rates, self.stages)
 
-    def fit_state(self) -> FitState:
-        """Return the state for effects after the last step."""
-        return self._fit_state(self.last_step, self.iteration)
-
-    def _fit_state(self, step: Step, iteration: int) -> FitState:
+    def fit_state(self, step: Step | None = None, iteration: int | None = None) -> FitState:
+        """Return the state for effects, by default after the last step."""
+        step = step or self.last_step
+        iteration = self.iteration if iteration is None else iteration
         return FitState(
             iteration=iteration,
             iterations_of_step=step.iterations,

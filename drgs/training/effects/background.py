@@ -1,4 +1,4 @@
-"""Random backgrounds behind transparent photographs. Imported for ``data.random_background``."""
+"""Random backgrounds behind transparent photographs."""
 
 from __future__ import annotations
 

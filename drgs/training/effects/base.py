@@ -103,10 +103,7 @@ class FitState:
 
 
 class TrainingEffect(Protocol):
-    """Base class of effects, which does nothing.
-
-    Images are tensors (H, W, C) in display space.
-    """
+    """Base class of effects, which does nothing; images are (H, W, C) in display space."""
 
     @classmethod
     def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
@@ -169,7 +166,7 @@ class TrainingEffect(Protocol):
         """Take a step, when the derivatives of all views of the fit's step are known.
 
         derivatives: of the step's loss, with respect to the view's :meth:`leaves`. Called in the
-        order of the views, some of which other processes may have rendered.
+        order of the views, on all processes.
         """
 
     def on_population_change(self, fit: FitState) -> None:

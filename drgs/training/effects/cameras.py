@@ -1,8 +1,8 @@
 """Training cameras that are optimised together with the splats.
 
-Imported when ``cameras.optimise`` is set. A view's camera is moved, in its own axes, by a rotation
-exp(turn) and a translation; all views share factors of the focal lengths and a shift of the
-principal point. Both poses of a camera that moves while it exposes are moved alike.
+A view's camera is moved, in its own axes, by a rotation exp(turn) and a translation; all views
+share factors of the focal lengths and a shift of the principal point. Both poses of a camera that
+moves while it exposes are moved alike.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ from drgs.training.effects.view_parameters import OptimisedEffect
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
-MAX_FOCAL_FACTOR = 1000
-"""Largest factor, up or down, of a focal length that was known when the fit began."""
+MAX_FOCAL_FACTOR = 1000  # up or down
 
 
 @dataclass(frozen=True)
@@ -148,11 +147,9 @@ class CameraRefinement(OptimisedEffect):
         """Return the training views with their cameras as they are now."""
         numbers, result = self.numpy(), []
         for index, view in enumerate(views):
-            row = {
-                name: cast(Float, mi.Float(v[min(index, len(v) - 1)]))
-                for name, v in numbers.items()
-            }
-            camera = self._camera(self.upload(view), row)
+            rows = {name: v[min(index, len(v) - 1)] for name, v in numbers.items()}
+            leaves = {name: cast(Float, mi.Float(row)) for name, row in rows.items()}
+            camera = self._camera(self.upload(view), leaves)
             values: dict[str, object] = {name: float(camera[name][0]) for name in INTRINSICS}
             if view.motion is not None:
                 close = _pose(camera["to_world_close"])
@@ -167,8 +164,8 @@ class CameraRefinement(OptimisedEffect):
         Raises :class:`UserError` for focal lengths that no camera has.
         """
         shared = self.optimizers.keys() & {"log_focals", "shifts"}
-        found = self.numpy()
-        numbers, changes = {name: found[name][0].astype(np.float64) for name in shared}, {}
+        values, changes = self.numpy(), {}
+        numbers = {name: values[name][0].astype(np.float64) for name in shared}
         if "log_focals" in numbers:
             if np.abs(numbers["log_focals"]).max() > np.log(MAX_FOCAL_FACTOR):
                 raise UserError(
@@ -189,10 +186,10 @@ class CameraRefinement(OptimisedEffect):
     @override
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
+        cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
+        content = {"lens_change": asdict(self.lens_change), **cameras}
         with atomic_path(folder / CAMERAS) as temporary:
-            cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
-            found = {"lens_change": asdict(self.lens_change), **cameras}
-            temporary.write_text(json.dumps(found, indent=1) + "\n")
+            temporary.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _put(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:

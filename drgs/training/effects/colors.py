@@ -1,10 +1,9 @@
 """Exposure and white balance: an affine colour transform for each training photograph.
 
-Imported when ``colors.lr`` is given. A rendering is transformed, y = A (r, g, b, 1), before it is
-compared with its photograph. A starts as the identity and is drawn to it; and since darker splats
-under brighter transforms would look the same, the mean of all photographs' transforms is the
-identity. New views are rendered without a transform. (The 3DGS reference's "exposure compensation"
-has neither bond.) The background behind a transparent photograph stays as it is.
+A rendering is transformed, y = A (r, g, b, 1), before it is compared with its photograph. A starts
+as the identity and is drawn to it; and since darker splats under brighter transforms would look the
+same, the mean of all photographs' transforms is the identity. (The 3DGS reference's "exposure
+compensation" has neither bond.) The background behind a transparent photograph stays as it is.
 """
 
 from __future__ import annotations
@@ -108,8 +107,8 @@ class ColorCorrection(OptimisedEffect):
     @override
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``colors.json``: the transform of each training view, 3 x 4, by name."""
-        found = zip(dataset.train, self.transforms(), strict=True)
-        by_view = {view.name: matrix.tolist() for view, matrix in found}
+        pairs = zip(dataset.train, self.transforms(), strict=True)
+        by_view = {view.name: matrix.tolist() for view, matrix in pairs}
         with atomic_path(folder / COLORS) as temporary:
             temporary.write_text(json.dumps(by_view, indent=1) + "\n")
 

@@ -1,4 +1,4 @@
-"""Pixels that the dataset's masks leave out of a fit. Imported where a view has a mask."""
+"""Pixels that the dataset's masks leave out of a fit."""
 
 from __future__ import annotations
 
