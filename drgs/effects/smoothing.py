@@ -125,8 +125,8 @@ def bake_for_viewers(
     cameras = list(cameras)
     host = dr.detach(gaussians).numpy()
     nyquist = np.array(smoothing_of(gaussians.means, cameras), np.float64)
-    added = VIEWER_APPROXIMATIONS.low_pass - fitted.low_pass
-    taken = added * np.square(nyquist) / FILTER_VARIANCE
+    difference = VIEWER_APPROXIMATIONS.low_pass - fitted.low_pass
+    taken = difference * np.square(nyquist) / FILTER_VARIANCE
     variances = np.exp(2 * host.log_scales.astype(np.float64))
     left = np.maximum(variances - taken[:, None], MIN_VARIANCE_SHARE * variances)
     baked = replace(host, log_scales=(np.log(left) / 2).astype(np.float32))

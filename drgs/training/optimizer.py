@@ -278,7 +278,7 @@ class Population:
 
     def set_values(self, name: str, value: dr.ArrayBase) -> None:
         """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
-        old, *others = self.optimizer.state[name]
+        old, promoted, rate, extra = self.optimizer.state[name]
         if tuple(value.shape) != tuple(old.shape):
             raise ValueError(
                 f"Population.set_values(): {name} has shape {tuple(old.shape)}, the new values "
@@ -287,7 +287,7 @@ class Population:
         value = type(old)(dr.detach(value))
         dr.make_opaque(value)
         dr.enable_grad(value)
-        self.optimizer.state[name] = value, *others
+        self.optimizer.state[name] = value, promoted, rate, extra
 
     def gather_terms(
         self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
