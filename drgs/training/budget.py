@@ -343,7 +343,7 @@ _DURATION = re.compile(f"(?:{_NUMBER}h)?(?:{_NUMBER}m)?(?:{_NUMBER}s)?|{_NUMBER}
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``; ``1h30`` is none."""
+    """Return the seconds of ``90``, ``5m`` or ``1h30m``; raise ``ArgumentTypeError`` for others."""
     match = _DURATION.fullmatch(text.strip())
     parts = match.groups(default="0") if match else ()
     seconds = sum(scale * float(part) for scale, part in zip((3600, 60, 1, 1), parts, strict=False))

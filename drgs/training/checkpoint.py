@@ -26,7 +26,7 @@ from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 
 PATH_KEYS = ("data.path", "data.source", "init.point_cloud")
-"""Values that differ in a project that was moved."""
+"""Values that differ in a project that was moved; the data has a fingerprint."""
 
 MEANS_ARRAY = "means.value"  # the array that has a row for each Gaussian
 

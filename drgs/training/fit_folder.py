@@ -23,12 +23,7 @@ from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import files, folder
 from drgs.results.history import write_density, write_history
-from drgs.results.metrics import (
-    FitMetrics,
-    SplitMetrics,
-    mean_of,
-    mean_quality,
-)
+from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
 from drgs.results.report import FitImages, write_images, write_results
 from drgs.results.viewer import DisplaySettings, shows_as_fitted
@@ -60,9 +55,9 @@ class FitFolder:
         """Return whether the folder holds all results of the fit already."""
         if self.overwrites:
             return False
-        return (
-            folder.has_results(self.path) if self.resumes else folder.is_finished(self.path, config)
-        )
+        if self.resumes:
+            return folder.has_results(self.path)
+        return folder.is_finished(self.path, config)
 
     def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
         """Return the checkpoint to continue from, if there is one.
@@ -77,7 +72,7 @@ class FitFolder:
             folder.check_output_folder(self.path, config)
         return load_checkpoint(self.path, config)
 
-    def take(self, config: FitConfig, dataset: Dataset) -> None:
+    def claim(self, config: FitConfig, dataset: Dataset) -> None:
         """Make the folder that of the fit, or raise ``UserError`` and leave it as it is."""
         self._keep()
         images = folder.image_names(dataset.test_split, [view.name for view in dataset.test])

@@ -13,13 +13,7 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.datasets.types import View
-from drgs.results.history import (
-    DENSITY_COLUMNS,
-    DensityReport,
-    DensityRow,
-    FitHistory,
-    HistoryRow,
-)
+from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, FitHistory, HistoryRow
 from drgs.results.metrics import psnr
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer

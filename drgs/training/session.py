@@ -125,7 +125,7 @@ class FitSession:
                 return True
             plan = self.prepare()
             if folder is not None:
-                folder.take(*self._inputs)
+                folder.claim(*self._inputs)
             if plan is not None:
                 self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
                 if folder is not None and self.budget is not None:

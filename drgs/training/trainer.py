@@ -50,11 +50,7 @@ from drgs.training.optimizer import (
     restore_optimizer,
 )
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.parallel.population import (
-    check_shardable,
-    local_gaussians,
-    make_population,
-)
+from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
 from drgs.training.rates import rates_over_time, revised_plan
 from drgs.training.steps import (
     Step,

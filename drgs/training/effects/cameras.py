@@ -91,14 +91,14 @@ class CameraRefinement(OptimisedEffect):
         self.numbers[view.index] = numbers = dr.detach(self._camera_of(view))
         if self._has_begun(fit):
             dr.enable_grad(numbers)
-        _put(view.sensor, numbers)
+        _set_sensor(view.sensor, numbers)
 
     def _has_begun(self, fit: FitState) -> bool:
         return fit.iterations_of_step[0] > self.first
 
     @override
     def place(self, view: TrainingView) -> None:
-        _put(view.sensor, dr.detach(self._camera_of(view)))
+        _set_sensor(view.sensor, dr.detach(self._camera_of(view)))
 
     @override
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
@@ -192,7 +192,7 @@ class CameraRefinement(OptimisedEffect):
             temporary.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def _put(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:
+def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:
     """Set a sensor's parameters."""
     params = mi.traverse(sensor)
     params["to_world"] = _transform(numbers["to_world"])
