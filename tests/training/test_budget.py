@@ -44,7 +44,7 @@ def test_durations(text, seconds):
     "text",
     ["", "0", "m", "5 minutes", "-3s", "nan", "1m2h", "0s", "1h30", "5m5", "\u0665m", "9" * 400],
 )
-def test_what_is_no_duration_is_refused(text):
+def test_invalid_durations_are_refused(text):
     with pytest.raises(ArgumentTypeError, match="must be a time such as 90s, 5m or 1h30m"):
         parse_duration(text)
 

@@ -538,5 +538,5 @@ def test_derivatives_of_a_camera_that_does_not_move_are_those_of_one_that_may():
         np.testing.assert_allclose(other, found[0], atol=5e-4 * np.abs(found[0]).max())
 
 
-def test_without_being_asked_for_there_is_no_effect():
+def test_effects_are_off_by_default():
     assert training_effects(fits.config_of(), fits.plain_dataset()) == []

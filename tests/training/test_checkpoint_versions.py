@@ -58,7 +58,7 @@ def without_what_is_new(values):
     values["densify"] = {name: densify[name] for name in kept}
 
 
-def test_a_checkpoint_of_an_earlier_version_goes_on(folder, config):
+def test_a_checkpoint_of_an_earlier_version_resumes(folder, config):
     saved_as(folder, config, without_what_is_new)
     assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
 

@@ -161,7 +161,7 @@ def test_objects_give_the_bytes_of_names(examples):
         np.testing.assert_array_equal(getattr(given, name), getattr(named, name))
 
 
-def test_a_fit_goes_on_from_a_checkpoint_to_the_same_bytes():
+def test_a_fit_resumes_from_a_checkpoint_to_the_same_bytes():
     def trainer():
         return fits.Trainer(configured(), fits.plain_dataset(), fits.disturbed_blobs())
 
@@ -200,7 +200,7 @@ def fit_inputs():
     return fits.plain_dataset(), fits.disturbed_blobs()
 
 
-def test_what_an_extension_raises_is_reported_with_its_name(examples, monkeypatch):
+def test_errors_of_extensions_name_the_extension(examples, monkeypatch):
     module = examples["vignetting"]
     exec("def adjust(self, image, view):\n    raise KeyError('oh')\n", vars(module))
     monkeypatch.setattr(module.Vignetting, "adjust", module.adjust)

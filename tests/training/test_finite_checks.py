@@ -166,7 +166,7 @@ def test_nothing_is_saved_returned_or_edited_after_a_fault(monkeypatch, event):
             attempt(trainer)
 
 
-def test_restored_trainer_has_left_the_fault_behind(monkeypatch):
+def test_a_restored_trainer_forgets_the_fault(monkeypatch):
     trainer = make_trainer()
     trainer.step()
     good = trainer.state()

@@ -235,7 +235,7 @@ def test_nothing_is_advised_where_nothing_helps(available):
         room(config_of(1000, 1000), dataset_of(20, 20, 4))
 
 
-def test_a_trainer_asks_before_it_takes_anything(available):
+def test_a_trainer_checks_memory_before_it_allocates(available):
     mi.set_variant("llvm_ad_rgb")
     config, dataset = config_of(1000, 1000), dataset_of(20, 20, 4)
     available(100_000_000)

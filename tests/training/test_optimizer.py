@@ -238,7 +238,7 @@ def test_edit_without_appending_and_without_keeping():
     step(optimizer, 0, np.arange(3))
 
 
-def test_edit_refuses_what_would_misalign_rows():
+def test_edit_refuses_misaligned_rows():
     optimizer = make_optimizer(parameters(4), RATES)
     with pytest.raises(ValueError, match="row numbers below 4"):
         rows_of(optimizer).edit(UInt32(0, 4))

@@ -39,7 +39,7 @@ def test_a_few_views_stand_for_all(count, expected):
     assert list(chosen) == (expected or [0, 3, 7, 10, 14, 17, 21, 24])
 
 
-def test_measuring_changes_nothing_that_comes():
+def test_measuring_does_not_change_the_fit():
     """With densification, a filter that follows the means, and random backgrounds."""
     changes = {
         "model__smoothing": True,

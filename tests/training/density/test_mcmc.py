@@ -35,7 +35,7 @@ def act(optimizer, iteration=600, seed=0, **config):
 # ---- what copies look like
 @pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
-def test_copies_composite_to_what_they_are_copies_of(opacity, count):
+def test_copies_composite_to_the_original(opacity, count):
     (copies,), (factor,) = correct_copies(np.array([opacity]), np.array([count]))
     assert 1 - (1 - copies) ** count == pytest.approx(opacity, rel=1e-12)
     # Along a line through the centre, x in standard deviations of the copies: as much in all.
@@ -109,7 +109,7 @@ def test_the_image_before_and_after_is_nearly_the_same():
     assert np.abs(rendered() - before).max() < 0.06 * np.abs(before - 1).max()
 
 
-def test_copies_are_spread_over_what_they_are_copies_of():
+def test_copies_are_spread_over_the_original():
     num, opacity = 4000, 0.7
     optimizer = make(np.full(num, 0.3), opacity, tensor_type=TensorXf64)
     before = values(optimizer)
@@ -202,7 +202,7 @@ def test_equal_seeds_give_equal_bytes():
     assert population(3, 700) != first
 
 
-def test_it_acts_between_start_and_stop():
+def test_mcmc_refines_between_start_and_stop():
     chain = strategy()
     acting = [i for i in range(1, 20_000) if chain.is_due(i)]
     assert acting == list(range(600, 15_000, 100))

@@ -94,7 +94,7 @@ def test_as_many_fall_below_the_threshold_as_are_to_go():
         np.testing.assert_array_equal(moment, expected[kept])
 
 
-def test_pressure_has_a_limit_and_then_nobody_goes():
+def test_limited_pressure_may_prune_nothing():
     optimizer = make([SIZE] * 20, 0.5)
     phase = NaturalSelection(config_of(to=5))
     assert phase.refine(rows_of(optimizer), 2050) is None
@@ -176,7 +176,7 @@ def test_those_that_show_least_in_the_phase_go():
 
 
 @pytest.mark.parametrize("method", [NaturalSelection, Importance])
-def test_a_phase_goes_on_from_its_state(method):
+def test_a_phase_resumes_from_its_state(method):
     def begun():
         phase = method(config_of(to=2))
         optimizer = make([SIZE] * 8, np.linspace(0.01, 0.6, 8))

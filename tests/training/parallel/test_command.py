@@ -175,7 +175,7 @@ def started(path, out, size=2):
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_and_another_number_goes_on(config, tmp_path):
+def test_ctrl_c_saves_and_another_number_of_processes_resumes(config, tmp_path):
     path = config(iterations=800)
     process = started(path, tmp_path / "out")
     process.send_signal(signal.SIGINT)
@@ -188,7 +188,7 @@ def test_ctrl_c_saves_and_another_number_goes_on(config, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_a_process_that_dies_takes_the_others_along(config, tmp_path, seed):
+def test_if_a_process_dies_all_end(config, tmp_path, seed):
     """At any moment; the checkpoint is whole, and others go on with it."""
     out, rng = tmp_path / "out", random.Random(seed)
     process = started(config(iterations=800), out, 3)
