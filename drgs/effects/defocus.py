@@ -47,25 +47,25 @@ class Defocused:
 class DimmedFalloff(GaussianFalloff):
     """Falloff whose splats end as if undimmed; geometry: then the base-2 logarithm of dimming."""
 
-    of: GaussianFalloff
+    falloff: GaussianFalloff
 
     @property
     @override
     def num_geometry(self) -> int:
-        return self.of.num_geometry + 1
+        return self.falloff.num_geometry + 1
 
     @property
     @override
     def num_moments(self) -> int:
-        return self.of.num_moments
+        return self.falloff.num_moments
 
     @override
     def for_camera(self, camera: Camera) -> DimmedFalloff:
-        return replace(self, of=self.of.for_camera(camera))
+        return replace(self, falloff=self.falloff.for_camera(camera))
 
     @override
     def log2_opacity(self, geometry: list[Float]) -> Float:
-        return self.of.log2_opacity(geometry[:-1])
+        return self.falloff.log2_opacity(geometry[:-1])
 
     @override
     def log2_floor(self, geometry: list[Float], cutoffs: Cutoffs) -> Float:
@@ -77,50 +77,50 @@ class DimmedFalloff(GaussianFalloff):
     @override
     def geometry(self, splats: Splats2D) -> list[Float]:
         assert splats.opacity_compensation is not None, "see Defocused"
-        return [*self.of.geometry(splats), dr.log2(splats.opacity_compensation)]
+        return [*self.falloff.geometry(splats), dr.log2(splats.opacity_compensation)]
 
     @override
     def differentiable(self, splats: Splats2D) -> list[Float]:
         assert splats.opacity_compensation is not None, "see Defocused"
-        return [*self.of.differentiable(splats), dr.detach(splats.opacity_compensation)]
+        return [*self.falloff.differentiable(splats), dr.detach(splats.opacity_compensation)]
 
     @override
     def bounds(
         self, splats: Splats2D, geometry: list[Float], reach: Float
     ) -> tuple[Array2f, Array2f]:
-        return self.of.bounds(splats, geometry[:-1], reach)
+        return self.falloff.bounds(splats, geometry[:-1], reach)
 
     @override
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
-        return self.of.outline(geometry[:-1], reach)
+        return self.falloff.outline(geometry[:-1], reach)
 
     @override
     def coordinates(self, geometry: list[Float], x: Float, y: Float) -> tuple[Float, Float]:
-        return self.of.coordinates(geometry[:-1], x, y)
+        return self.falloff.coordinates(geometry[:-1], x, y)
 
     @override
     def footprint(
         self, geometry: list[Float], offsets_from: Offsets, active: Bool | bool
     ) -> Footprint:
-        return self.of.footprint(geometry[:-1], offsets_from, active)
+        return self.falloff.footprint(geometry[:-1], offsets_from, active)
 
     @override
     def moments(
         self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
-        return self.of.moments(footprint, weights, positions)
+        return self.falloff.moments(footprint, weights, positions)
 
     @override
     def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
-        derivatives = self.of.derivatives(geometry[:-1], totals)
+        derivatives = self.falloff.derivatives(geometry[:-1], totals)
         return [*derivatives, dr.zeros(type(totals[0]), dr.width(totals[0]))]
 
     @override
     def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
-        return [*self.of.pack_tangents(geometry[:-1], tangents[:-1]), tangents[-1]]
+        return [*self.falloff.pack_tangents(geometry[:-1], tangents[:-1]), tangents[-1]]
 
     @override
     def tangent(
         self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
     ) -> list[Float]:
-        return self.of.tangent(geometry[:-1], footprint, d_geometry[:-1])
+        return self.falloff.tangent(geometry[:-1], footprint, d_geometry[:-1])

@@ -1,8 +1,8 @@
 """Surfaces between the splats: the occluded part of each splat, at each pixel.
 
-Imported when a scene has surfaces. At a pixel, a surface k at depth z_k that stops the part p_k of
-the light behind it lies between splats like one more splat. With w_i = T_i a_i the weights of the
-splats as they are without it (see ``drgs.splatting.rasterize``),
+At a pixel, a surface k at depth z_k that stops the part p_k of the light behind it lies between
+splats like one more splat. With w_i = T_i a_i the weights of the splats without it (see
+``drgs.splatting.rasterize``),
 
     C = sum_i s_i w_i c_i,   s_i = 1 - sum of p_k over the surfaces in front (z_k < z_i),
 
@@ -11,11 +11,8 @@ and each surface's own share is p_k times T_k, the transmittance in front of it:
     T_k = 1 - sum_{i: z_i <= z_k} w_i.
 
 So surfaces change no alpha and no transmittance: they scale features, and one more plane for each
-sums the weights in front. Adjoint and tangent follow from the features', and nothing else has to
-know.
-
-Which splats are in front is decided by the depths of their means, as their order is. Not
-differentiated: z, p, and that decision.
+sums the weights in front. Which splats are in front is decided by the depths of their means, as
+their order is. Not differentiated: z, p, and that decision.
 """
 
 from __future__ import annotations

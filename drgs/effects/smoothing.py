@@ -28,7 +28,6 @@ from drgs.core.types import Array3f, Float, TensorXf
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import (
     GaussianRows,
-    OpacityRule,
     compensated_opacity,
     load_rows,
     plain_opacity,
@@ -39,7 +38,7 @@ FILTER_VARIANCE = 0.2
 """Variance of the filter, in squared distances between samples (Mip-Splatting, equation 9)."""
 
 FILM_MARGIN = 0.15
-"""Parts of the film's size by which a camera is taken to see beyond it (Mip-Splatting's code)."""
+"""Share of the film's size by which a camera is taken to see beyond it (Mip-Splatting's code)."""
 
 
 def apply_smoothing(rows: GaussianRows) -> GaussianRows:
@@ -89,18 +88,19 @@ def bake_smoothing(gaussians: Gaussians) -> Gaussians:
     opacities = np.sqrt(np.prod(variances / widened, axis=1)) / (
         1 + np.exp(-g.logit_opacities.astype(np.float64))
     )
+    log_scales = (np.log(widened) / 2).astype(np.float32)
+    logits = _finite_logits(opacities)
+    return replace(g, log_scales=log_scales, logit_opacities=logits, smoothing=None)
+
+
+def _finite_logits(opacities: np.ndarray) -> np.ndarray:
     tiny = np.finfo(np.float32).tiny
     opacities = np.clip(opacities, tiny, 1 - np.finfo(np.float32).eps)
-    return replace(
-        g,
-        log_scales=(np.log(widened) / 2).astype(np.float32),
-        logit_opacities=(np.log(opacities) - np.log1p(-opacities)).astype(np.float32),
-        smoothing=None,
-    )
+    return (np.log(opacities) - np.log1p(-opacities)).astype(np.float32)
 
 
-KEPT_VARIANCE = 0.04
-"""Parts of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
+MIN_VARIANCE_SHARE = 0.04
+"""Share of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
 derivatives by their scales."""
 
 VIEWER_APPROXIMATIONS = Approximations()  # approximations of viewers
@@ -125,20 +125,16 @@ def bake_for_viewers(
     cameras = list(cameras)
     host = dr.detach(gaussians).numpy()
     nyquist = np.array(smoothing_of(gaussians.means, cameras), np.float64)
-    taken = (
-        (VIEWER_APPROXIMATIONS.low_pass - fitted.low_pass) * np.square(nyquist) / FILTER_VARIANCE
-    )
+    difference = VIEWER_APPROXIMATIONS.low_pass - fitted.low_pass
+    taken = difference * np.square(nyquist) / FILTER_VARIANCE
     variances = np.exp(2 * host.log_scales.astype(np.float64))
-    left = np.maximum(variances - taken[:, None], KEPT_VARIANCE * variances)
+    left = np.maximum(variances - taken[:, None], MIN_VARIANCE_SHARE * variances)
     baked = replace(host, log_scales=(np.log(left) / 2).astype(np.float32))
     before = _integrals(gaussians, cameras, fitted)
     after = _integrals(baked.to(type(gaussians.means)), cameras, VIEWER_APPROXIMATIONS)
     factor = np.divide(before, after, out=np.ones_like(after), where=after > 0)
     opacities = factor / (1 + np.exp(-host.logit_opacities.astype(np.float64)))
-    tiny = np.finfo(np.float32).tiny
-    opacities = np.clip(opacities, tiny, 1 - np.finfo(np.float32).eps)
-    logits = np.log(opacities) - np.log1p(-opacities)
-    return replace(baked, logit_opacities=logits.astype(np.float32))
+    return replace(baked, logit_opacities=_finite_logits(opacities))
 
 
 def _integrals(
@@ -149,14 +145,11 @@ def _integrals(
     rows = load_rows(gaussians, 0)
     total = dr.zeros(type(rows.logit_opacities), gaussians.num_gaussians)
     for camera in cameras:
-        total += _integral(rows, camera, rule, approximations.low_pass)
+        low_pass = approximations.low_pass
+        splats = project(rows, camera, 0, rule, low_pass=low_pass, least_alpha=0.0)
+        beside = (splats.means2d < camera.film_start) | (splats.means2d > camera.film_end)
+        p, _, s = splats.conic_factor
+        seen = splats.visible & ~(beside.x | beside.y)
+        total += dr.select(seen, splats.opacities / dr.abs(p * s), 0)
         dr.eval(total)
     return np.array(total, np.float64)
-
-
-def _integral(rows: GaussianRows, camera: Camera, rule: OpacityRule, low_pass: float) -> Float:
-    splats = project(rows, camera, 0, rule, low_pass=low_pass, least_alpha=0.0)
-    beside = (splats.means2d < camera.film_start) | (splats.means2d > camera.film_end)
-    p, _, s = splats.conic_factor
-    seen = splats.visible & ~(beside.x | beside.y)
-    return dr.select(seen, splats.opacities / dr.abs(p * s), 0)

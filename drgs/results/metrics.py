@@ -39,17 +39,7 @@ class SplitMetrics(TypedDict):
     split: str
 
 
-class Circumstances(TypedDict):
-    """Entries of ``metrics.json`` about machine, time and software."""
-
-    versions: dict[str, str]
-    variant: str
-    threads: int
-    processor: str
-    date: str  # of the results: ISO 8601, local time
-
-
-class FitMetrics(Circumstances):
+class FitMetrics(TypedDict):
     """The content of a fit's ``metrics.json``."""
 
     iterations: int
@@ -58,6 +48,11 @@ class FitMetrics(Circumstances):
     test: SplitMetrics
     viewers: NotRequired[SplitMetrics]  # of the file for viewers, in their rendering
     seed: int
+    versions: dict[str, str]
+    variant: str
+    threads: int
+    processor: str
+    date: str  # of the results: ISO 8601, local time
     command: str  # command line
     config: dict[str, Any]  # YAML values
 

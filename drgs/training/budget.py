@@ -1,13 +1,11 @@
 """A fit for a given time: strategy, number of iterations, and end.
 
 ``scenes/studies/training.py`` measures quality over time on the shipped scene: a curve for each
-:class:`Strategy`. Its unit of time is an iteration at the start of a fit, with full images and the
-first Gaussians; a few iterations of the planned fit convert it to seconds. The strategy whose curve
-is highest at the deadline is chosen.
-
-Curves of another scene predict a time to some ten or twenty per cent, so the clock revises the rest
-of the plan and ends the fit (:class:`Deadline`). The resulting configuration gives the same bytes
-without a clock.
+:class:`Strategy`, in the time of an iteration at the start of a fit, with full images and the first
+Gaussians. A few iterations of the planned fit convert it to seconds, and the strategy whose curve
+is highest at the deadline is chosen. Curves of another scene predict a time to some ten or twenty
+per cent, so the clock revises the rest of the plan and ends the fit (:class:`Deadline`). The
+resulting configuration gives the same bytes without a clock.
 """
 
 from __future__ import annotations
@@ -22,8 +20,8 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import override
@@ -42,11 +40,7 @@ from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.inputs import share_inputs
 from drgs.training.trainer import Trainer
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
 CURVES = Path(__file__).parent / "training_curves.csv"
-"""Curves that ``scenes/studies/training.py`` measured."""
 
 MIN_ITERATIONS = 50  # fewer fit nothing
 
@@ -73,7 +67,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Strategy:
-    """A choice of a plan besides the number of iterations."""
+    """A fast variant of a fit, besides the number of iterations."""
 
     name: str  # of its curve
     half_size: float | None = None  # share of the iterations, at the start, with small images
@@ -118,8 +112,7 @@ STRATEGIES = (
 class Curve:
     """Measured points of one strategy, by ascending number of iterations.
 
-    Interpolated and extrapolated: time as a power of the number of iterations, PSNR in its
-    logarithm.
+    Time is interpolated as a power of the number of iterations, PSNR in its logarithm.
     """
 
     iterations: tuple[int, ...]
@@ -171,34 +164,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Plan:
-    """A resolved configuration, and where it comes from."""
+    """A configuration without open values, and where it comes from."""
 
-    config: FitConfig  # completed
+    config: FitConfig
     chosen: Candidate
     candidates: tuple[Candidate, ...]
-    seconds: float  # for the iterations
-    start_s: float  # of an iteration at the start
-    most: int  # Gaussians
+    reasons: str  # as text
     end: float = math.inf  # of the iterations, by time.perf_counter
-
-    @property
-    def reasons(self) -> str:
-        """The choice and its reasons, as text."""
-        coarse = self.config.coarse
-        stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in coarse]
-        sizes = ", ".join([*stages, "then full size"]) if stages else "full size"
-        lines = [
-            f"An iteration takes {1e3 * self.start_s:.0f} ms at the start here.",
-            f"By the curves of the shipped scene, {self.seconds:.0f} s are enough for",
-            *(
-                f"  {c.iterations:7,} iterations, {c.psnr:.2f} dB there: {c.strategy.name}"
-                + (" (chosen)" if c == self.chosen else "")
-                for c in self.candidates
-            ),
-            f"Planned: {self.config.iterations:,} iterations; {sizes}; at most {self.most:,} "
-            f"Gaussians; the population changes until iteration {self.config.densify.stop:,}.",
-        ]
-        return "\n".join(lines)
 
 
 def make_plan(
@@ -235,23 +207,20 @@ def make_plan(
     planned = with_iterations(config, chosen.iterations)
     planned = chosen.strategy.apply(planned, num_points)
     most = max(num_points, target_of(planned) or planned.densify.max_gaussians)
-    return Plan(planned, chosen, tuple(candidates), seconds, start_s, most)
-
-
-class FitObjects(TypedDict):
-    """Objects that take part in a fit besides those of its configuration, for :class:`Trainer`."""
-
-    density: DensityStrategy | None
-    effects: Sequence[TrainingEffect]
-    loss: Loss | None
-
-
-@dataclass(frozen=True)
-class Rehearsal:
-    """The first iterations of a fit, to be thrown away."""
-
-    trainer: Trainer
-    iteration_s: float  # of an iteration: full images, the first Gaussians
+    stages = [f"1/{s.factor} size until iteration {s.until:,}" for s in planned.coarse]
+    sizes = ", ".join([*stages, "then full size"]) if stages else "full size"
+    reasons = [
+        f"An iteration takes {1e3 * start_s:.0f} ms at the start here.",
+        f"By the curves of the shipped scene, {seconds:.0f} s are enough for",
+        *(
+            f"  {c.iterations:7,} iterations, {c.psnr:.2f} dB there: {c.strategy.name}"
+            + (" (chosen)" if c == chosen else "")
+            for c in candidates
+        ),
+        f"Planned: {planned.iterations:,} iterations; {sizes}; at most {most:,} "
+        f"Gaussians; the population changes until iteration {planned.densify.stop:,}.",
+    ]
+    return Plan(planned, chosen, tuple(candidates), "\n".join(reasons))
 
 
 def rehearse(
@@ -259,18 +228,26 @@ def rehearse(
     dataset: Dataset | None,
     gaussians: Gaussians,
     comm: Communicator | None = None,
-    **objects: Unpack[FitObjects],
-) -> Rehearsal:
-    """Time a few iterations on a few of the views.
+    density: DensityStrategy | None = None,
+    effects: Sequence[TrainingEffect] = (),
+    loss: Loss | None = None,
+) -> tuple[Trainer, float]:
+    """Run a few iterations on a few of the views; return their trainer, and seconds of one.
 
-    comm: the processes that share the fit; only rank 0 gives configuration and dataset; objects:
-    strategy, effects and loss of the fit, which are copied.
+    An iteration has full images and the first Gaussians. The arguments are those of
+    :class:`Trainer`; configuration and dataset are None on other ranks than 0.
     """
     comm = comm or Communicator()
     if config is not None and dataset is not None:
-        config, dataset = _first_iterations(config, dataset)
+        views_per_step = config.optimizer.views_per_step
+        count = max(REHEARSAL_VIEWS, views_per_step)
+        views = dataset.train[:: max(1, len(dataset.train) // count)][:count]
+        dataset = replace(dataset, train=views)
+        never = config.iterations + (WARM_UP_ITERATIONS + TIMED_ITERATIONS) * views_per_step
+        still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
+        config = with_changes(config, {"coarse": [], **still})
     config, dataset = share_inputs(comm, config, dataset)
-    trainer = Trainer(config, dataset, gaussians, comm, **deepcopy(objects))
+    trainer = Trainer(config, dataset, gaussians, comm, *deepcopy((density, effects, loss)))
     views_per_step = config.optimizer.views_per_step
     # Steps of several views are fewer.
     warm_up, timed = (
@@ -280,30 +257,23 @@ def rehearse(
         start = time.perf_counter()
         reports = [trainer.step() for _ in range(count)]
         _ = reports[-1].loss  # waits for the device
-    return Rehearsal(trainer, (time.perf_counter() - start) / (timed * views_per_step))
-
-
-def _first_iterations(config: FitConfig, dataset: Dataset) -> tuple[FitConfig, Dataset]:
-    """Return a configuration without changes of the population, and a few of the views."""
-    views_per_step = config.optimizer.views_per_step
-    count = max(REHEARSAL_VIEWS, views_per_step)
-    views = dataset.train[:: max(1, len(dataset.train) // count)]
-    never = config.iterations + (WARM_UP_ITERATIONS + TIMED_ITERATIONS) * views_per_step
-    still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
-    return with_changes(config, {"coarse": [], **still}), replace(dataset, train=views[:count])
+    return trainer, (time.perf_counter() - start) / (timed * views_per_step)
 
 
 def plan_fit(
-    config: FitConfig, dataset: Dataset, gaussians: Gaussians, end: float, rehearsal: Rehearsal
+    config: FitConfig,
+    dataset: Dataset,
+    gaussians: Gaussians,
+    end: float,
+    scene: mi.Scene,
+    start_s: float,
 ) -> Plan:
     """Plan a fit, results included, until ``end``, by ``time.perf_counter``.
 
-    rehearsal: of the fit; ``full_scene()`` of its trainer has been called.
+    scene: of the first Gaussians; start_s: of an iteration at the start.
     """
     num_points, most = gaussians.num_gaussians, target_of(config) or 0
-    scene, degree = rehearsal.trainer.full_scene(), config.model.sh_degree
-    assert scene is not None, "rank 0 plans"
-    results = seconds_of_results(scene, dataset, max(num_points, most), degree)
+    results = seconds_of_results(scene, dataset, max(num_points, most), config.model.sh_degree)
     images = results.renders if config.output.save_renders else 0.0
     images += results.report + seconds_of_curves() if config.output.report else 0.0
     if images > MAX_IMAGES_SHARE * (end - time.perf_counter()):
@@ -323,7 +293,7 @@ def plan_fit(
 
         end -= TIME_SHARE * max(0.0, end - time.perf_counter())
     side = min(min(view.width, view.height) for view in dataset.train)
-    seconds, start_s = end - time.perf_counter(), rehearsal.iteration_s
+    seconds = end - time.perf_counter()
     plan = make_plan(config, num_points, side, seconds, start_s, load_curves())
     return replace(plan, end=end)
 
@@ -331,9 +301,8 @@ def plan_fit(
 class Deadline(StopCriterion):
     """Ends a fit when its time is up.
 
-    Ten times during the fit, the curve is scaled to the time taken so far, and the trainer's
-    configuration gets new last iterations of the fit and of changes of the population, which keep
-    their share of the fit.
+    Ten times during the fit, the curve is scaled to the time taken so far, and the fit gets another
+    number of iterations, and changes of the population the same share of it.
     """
 
     def __init__(self, trainer: Trainer, end: float, curve: Curve) -> None:
@@ -345,7 +314,6 @@ class Deadline(StopCriterion):
 
     @override
     def should_continue(self, trainer: Trainer) -> bool:
-        """Return whether there is time; revises the trainer's configuration."""
         now, done = time.perf_counter(), trainer.iteration
         if now >= self._end and done > 0:
             trainer.reschedule(done, trainer.config.densify.stop)
@@ -361,7 +329,6 @@ class Deadline(StopCriterion):
 
     @override
     def num_iterations(self, trainer: Trainer) -> int:
-        """Return the iterations in all: as planned, later by the curve and the time so far."""
         now, done = time.perf_counter(), trainer.iteration
         if done == 0:
             return trainer.config.iterations
@@ -376,10 +343,7 @@ _DURATION = re.compile(f"(?:{_NUMBER}h)?(?:{_NUMBER}m)?(?:{_NUMBER}s)?|{_NUMBER}
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of ``90``, ``90s``, ``5m``, ``1m30s``, ``1h30m``.
-
-    Raises ``argparse.ArgumentTypeError`` for anything else, such as ``1h30``.
-    """
+    """Return the seconds of ``90``, ``5m`` or ``1h30m``; raise ``ArgumentTypeError`` for others."""
     match = _DURATION.fullmatch(text.strip())
     parts = match.groups(default="0") if match else ()
     seconds = sum(scale * float(part) for scale, part in zip((3600, 60, 1, 1), parts, strict=False))

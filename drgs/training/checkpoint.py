@@ -1,9 +1,7 @@
 """Checkpoints: a fit that was stopped continues to the bytes that it would have given.
 
-One file, ``checkpoint.npz``, contains the trainer's state, the history so far, the seconds spent,
-the configuration, and a fingerprint of the data. It is written atomically, and ``config.yml`` after
-it. Since a process may end between the two files, the checkpoint also contains the configuration
-before the last revision of the plan.
+``checkpoint.npz`` is written atomically, and ``config.yml`` after it. Since a process may end
+between the two, it also contains the configuration before the last revision of the plan.
 """
 
 from __future__ import annotations
@@ -28,8 +26,7 @@ from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 
 PATH_KEYS = ("data.path", "data.source", "init.point_cloud")
-"""Values that say where something is: a project that was moved has others. The start point is
-needed no more; the data has a fingerprint."""
+"""Values that differ in a project that was moved; the data has a fingerprint."""
 
 MEANS_ARRAY = "means.value"  # the array that has a row for each Gaussian
 
@@ -50,10 +47,7 @@ class Checkpoint:
 
 
 def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> None:
-    """Write or replace the checkpoint of the output folder ``folder``, and then its ``config.yml``.
-
-    The configuration's end may have changed since ``config.yml`` was written.
-    """
+    """Write or replace the checkpoint of an output folder, and ``config.yml`` if it is revised."""
     try:
         before = load_run_config(folder)
     except UserError:  # there is none, or the user is just editing it
@@ -74,9 +68,7 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
 
 
 def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
-    """Return the checkpoint of ``folder``, or None if there is none yet.
-
-    config: the run's; the checkpoint's is newer if the plan had just been revised.
+    """Return the checkpoint of ``folder``, or None if there is none yet; config: the run's.
 
     Raises UserError if the file is damaged or belongs to another configuration.
     """
@@ -113,11 +105,29 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
 def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndarray]) -> None:
     """Raise UserError if a trainer cannot continue from the checkpoint in ``folder``.
 
-    start: ``Trainer.state()`` of that trainer before its first iteration.
+    start: ``Trainer.state()`` of that trainer before its first iteration; names, types and shapes
+    of arrays must be the same, but for the number of Gaussians.
     """
-    assert checkpoint.config is not None, "it was read from a file"
+    state, config = checkpoint.trainer, checkpoint.config
+    assert config is not None, "it was read from a file"
     try:
-        _check_state(checkpoint.trainer, start, checkpoint.config)
+        if missing := [name for name in start if name not in state]:
+            raise ValueError(f"{format_names(missing)} missing")
+        num, most = len(np.atleast_1d(state[MEANS_ARRAY])), config.densify.max_gaussians
+        if not 1 <= num <= most:
+            raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")
+        expected = {name: (_shape(name, start, num), array.dtype) for name, array in start.items()}
+        expected[SMOOTHING_ARRAY] = (num,), np.dtype(np.float32)
+        values = [name for name in start if name.endswith(".value")]
+        expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
+        for name in filter(expected.__contains__, state):
+            _check_shape(name, state[name], *expected[name])
+            _check_finite(name, state[name])
+        iteration = int(state["iteration"])
+        if not 0 <= iteration <= config.iterations:
+            raise ValueError(
+                f"iteration must be between 0 and {config.iterations:,}, got {iteration:,}"
+            )
     except ValueError as error:
         raise _damaged_error(folder / CHECKPOINT, error) from None
 
@@ -136,10 +146,7 @@ def check_same_data(folder: Path, where: Path, before: Fingerprint, now: Fingerp
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """Remove the checkpoint of a finished fit.
-
-    Raises :class:`UserError` where the file system refuses.
-    """
+    """Remove the checkpoint of a finished fit, or raise :class:`UserError`."""
     path = folder / CHECKPOINT
     try:
         path.unlink(missing_ok=True)
@@ -169,37 +176,6 @@ def _match_leaves(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
         places[key] = getattr(getattr(config, section), name)
     output = config.output.model_dump()
     return with_changes(FitConfig.model_validate({**values, "output": output}), places)
-
-
-# ----------------------------------------------------------------------------------------------
-# Arrays of a file that may be damaged
-# ----------------------------------------------------------------------------------------------
-
-
-def _check_state(
-    state: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray], config: FitConfig
-) -> None:
-    """Raise ValueError unless names, types and shapes of arrays are those of a trainer's start.
-
-    The number of Gaussians may differ.
-    """
-    if missing := [name for name in start if name not in state]:
-        raise ValueError(f"{format_names(missing)} missing")
-    num, most = len(np.atleast_1d(state[MEANS_ARRAY])), config.densify.max_gaussians
-    if not 1 <= num <= most:
-        raise ValueError(f"must hold 1 to {most:,} Gaussians, got {num:,}")
-    expected = {name: (_shape(name, start, num), array.dtype) for name, array in start.items()}
-    expected[SMOOTHING_ARRAY] = (num,), np.dtype(np.float32)
-    values = [name for name in start if name.endswith(".value")]
-    expected |= {name.replace(".value", ".gradient"): expected[name] for name in values}
-    for name in filter(expected.__contains__, state):
-        _check_shape(name, state[name], *expected[name])
-        _check_finite(name, state[name])
-    iteration = int(state["iteration"])
-    if not 0 <= iteration <= config.iterations:
-        raise ValueError(
-            f"iteration must be between 0 and {config.iterations:,}, got {iteration:,}"
-        )
 
 
 def _shape(name: str, start: Mapping[str, np.ndarray], num: int) -> tuple[int, ...]:

@@ -1,6 +1,6 @@
 """The history of a fit as TensorBoard reads it, written as the fit goes.
 
-Imported with ``--tensorboard``. tensorboardX's ``SummaryWriter`` names files after the time and the
+tensorboardX's ``SummaryWriter`` names files after the time and the
 host, and writes them from a thread; the file of a fit has one name, and is complete after each row.
 """
 
@@ -19,8 +19,6 @@ from drgs.results.history import HistoryRow
 from drgs.training.loop import History, Iteration, Observer
 from drgs.training.trainer import Trainer
 
-VERSION = "brain.Event:2"  # version of the format, in the first record
-
 TAGS = {
     "loss": "loss",
     "psnr": "PSNR/training_view",
@@ -32,16 +30,14 @@ TAGS = {
 
 
 class EventLog(Observer):
-    """Writes new rows of the history: see ``drgs.training.loop.Observer``.
-
-    The file begins with existing rows, so that a fit that was stopped and resumed is one curve.
-    """
+    """Writes the history's rows, existing ones first: a fit that was resumed is one curve."""
 
     def __init__(self, path: Path, history: History) -> None:
         """path: is replaced."""
         path.parent.mkdir(parents=True, exist_ok=True)
         self._writer = RecordWriter(str(path.absolute()))
-        self._writer.write(Event(wall_time=time.time(), file_version=VERSION).SerializeToString())
+        version = Event(wall_time=time.time(), file_version="brain.Event:2")
+        self._writer.write(version.SerializeToString())
         for row in history.rows:
             self._write(row, history)
         self._writer.flush()

@@ -1,8 +1,7 @@
 """Errors for a fit whose numbers are no longer finite, before it saves them.
 
 A check waits for the device. So the trainer keeps the results of every iteration, and checks them
-when the host waits in any case: before the state is saved, returned or changed row by row, and when
-a row of the history is read. Errors name the first iteration with such a number.
+when the host waits in any case. Errors name the first iteration with such a number.
 """
 
 from __future__ import annotations
@@ -52,23 +51,16 @@ class WatchedIteration:
             yield f"the gradient of {name} in row {row} is not finite, or too large to be squared"
 
 
-class GradientWatch:
+class GradientWatch(list[WatchedIteration]):
     """The losses and gradients of the iterations that are not checked yet."""
-
-    def __init__(self) -> None:
-        self._iterations: list[WatchedIteration] = []
-
-    def add(self, iteration: WatchedIteration) -> None:
-        """Add an iteration; waits for nothing."""
-        self._iterations.append(iteration)
 
     def check(self) -> None:
         """Raise :class:`NonFiniteError` for the first iteration at fault; waits for the device."""
-        for iteration in self._iterations:
+        for iteration in self:
             if faults := list(iteration.faults()):
                 where = f"iteration {iteration.number}, view {iteration.view}"
                 raise NonFiniteError(f"{where}: {' and '.join(faults)}", iteration.number)
-        self._iterations.clear()
+        self.clear()
 
 
 def check_values(

@@ -21,38 +21,9 @@ from drgs.core.files import atomic_path
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.results.files import (
-    BUDGET_PLAN,
-    CHECKPOINT,
-    DENSITY,
-    GAUSSIANS,
-    GAUSSIANS_FOR_VIEWERS,
-    HISTORY,
-    METRICS,
-    REPORT,
-    VIEWS,
-)
-from drgs.results.folder import (
-    check_output_folder,
-    claim_output_folder,
-    continue_run,
-    has_results,
-    image_names,
-    is_finished,
-    remove_run,
-    require_no_run,
-    seal_run,
-    write_run_config,
-)
+from drgs.results import files, folder
 from drgs.results.history import write_density, write_history
-from drgs.results.metrics import (
-    Circumstances,
-    FitMetrics,
-    Quality,
-    SplitMetrics,
-    mean_of,
-    mean_quality,
-)
+from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
 from drgs.results.report import FitImages, write_images, write_results
 from drgs.results.viewer import DisplaySettings, shows_as_fitted
@@ -84,7 +55,9 @@ class FitFolder:
         """Return whether the folder holds all results of the fit already."""
         if self.overwrites:
             return False
-        return has_results(self.path) if self.resumes else is_finished(self.path, config)
+        if self.resumes:
+            return folder.has_results(self.path)
+        return folder.is_finished(self.path, config)
 
     def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
         """Return the checkpoint to continue from, if there is one.
@@ -94,31 +67,31 @@ class FitFolder:
         if self.overwrites:
             return None
         if has_budget:
-            require_no_run(self.path)
+            folder.require_no_run(self.path)
         elif not self.resumes:
-            check_output_folder(self.path, config)
+            folder.check_output_folder(self.path, config)
         return load_checkpoint(self.path, config)
 
-    def take(self, config: FitConfig, dataset: Dataset) -> None:
+    def claim(self, config: FitConfig, dataset: Dataset) -> None:
         """Make the folder that of the fit, or raise ``UserError`` and leave it as it is."""
         self._keep()
-        images = image_names(dataset.test_split, [view.name for view in dataset.test])
+        images = folder.image_names(dataset.test_split, [view.name for view in dataset.test])
         if self.overwrites:
-            remove_run(self.path, images)
+            folder.remove_run(self.path, images)
         if self.resumes:
-            continue_run(self.path, config, images)
+            folder.continue_run(self.path, config, images)
         else:
-            claim_output_folder(self.path, config, images)
+            folder.claim_output_folder(self.path, config, images)
 
     def write_plan(self, text: str) -> None:
         """Write the plan and its reasons."""
-        with atomic_path(self.path / BUDGET_PLAN) as temporary:
+        with atomic_path(self.path / files.BUDGET_PLAN) as temporary:
             temporary.write_text(text)
 
     @property
     def remedy(self) -> str:
         """Advice after numbers that are not finite."""
-        has_checkpoint = (self.path / CHECKPOINT).exists()
+        has_checkpoint = (self.path / files.CHECKPOINT).exists()
         kept = "the last checkpoint is kept" if has_checkpoint else "nothing was saved yet"
         return (
             f"{kept}. --resume {self.path} --debug repeats this with range checks; lower learning "
@@ -135,36 +108,27 @@ class FitFolder:
     ) -> FitMetrics:
         """Write the results of a finished fit, and measure them; return ``metrics.json``.
 
-        gaussians: the trainer's; for_viewers: None if other viewers render as the fit does; wall_s:
-        time of iterations.
+        for_viewers: None if other viewers render as the fit does; wall_s: time of iterations.
         """
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
-        saved_gaussians(gaussians, config).save(out / GAUSSIANS)
+        saved_gaussians(gaussians, config).save(out / files.GAUSSIANS)
         for effect in trainer.effects:
             effect.write(out, dataset)
-        write_history(out / HISTORY, history.rows)
-        write_density(out / DENSITY, history.density)
-        write_views(out / VIEWS, dataset)
-        write_run_config(out, config)
+        write_history(out / files.HISTORY, history.rows)
+        write_density(out / files.DENSITY, history.density)
+        write_views(out / files.VIEWS, dataset)
+        folder.write_run_config(out, config)
         output, split = config.output, dataset.test_split
         scores = write_images(out, dataset, render, output.save_renders, output.report)
-        metrics: FitMetrics = {
-            "iterations": config.iterations,
-            "num_gaussians": gaussians.num_gaussians,
-            "wall_s": round(wall_s, 2),
-            "test": _split_metrics(mean_of(scores), split),
-            "seed": config.seed,
-            **_circumstances(),
-            "command": self.command,
-            "config": config.model_dump(mode="json"),
-        }
+        test = SplitMetrics(**vars(mean_of(scores)), split=split)
+        metrics = self._metrics(config, gaussians.num_gaussians, wall_s, test)
         other, approximations = None, config.model.approximations
         if for_viewers is not None:
             other = for_viewers.gaussians
-            other.save(out / GAUSSIANS_FOR_VIEWERS)
+            other.save(out / files.GAUSSIANS_FOR_VIEWERS)
             images = zip(for_viewers.images(dataset.test), dataset.test, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
-            metrics["viewers"] = _split_metrics(quality, split)
+            metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
         if output.report:
             shown = gaussians_on_page(gaussians, approximations, other)
             scene = trainer.full_scene()
@@ -173,6 +137,32 @@ class FitFolder:
             write_results(out, dataset, fitted, scores, history, metrics)
         self.finish(metrics)
         return metrics
+
+    def _metrics(
+        self, config: FitConfig, num_gaussians: int, wall_s: float, test: SplitMetrics
+    ) -> FitMetrics:
+        known = versions()
+        return {
+            "iterations": config.iterations,
+            "num_gaussians": num_gaussians,
+            "wall_s": round(wall_s, 2),
+            "test": test,
+            "seed": config.seed,
+            "versions": {
+                "drgs": known["drgs"],
+                "mitsuba": known["Mitsuba"],
+                "drjit": known["Dr.Jit"],
+                "numpy": known["numpy"],
+                "python": platform.python_version(),
+                "llvm": known["LLVM"],
+            },
+            "variant": mi.variant() or "",
+            "threads": dr.thread_count(),
+            "processor": processor(),
+            "date": datetime.now().astimezone().isoformat(timespec="minutes"),
+            "command": self.command,
+            "config": config.model_dump(mode="json"),
+        }
 
     def describe(self, metrics: FitMetrics) -> str:
         """Return the results in a few lines, and where they are."""
@@ -183,27 +173,27 @@ class FitFolder:
             f"{metrics['iterations']} iterations in {metrics['wall_s']:.0f} s"
         ]
         if viewers is not None:
-            path = self.path / GAUSSIANS_FOR_VIEWERS
+            path = self.path / files.GAUSSIANS_FOR_VIEWERS
             lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
         lines.append(f"written: {self.path}")
         if cast("dict[str, object]", metrics["config"]["output"])["report"]:
-            lines.append(f"open {self.path / REPORT}")
+            lines.append(f"open {self.path / files.REPORT}")
         return "\n".join(lines)
 
     def finish(self, metrics: FitMetrics | None = None) -> None:
         """Write ``metrics.json`` (None: it is there), and end the run: no checkpoint is left."""
         if metrics is not None:
-            with atomic_path(self.path / METRICS) as temporary:
+            with atomic_path(self.path / files.METRICS) as temporary:
                 temporary.write_text(json.dumps(metrics, indent=2) + "\n")
         remove_checkpoint(self.path)
-        seal_run(self.path)
+        folder.seal_run(self.path)
 
 
 def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
-    """Return the Gaussians of ``point_cloud.ply``: with ``output.bake_smoothing``, without a
-    filter.
+    """Return the Gaussians of ``point_cloud.ply`` from the trainer's.
 
-    Its header records approximations that are not the default. gaussians: the trainer's.
+    Its header records approximations that are not the default. It has no smoothing filter with
+    ``output.bake_smoothing``.
     """
     others = config.model.approximations.non_default
     gaussians = replace(gaussians, rendered_with=others or None)
@@ -213,10 +203,7 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
 def gaussians_on_page(
     gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
 ) -> DisplaySettings:
-    """Return the Gaussians of ``viewer.html``: the fit's own, if it renders their approximations.
-
-    for_viewers: the alternative, or None.
-    """
+    """Return the Gaussians of ``viewer.html``: those for viewers if it cannot render the fit's."""
     if for_viewers is not None and not shows_as_fitted(approximations):
         return DisplaySettings(for_viewers, Approximations())
     return DisplaySettings(_remove_filter(gaussians), approximations)
@@ -225,33 +212,6 @@ def gaussians_on_page(
 def _remove_filter(gaussians: Gaussians) -> Gaussians:
     if gaussians.smoothing is None:
         return gaussians
-    from drgs.effects.smoothing import bake_smoothing  # imported where there is a filter
+    from drgs.effects.smoothing import bake_smoothing
 
     return bake_smoothing(gaussians)
-
-
-def _split_metrics(quality: Quality, split: str) -> SplitMetrics:
-    return {
-        "psnr": quality.psnr,
-        "ssim": quality.ssim,
-        "num_views": quality.num_views,
-        "split": split,
-    }
-
-
-def _circumstances() -> Circumstances:
-    known = versions()
-    return {
-        "versions": {
-            "drgs": known["drgs"],
-            "mitsuba": known["Mitsuba"],
-            "drjit": known["Dr.Jit"],
-            "numpy": known["numpy"],
-            "python": platform.python_version(),
-            "llvm": known["LLVM"],
-        },
-        "variant": mi.variant() or "",
-        "threads": dr.thread_count(),
-        "processor": processor(),
-        "date": datetime.now().astimezone().isoformat(timespec="minutes"),
-    }

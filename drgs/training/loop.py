@@ -13,19 +13,12 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.datasets.types import View
-from drgs.results.history import (
-    DENSITY_COLUMNS,
-    DensityReport,
-    DensityRow,
-    FitHistory,
-    HistoryRow,
-)
+from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, FitHistory, HistoryRow
 from drgs.results.metrics import psnr
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
 
-PSNR_SMOOTHING = 0.9
-"""Weight of the past in the PSNR of training views, each of which is another photograph."""
+PSNR_SMOOTHING = 0.9  # weight of the past in the PSNR of training views
 
 MAX_MEASURED_VIEWS = 8  # test views that are measured on the way, spread over all of them
 
@@ -101,27 +94,15 @@ def exponential_mean(values: Iterable[float]) -> np.ndarray:
     return np.fromiter(accumulate(values, smoother), np.float64)
 
 
-class StopCriterion(Protocol):
-    """Decides when a fit ends."""
+class StopCriterion:
+    """Ends a fit after the iterations of its configuration; subclasses decide otherwise."""
 
     def should_continue(self, trainer: Trainer) -> bool:
         """Return whether to run another iteration; may revise the trainer's configuration."""
-        ...
+        return trainer.iteration < trainer.config.iterations
 
     def num_iterations(self, trainer: Trainer) -> int:
         """Return the number of iterations of the whole fit, as expected now."""
-        ...
-
-
-class AllIterations(StopCriterion):
-    """Ends a fit after the number of iterations of its configuration."""
-
-    @override
-    def should_continue(self, trainer: Trainer) -> bool:
-        return trainer.iteration < trainer.config.iterations
-
-    @override
-    def num_iterations(self, trainer: Trainer) -> int:
         return trainer.config.iterations
 
 
@@ -159,12 +140,12 @@ class Iteration:
 
 
 class Observer(Protocol):
-    """Follows a fit as it runs; the result has the same bytes without it."""
+    """Follows a fit as it runs, whose bytes do not depend on it."""
 
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
     ) -> None:
-        """Called after an iteration, by the thread that fits; history: with its row, if it has one.
+        """Called after an iteration, by the thread that fits; history: with its row, if any.
 
         stops: whether the fit is to stop at once; an observer that waits has to call it.
         """
@@ -174,9 +155,8 @@ def iterations(trainer: Trainer, history: History, criterion: StopCriterion) -> 
     """Run the remaining iterations: a generator, one step an item.
 
     Rows are added to ``history`` every ``output.history_every`` iterations, and for the last one.
-
-    Raises ``NonFiniteError``, at a row of the history or at a change of the population, if a loss,
-    a gradient or a value is not finite.
+    There, and at changes of the population, ``NonFiniteError`` is raised if a loss, a gradient or a
+    value is not finite.
     """
     continues = criterion.should_continue(trainer)
     while continues:
@@ -212,9 +192,8 @@ class HeldOutQuality(Observer):
         trainer.sync_scene()
         pairs = zip(trainer.images(self._views), self._views, strict=True)
         scores = [psnr(image, view.image, view.mask) for image, view in pairs]
-        history.add_test_psnr(
-            float(trainer.comm.broadcast_numbers(np.mean(scores) if scores else np.nan))
-        )
+        mean = np.mean(scores) if scores else np.nan
+        history.add_test_psnr(float(trainer.comm.broadcast_numbers(mean)))
         history.leave_out(time.perf_counter() - start)
 
 

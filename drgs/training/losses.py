@@ -9,9 +9,8 @@ symmetric window and zero padding is its own adjoint, so the gradient is three m
 is scattered, and the result is bit-reproducible.
 
 Each channel is cut into 8 x 8 tiles. One lane computes the 8 outputs of one tile row (or column)
-from the 18 inputs that they share, which it loads as three packets of 8. It stores the outputs in
-the order in which the next pass reads them. Maps are blurred one after the other, as the inputs of
-one alone fit into a core's registers.
+from the 18 inputs that they share, which it loads as three packets of 8. Maps are blurred one after
+the other, as the inputs of one alone fit into a core's registers.
 """
 
 from __future__ import annotations
@@ -121,9 +120,8 @@ class LossTerm:
     def of_gaussians(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Float | None:
         """Return a ``Float`` of one value, or None.
 
-        parameters: raw values by name, attached, of ``num_rows`` Gaussians in all. If several
-        processes fit, each has some of the rows: a sum over them, divided by ``num_rows``, is
-        right for any number of processes.
+        parameters: raw values by name, attached, of ``num_rows`` Gaussians in all, of which each
+        process has some: terms are sums over these, divided by ``num_rows``.
         """
 
 
@@ -134,8 +132,7 @@ class PhotometricLoss(Loss):
 
     SSIM's window is the one that the target was prepared with. Windows reach beyond the image
     into zeros, as in the 3DGS reference implementation. The derivative of |x - y| at x = y is
-    taken as 0. Differentiable in the image; not differentiated: the target. Films of one size
-    share their kernels; nothing waits for the device.
+    taken as 0. Differentiable in the image; not differentiated: the target.
     """
 
     dssim_weight: float = 0.2  # w, in [0, 1]
@@ -208,8 +205,10 @@ class _PhotometricOp(dr.CustomOp):
         return dr.sum(loss) / count, dr.sum(squared) / count
 
     def gradient(self) -> Float:
-        """Return d loss / d image, flat, row-major."""
-        blurred = _blur_partials_down_columns(self.tiling, self.partials)
+        """Return d loss / d image, flat, row-major; pass 3 blurs the partials along columns."""
+        columns, weights = self.tiling.columns, self.tiling.weights
+        blurred = [columns.store_across(_blur(columns.read(z), weights)) for z in self.partials]
+        dr.eval(blurred)
         tiles = _assemble_gradient(self.tiling, blurred, self.values, self.target, self.weight)
         return self.tiling.from_tiles(tiles)
 
@@ -283,14 +282,6 @@ def _ssim_and_partials(
     return loss, stored
 
 
-def _blur_partials_down_columns(tiling: _Tiling, partials: list[Float]) -> list[Float]:
-    """Pass 3: the partials blurred along columns, row order."""
-    columns = tiling.columns
-    blurred = [columns.store_across(_blur(columns.read(z), tiling.weights)) for z in partials]
-    dr.eval(blurred)
-    return blurred
-
-
 def _assemble_gradient(
     tiling: _Tiling, partials: list[Float], values: Float, target: Target, weight: float
 ) -> Float:
@@ -311,7 +302,7 @@ def _assemble_gradient(
 
 
 def _variance(mean: Float, mean_square: Float) -> Float:
-    """Return E[x^2] - E[x]^2, which only rounding can make negative (it would, for x >> 1)."""
+    """Return E[x^2] - E[x]^2, which rounding would make negative for x >> 1."""
     variance = mean_square - mean * mean
     return dr.select(variance < 0, 0, variance)
 
@@ -332,12 +323,6 @@ class _Tiling:
     width: int
     weights: tuple[float, ...]
     index_type: type  # UInt32 of the image's backend
-
-    @property
-    def support(self) -> range:
-        """Pixels along a line, counted from its tile's edge, that outputs 0 ... 7 depend on."""
-        radius = len(self.weights) // 2
-        return range(-radius, _TILE + radius)
 
     @property
     def num_values(self) -> int:
@@ -422,12 +407,13 @@ class _Lines:
         return self._read_packet(values, self.lane, True)
 
     def read(self, values: Float) -> dict[int, Float]:
-        """Return the inputs of the line's 8 outputs, over ``tiling.support``; 0 beyond the tiles.
+        """Return the inputs of the line's 8 outputs by pixel, from its tile's edge; 0 beyond tiles.
 
         values: contiguous along lines.
         """
         packets = [self._read_packet(values, *self._neighbour(step)) for step in (-1, 0, 1)]
-        return {k: packets[1 + k // _TILE][k % _TILE] for k in self.tiling.support}
+        radius = len(self.tiling.weights) // 2
+        return {k: packets[1 + k // _TILE][k % _TILE] for k in range(-radius, _TILE + radius)}
 
     def store(self, values: list[Float]) -> Float:
         """Store each line's 8 values, contiguous along lines."""
@@ -471,7 +457,7 @@ def _product(x: dict[int, Float], y: dict[int, Float]) -> dict[int, Float]:
 
 
 def _blur(values: dict[int, Float], weights: tuple[float, ...]) -> list[Float]:
-    """Return a blurred map at the line's 8 pixels, from its values over ``tiling.support``."""
+    """Return a blurred map at the line's 8 pixels; values: see :meth:`_Lines.read`."""
     radius = len(weights) // 2
     blurred = []
     for k in range(_TILE):

@@ -22,7 +22,8 @@ from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.reduction import BAND_SLOTS
-from drgs.training.density.registry import density_strategy
+from drgs.training.density.strategy import density_strategy
+from drgs.training.parallel.communicator import Communicator
 
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results
 
@@ -52,6 +53,10 @@ USABLE_SHARE = 0.9  # share of the available memory that is used: estimates are 
 
 MIN_WIDTH_PX = 16  # no smaller images are advised
 
+MAX_TARGET_BYTES = 1 << 30
+"""Most memory of targets and effects' uploads that stay on the device until their view is drawn
+again: those of 180 images of 400 x 400 px. To make them anew takes a tenth of an iteration."""
+
 
 @dataclass(frozen=True)
 class FitMemory:
@@ -70,29 +75,18 @@ class FitMemory:
         return self.process + self.photographs + self.gaussians + self.splats + self.pixels
 
 
-@dataclass(frozen=True)
-class Share:
-    """The part that one of several processes has of a fit and of its machine."""
-
-    processes: int = 1  # that share the Gaussians; each renders images of all of them
-    on_machine: int = 1  # of these, that share the machine's memory
-
-
-WHOLE_SHARE = Share()
-
-
 def estimate(
     config: FitConfig,
     dataset: Dataset,
     gaussians: Gaussians,
-    view_bytes: int,
+    pixel_bytes: int,
     scale: float = 1.0,
-    share: Share = WHOLE_SHARE,
+    processes: int = 1,
 ) -> FitMemory:
     """Estimate the peak, in one process, of a fit that starts with ``gaussians``.
 
-    view_bytes: device memory of a view's images per pixel; scale: of all images' width and height,
-    for another ``data.image_size``.
+    pixel_bytes: see ``steps.bytes_per_pixel``; scale: of all images' width and height, for another
+    ``data.image_size``; processes: share the Gaussians, and each renders images of all of them.
     """
     train, views = dataset.train, {*dataset.train, *dataset.test}
     start = gaussians.num_gaussians
@@ -111,9 +105,9 @@ def estimate(
     of_gaussian = NUMBER_BYTES * numbers + GAUSSIAN_BYTES + (GROWTH_BYTES if count > start else 0)
     return FitMemory(
         process=PROCESS_BYTES,
-        photographs=round(sum(_kept_bytes(view, scale) for view in views)),
-        targets=round(scale**2 * view_bytes * sum(view.width * view.height for view in train)),
-        gaussians=round(of_gaussian * count / share.processes),
+        photographs=round(sum(_photograph_bytes(view, scale) for view in views)),
+        targets=round(scale**2 * pixel_bytes * sum(view.width * view.height for view in train)),
+        gaussians=round(of_gaussian * count / processes),
         splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * min(slots, BAND_SLOTS)),
         pixels=round(PIXEL_BYTES * pixels * times + MEASURED_BYTES * measured),
     )
@@ -124,7 +118,7 @@ def max_num_gaussians(config: FitConfig, start: int) -> int:
     return density_strategy(config).max_num_gaussians(start, config.iterations)
 
 
-def _kept_bytes(view: View, scale: float) -> float:
+def _photograph_bytes(view: View, scale: float) -> float:
     """Return the bytes of a view's images, or of the numbers of smaller ones if these take less."""
     images = [p for p in (view.image, view.alpha, view.mask, view.depth) if p is not None]
     numbers = 4 * scale**2 * sum(math.prod(rendered.shape) for rendered in images)
@@ -169,21 +163,19 @@ def room_for_targets(
     config: FitConfig,
     dataset: Dataset,
     gaussians: Gaussians,
-    view_bytes: int,
-    most: int,
-    share: Share = WHOLE_SHARE,
+    pixel_bytes: int,
+    comm: Communicator,
 ) -> int:
-    """Return the bytes of targets that may stay on the device, at most ``most``.
+    """Return the bytes of targets that may stay on the device; pixel_bytes: see :func:`estimate`.
 
-    view_bytes: see :func:`estimate`. Raises :class:`UserError` where the fit would not fit into
-    memory.
+    Raises :class:`UserError` where the fit would not fit into memory.
     """
-    memory = estimate(config, dataset, gaussians, view_bytes, share=share)
-    usable = round(USABLE_SHARE * (available_memory() / share.on_machine + resident_memory()))
+    memory = estimate(config, dataset, gaussians, pixel_bytes, processes=comm.size)
+    usable = round(USABLE_SHARE * (available_memory() / comm.num_on_machine + resident_memory()))
     if memory.required_bytes > usable:
-        raise UserError(_refusal(config, dataset, gaussians, memory, usable, share))
-    # Some are left, as an estimate may be wrong.
-    return max(0, min(most, memory.targets, usable - round(1.15 * memory.required_bytes)))
+        raise UserError(_refusal(config, dataset, gaussians, memory, usable, comm.size))
+    left = usable - round(1.15 * memory.required_bytes)  # an estimate may be wrong
+    return max(0, min(MAX_TARGET_BYTES, memory.targets, left))
 
 
 def _refusal(
@@ -192,7 +184,7 @@ def _refusal(
     gaussians: Gaussians,
     memory: FitMemory,
     usable: int,
-    share: Share,
+    processes: int,
 ) -> str:
     train, start = dataset.train, gaussians.num_gaussians
     count, width = max_num_gaussians(config, start), max(view.width for view in train)
@@ -200,17 +192,17 @@ def _refusal(
     def fits(most: int, scale: float = 1.0) -> bool:
         densify = config.densify.model_copy(update={"max_gaussians": most})
         smaller = config.model_copy(update={"densify": densify})
-        return (
-            estimate(smaller, dataset, gaussians, 0, scale, share).required_bytes <= 0.95 * usable
-        )
+        needed = estimate(smaller, dataset, gaussians, 0, scale, processes).required_bytes
+        return needed <= 0.95 * usable
 
     most = next(filter(fits, _smaller(count, start)), None)
     size = next((s for s in _smaller(width, MIN_WIDTH_PX) if fits(count, s / width)), None)
     remedies = [f"densify.max_gaussians={most}"] if most else []
     remedies += [f"data.image_size={size}"] if size else []
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
-    who = "the fit" if share == WHOLE_SHARE else "a process of the fit"
-    part = "" if share.processes == 1 else f"1/{share.processes} of "
+    who, part = "the fit", ""
+    if processes > 1:
+        who, part = "a process of the fit", f"1/{processes} of "
     return (
         f"memory: {who} needs about {format_bytes(memory.required_bytes)} "
         f"({format_bytes(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "

@@ -3,18 +3,16 @@
 ``drjit.opt.Adam`` keeps, for each parameter, ``(value, promoted, rate, (t, m, v, v_max))``: the
 step count t and the moments m, v (flat arrays as long as the value). Assigning a value of another
 shape to it discards moments, step count and rate, so every change of the number of Gaussians goes
-through :func:`edit_rows`, which moves a row's value and moments together and leaves everything else
-as it was.
+through :meth:`Population.edit`, which moves a row's value and moments together.
 
-Parameters are named as in ``gaussians.PARAMETER_NAMES``; in the optimizer (and in Mitsuba's
-parameter tables) a prefix such as ``integrator.`` precedes the name. Entries without the prefix
-are left alone. A parameter of zero size, ``shN`` at degree 0, cannot be registered and is not.
+Parameters are named as in ``gaussians.PARAMETER_NAMES``. One of zero size, ``shN`` at degree 0,
+cannot be registered and is not.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,20 +21,13 @@ import numpy as np
 from drjit.opt import Adam, LearningRate
 from typing_extensions import override
 
-from drgs.core.arrays import Array, types_of
+from drgs.core.arrays import Array, from_host, types_of
 from drgs.core.private import new_rate_cache, same_memory
-from drgs.core.types import UInt32
+from drgs.core.types import Float, UInt32
+from drgs.gaussians.parameters import Gaussians
 
 if TYPE_CHECKING:
     from drjit.opt import _LRCache
-
-AdamState = tuple[
-    dr.ArrayBase,
-    bool,
-    LearningRate | None,
-    tuple[int, dr.ArrayBase, dr.ArrayBase, dr.ArrayBase | None],
-]
-"""The optimizer's entry of a parameter: ``(value, promoted, rate, (t, m, v, v_max))``."""
 
 LARGE_WIDTH = 1 << 20  # entries of an array from which on memory is worth saving
 
@@ -45,19 +36,13 @@ LARGE_WIDTH = 1 << 20  # entries of an array from which on memory is worth savin
 class _Moments:
     """The moments of a parameter, and aliases by which they are read while they are overwritten.
 
-    Dr.Jit copies an array before it scatters to it, if anything else refers to it, and the new
-    moments do. The former ones are therefore read under a name that Dr.Jit takes for other memory.
+    Dr.Jit copies an array before it scatters to it, if anything else refers to it, as the new
+    moments do: they refer to aliases, which Dr.Jit takes for other memory.
     """
 
     arrays: Sequence[dr.ArrayBase]  # as in the optimizer's state
     indices: Sequence[int]  # of the arrays: an array has another one if it was assigned to
     former: tuple[dr.ArrayBase, dr.ArrayBase]  # of the same memory
-
-    @staticmethod
-    def from_arrays(first: dr.ArrayBase, second: dr.ArrayBase) -> _Moments:
-        """Wait for the device, and take other names for the memory of arrays."""
-        former = same_memory(first), same_memory(second)
-        return _Moments((first, second), (first.index, second.index), former)
 
     def match(self, *arrays: dr.ArrayBase) -> bool:
         """Return whether these are the moments still."""
@@ -89,9 +74,8 @@ class LeanAdam(Adam):
     ) -> None:
         """Take a step, and clear the gradients of large arrays.
 
-        Waits for nothing, but in the first step after large moments were assigned. A step that is
-        scaled, masked or not evaluated, and one with more than two moments, is that of
-        ``drjit.opt.Adam``, where the arguments are documented.
+        Waits only in the first step after large moments were assigned. A step that is scaled,
+        masked or not evaluated, or has more than two moments, is that of ``drjit.opt.Adam``.
         """
         is_plain = eval and grad_scale is None and active is None
         if not is_plain or self.mask_updates or self.amsgrad:
@@ -112,7 +96,9 @@ class LeanAdam(Adam):
         if is_large:
             known = self._moments.get(key)
             if known is None or not known.match(first, second):
-                self._moments[key] = known = _Moments.from_arrays(first, second)
+                former = same_memory(first), same_memory(second)  # waits for the device
+                known = _Moments((first, second), (first.index, second.index), former)
+                self._moments[key] = known
             former = known.former
         rate_in_use = self.lr if rate is None else rate
         flat, gradient = dr.detach(value).array, value.grad.array
@@ -135,14 +121,13 @@ class LeanAdam(Adam):
 def make_optimizer(
     parameters: Mapping[str, dr.ArrayBase],
     rates: Mapping[str, float],
-    prefix: str = "",
     beta_1: float = 0.9,
     beta_2: float = 0.999,
     epsilon: float = 1e-15,
 ) -> LeanAdam:
     """Return an Adam optimizer (Kingma and Ba 2015) with a learning rate for each parameter.
 
-    parameters: tensors by name, without the prefix; those of zero size are left out.
+    parameters: tensors by name; those of zero size are left out.
     rates: learning rate per step by name. A fixed rate of 0 is allowed.
     epsilon: 3DGS uses 1e-15, because gradients of a mean over pixels are far below 1e-8.
     """
@@ -155,129 +140,205 @@ def make_optimizer(
             )
         if dr.width(value) == 0:
             continue
-        optimizer[prefix + name] = value
-        optimizer.set_learning_rate({prefix + name: float(rates[name])})
+        optimizer[name] = value
+        optimizer.set_learning_rate({name: float(rates[name])})
     return optimizer
 
 
-def num_rows(optimizer: Adam, prefix: str = "") -> int:
-    """Return the number of Gaussians N, the first dimension that all parameters share."""
-    counts = {optimizer.state[prefix + name][0].shape[0] for name in _names(optimizer, prefix)}
-    if len(counts) != 1:
-        raise ValueError(
-            f'num_rows(): the optimizer\'s parameters with prefix "{prefix}" must share one '
-            f"number of rows, got {sorted(counts) or 'no parameters'}"
-        )
-    return counts.pop()
+@dataclass(frozen=True)
+class Population:
+    """The rows of a fit, which a strategy may read and change.
 
-
-def edit_rows(
-    optimizer: LeanAdam,
-    keep: UInt32,
-    append: Mapping[str, dr.ArrayBase] | None = None,
-    prefix: str = "",
-) -> None:
-    """Keep some rows of every parameter, in the order given, and append new ones.
-
-    keep: (K,) ``UInt32``, the rows that stay. append: M new rows of every parameter by name,
-    without the prefix; ``None``: none are appended. Afterwards row i is former row keep[i] for
-    i < K, and appended row i - K from there on.
-
-    Kept rows take their moments along bit by bit, appended rows start with moments of zero, and
-    step counts and learning rates stay: the next steps move a kept row as if nothing had
-    happened. Detached; waits for the device once, to check ``keep``.
+    A row is a Gaussian: its parameters, named as in ``gaussians.PARAMETER_NAMES``, and the moments
+    that Adam keeps of them. Everything is detached. Where several processes fit, each has some rows
+    (:class:`drgs.training.parallel.population.ShardedPopulation`).
     """
-    total = num_rows(optimizer, prefix)
-    if dr.width(keep) > 0 and dr.max(keep)[0] >= total:
-        raise ValueError(f"edit_rows(): keep must hold row numbers below {total}")
-    added = _num_appended(optimizer, append, prefix)
-    if dr.width(keep) + added == 0:
-        raise ValueError("edit_rows(): at least one row must remain, but none is kept or appended")
-    optimizer.forget_moments()
-    for name in _names(optimizer, prefix):
-        value, promoted, rate, (step, first, second, _) = optimizer.state[prefix + name]
-        row_shape = tuple(value.shape[1:])
-        width = math.prod(row_shape)
-        elements = _elements(keep, width)
-        new_rows = no_moments = None
-        if append is not None and added > 0:
-            new_rows = dr.detach(append[name]).array
-            no_moments = dr.zeros(type(new_rows), added * width)
 
-        flat = _gather_and_append(dr.detach(value).array, elements, new_rows)
-        first, second = (_gather_and_append(m, elements, no_moments) for m in (first, second))
-        if dr.is_tensor_v(value):
-            flat = type(value)(flat, (dr.width(flat) // width, *row_shape))
-        dr.enable_grad(flat)
-        dr.schedule(flat, first, second)
-        optimizer.state[prefix + name] = flat, promoted, rate, (step, first, second, None)
-    dr.eval()
+    optimizer: LeanAdam
+    extent: float  # of the scene, world units
+    seed: int
+
+    @property
+    def num_rows(self) -> int:
+        """The number of Gaussians at the moment."""
+        return self.num_local_rows
+
+    @property
+    def num_local_rows(self) -> int:
+        """The number of rows of :meth:`value`."""
+        return self.optimizer["means"].shape[0]
+
+    @property
+    def first_row(self) -> int:
+        """The number of the first row of this process."""
+        return 0
+
+    def value(self, name: str) -> dr.ArrayBase:
+        """Return a parameter as it is at the moment, on the device: the rows of this process."""
+        return dr.detach(self.optimizer[name])
+
+    def host(self, name: str) -> np.ndarray:
+        """Return a parameter of all rows on the host, float64; waits for the device."""
+        return self.gather(self.value(name))
+
+    def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
+        """Return the values of all rows from those of this process: on the host, float64."""
+        return np.array(values, dtype=np.float64)
+
+    def local(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the rows of this process from those of all rows."""
+        return values
+
+    def zeros(self) -> Float:
+        """Return a number 0 for each row of this process: Float."""
+        return dr.zeros(type(self.value("means").array), self.num_local_rows)
+
+    def rows(self, numbers: np.ndarray) -> UInt32:
+        """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
+        return from_host(self._index_type, numbers.astype(np.uint32))
+
+    def row_numbers(self) -> UInt32:
+        """Return the numbers of the rows of this process: UInt32."""
+        return dr.arange(self._index_type, self.num_local_rows)
+
+    @property
+    def _index_type(self) -> type:
+        return dr.uint32_array_t(type(self.value("means").array))
+
+    def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
+        """Return copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
+        result = {}
+        for name in self.optimizer.state:
+            value = self.value(name)
+            row_shape = tuple(value.shape[1:])
+            flat = value.array
+            flat = dr.gather(type(flat), flat, _elements(rows, math.prod(row_shape)))
+            is_tensor = dr.is_tensor_v(value)
+            result[name] = type(value)(flat, (dr.width(rows), *row_shape)) if is_tensor else flat
+        return result
+
+    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
+        """Keep some rows of every parameter, in the order given, and append new ones.
+
+        keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Afterwards
+        row i is former row keep[i] for i < K, and appended row i - K from there on. Kept rows have
+        their moments, bit by bit, and appended ones moments of zero; step counts and learning rates
+        stay. Waits for the device once, to check ``keep``.
+        """
+        optimizer, total = self.optimizer, self.num_local_rows
+        if dr.width(keep) > 0 and dr.max(keep)[0] >= total:
+            raise ValueError(f"Population.edit(): keep must hold row numbers below {total}")
+        added = self._num_appended(append)
+        if dr.width(keep) + added == 0:
+            raise ValueError("Population.edit(): at least one row must remain, got none")
+        optimizer.forget_moments()
+        for name, (value, promoted, rate, (step, first, second, _)) in optimizer.state.items():
+            row_shape = tuple(value.shape[1:])
+            width = math.prod(row_shape)
+            elements = _elements(keep, width)
+            new_rows = no_moments = None
+            if append is not None and added > 0:
+                new_rows = dr.detach(append[name]).array
+                no_moments = dr.zeros(type(new_rows), added * width)
+
+            flat = _gather_and_append(dr.detach(value).array, elements, new_rows)
+            first, second = (_gather_and_append(m, elements, no_moments) for m in (first, second))
+            if dr.is_tensor_v(value):
+                flat = type(value)(flat, (dr.width(flat) // width, *row_shape))
+            dr.enable_grad(flat)
+            dr.schedule(flat, first, second)
+            optimizer.state[name] = flat, promoted, rate, (step, first, second, None)
+        dr.eval()
+
+    def _num_appended(self, rows: Mapping[str, dr.ArrayBase] | None) -> int:
+        """Return the number of ``rows``, which must be given for every parameter in its shape."""
+        if rows is None:
+            return 0
+        count = max((value.shape[0] for value in rows.values()), default=0)
+        for name, value in self.optimizer.items():
+            expected = (count, *value.shape[1:])
+            got = tuple(rows[name].shape) if name in rows else "none"
+            if got != expected:
+                raise ValueError(
+                    f"Population.edit(): appended rows of {name} must have the shape {expected}, "
+                    f"got {got}"
+                )
+        return count
+
+    def replace(self, name: str, value: dr.ArrayBase) -> None:
+        """Give a parameter new values of the same shape, and moments of zero.
+
+        The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
+        correction does not start again.
+        """
+        self.set_values(name, value)
+        new, promoted, rate, (step, first, second, _) = self.optimizer.state[name]
+        first, second = (dr.opaque(type(m), 0, m.shape) for m in (first, second))
+        self.optimizer.state[name] = new, promoted, rate, (step, first, second, None)
+
+    def set_values(self, name: str, value: dr.ArrayBase) -> None:
+        """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
+        old, promoted, rate, extra = self.optimizer.state[name]
+        if tuple(value.shape) != tuple(old.shape):
+            raise ValueError(
+                f"Population.set_values(): {name} has shape {tuple(old.shape)}, the new values "
+                f"{tuple(value.shape)}: edit() adds and removes rows"
+            )
+        value = type(old)(dr.detach(value))
+        dr.make_opaque(value)
+        dr.enable_grad(value)
+        self.optimizer.state[name] = value, promoted, rate, extra
+
+    def gather_terms(
+        self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
+    ) -> list[Float] | list[np.ndarray]:
+        """Return terms of the loss over all rows, detached.
+
+        terms: over the rows of this process; compute: computes them from parameters by name.
+        """
+        return [dr.detach(term) for term in terms]
+
+    def gather_gaussians(self, local: Gaussians) -> Gaussians:
+        """Return all Gaussians, from those of this process."""
+        return local
+
+    def gather_state(
+        self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
+    ) -> dict[str, np.ndarray]:
+        """Return a trainer's state with all rows, from that of this process."""
+        return state
+
+    def scatter_state(
+        self, state: Mapping[str, np.ndarray], is_by_row: Callable[[str], bool]
+    ) -> Mapping[str, np.ndarray]:
+        """Return the part of a whole state that this process has."""
+        return state
 
 
-def take_rows(optimizer: Adam, rows: UInt32, prefix: str = "") -> dict[str, dr.ArrayBase]:
-    """Return copies of some rows of every parameter by name, detached; rows: (M,) ``UInt32``."""
-    result = {}
-    for name in _names(optimizer, prefix):
-        value = dr.detach(optimizer.state[prefix + name][0])
-        row_shape = tuple(value.shape[1:])
-        flat = value.array
-        flat = dr.gather(type(flat), flat, _elements(rows, math.prod(row_shape)))
-        is_tensor = dr.is_tensor_v(value)
-        result[name] = type(value)(flat, (dr.width(rows), *row_shape)) if is_tensor else flat
-    return result
-
-
-def replace_values(optimizer: Adam, name: str, value: dr.ArrayBase, prefix: str = "") -> None:
-    """Give a parameter new values of the same shape, and moments of zero.
-
-    The step count and the learning rate stay: as in the reference's opacity reset, Adam's bias
-    correction does not start again.
-    """
-    new, promoted, rate, (step, first, second, _) = _with_value(
-        "replace_values", optimizer, prefix + name, value
-    )
-    first, second = (dr.opaque(type(m), 0, m.shape) for m in (first, second))
-    optimizer.state[prefix + name] = new, promoted, rate, (step, first, second, None)
-
-
-def set_values(optimizer: Adam, name: str, value: dr.ArrayBase, prefix: str = "") -> None:
-    """Give a parameter new values of the same shape; moments, step count and rate stay.
-
-    Detached; waits for nothing.
-    """
-    key = prefix + name
-    optimizer.state[key] = _with_value("set_values", optimizer, key, value)
-
-
-def optimizer_state(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
+def optimizer_state(optimizer: Adam) -> dict[str, np.ndarray]:
     """Return values, moments and step counts, numpy: ``NAME.value``, ``.m``, ``.v``, ``.t``.
 
     Learning rates are not part of it: they follow from the configuration and the iteration.
     """
     state = {}
-    for name in _names(optimizer, prefix):
-        value, _, _, (step, first, second, _) = optimizer.state[prefix + name]
+    for name, (value, _, _, (step, first, second, _)) in optimizer.state.items():
         state[f"{name}.value"] = np.array(dr.detach(value))
         state[f"{name}.m"], state[f"{name}.v"] = np.array(first), np.array(second)
         state[f"{name}.t"] = np.array(step)
     return state
 
 
-def pending_gradients(optimizer: Adam, prefix: str = "") -> dict[str, np.ndarray]:
+def pending_gradients(optimizer: Adam) -> dict[str, np.ndarray]:
     """Return the gradients of a step that is not taken yet, numpy: ``NAME.gradient``."""
-    return {
-        f"{name}.gradient": np.array(dr.grad(optimizer.state[prefix + name][0]))
-        for name in _names(optimizer, prefix)
-    }
+    return {f"{name}.gradient": np.array(dr.grad(value)) for name, value in optimizer.items()}
 
 
-def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: str = "") -> None:
+def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray]) -> None:
     """Continue from :func:`optimizer_state`, and :func:`pending_gradients` if there are any.
 
     Bit by bit; rates stay as they are.
     """
-    for name in _names(optimizer, prefix):
-        old, promoted, rate, (step, first, second, maximum) = optimizer.state[prefix + name]
+    for name, (old, promoted, rate, (step, first, second, maximum)) in optimizer.state.items():
         value = type(old)(state[f"{name}.value"])
         dr.make_opaque(value)
         dr.enable_grad(value)
@@ -285,41 +346,7 @@ def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray], prefix: 
             dr.set_grad(value, type(old)(state[f"{name}.gradient"]))
         moments = type(first)(state[f"{name}.m"]), type(second)(state[f"{name}.v"])
         extra = (type(step)(state[f"{name}.t"]), *moments, maximum)
-        optimizer.state[prefix + name] = value, promoted, rate, extra
-
-
-def _with_value(caller: str, optimizer: Adam, key: str, value: dr.ArrayBase) -> AdamState:
-    """Return the optimizer's entry of a parameter with other values, which are evaluated."""
-    old, promoted, rate, extra = optimizer.state[key]
-    if tuple(value.shape) != tuple(old.shape):
-        raise ValueError(
-            f"{caller}(): {key} has shape {tuple(old.shape)}, the new values "
-            f"{tuple(value.shape)}: edit_rows() adds and removes rows"
-        )
-    value = type(old)(dr.detach(value))
-    dr.make_opaque(value)
-    dr.enable_grad(value)
-    return value, promoted, rate, extra
-
-
-def _names(optimizer: Adam, prefix: str) -> list[str]:
-    """Names without the prefix, in the order of registration."""
-    return [key[len(prefix) :] for key in optimizer.state if key.startswith(prefix)]
-
-
-def _num_appended(optimizer: Adam, rows: Mapping[str, dr.ArrayBase] | None, prefix: str) -> int:
-    """Return the number of ``rows``, which must be given for every parameter in its shape."""
-    if rows is None:
-        return 0
-    count = max((value.shape[0] for value in rows.values()), default=0)
-    for name in _names(optimizer, prefix):
-        expected = (count, *optimizer.state[prefix + name][0].shape[1:])
-        got = tuple(rows[name].shape) if name in rows else "none"
-        if got != expected:
-            raise ValueError(
-                f"edit_rows(): appended rows of {name} must have the shape {expected}, got {got}"
-            )
-    return count
+        optimizer.state[name] = value, promoted, rate, extra
 
 
 def _elements(rows: UInt32, width: int) -> UInt32:

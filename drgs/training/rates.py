@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from drgs.config.changes import with_changes
 from drgs.config.density import StopAim
-from drgs.config.schema import FitConfig, OptimizerConfig
+from drgs.config.schema import FitConfig
 
 
 @dataclass(frozen=True)
@@ -61,43 +61,34 @@ class LearningRates:
     decay_from: float  # share of the iterations after coarse stages
 
     def __call__(self, iteration: int) -> dict[str, float]:
-        """Return the rates of an iteration that are not those of the start; by parameter."""
-        rates = {"means": self.means(iteration)}
-        if self.decay < 1:
-            late = (self.means.progress(iteration) - self.decay_from) / (1 - self.decay_from)
-            factor = self.decay ** max(late, 0.0)
-            rates |= {name: factor * rate for name, rate in self.others.items()}
-        return rates
+        """Return the rates of an iteration, by parameter."""
+        late = (self.means.progress(iteration) - self.decay_from) / (1 - self.decay_from)
+        factor = self.decay ** max(late, 0.0)
+        others = {name: factor * rate for name, rate in self.others.items()}
+        return {"means": self.means(iteration), **others}
 
 
 def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
-    """Return the rates of all parameters; extent: world units."""
-    optimizer, others = config.optimizer, learning_rates(config.optimizer, extent)
-    others.pop("means")
-    longer = math.sqrt(optimizer.views_per_step)
-    first, last = (
-        longer * rate * extent for rate in (optimizer.means_lr, optimizer.means_lr_final)
-    )
-    means = ExponentialDecay(first, last, tuple(_rate_aims(config)))
-    return LearningRates(means, others, optimizer.decay, optimizer.decay_from)
-
-
-def learning_rates(config: OptimizerConfig, extent: float) -> dict[str, float]:
-    """Return the rate per step of each parameter at the start; extent: world units.
+    """Return the rates per step of all parameters; extent: world units.
 
     Steps of B views are sqrt(B) times as long, and moments forget as much in a step as in B steps
     of one view (Malladi et al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient
     Algorithms"; for splats Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training").
     """
-    longer = math.sqrt(config.views_per_step)
-    return {
-        "means": longer * config.means_lr * extent,
-        "quats": longer * config.quats_lr,
-        "log_scales": longer * config.scales_lr,
-        "logit_opacities": longer * config.opacities_lr,
-        "sh0": longer * config.sh0_lr,
-        "shN": longer * config.shN_lr,
+    optimizer = config.optimizer
+    longer = math.sqrt(optimizer.views_per_step)
+    first, last = (
+        longer * rate * extent for rate in (optimizer.means_lr, optimizer.means_lr_final)
+    )
+    others = {
+        "quats": longer * optimizer.quats_lr,
+        "log_scales": longer * optimizer.scales_lr,
+        "logit_opacities": longer * optimizer.opacities_lr,
+        "sh0": longer * optimizer.sh0_lr,
+        "shN": longer * optimizer.shN_lr,
     }
+    means = ExponentialDecay(first, last, tuple(_rate_aims(config)))
+    return LearningRates(means, others, optimizer.decay, optimizer.decay_from)
 
 
 def revised_plan(config: FitConfig, now: int, iterations: int, densify_stop: int) -> FitConfig:

@@ -35,14 +35,13 @@ from drgs.initialization.start import description_of_start, gaussians_at, start_
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
 from drgs.results.history import HistoryRow
-from drgs.training.budget import Budget, Deadline, FitObjects, Plan, plan_fit, rehearse
+from drgs.training.budget import Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.fit_folder import FitFolder, saved_gaussians
 from drgs.training.loop import (
-    AllIterations,
     HeldOutQuality,
     History,
     Iteration,
@@ -101,18 +100,16 @@ class FitSession:
     loss: Loss | None = None  # None: that of the configuration
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
-    criterion: StopCriterion = field(init=False, default_factory=AllIterations)
+    criterion: StopCriterion = field(init=False, default_factory=StopCriterion)
     observers: list[Observer] = field(init=False, default_factory=list)
     _fingerprint: Fingerprint | None = field(init=False, default=None)
 
     @property
-    def _objects(self) -> FitObjects:
-        """The objects that take part, as arguments of :class:`Trainer`."""
-        return {"density": self.strategy, "effects": self.effects, "loss": self.loss}
+    def _objects(self) -> tuple[DensityStrategy | None, Sequence[TrainingEffect], Loss | None]:
+        return self.strategy, self.effects, self.loss
 
     @property
     def _inputs(self) -> tuple[FitConfig, Dataset]:
-        """Configuration and dataset: of rank 0, once they are loaded; later of each rank."""
         assert self.config is not None and self.dataset is not None, "they are loaded"
         return self.config, self.dataset
 
@@ -128,14 +125,16 @@ class FitSession:
                 return True
             plan = self.prepare()
             if folder is not None:
-                folder.take(*self._inputs)
+                folder.claim(*self._inputs)
             if plan is not None:
-                self._follow(plan)
+                self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
+                if folder is not None and self.budget is not None:
+                    folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
             self.on_start(self)
             try:
                 if not self.iterate():
                     return False
-                self._finish(self.history.wall_s, self.trainer.gaussians())
+                self._finish()
             except NonFiniteError as error:
                 remedy = "" if folder is None else f"; {folder.remedy}"
                 raise UserError(f"{error}{remedy}") from None
@@ -143,22 +142,17 @@ class FitSession:
 
     def _is_finished(self) -> bool:
         finished, folder = False, self.folder
-        if folder is not None:
-            finished = folder.is_finished(self._given_config)
+        if folder is not None and self.config is not None:
+            finished = folder.is_finished(self.config)
             if finished:
                 folder.finish()  # a process that was killed after its last file has not
                 self._print(f"{folder.path}: this fit is finished; --overwrite does it again")
         return bool(self.comm.broadcast_numbers(finished))
 
-    @property
-    def _given_config(self) -> FitConfig:
-        assert self.config is not None, "rank 0 has one"
-        return self.config
-
     def prepare(self) -> Plan | None:
         """Load the data, initialize the Gaussians, make the trainer; return the plan, if any.
 
-        Input that cannot be used raises ``UserError`` here; nothing is written.
+        Raises ``UserError`` for input that cannot be used. Nothing is written.
         """
         comm, checkpoint, gaussians, plan = self.comm, None, None, None
         if comm.is_root:
@@ -171,7 +165,7 @@ class FitSession:
         if self.budget is not None:
             plan = self._plan(gaussians, self.budget)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
-        self.trainer = Trainer(self.config, self.dataset, gaussians, comm, **self._objects)
+        self.trainer = Trainer(self.config, self.dataset, gaussians, comm, *self._objects)
         self.history = History()  # whose clock begins
         if comm.broadcast_numbers(checkpoint is not None):
             self._restore(checkpoint)
@@ -179,7 +173,8 @@ class FitSession:
 
     def _load(self) -> Checkpoint | None:
         """Load the dataset and complete the configuration; return the checkpoint, if any."""
-        folder, config, checkpoint = self.folder, self._given_config, None
+        folder, config, checkpoint = self.folder, self.config, None
+        assert config is not None, "rank 0 has one"
         if folder is not None:
             checkpoint = folder.checkpoint_for(config, self.budget is not None)
         if checkpoint is not None and checkpoint.config is not None:
@@ -196,20 +191,15 @@ class FitSession:
 
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
-        rehearsal = rehearse(self.config, self.dataset, gaussians, self.comm, **self._objects)
-        rehearsal.trainer.full_scene()  # gathered from all ranks
-        if not self.comm.is_root:
+        start = self.config, self.dataset, gaussians, self.comm
+        trainer, iteration_s = rehearse(*start, *self._objects)
+        scene = trainer.full_scene()  # gathered from all ranks
+        if scene is None:
             return None
-        plan = plan_fit(*self._inputs, gaussians, budget.end, rehearsal)
+        plan = plan_fit(*self._inputs, gaussians, budget.end, scene, iteration_s)
         self.config = plan.config
         self._print(plan.reasons)
         return plan
-
-    def _follow(self, plan: Plan) -> None:
-        """End the fit when the time of its plan is up."""
-        self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
-        if self.folder is not None and self.budget is not None:
-            self.folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
 
     def _initial_gaussians(self) -> Gaussians:
         """Print data, start and simulated effects; return the initial Gaussians.
@@ -243,8 +233,7 @@ class FitSession:
     def iterate(self) -> bool:
         """Run the iterations that are left, with checkpoints; False if Ctrl-C stopped them.
 
-        The state is saved then, and after the last iteration: from then on the configuration
-        specifies what was done, which half-written results belong to.
+        The state is saved then, and after the last iteration, before results are written.
         """
         trainer, comm = self.trainer, self.comm
         criterion, stop = RootDecides(self.criterion, comm), StopRequest()
@@ -260,15 +249,13 @@ class FitSession:
                 for observer in observers:
                     observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
                 stops = bool(comm.broadcast_numbers(stop.requested))
-                if stops or self._is_checkpoint_due(done):
+                every = trainer.config.output.checkpoint_every
+                is_due = every is not None and (done.is_last or done.report.passes(every))
+                if stops or is_due:
                     self._save_checkpoint()
                 if stops:
                     return False
         return True
-
-    def _is_checkpoint_due(self, done: Iteration) -> bool:
-        every = self.trainer.config.output.checkpoint_every
-        return every is not None and (done.is_last or done.report.passes(every))
 
     def _save_checkpoint(self) -> None:
         state, history = self.trainer.state(), self.history
@@ -277,26 +264,29 @@ class FitSession:
             checkpoint = Checkpoint(state, *past, self._fingerprint)
             save_checkpoint(self.folder.path, self.trainer.config, checkpoint)
 
-    def _finish(self, wall_s: float, gaussians: Gaussians) -> None:
+    def _finish(self) -> None:
         """Fit the file for other viewers, if one is needed; measure and write the results."""
-        if self.comm.is_root:
-            _warn_if_not_pruned(self.trainer)
+        trainer, wall_s = self.trainer, self.history.wall_s
+        gaussians, wanted = trainer.gaussians(), trainer.config.densify.prune.to
+        if self.comm.is_root and wanted is not None and trainer.num_gaussians > wanted:
+            note = (
+                f"time was up before there were only densify.prune.to = {wanted:,} Gaussians: "
+                f"there are {trainer.num_gaussians:,}; give --budget more time"
+            )
+            warnings.warn(UserNote(note), stacklevel=2)
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
-        self.trainer.full_scene()  # gathered from all ranks
+        trainer.full_scene()  # gathered from all ranks
         for_viewers = None
-        if not self.trainer.config.model.approximations.is_default:
+        if not trainer.config.model.approximations.is_default:
             for_viewers = self._fit_for_viewers(gaussians)
         if self.folder is not None:
             metrics = self.folder.write_results(
-                self.trainer, self.history, gaussians, for_viewers, wall_s
+                trainer, self.history, gaussians, for_viewers, wall_s
             )
             self._print(self.folder.describe(metrics))
 
     def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
-        """Return Gaussians for other viewers.
-
-        The trainer is released, and continues to render the fit's own.
-        """
+        """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
         from drgs.training.viewers import for_viewers, num_iterations
 
         if not self.uses_terminal:
@@ -304,17 +294,6 @@ class FitSession:
         total = num_iterations(self.trainer.config)
         with RunProgress("iteration for viewers", total) as shown:
             return for_viewers(self.trainer, gaussians, lambda done: shown.update(done, total))
-
-
-def _warn_if_not_pruned(trainer: Trainer) -> None:
-    """Note where a plan was revised and time was up before the last phase had ended."""
-    wanted = trainer.config.densify.prune.to
-    if wanted is not None and trainer.num_gaussians > wanted:
-        note = (
-            f"time was up before there were only densify.prune.to = {wanted:,} Gaussians: there "
-            f"are {trainer.num_gaussians:,}; give --budget more time"
-        )
-        warnings.warn(UserNote(note), stacklevel=2)
 
 
 @dataclass(frozen=True)
@@ -337,17 +316,16 @@ def train(
 ) -> FitResult:
     """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
 
-    config: what to fit, and how: the path of a YAML file, or of the folder of a dataset, to have
-    that chosen (``drgs.datasets.folders``); the same as nested mappings, or a
-    :class:`drgs.config.schema.FitConfig`; dataset: the photographs, whose background is that of the
-    splats, by default those of the configuration's section ``data``; callback: called after each
-    iteration with what it did, a :class:`drgs.training.trainer.StepReport`; the fit ends early
+    config: the path of a YAML file, or of a dataset's folder (``drgs.datasets.folders`` chooses the
+    configuration); nested mappings, or a :class:`drgs.config.schema.FitConfig`. dataset: the
+    photographs and their background, by default those of the section ``data``. callback: called
+    after each iteration with its :class:`drgs.training.trainer.StepReport`; the fit ends early
     where it returns True.
 
     strategy: changes the population, instead of ``densify.strategy``; effects: take part in the fit
     besides those of the configuration; loss: of an image and its photograph, instead of ``loss``.
 
-    Where no Mitsuba variant is active, ``llvm_ad_rgb`` is made so. Nothing is written.
+    Activates the Mitsuba variant ``llvm_ad_rgb`` where none is active. Nothing is written.
 
     Raises ``drgs.core.errors.UserError`` (a ValueError) for wrong input, naming the key and the
     remedy, and ``drgs.training.finite_checks.NonFiniteError`` if a number is not finite.

@@ -1,8 +1,6 @@
 """Stages and steps of a fit: the views of an iteration, their size, and their gradients.
 
-A stage trains on images of one size. A step ends with one change of the Gaussians. With a single
-view, ``dr.backward`` leaves its gradients in the parameters; several views use
-``drgs.training.parallel.exchange``.
+A stage trains on images of one size. A step ends with one change of the Gaussians.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
@@ -21,15 +18,9 @@ from drgs.datasets.images import smaller_view
 from drgs.datasets.types import View
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.types import SplatsPlugin
-from drgs.training.effects.base import TrainingEffect, as_tensor
-from drgs.training.losses import TARGET_BYTES, Target, prepare_target
+from drgs.training.effects.base import TrainingEffect, TrainingView
+from drgs.training.losses import TARGET_BYTES
 from drgs.training.rates import LearningRates
-from drgs.training.views import TrainingView
-
-KEPT_BYTES = 1 << 30
-"""Memory of targets and effects' uploads that stay on the device until their view is drawn again:
-those of 180 images of 400 x 400 px. Without room, they are made anew, which takes a tenth of an
-iteration."""
 
 
 @dataclass(eq=False)
@@ -38,19 +29,18 @@ class Stage:
 
     until: float  # last iteration
     views: list[TrainingView]
-    view_bytes: int  # of a pixel: what is made of a view's images
-    room: int  # bytes left for what stays on the device
-    kept: set[int] = field(default_factory=set)  # indices of the views that have it
+    pixel_bytes: int  # see bytes_per_pixel
+    room: int  # bytes left for targets and uploads that stay on the device
+    kept: set[int] = field(default_factory=set)  # indices of their views
 
     def keep_or_free(self, view: TrainingView) -> None:
         """Keep targets and uploads of a rendered view while there is room, else free them.
 
-        The first views are kept: each round draws all views in another order, so recent views are
-        no more likely to be drawn next.
+        Recent views are no more likely to be drawn next than the first ones.
         """
         if view.index in self.kept:
             return
-        size = view.width * view.height * self.view_bytes
+        size = view.width * view.height * self.pixel_bytes
         if size > self.room:
             view.free()
         else:
@@ -72,39 +62,22 @@ def make_stages(
     room: bytes of targets and uploads that may stay on the device.
     """
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
-    view_bytes = bytes_on_device(effects)
-    return [
-        Stage(until, _make_training_views(resized, config, effects), view_bytes, room)
-        for until, resized in [*sizes, (math.inf, views)]
-    ]
+    is_refined = any(effect.moves_sensors for effect in effects)
+    window = config.loss.window, config.loss.sigma
+    stages = []
+    for until, resized in [*sizes, (math.inf, views)]:
+        sensors = make_sensors(resized, calibrated=is_refined)
+        training_views = [
+            TrainingView(view, index, sensor, effects, window)
+            for index, (view, sensor) in enumerate(zip(resized, sensors, strict=True))
+        ]
+        stages.append(Stage(until, training_views, bytes_per_pixel(effects), room))
+    return stages
 
 
-def bytes_on_device(effects: Sequence[TrainingEffect]) -> int:
-    """Return the bytes of a pixel of a view: its target, and the most that effects upload."""
+def bytes_per_pixel(effects: Sequence[TrainingEffect]) -> int:
+    """Return the memory of a view's pixel on the device: its target, and effects' uploads."""
     return TARGET_BYTES + sum(effect.upload_bytes for effect in effects)
-
-
-def _make_training_views(
-    views: Sequence[View], config: FitConfig, effects: Sequence[TrainingEffect]
-) -> list[TrainingView]:
-    sensors = make_sensors(views, calibrated=any(e.moves_sensors for e in effects))
-    return [
-        TrainingView(
-            view,
-            index,
-            sensor,
-            partial(_make_target, view, config, effects),
-            {effect.name: partial(effect.upload, view) for effect in effects},
-        )
-        for index, (view, sensor) in enumerate(zip(views, sensors, strict=True))
-    ]
-
-
-def _make_target(view: View, config: FitConfig, effects: Sequence[TrainingEffect]) -> Target:
-    image = np.asarray(view.image)
-    for effect in effects:
-        image = effect.target_image(view, image)
-    return prepare_target(as_tensor(image), config.loss.window, config.loss.sigma)
 
 
 @dataclass(frozen=True)
@@ -173,9 +146,7 @@ def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) 
     """Return the view of an iteration: every round visits all views in an order of its own.
 
     With B views a step, the b-th iteration of each step draws from the views b, b + B, ... alone,
-    in rounds of these: who computes it needs no other photographs.
-
-    A function of its arguments alone, so that a fit can be resumed at any iteration.
+    in rounds of these: its process needs no other photographs.
     """
     which_step, place = divmod(iteration - 1, views_per_step)
     own = range(place % num_views, num_views, views_per_step)
@@ -205,7 +176,10 @@ class ViewLoss:
 
 
 class WholeGradients:
-    """Steps of one view: see :class:`drgs.training.parallel.exchange.ViewExchange`."""
+    """Steps of one view, whose gradients ``dr.backward`` leaves in the parameters.
+
+    Steps of several views use :class:`drgs.training.parallel.exchange.ViewExchange`.
+    """
 
     def __init__(self, integrator: SplatsPlugin) -> None:
         self.integrator = integrator

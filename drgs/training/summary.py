@@ -5,13 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drgs.config.extensions import (
-    EFFECTS,
-    LOSS_TERMS,
-    LOSSES,
-    STRATEGIES,
-    extensions_in_use,
-)
+from drgs.config.extensions import EFFECTS, LOSS_TERMS, LOSSES, STRATEGIES, extensions_in_use
 from drgs.config.schema import FitConfig
 from drgs.datasets.types import Dataset
 from drgs.integrator.summary import (

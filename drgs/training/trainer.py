@@ -26,22 +26,23 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
-from drgs.training.density.registry import density_strategy
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
     PixelWeight,
     StepInfo,
+    density_strategy,
 )
 from drgs.training.effects.base import (
     FitState,
     TrainingEffect,
+    TrainingView,
     integrator_settings,
     training_effects,
 )
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
-from drgs.training.memory import Share, room_for_targets
+from drgs.training.memory import room_for_targets
 from drgs.training.optimizer import (
     make_optimizer,
     optimizer_state,
@@ -49,29 +50,20 @@ from drgs.training.optimizer import (
     restore_optimizer,
 )
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.parallel.population import (
-    check_shardable,
-    local_gaussians,
-    make_population,
-)
-from drgs.training.rates import learning_rates, rates_over_time, revised_plan
+from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
+from drgs.training.rates import rates_over_time, revised_plan
 from drgs.training.steps import (
-    KEPT_BYTES,
     Step,
     StepView,
     ViewGradients,
     ViewLoss,
     WholeGradients,
-    bytes_on_device,
+    bytes_per_pixel,
     make_stages,
     plan_step,
 )
-from drgs.training.views import TrainingView
 
-PREFIX = "integrator."  # precedes a parameter's name when the scene is traversed
-
-DENSITY = "density/"
-"""Precedes the names of the strategy's state: a row for each Gaussian, or single numbers."""
+DENSITY = "density/"  # precedes the names of the strategy's state
 
 
 @dataclass(frozen=True)
@@ -113,7 +105,7 @@ class Trainer:
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
     ) -> None:
-        """gaussians: all, on each process; comm: the processes; None: this one.
+        """gaussians: all, on each process; comm: None: this process alone.
 
         density, loss: None: those of the configuration; effects: besides the configuration's.
         """
@@ -124,9 +116,10 @@ class Trainer:
         check_shardable(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset, effects)
         self._given_density, self._given_effects, self._given_loss = density, effects, loss
-        share = Share(comm.size, comm.num_on_machine)
-        limits = bytes_on_device(self.effects), KEPT_BYTES, share
-        room = comm.collective(lambda: room_for_targets(config, dataset, gaussians, *limits))
+        pixel_bytes = bytes_per_pixel(self.effects)
+        room = comm.collective(
+            lambda: room_for_targets(config, dataset, gaussians, pixel_bytes, comm)
+        )
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,
@@ -134,17 +127,16 @@ class Trainer:
             **integrator_settings(self.effects),
         )
         self.integrator = cast(SplatsPlugin, self.scene.integrator())
-        self.params = mi.traverse(self.scene)
-        self.params.keep([PREFIX + name for name in PARAMETER_NAMES])
+        self.params = mi.traverse(self.integrator)
+        self.params.keep(list(PARAMETER_NAMES))
+        self.rates = rates_over_time(config, self.extent)
         self.optimizer = make_optimizer(
-            {key.removeprefix(PREFIX): value for key, value in self.params.items()},
-            learning_rates(config.optimizer, self.extent),
-            prefix=PREFIX,
+            dict(self.params.items()),
+            self.rates(0),
             beta_1=config.optimizer.beta_1**views_per_step,
             beta_2=config.optimizer.beta_2**views_per_step,
             epsilon=config.optimizer.epsilon,
         )
-        self.rates = rates_over_time(config, self.extent)
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
         self.stages = make_stages(dataset.train, config, self.effects, room)
@@ -152,37 +144,29 @@ class Trainer:
         if views_per_step > 1:
             from drgs.training.parallel.exchange import ViewExchange
 
-            self.gradients = ViewExchange(
-                comm, self.integrator, self.params, PREFIX, views_per_step
-            )
-        population = self.optimizer, PREFIX, self.extent, config.seed
-        self.population = make_population(*population, comm, gaussians.num_gaussians)
+            self.gradients = ViewExchange(comm, self.integrator, self.params, views_per_step)
+        self.population = make_population(
+            self.optimizer, self.extent, config.seed, comm, gaussians.num_gaussians
+        )
         self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0  # the last one that is done
         self._full_scene: tuple[int, mi.Scene | None] | None = None  # with its iteration
 
     def step(self) -> StepReport:
-        """Render the views of a step, and change the Gaussians along their mean gradient.
-
-        An iteration renders one view. All views of a step (``views_per_step``) see the same
-        Gaussians. With several processes, each renders some of the views.
-        """
+        """Render the views of a step, one per iteration, and step along their mean gradient."""
         step = self._begin_step()
         penalties = self._differentiate_penalties(step)
         losses: dict[int, ViewLoss] = {}
         for view in self.gradients.own_views():
             losses[view.place] = self._differentiate(step, view)
-        found = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
-        views = self._total_losses(step, found, losses, penalties)
+        gradients = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
+        views = self._total_losses(step, gradients, losses, penalties)
         if step.is_update:
             self._set_learning_rates(step)
             self.optimizer.step()
         self._update_effects(step)
-        for view, gradients in zip(step.views, found, strict=True):
-            if self.density.needs_statistics(view.iteration):
-                self.density.update_statistics(_step_info(step, view, gradients))
-        report = self._control_density(step)
+        report = self._control_density(step, gradients)
         for place in losses:
             step.stage.keep_or_free(step.views[place].view)
         means_lr = self.rates.means(step.last_iteration)
@@ -190,13 +174,15 @@ class Trainer:
 
     def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
         """Render a view, and add the derivatives of its loss to those of the step."""
-        fit = self._fit_state(step, view.iteration)
+        fit = self.fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before_render(fit, view.view)
         rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
         image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
         dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
-        self.gradients.end_view(self._weight_planes(view, dr.detach(image)))
+        image, photograph = dr.detach(image), view.view.target.image
+        weights = self._pixel_weights(view.iteration)
+        self.gradients.end_view({name: weigh(image, photograph) for name, weigh in weights.items()})
         return ViewLoss(dr.detach(loss), error, view.view.counted_share)
 
     def _begin_step(self) -> Step:
@@ -207,7 +193,7 @@ class Trainer:
         self.iteration = step.last_iteration
         self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
         self.params.update(self.optimizer)
-        fit = self._fit_state(step, step.iterations[0])
+        fit = self.fit_state(step, step.iterations[0])
         for effect in self.effects:
             effect.begin(fit)
 
@@ -248,11 +234,6 @@ class Trainer:
                 loss = loss + term
         return image, loss, error
 
-    def _weight_planes(self, view: StepView, image: TensorXf) -> dict[str, Float]:
-        """Evaluate the strategy's pixel weights of an image, by name."""
-        weights = self._pixel_weights(view.iteration)
-        return {name: weigh(image, view.view.target.image) for name, weigh in weights.items()}
-
     def _pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
         needs_statistics = self.density.needs_statistics(iteration)
         return self.density.pixel_weights(iteration) if needs_statistics else {}
@@ -260,42 +241,41 @@ class Trainer:
     def _total_losses(
         self,
         step: Step,
-        found: Sequence[ViewGradients],
+        gradients: Sequence[ViewGradients],
         losses: Mapping[int, ViewLoss],
         penalties: Sequence[Float | np.ndarray],
     ) -> list[ViewLoss]:
         """Return the losses of all views with the strategy's terms, and remember to check them."""
         shared, results = self.gradients.share_losses(losses), []
         first_row = self.population.first_row * len(PARAMETER_NAMES)
-        for view, gradients, loss in zip(step.views, found, shared, strict=True):
+        for view, own, loss in zip(step.views, gradients, shared, strict=True):
             total = cast(Float, sum(penalties, loss.loss))
-            fault = gradients.first_nonfinite
+            fault = own.first_nonfinite
             if first_row:
-                fault = dr.select(
-                    fault == NO_FAULT, fault, fault + dr.opaque(type(fault), first_row)
-                )
+                shifted = fault + dr.opaque(type(fault), first_row)
+                fault = dr.select(fault == NO_FAULT, fault, shifted)
             numbers = {
                 f"{effect.name}.{name}": values
                 for effect in self.effects
                 for name, values in effect.numbers_of(view.view).items()
             }
-            watched = view.iteration, view.view.name, total, fault, numbers
-            self.watch.add(WatchedIteration(*watched))
+            self.watch.append(
+                WatchedIteration(view.iteration, view.view.name, total, fault, numbers)
+            )
             results.append(replace(loss, loss=total))
         return results
 
     def _set_learning_rates(self, step: Step) -> None:
         """Set the rates of a step, times the factors of the strategy."""
-        rates, initial = self.rates(step.last_iteration), self.rates.others
+        rates = self.rates(step.last_iteration)
         for name, factor in self.density.rate_factors(step.last_iteration).items():
-            rates[name] = factor * (rates[name] if name in rates else initial[name])
+            rates[name] *= factor
         state = self.optimizer.state  # shN is not in it, where the degree is 0
-        rates = {PREFIX + name: rate for name, rate in rates.items() if PREFIX + name in state}
-        self.optimizer.set_learning_rate(rates)
+        self.optimizer.set_learning_rate({n: rate for n, rate in rates.items() if n in state})
 
     def _update_effects(self, step: Step) -> None:
         """Let effects take their own steps."""
-        fit = self._fit_state(step, step.last_iteration)
+        fit = self.fit_state(step, step.last_iteration)
         for view in step.views:
             for effect in self.effects:
                 derivatives = {
@@ -304,20 +284,28 @@ class Trainer:
                 }
                 effect.after_backward(fit, view.view, derivatives)
 
-    def _control_density(self, step: Step) -> DensityReport | None:
-        """Let the strategy change the rows; returns the last report of a step."""
-        density, report = self.density, None
+    def _control_density(
+        self, step: Step, gradients: Sequence[ViewGradients]
+    ) -> DensityReport | None:
+        """Update the strategy's statistics, and let it change the rows; return the last report."""
+        density, report, last = self.density, None, step.last_iteration
+        for view, own in zip(step.views, gradients, strict=True):
+            if density.needs_statistics(view.iteration):
+                means2d_grad = own.means2d_grad
+                if step.num_averaged > 1:  # it is a part of a mean
+                    means2d_grad = means2d_grad * step.num_averaged
+                size = view.view.width, view.view.height
+                sums = own.visible, own.weighted_sums
+                density.update_statistics(StepInfo(view.iteration, *size, means2d_grad, *sums))
         if step.is_update:
-            density.perturb(
-                self.population, step.last_iteration, self.rates.means(step.last_iteration)
-            )
+            density.perturb(self.population, last, self.rates.means(last))
         for iteration in filter(density.is_due, step.iterations):
             self.check()
-            found = density.refine(self.population, iteration)
-            if found is not None:
-                report = found
+            change = density.refine(self.population, iteration)
+            if change is not None:
+                report = change
                 for effect in self.effects:
-                    effect.on_population_change(self._fit_state(step, iteration))
+                    effect.on_population_change(self.fit_state(step, iteration))
                 # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
                 dr.flush_malloc_cache()
         return report
@@ -326,18 +314,17 @@ class Trainer:
         """Return the step that an iteration is part of."""
         return plan_step(iteration, self.config, self.rates, self.stages)
 
-    def fit_state(self) -> FitState:
-        """Return the state for effects after the last step."""
-        return self._fit_state(self.last_step, self.iteration)
-
-    def _fit_state(self, step: Step, iteration: int) -> FitState:
+    def fit_state(self, step: Step | None = None, iteration: int | None = None) -> FitState:
+        """Return the state for effects, by default after the last step."""
+        step = step or self.last_step
+        iteration = self.iteration if iteration is None else iteration
         return FitState(
             iteration=iteration,
             iterations_of_step=step.iterations,
             begins_stage=step.begins_stage,
             rate_decay=self.rates.means(iteration) / self.rates.means.initial,
             integrator=self.integrator,
-            means=cast(TensorXf, self.optimizer[PREFIX + "means"]),
+            means=cast(TensorXf, self.optimizer["means"]),
             views=step.stage.views,
             effects=self.effects,
         )
@@ -345,7 +332,7 @@ class Trainer:
     @property
     def parameters(self) -> dict[str, dr.ArrayBase]:
         """Raw values by name, as the optimizer has them: the rows of this process."""
-        return {key.removeprefix(PREFIX): value for key, value in self.optimizer.items()}
+        return dict(self.optimizer.items())
 
     @property
     def num_gaussians(self) -> int:
@@ -364,7 +351,7 @@ class Trainer:
 
     @property
     def sh_degree(self) -> int:
-        """The degree in use."""
+        """The degree of the spherical harmonics in use."""
         return self.sh_degree_at(self.iteration)
 
     def sh_degree_at(self, iteration: int) -> int:
@@ -408,10 +395,6 @@ class Trainer:
         scene = self.full_scene()
         return iter(()) if scene is None else render_views(scene, views)
 
-    def sensors(self) -> list[mi.Sensor]:
-        """Return the sensors of the training views, where effects have them now."""
-        return self.fit_state().sensors()
-
     def check_iterations(self) -> None:
         """Raise ``NonFiniteError`` if a loss or a gradient of an iteration so far is not finite.
 
@@ -421,15 +404,16 @@ class Trainer:
 
     def check(self) -> None:
         """Raise ``NonFiniteError`` if a loss, a gradient or a value is not; waits for it."""
-        self.comm.collective(self._check_own)
 
-    def _check_own(self) -> None:
-        self.watch.check()
-        first_row = self.population.first_row
-        check_values(self.iteration, self.parameters, first_row)
-        check_values(self.iteration, self.density.state(), first_row)
-        of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
-        check_values(self.iteration, of_views, views=[view.name for view in self.views])
+        def check_own() -> None:
+            self.watch.check()
+            first_row = self.population.first_row
+            check_values(self.iteration, self.parameters, first_row)
+            check_values(self.iteration, self.density.state(), first_row)
+            of_views = {f"{e.name}.{k}": v for e in self.effects for k, v in e.values().items()}
+            check_values(self.iteration, of_views, views=[view.name for view in self.views])
+
+        self.comm.collective(check_own)
 
     def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
         """Return a trainer with the same photographs, and copies of the given effects and loss.
@@ -443,8 +427,7 @@ class Trainer:
         """Begin after the iterations of another trainer, with the state of its effects."""
         before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
         self.iteration = -(-before // views_per_step) * views_per_step  # a step begins after it
-        found = {effect.name: effect.state() for effect in former.effects}
-        self._restore_effects({f"{name}/{k}": v for name in found for k, v in found[name].items()})
+        self._restore_effects({effect.name: effect.state() for effect in former.effects})
 
     def release(self) -> None:
         """Free memory that only iterations need; the scene still renders the fit's Gaussians."""
@@ -453,7 +436,7 @@ class Trainer:
         release_unused_memory()
 
     def reschedule(self, iterations: int, densify_stop: int) -> None:
-        """End the fit, and changes of the population, at other iterations that are ahead.
+        """Move the end of the fit, and that of changes of the population, to other iterations.
 
         The configuration becomes one which would have given the fit so far. Raises ValueError where
         there is none.
@@ -479,8 +462,8 @@ class Trainer:
         state = {
             "iteration": np.array(self.iteration),
             **{f"{DENSITY}{name}": values for name, values in self.density.state().items()},
-            **optimizer_state(self.optimizer, PREFIX),
-            **({} if is_update else pending_gradients(self.optimizer, PREFIX)),
+            **optimizer_state(self.optimizer),
+            **({} if is_update else pending_gradients(self.optimizer)),
             **{f"{e.name}/{k}": v for e in self.effects for k, v in e.state().items()},
         }
         return self.population.gather_state(state, self._is_by_row)
@@ -493,17 +476,17 @@ class Trainer:
         state = self.population.scatter_state(state, self._is_by_row)
         self.iteration = int(state["iteration"])
         self.integrator.sh_degree = self.sh_degree
-        restore_optimizer(self.optimizer, state, PREFIX)
+        restore_optimizer(self.optimizer, state)
         self.density = self._density_from(_part(state, DENSITY))
-        self._restore_effects(state)
+        self._restore_effects({e.name: _part(state, f"{e.name}/") for e in self.effects})
         self.watch = GradientWatch()
         self.params.update(self.optimizer)
 
-    def _restore_effects(self, state: Mapping[str, np.ndarray]) -> None:
+    def _restore_effects(self, states: Mapping[str, Mapping[str, np.ndarray]]) -> None:
         fit = self.fit_state()
         for effect in self.effects:
             effect.on_population_change(fit)
-            effect.restore(_part(state, f"{effect.name}/"))
+            effect.restore(states[effect.name])
 
     def _is_by_row(self, name: str) -> bool:
         """Return whether an array of the state has a row for each Gaussian."""
@@ -519,16 +502,6 @@ class Trainer:
         if state:
             density.restore(state)
         return density
-
-
-def _step_info(step: Step, view: StepView, gradients: ViewGradients) -> StepInfo:
-    """Return the statistics of a view for the strategy of density."""
-    means2d_grad = gradients.means2d_grad
-    if step.num_averaged > 1:  # it is a part of a mean
-        means2d_grad = means2d_grad * step.num_averaged
-    size = view.view.width, view.view.height
-    found = means2d_grad, gradients.visible, gradients.weighted_sums
-    return StepInfo(view.iteration, *size, *found)
 
 
 def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -31,8 +31,7 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.parallel.inputs import share_gaussians
 from drgs.training.trainer import Trainer
 
-ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12
-"""Iterations that are added, as a share of the fit's; and their time: late ones take longer."""
+ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12  # of those of the fit: late iterations take longer
 
 RATES = {
     "means_lr": 1.6e-5,
@@ -75,13 +74,12 @@ def for_viewers(
     gaussians: Gaussians,
     watch: Callable[[int], None] = lambda done: None,
 ) -> ForViewers:
-    """Fit a copy of a fit's Gaussians as viewers render; the same bytes in every run.
+    """Fit a copy of a fit's Gaussians as viewers render.
 
-    trainer: of the finished fit, released (:meth:`drgs.training.trainer.Trainer.release`).
+    trainer: of the finished fit; is released (:meth:`drgs.training.trainer.Trainer.release`).
     gaussians: ``trainer.gaussians()``. watch: called after each iteration with their number.
 
-    If it fails, such as by a number that is not finite, the closed form is returned, with a
-    :class:`UserNote`.
+    If it fails, the closed form is returned, with a :class:`UserNote`.
     """
     others = trainer.config.model.approximations.non_default
     start, further = _closed_form(trainer, gaussians), tuning(trainer.config)
@@ -105,7 +103,9 @@ def for_viewers(
 
 def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
     """Return Gaussians in closed form, by the training cameras as the fit has them."""
-    states = (read_sensor(sensor, trainer.integrator.near) for sensor in trainer.sensors())
+    states = (
+        read_sensor(sensor, trainer.integrator.near) for sensor in trainer.fit_state().sensors()
+    )
     on_device = bake_smoothing(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
         cameras = map(camera_from_sensor, states)
@@ -133,7 +133,7 @@ def tuning(config: FitConfig) -> FitConfig:
 
 
 def _configured_default(name: str) -> object:
-    declared = DECLARED[name]
-    if declared.unrounded is not None:
-        return declared.unrounded
-    return None if declared.default == math.inf else declared.default
+    default, unrounded = DECLARED[name].default, DECLARED[name].unrounded
+    if unrounded is not None:
+        return unrounded
+    return None if default == math.inf else default

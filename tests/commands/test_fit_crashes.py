@@ -72,7 +72,7 @@ def quick(monkeypatch):
         )
 
     monkeypatch.setattr(session, "plan_fit", plan)
-    monkeypatch.setattr(session, "rehearse", lambda *_, **_others: Mock())
+    monkeypatch.setattr(session, "rehearse", lambda *_: (Mock(), 1.0))
     monkeypatch.setattr(session, "Deadline", Revised)
 
 

@@ -36,7 +36,6 @@ class Planned:
 @pytest.fixture
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
-    rehearsal = SimpleNamespace(trainer=SimpleNamespace(full_scene=object), iteration_s=0.1)
     monkeypatch.setattr(
         budget, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0)
     )
@@ -45,7 +44,7 @@ def planned(monkeypatch):
     monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: 0.0))
 
     def plan(config, seconds):
-        plan = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds, rehearsal)
+        plan = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds, None, 0.1)
         return plan.end, plan.config
 
     return plan

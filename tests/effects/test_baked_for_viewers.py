@@ -9,7 +9,7 @@ from support.small_capture import blobs, make_dataset
 from support.small_fits import double, reference_camera
 
 from drgs.config.approximations import Approximations
-from drgs.effects.smoothing import KEPT_VARIANCE, bake_for_viewers
+from drgs.effects.smoothing import MIN_VARIANCE_SHARE, bake_for_viewers
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.reference import splatting as reference
@@ -65,9 +65,9 @@ def test_baking_matches_the_documented_closed_form(fitted):
     assert (nu > 0).all()
     variances = np.exp(2 * gaussians.log_scales.astype(float))
     left = variances - ((0.3 - fitted.low_pass) / nu**2)[:, None]
-    left = np.maximum(left, KEPT_VARIANCE * variances)
+    left = np.maximum(left, MIN_VARIANCE_SHARE * variances)
     if fitted.low_pass < 0.3:
-        assert 0.05 < np.mean(left == KEPT_VARIANCE * variances) < 0.95
+        assert 0.05 < np.mean(left == MIN_VARIANCE_SHARE * variances) < 0.95
     np.testing.assert_allclose(found.log_scales, np.log(left) / 2, atol=2e-5)
 
     before = after = 0.0

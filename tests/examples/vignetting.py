@@ -7,8 +7,8 @@ from pydantic import Field
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.section import Section
-from drgs.training.effects.base import TrainingEffect, as_tensor
-from drgs.training.effects.view_parameters import ViewParameters
+from drgs.training.effects.base import as_tensor
+from drgs.training.effects.view_parameters import OptimisedEffect
 
 
 class VignettingSection(Section):
@@ -18,14 +18,14 @@ class VignettingSection(Section):
 
 
 @EFFECTS.register("vignetting", section=VignettingSection)
-class Vignetting(TrainingEffect):
+class Vignetting(OptimisedEffect):
     """Renderings are darkened towards the corners, as the photographs are."""
 
     name = "vignetting"
 
     def __init__(self, section: VignettingSection) -> None:
         strength = {"strength": np.zeros((1, 1))}  # one for all views
-        self.parameters = ViewParameters(strength, {"strength": section.lr})
+        super().__init__(strength, {"strength": section.lr})
 
     def upload(self, view):
         """Return half of the squared distance from the middle, (H, W, 3); 1 in the corners."""
@@ -35,23 +35,11 @@ class Vignetting(TrainingEffect):
 
     def adjust(self, image, view):
         """Return the rendering as the camera would have taken it."""
-        strength = self.leaves(view)["strength"]
+        strength = self.parameters(view)["strength"]
         falloff = 1 - strength * view.uploads[self.name].array
         return mi.TensorXf(image.array * falloff, image.shape)
 
-    def leaves(self, view):
-        """Return the numbers that are fitted."""
-        return self.parameters.leaves(view.index)
-
     def after_backward(self, fit, view, derivatives):
         """Take a step of Adam."""
-        dr.set_grad(self.leaves(view), derivatives)
-        self.parameters.step(view.index, fit.rate_decay)
-
-    def state(self):
-        """Return what a checkpoint has to hold."""
-        return self.parameters.state()
-
-    def restore(self, state):
-        """Continue from a checkpoint."""
-        self.parameters.restore(state)
+        dr.set_grad(self.parameters(view), derivatives)
+        self.step(view, fit.rate_decay)

@@ -5,8 +5,7 @@ import numpy as np
 from drjit.llvm.ad import Float, TensorXf
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.density.strategy import Population
-from drgs.training.optimizer import make_optimizer
+from drgs.training.optimizer import Population, make_optimizer
 
 EXTENT = 4.0
 
@@ -49,9 +48,9 @@ def statistics(gradient_norms, views=None):
     return Float(norms * views), Float(views)
 
 
-def rows_of(optimizer, seed=0, prefix=""):
+def rows_of(optimizer, seed=0):
     """The same as strategies see them."""
-    return Population(optimizer, prefix, EXTENT, seed)
+    return Population(optimizer, EXTENT, seed)
 
 
 def values(optimizer):

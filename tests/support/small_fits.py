@@ -185,6 +185,5 @@ def gradients_of_loss(trainer: Trainer, view) -> dict[str, np.ndarray]:
     dr.set_grad(trainer.optimizer, 0)
     dr.backward(loss)
     return {
-        key.removeprefix("integrator."): np.array(dr.grad(value)).astype(np.float64)
-        for key, value in trainer.optimizer.items()
+        key: np.array(dr.grad(value)).astype(np.float64) for key, value in trainer.optimizer.items()
     }

@@ -143,7 +143,7 @@ def test_derivatives_of_the_loss_equal_differences_in_numpy(index):
     rendered = fits.photograph(fits.double(start), moved(photo, **row))
     assert not rendered.near_threshold.any() and rendered.image.max() <= 1
     effect.before_render(trainer.fit_state(), view)
-    leaves = effect.parameters.leaves(view.index)
+    leaves = effect.parameters(view)
     trainer.params.update(trainer.optimizer)
     image = mi.render(trainer.scene, trainer.params, sensor=view.sensor, spp=1)
     _, loss, _ = trainer.compare(image, view)
@@ -181,14 +181,14 @@ def test_derivatives_of_the_loss_equal_differences_in_numpy(index):
 def test_intrinsics_with_zero_rates_are_left_out():
     """They have no number, and are not computed."""
     trainer = make_trainer()
-    assert set(effect_of(trainer).parameters.numpy()) == {"turns", "moves"}
+    assert set(effect_of(trainer).numpy()) == {"turns", "moves"}
     fits.steps(trainer, 3)
     for view, photo in zip(trainer.views, fits.plain_dataset().train, strict=True):
         params = mi.traverse(view.sensor)
         for name in ("fx", "fy", "cx", "cy"):
             assert float(params[name][0]) == np.float32(getattr(photo, name))
     only_focal = make_trainer(cameras__focal_lr=1e-3)
-    assert set(effect_of(only_focal).parameters.numpy()) == {"turns", "moves", "log_focals"}
+    assert set(effect_of(only_focal).numpy()) == {"turns", "moves", "log_focals"}
 
 
 def test_only_the_current_view_and_shared_intrinsics_change():
@@ -221,7 +221,7 @@ def test_first_steps_equal_the_rates():
     """Moves in units of the scene's extent; all rates fall as that of the means does."""
     trainer = make_trainer(**ALL_RATES, iterations=1)  # the means' rate is the last one at once
     trainer.step()
-    numbers = effect_of(trainer).parameters.numpy()
+    numbers = effect_of(trainer).numpy()
     extent, decay = fits.plain_dataset().extent, 0.01
     rates = {"turns": 1e-3, "moves": 2e-3 * extent, "log_focals": 3e-3, "shifts": 4e-3}
     for name, rate in rates.items():
@@ -236,7 +236,7 @@ def test_cameras_are_unchanged_before_the_start():
     plain = fits.make_trainer(fits.plain_dataset())
     for iteration in range(1, 6):
         report, expected = trainer.step(), plain.step()
-        numbers = effect.parameters.numpy()
+        numbers = effect.numpy()
         has_moved = any(value.any() for value in numbers.values())
         assert has_moved == (iteration > 3)
         if iteration <= 3:
@@ -467,7 +467,7 @@ def test_filter_uses_refined_cameras():
         replace(fits.plain_dataset(), train=tuple(refined)), model__smoothing=True
     )
     plain.step()  # with the cameras where they are
-    plain.optimizer["integrator.means"] = mi.TensorXf(trainer.gaussians().means)
+    plain.optimizer["means"] = mi.TensorXf(trainer.gaussians().means)
     np.testing.assert_allclose(
         trainer.gaussians().smoothing, plain.gaussians().smoothing, rtol=1e-4
     )
@@ -528,7 +528,7 @@ def test_static_camera_has_the_derivatives_of_a_moving_one_with_equal_poses():
         trainer.iteration = 1
         effect, view = effect_of(trainer), trainer.views[0]
         effect.before_render(trainer.fit_state(), view)
-        leaves = effect.parameters.leaves(view.index)
+        leaves = effect.parameters(view)
         fits.gradients_of_loss(trainer, view)
         fits.end_view(effect, trainer, view)
         found.append(np.concatenate([np.array(dr.grad(leaves[n])) for n in ("turns", "moves")]))

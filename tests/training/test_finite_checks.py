@@ -20,9 +20,8 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
 from drgs.training import fit_folder, session
 from drgs.training.finite_checks import GradientWatch, NonFiniteError, check_values
-from drgs.training.optimizer import replace_values
 from drgs.training.steps import view_of
-from drgs.training.trainer import PREFIX, Trainer
+from drgs.training.trainer import Trainer
 
 ROW = 17
 
@@ -71,10 +70,10 @@ def poison_gradient(monkeypatch, trainer, name, iteration, value=np.nan, row=ROW
 
 def poison_value(trainer, name, value=np.nan, row=ROW):
     """One component of one row of a parameter is ``value`` from now on."""
-    old = dr.detach(trainer.optimizer[PREFIX + name])
+    old = dr.detach(trainer.optimizer[name])
     host = np.array(old)
     host[(row, *(-1,) * (host.ndim - 1))] = value
-    replace_values(trainer.optimizer, name, type(old)(host), PREFIX)
+    trainer.population.replace(name, type(old)(host))
 
 
 # ----------------------------------------------------------------------------------------------
@@ -299,7 +298,7 @@ def test_guards_do_not_change_the_bytes_of_a_fit(monkeypatch):
 
     guarded = result()
     monkeypatch.setattr(rendering, "_nonfinite_flags", lambda d_rows, visible: mi.UInt32(0))
-    monkeypatch.setattr(GradientWatch, "add", lambda *arguments: None)
+    monkeypatch.setattr(GradientWatch, "append", lambda *arguments: None)
     assert result() == guarded
 
 

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from functools import cache
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +24,7 @@ from drgs.integrator.scene import make_scene, make_sensors
 from drgs.splatting import rasterize
 from drgs.training import memory
 from drgs.training.losses import TARGET_BYTES
+from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer
 
 GB = 10**9
@@ -54,9 +56,9 @@ def start_of(count):
     return initial_gaussians(config_of(count, count), dataset_of(4, 4, 1))
 
 
-def estimated(config, dataset, view_bytes=TARGET_BYTES, scale=1.0):
+def estimated(config, dataset, scale=1.0):
     gaussians = start_of(config.init.num_points)
-    return memory.estimate(config, dataset, gaussians, view_bytes, scale)
+    return memory.estimate(config, dataset, gaussians, TARGET_BYTES, scale)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -76,14 +78,14 @@ def estimated(config, dataset, view_bytes=TARGET_BYTES, scale=1.0):
         pytest.param(1000, 150_000, 300_000, 6, 2105, marks=pytest.mark.slow),
     ],
 )
-def test_memory_estimates_match_measurements(size, start, most, views, measured_mb):
+def test_estimates_are_what_was_measured(size, start, most, views, measured_mb):
     """Peaks of resident memory, MiB, of fits that grew to their cap, with all targets kept."""
     dataset = dataset_of(size, size, views)
     peak = estimated(config_of(start, most), dataset)
     assert (peak.required_bytes + peak.targets) / 2**20 == pytest.approx(measured_mb, rel=0.18)
 
 
-def test_estimated_entries_and_slots_match_a_rendering(monkeypatch):
+def test_entries_and_slots_at_the_start_are_those_of_a_rendering(monkeypatch):
     mi.set_variant("llvm_ad_rgb")
     dataset = dataset_of(200, 150, 8)
     config = config_of(3000, 3000)
@@ -108,7 +110,7 @@ def test_estimated_entries_and_slots_match_a_rendering(monkeypatch):
     assert found == pytest.approx((max(entries), max(slots)), rel=0.1)
 
 
-def test_photographs_are_counted_as_stored():
+def test_photographs_count_as_they_are_kept():
     """They are kept as bytes, and as numbers at a width where these take less."""
     config, pixels = config_of(1000, 1000), 300 * 200 * 12
     dataset = dataset_of(300, 200, 10)
@@ -118,7 +120,7 @@ def test_photographs_are_counted_as_stored():
     assert estimated(config, dataset).targets == TARGET_BYTES * pixels * 10 / 12
 
 
-def test_shutter_samples_are_counted():
+def test_each_time_of_a_shutter_counts():
     config, dataset = config_of(1000, 1000), dataset_of(60, 40, 3)
     first = dataset.train[0]
     blurred = replace(first, motion=CameraMotion(first.camera_to_world, "global", 10))
@@ -140,7 +142,7 @@ def test_shutter_samples_are_counted():
         ({"densify.start": 29_000, "densify.stop": 29_050}, 1000),
     ],
 )
-def test_estimated_population_reaches_its_cap_if_there_is_time(changes, expected):
+def test_a_population_grows_to_its_cap_if_there_is_time(changes, expected):
     config = config_of(500, 10**6, **changes)
     assert memory.max_num_gaussians(config, 1000) == expected
 
@@ -162,33 +164,34 @@ def available(monkeypatch):
     return set_to
 
 
-def room(config, dataset, most=GB):
+def room(config, dataset):
     gaussians = start_of(config.init.num_points)
-    return memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, most)
+    return memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, Communicator())
 
 
-def test_targets_get_the_remaining_memory(available):
+def test_targets_get_what_is_left(available, monkeypatch):
     config, dataset = config_of(1000, 1000), dataset_of(100, 100, 20)
     peak = estimated(config, dataset)
     assert peak.targets == 7_200_000
     for left, expected in ((0, 0), (10**6, 10**6), (GB, 7_200_000)):
         available(1.15 * peak.required_bytes + left)
         assert room(config, dataset) == pytest.approx(expected, abs=10)
-    assert room(config, dataset, most=3) == 3
+    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 3)
+    assert room(config, dataset) == 3
 
 
 def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
     """Four of them, on two machines: a quarter of the Gaussians, in half of a machine."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
-    gaussians, share = start_of(10_000), memory.Share(processes=4, on_machine=2)
+    gaussians, comm = start_of(10_000), Mock(size=4, num_on_machine=2)
     alone = estimated(config, dataset)
-    shared = memory.estimate(config, dataset, gaussians, TARGET_BYTES, share=share)
+    shared = memory.estimate(config, dataset, gaussians, TARGET_BYTES, processes=4)
     assert shared.gaussians == pytest.approx(alone.gaussians / 4, abs=1)
     assert (shared.splats, shared.pixels) == (alone.splats, alone.pixels)
     assert shared.required_bytes < alone.required_bytes / 1.5
     for factor, fits in ((2.1, True), (1.9, False)):
         available(factor * shared.required_bytes)
-        arguments = config, dataset, gaussians, TARGET_BYTES, GB, share
+        arguments = config, dataset, gaussians, TARGET_BYTES, comm
         if fits:
             memory.room_for_targets(*arguments)
             continue
@@ -196,7 +199,7 @@ def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
             memory.room_for_targets(*arguments)
 
 
-def test_fit_larger_than_memory_is_refused_with_numbers_and_remedies(available):
+def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
     """The advised number fits, and a quarter more does not."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
     available(GB)
@@ -215,7 +218,7 @@ def test_fit_larger_than_memory_is_refused_with_numbers_and_remedies(available):
         room(config_of(10_000, fewer * 5 // 4), dataset)
 
 
-def test_smaller_images_are_suggested_if_they_help(available):
+def test_smaller_images_are_advised_where_they_help(available):
     config, dataset = config_of(10_000, 10_000), dataset_of(5376, 3024, 4)
     available(3 * GB)
     with pytest.raises(UserError, match=r"set data\.image_size=") as error:
@@ -226,13 +229,13 @@ def test_smaller_images_are_suggested_if_they_help(available):
     assert 2 * GB < peak.required_bytes < 3 * GB
 
 
-def test_image_size_is_not_suggested_if_it_does_not_help(available):
+def test_nothing_is_advised_where_nothing_helps(available):
     available(100_000_000)
     with pytest.raises(UserError, match=r"available; use fewer views and Gaussians$"):
         room(config_of(1000, 1000), dataset_of(20, 20, 4))
 
 
-def test_trainer_checks_memory_before_allocation(available):
+def test_a_trainer_checks_memory_before_it_allocates(available):
     mi.set_variant("llvm_ad_rgb")
     config, dataset = config_of(1000, 1000), dataset_of(20, 20, 4)
     available(100_000_000)
@@ -248,12 +251,11 @@ MEASURED = """
 import sys
 from drgs import fit
 from drgs.training import memory
-from drgs.training.steps import KEPT_BYTES
 peaks, estimate = [], memory.estimate
 memory.estimate = lambda *a, **k: peaks.append(estimate(*a, **k)) or peaks[-1]
 fit.main(sys.argv[1:])
-expected = peaks[0].required_bytes + min(peaks[0].targets, KEPT_BYTES)
-# getrusage may report the peak of the parent process.
+expected = peaks[0].required_bytes + min(peaks[0].targets, memory.MAX_TARGET_BYTES)
+# What getrusage says may be the peak of the process that started this one.
 status = dict(line.split(":") for line in open("/proc/self/status"))
 print("peak", expected, 1024 * int(status["VmHWM"].split()[0]))
 """

@@ -7,21 +7,17 @@ import numpy as np
 import pytest
 from drjit.llvm.ad import Float, TensorXf, TensorXf64, UInt32
 from drjit.opt import Adam
+from support.populations import rows_of
 
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training import optimizer as optimizer_module
 from drgs.training.optimizer import (
     LARGE_WIDTH,
-    edit_rows,
     make_optimizer,
-    num_rows,
-    replace_values,
-    take_rows,
 )
 from drgs.training.rates import ExponentialDecay
 
-PREFIX = "integrator."
 RATES = {name: 0.01 * (k + 1) for k, name in enumerate(PARAMETER_NAMES)}
 
 
@@ -49,9 +45,9 @@ def parameters(num, sh_rows=15, seed=0, tensor_type=TensorXf):
 def step(optimizer, seed, rows):
     """One Adam step; row i gets a gradient that depends on seed and ``rows[i]`` alone."""
     for name, shape in row_shapes().items():
-        if PREFIX + name not in optimizer:
+        if name not in optimizer:
             continue
-        value = optimizer[PREFIX + name]
+        value = optimizer[name]
         table = np.random.default_rng([seed, len(name)]).standard_normal((100, *shape))
         gradient = type(value)(table[rows].astype(np.float32))
         dr.set_grad(value, gradient)
@@ -69,12 +65,12 @@ def snapshot(optimizer):
 
 
 def test_make_optimizer_sets_rates_and_leaves_out_empty_parameters():
-    optimizer = make_optimizer(parameters(5, sh_rows=0), RATES, PREFIX, epsilon=1e-12)
+    optimizer = make_optimizer(parameters(5, sh_rows=0), RATES, epsilon=1e-12)
     assert isinstance(optimizer, Adam)
     assert optimizer.epsilon == 1e-12
-    assert list(optimizer.keys()) == [PREFIX + name for name in PARAMETER_NAMES[:-1]]
+    assert list(optimizer.keys()) == list(PARAMETER_NAMES[:-1])
     for name in PARAMETER_NAMES[:-1]:
-        assert optimizer.learning_rate(PREFIX + name) == RATES[name]
+        assert optimizer.learning_rate(name) == RATES[name]
 
 
 def adam_and_ours(num):
@@ -83,12 +79,12 @@ def adam_and_ours(num):
     assert dr.width(values["shN"]) > LARGE_WIDTH > dr.width(values["quats"])
     plain = Adam(lr=0.0, epsilon=1e-15)
     for name, value in values.items():
-        plain[PREFIX + name] = value
-        plain.set_learning_rate({PREFIX + name: RATES[name]})
-    return plain, make_optimizer(values, RATES, PREFIX)
+        plain[name] = value
+        plain.set_learning_rate({name: RATES[name]})
+    return plain, make_optimizer(values, RATES)
 
 
-def test_steps_match_adam_and_free_large_gradients():
+def test_steps_are_those_of_adam_and_use_large_gradients_up():
     num = 25_000
     plain, ours = adam_and_ours(num)
     for seed in range(2):
@@ -99,24 +95,24 @@ def test_steps_match_adam_and_free_large_gradients():
         for array, other in zip(state, snapshot(plain)[key], strict=True):
             np.testing.assert_array_equal(array, other)
     left = {key for key, value in former.items() if np.any(np.array(dr.grad(value)))}
-    assert left == set(ours) - {PREFIX + "shN"}
+    assert left == set(ours) - {"shN"}
 
 
-def test_in_place_moments_equal_out_of_place_ones(monkeypatch):
+def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
     """Also after they were assigned, and while somebody else holds them."""
-    num, key = 25_000, PREFIX + "shN"
+    num, key = 25_000, "shN"
     results = []
     for large in (LARGE_WIDTH, 1 << 40):
         monkeypatch.setattr(optimizer_module, "LARGE_WIDTH", large)
-        optimizer = make_optimizer(parameters(num), RATES, PREFIX)
+        optimizer = make_optimizer(parameters(num), RATES)
         step(optimizer, 0, np.arange(num) % 100)
-        edit_rows(optimizer, dr.arange(UInt32, num) ^ 1, parameters(7), PREFIX)
+        rows_of(optimizer).edit(dr.arange(UInt32, num) ^ 1, parameters(7))
         step(optimizer, 1, np.arange(num + 7) % 100)
         held = Float(optimizer.state[key][3][1])
         at_the_time = np.array(held)
         step(optimizer, 2, np.arange(num + 7) % 100)
         np.testing.assert_array_equal(np.array(held), at_the_time)
-        replace_values(optimizer, "shN", optimizer[key] + 1, PREFIX)
+        rows_of(optimizer).replace("shN", optimizer[key] + 1)
         step(optimizer, 3, np.arange(num + 7) % 100)
         results.append(snapshot(optimizer))
     for key, arrays in results[0].items():
@@ -124,9 +120,9 @@ def test_in_place_moments_equal_out_of_place_ones(monkeypatch):
             np.testing.assert_array_equal(array, other)
 
 
-def test_step_does_not_synchronise(monkeypatch):
+def test_a_step_waits_for_nothing(monkeypatch):
     """Once it has large moments, it asks for no memory of theirs again."""
-    optimizer = make_optimizer(parameters(25_000), RATES, PREFIX)
+    optimizer = make_optimizer(parameters(25_000), RATES)
     asked = []
     original = optimizer_module.same_memory
     monkeypatch.setattr(
@@ -137,7 +133,7 @@ def test_step_does_not_synchronise(monkeypatch):
         assert len(asked) == 2
 
 
-def test_step_uses_less_memory_than_adam_by_two_sh_arrays():
+def test_a_step_takes_two_blocks_of_harmonics_less_than_that_of_adam():
     num = 25_000
     peaks = []
     for optimizer in adam_and_ours(num):
@@ -172,14 +168,14 @@ def test_missing_rate_is_refused_by_name():
 @pytest.mark.parametrize("tensor_type", [TensorXf, TensorXf64])
 def test_surviving_rows_continue_bitwise(tensor_type):
     def run(edit):
-        optimizer = make_optimizer(parameters(20, tensor_type=tensor_type), RATES, PREFIX)
+        optimizer = make_optimizer(parameters(20, tensor_type=tensor_type), RATES)
         rows = np.arange(20)
         for seed in range(3):
             step(optimizer, seed, rows)
         if edit:
             keep = [0, 3, 4, 7, 19]
             new = parameters(6, seed=9, tensor_type=tensor_type)
-            edit_rows(optimizer, UInt32(keep), new, PREFIX)
+            rows_of(optimizer).edit(UInt32(keep), new)
             rows = np.array([*keep, 50, 51, 52, 53, 54, 55])
         for seed in range(3, 7):
             step(optimizer, seed, rows)
@@ -193,84 +189,79 @@ def test_surviving_rows_continue_bitwise(tensor_type):
 
 
 def test_appended_rows_have_their_values_and_zero_moments():
-    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    optimizer = make_optimizer(parameters(4), RATES)
     step(optimizer, 0, np.arange(4))
     before = snapshot(optimizer)
     new = parameters(3, seed=5)
-    edit_rows(optimizer, UInt32(3, 1), new, PREFIX)
+    rows_of(optimizer).edit(UInt32(3, 1), new)
     after = snapshot(optimizer)
-    assert num_rows(optimizer, PREFIX) == 5
+    assert rows_of(optimizer).num_rows == 5
     for name in PARAMETER_NAMES:
-        value, m, v = after[PREFIX + name]
-        np.testing.assert_array_equal(value[:2], before[PREFIX + name][0][[3, 1]])
-        np.testing.assert_array_equal(m[:2], before[PREFIX + name][1][[3, 1]])
-        np.testing.assert_array_equal(v[:2], before[PREFIX + name][2][[3, 1]])
+        value, m, v = after[name]
+        np.testing.assert_array_equal(value[:2], before[name][0][[3, 1]])
+        np.testing.assert_array_equal(m[:2], before[name][1][[3, 1]])
+        np.testing.assert_array_equal(v[:2], before[name][2][[3, 1]])
         np.testing.assert_array_equal(value[2:], new[name].numpy().reshape(3, -1))
         assert (m[:2] != 0).all()
         assert (v[:2] != 0).all()
         assert (m[2:] == 0).all()
         assert (v[2:] == 0).all()
-        assert optimizer[PREFIX + name].shape == (5, *row_shapes()[name])
+        assert optimizer[name].shape == (5, *row_shapes()[name])
 
 
 def test_edit_keeps_step_counts_rates_order_and_gradients():
-    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
-    optimizer["exposure"] = Float(1, 2, 3)
+    optimizer = make_optimizer(parameters(4), RATES)
     step(optimizer, 0, np.arange(4))
     step(optimizer, 1, np.arange(4))
-    optimizer.set_learning_rate({PREFIX + "means": 0.125})
+    optimizer.set_learning_rate({"means": 0.125})
     keys = list(optimizer.keys())
-    edit_rows(optimizer, UInt32(2), parameters(2), PREFIX)
+    rows_of(optimizer).edit(UInt32(2), parameters(2))
     assert list(optimizer.keys()) == keys
-    assert optimizer.learning_rate(PREFIX + "means") == 0.125
-    assert optimizer.learning_rate(PREFIX + "quats") == RATES["quats"]
+    assert optimizer.learning_rate("means") == 0.125
+    assert optimizer.learning_rate("quats") == RATES["quats"]
     for name in PARAMETER_NAMES:
-        value, promoted, _, (t, _, _, _) = optimizer.state[PREFIX + name]
+        value, promoted, _, (t, _, _, _) = optimizer.state[name]
         assert t[0] == 2
         assert promoted is False
         assert dr.grad_enabled(value)
-    # Parameters without the prefix have no rows.
-    np.testing.assert_array_equal(optimizer["exposure"].numpy(), [1, 2, 3])
 
 
 def test_edit_without_appending_and_without_keeping():
-    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
-    expected = snapshot(optimizer)[PREFIX + "shN"][0][[2, 0]]
-    edit_rows(optimizer, UInt32(2, 0), prefix=PREFIX)
-    np.testing.assert_array_equal(snapshot(optimizer)[PREFIX + "shN"][0], expected)
+    optimizer = make_optimizer(parameters(4), RATES)
+    expected = snapshot(optimizer)["shN"][0][[2, 0]]
+    rows_of(optimizer).edit(UInt32(2, 0))
+    np.testing.assert_array_equal(snapshot(optimizer)["shN"][0], expected)
 
     new = parameters(3, seed=1)
-    edit_rows(optimizer, UInt32(), new, PREFIX)
-    np.testing.assert_array_equal(optimizer[PREFIX + "means"].numpy(), new["means"].numpy())
+    rows_of(optimizer).edit(UInt32(), new)
+    np.testing.assert_array_equal(optimizer["means"].numpy(), new["means"].numpy())
     step(optimizer, 0, np.arange(3))
 
 
 def test_edit_refuses_misaligned_rows():
-    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    optimizer = make_optimizer(parameters(4), RATES)
     with pytest.raises(ValueError, match="row numbers below 4"):
-        edit_rows(optimizer, UInt32(0, 4), prefix=PREFIX)
+        rows_of(optimizer).edit(UInt32(0, 4))
     with pytest.raises(ValueError, match="at least one row must remain"):
-        edit_rows(optimizer, UInt32(), prefix=PREFIX)
+        rows_of(optimizer).edit(UInt32())
     incomplete = parameters(2)
     del incomplete["quats"]
     with pytest.raises(ValueError, match=r"rows of quats must have the shape \(2, 4\), got none"):
-        edit_rows(optimizer, UInt32(0), incomplete, PREFIX)
+        rows_of(optimizer).edit(UInt32(0), incomplete)
     uneven = parameters(2) | {"sh0": parameters(3)["sh0"]}
     with pytest.raises(ValueError, match=r"rows of means must have the shape \(3, 3\)"):
-        edit_rows(optimizer, UInt32(0), uneven, PREFIX)
-    with pytest.raises(ValueError, match="must share one number of rows"):
-        num_rows(optimizer, "sensor.")
+        rows_of(optimizer).edit(UInt32(0), uneven)
 
 
 def test_later_edits_of_other_sizes_compile_no_kernel():
     def kernels(num, keep, added):
-        optimizer = make_optimizer(parameters(num), RATES, PREFIX)
+        optimizer = make_optimizer(parameters(num), RATES)
         # Memory of Dr.Jit's own: kernels that read numpy's also depend on its alignment.
         new = {name: value + 1 for name, value in parameters(added).items()}
         dr.eval(new)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            edit_rows(optimizer, dr.arange(UInt32, keep), new, PREFIX)
+            rows_of(optimizer).edit(dr.arange(UInt32, keep), new)
             history = dr.kernel_history([dr.KernelType.JIT])
         return {kernel["hash"] for kernel in history}
 
@@ -279,10 +270,10 @@ def test_later_edits_of_other_sizes_compile_no_kernel():
     assert kernels(70, 41, 22) == first
 
 
-def test_take_rows_returns_detached_copies():
+def test_taken_rows_are_detached_copies():
     values = parameters(5)
-    optimizer = make_optimizer(values, RATES, PREFIX)
-    rows = take_rows(optimizer, UInt32(4, 4, 1), PREFIX)
+    optimizer = make_optimizer(values, RATES)
+    rows = rows_of(optimizer).take(UInt32(4, 4, 1))
     for name in PARAMETER_NAMES:
         assert rows[name].shape == (3, *row_shapes()[name])
         np.testing.assert_array_equal(rows[name].numpy(), values[name].numpy()[[4, 4, 1]])
@@ -290,10 +281,10 @@ def test_take_rows_returns_detached_copies():
 
 
 def test_replaced_values_keep_step_count_and_rate_but_not_moments():
-    optimizer = make_optimizer(parameters(4), RATES, PREFIX)
+    optimizer = make_optimizer(parameters(4), RATES)
     step(optimizer, 0, np.arange(4))
-    replace_values(optimizer, "logit_opacities", Float(1, 2, 3, 4), PREFIX)
-    value, _, rate, (t, m, v, _) = optimizer.state[PREFIX + "logit_opacities"]
+    rows_of(optimizer).replace("logit_opacities", Float(1, 2, 3, 4))
+    value, _, rate, (t, m, v, _) = optimizer.state["logit_opacities"]
     np.testing.assert_array_equal(value.numpy(), [1, 2, 3, 4])
     assert rate == RATES["logit_opacities"]
     assert t[0] == 1
@@ -301,12 +292,12 @@ def test_replaced_values_keep_step_count_and_rate_but_not_moments():
     assert not v.numpy().any()
     assert dr.grad_enabled(value)
     # The others keep theirs.
-    assert snapshot(optimizer)[PREFIX + "means"][1].all()
+    assert snapshot(optimizer)["means"][1].all()
     with pytest.raises(ValueError, match=r"has shape \(4,\), the new values \(3,\)"):
-        replace_values(optimizer, "logit_opacities", Float(1, 2, 3), PREFIX)
+        rows_of(optimizer).replace("logit_opacities", Float(1, 2, 3))
 
 
-def test_decay_is_linear_in_the_logarithm():
+def test_decay_is_a_straight_line_in_the_logarithm():
     rate = ExponentialDecay(1.6e-4, 1.6e-6, ((0, 30_000),))
     assert rate(0) == pytest.approx(1.6e-4)
     assert rate(15_000) == pytest.approx(1.6e-5)
@@ -317,7 +308,7 @@ def test_decay_is_linear_in_the_logarithm():
         ExponentialDecay(1e-3, 0.0, ((0, 10),))
 
 
-def test_revised_decay_covers_the_remaining_iterations():
+def test_a_decay_that_is_revised_spreads_what_is_left():
     """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
     rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
     once = ExponentialDecay(1.0, 1e-4, ((0, 100),))

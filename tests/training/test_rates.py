@@ -8,8 +8,6 @@ from support.trainers import make_trainer
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
-PREFIX = "integrator."
-
 
 @pytest.fixture(scope="module", autouse=True)
 def variant():
@@ -22,7 +20,7 @@ FIXED_POPULATION = {"start": 1, "stop": 2}
 
 def rates_of(trainer):
     return {
-        name.removeprefix(PREFIX): float(np.array(trainer.optimizer.state[name][2]).ravel()[0])
+        name: float(np.array(trainer.optimizer.state[name][2]).ravel()[0])
         for name in trainer.optimizer.state
     }
 
@@ -80,7 +78,7 @@ def test_step_of_several_views_uses_their_mean_gradient():
     trainer = make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION)
     while trainer.iteration < 27:
         trainer.step()
-    name = PREFIX + "log_scales"
+    name = "log_scales"
     before = np.array(dr.detach(trainer.optimizer[name]), np.float64)
     _, _, rate, (t, m, v, _) = trainer.optimizer.state[name]
     m, v = np.array(m, np.float64), np.array(v, np.float64)

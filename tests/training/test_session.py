@@ -79,7 +79,8 @@ def test_other_trainers_of_a_session_get_copies_of_its_objects(tmp_path):
     session.prepare()
     assert session.run() and effect.count == VALUES["iterations"]
     dataset, start = session.dataset, session.trainer.gaussians()
-    rehearsal = rehearse(session.config, dataset, start, **session._objects).trainer
+    objects = session.strategy, session.effects, session.loss
+    rehearsal, _ = rehearse(session.config, dataset, start, None, *objects)
     further = session.trainer.spawn(session.config, start)
     assert type(rehearsal.density) is Halves is not type(further.density)
     assert rehearsal.num_gaussians == start.num_gaussians // 2

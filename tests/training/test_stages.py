@@ -6,8 +6,8 @@ import pytest
 from support import small_fits as fits
 from support.trainers import make_trainer
 
+from drgs.training import memory
 from drgs.training import steps as training_steps
-from drgs.training import trainer as trainer_module
 from drgs.training.losses import TARGET_BYTES
 
 PIXELS = 20 * 16
@@ -36,7 +36,7 @@ def test_targets_are_created_on_demand():
 
 
 def test_targets_are_cached_within_the_memory_limit(monkeypatch):
-    monkeypatch.setattr(trainer_module, "KEPT_BYTES", 2 * PIXELS * TARGET_BYTES + 7)
+    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 2 * PIXELS * TARGET_BYTES + 7)
     trainer, seen = make_trainer(), []
     for _ in range(8):  # two rounds of four views
         trainer.step()
@@ -53,7 +53,7 @@ def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
         return trainer, fits.everything_of(fits.steps(trainer, 8))
 
     _, kept = result()
-    monkeypatch.setattr(trainer_module, "KEPT_BYTES", 0)
+    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 0)
     trainer, made_again = result()
     assert indices_on_device(trainer) == [set()]
     assert not any(view.uploads for view in trainer.views)
@@ -69,7 +69,7 @@ def test_device_memory_of_a_view_is_counted():
     arrays += [view.uploads["colors"].array, view.uploads["background"].array]
     arrays += view.uploads["depth"]
     count = sum(len(array) for array in arrays) * 4
-    assert count == view.width * view.height * training_steps.bytes_on_device(trainer.effects)
+    assert count == view.width * view.height * training_steps.bytes_per_pixel(trainer.effects)
 
 
 def test_finished_stage_leaves_no_arrays_on_the_device():

@@ -93,7 +93,7 @@ def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
 
     def step_and_break(self):
         report = step(self)
-        self.optimizer["integrator.means"] = self.optimizer["integrator.means"] * np.nan
+        self.optimizer["means"] = self.optimizer["means"] * np.nan
         return report
 
     monkeypatch.setattr(Trainer, "step", step_and_break)

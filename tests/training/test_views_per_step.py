@@ -12,8 +12,6 @@ from support import small_fits as fits
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training.steps import step_of, view_of
 
-PREFIX = "integrator."
-
 
 @pytest.fixture(scope="module", autouse=True)
 def variant():
@@ -192,14 +190,14 @@ def test_effects_use_the_same_parameters_for_all_views_of_a_step():
 
     def watched(fit, view):
         before(fit, view)
-        shared.append(effect.parameters.numpy()["log_focals"].copy())
+        shared.append(effect.numpy()["log_focals"].copy())
 
     effect.before_render = watched
-    start = effect.parameters.numpy()["log_focals"].copy()
+    start = effect.numpy()["log_focals"].copy()
     trainer.step()
     assert len(shared) == 3 and all(np.array_equal(s, start) for s in shared)
-    assert not np.array_equal(effect.parameters.numpy()["log_focals"], start)
-    turns = effect.parameters.state()["turns.t"]
+    assert not np.array_equal(effect.numpy()["log_focals"], start)
+    turns = effect.state()["turns.t"]
     assert turns.sum() == 9  # each view has taken a step when it was seen
 
 

@@ -32,7 +32,7 @@ from support.small_fits import everything_of, make_trainer, true_dataset
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from drgs.config.approximations import Approximations
-from drgs.training.loop import AllIterations, History, iterations
+from drgs.training.loop import History, StopCriterion, iterations
 from drgs.viewer.page import StartView
 from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.server import (
@@ -226,9 +226,9 @@ def test_fit_with_hostile_clients_has_the_same_bytes(server, capfd):
     settings = {"iterations": 40, "densify__start": 2, "densify__stop": 30, "densify__every": 5}
     dataset = true_dataset()
     alone, watched = (make_trainer(dataset, **settings) for _ in range(2))
-    for _ in iterations(alone, History(), AllIterations()):
+    for _ in iterations(alone, History(), StopCriterion()):
         pass
-    watching, length = watch(server, watched, dataset, AllIterations())
+    watching, length = watch(server, watched, dataset, StopCriterion())
     served, history = [], History()
     show = watching._scheduler.show
     watching._scheduler.show = lambda *frame: (served.append(frame), show(*frame))

@@ -17,7 +17,7 @@ from support.small_fits import (
 
 from drgs.config.approximations import Approximations
 from drgs.integrator.scene import make_scene, render_views
-from drgs.training.loop import AllIterations, History, iterations
+from drgs.training.loop import History, StopCriterion, iterations
 from drgs.training.trainer import Trainer
 from drgs.viewer.frames import FRAME_CONTENTS, FrameRequest, ViewerCamera
 from drgs.viewer.scheduler import RenderRequests
@@ -68,7 +68,7 @@ class Screen:
 
 def run(trainer, queue=None, dataset=None, before=lambda iteration: None, stops=lambda: False):
     """A whole fit, watched if there are queue; before: is called before those are served."""
-    screen, length, history = Screen(), AllIterations(), History()
+    screen, length, history = Screen(), StopCriterion(), History()
     if queue is not None:
         length = EarlyStop(length, queue)
         watching = TrainingViewer(queue, screen, dataset, length)
@@ -145,7 +145,7 @@ def test_ending_before_the_start_or_after_the_end_has_no_effect():
     dataset, queue = plain_dataset(), RenderRequests()
     queue.end()
     trainer = make_trainer(dataset, iterations=3)
-    assert EarlyStop(AllIterations(), queue).should_continue(trainer)  # nothing is fitted yet
+    assert EarlyStop(StopCriterion(), queue).should_continue(trainer)  # nothing is fitted yet
     config = config_of(iterations=3)
     queue = RenderRequests()
     run(trainer, queue, dataset, lambda iteration: iteration == 3 and queue.end())
@@ -169,8 +169,8 @@ def test_pause_stops_fit_and_clock_and_serves_requests():
                 queue.pause(False)
 
     screen, history = Watcher(), History()
-    watching = TrainingViewer(queue, screen, dataset, AllIterations())
-    for done in iterations(trainer, history, AllIterations()):
+    watching = TrainingViewer(queue, screen, dataset, StopCriterion())
+    for done in iterations(trainer, history, StopCriterion()):
         if done.report.iteration == 2:
             queue.pause(True)
             queue.put(1, FrameRequest(EYE, 8, 8))

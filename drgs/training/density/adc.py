@@ -1,9 +1,7 @@
 """Adaptive density control, the strategy ``adc``: clone, split, prune and the opacity reset.
 
 Section 5 of the 3DGS paper (Kerbl et al. 2023) with the details of its reference implementation,
-except where a docstring states otherwise. Rows are chosen on the host and moved by
-``drgs.training.optimizer`` together with their moments. Equal inputs give equal bytes: no atomics,
-ties are broken by index, and random numbers depend on seed and iteration alone.
+except where a docstring states otherwise. Rows are chosen on the host; ties are broken by index.
 """
 
 from __future__ import annotations
@@ -57,9 +55,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
     @override
     def begin(self, population: Population) -> None:
-        float_type = type(population.value("means").array)
-        self.gradient_norms = dr.zeros(float_type, population.num_local_rows)
-        self.views = dr.zeros(float_type, population.num_local_rows)
+        self.gradient_norms, self.views = population.zeros(), population.zeros()
 
     @override
     def needs_statistics(self, iteration: int) -> bool:
@@ -112,7 +108,7 @@ class AdaptiveDensityControl(DensityStrategy):
         return report
 
     def densify_and_prune(self, population: Population, iteration: int) -> DensityReport:
-        """Clone, split and prune; the statistics start again after it.
+        """Clone, split and prune.
 
         A Gaussian whose mean gradient norm reaches the threshold is cloned in place if it is small;
         otherwise it is replaced by samples of itself, which are smaller. Of more candidates than

@@ -12,10 +12,8 @@ removed, and there are no opacity resets.
 
 A known number with a curve of growth and the split along the longest axis are ideas of Improved-GS
 (Deng et al. 2025), the sum of errors is one of 3DGS densification by error (Rota Bulo et al. 2024,
-"Revising Densification in Gaussian Splatting"). Rows are chosen on the host. Equal inputs give
-equal bytes: nothing is random, and ties are broken by index.
-
-Iterations are counted from 1.
+"Revising Densification in Gaussian Splatting"). Rows are chosen on the host. Nothing is random, and
+ties are broken by index.
 """
 
 from __future__ import annotations
@@ -78,9 +76,8 @@ class GrowthToNumber(DensityStrategy):
 
     @override
     def begin(self, population: Population) -> None:
-        float_type = type(population.value("means").array)
         self.first = self.first or population.num_rows
-        self.errors = dr.zeros(float_type, population.num_local_rows)
+        self.errors = population.zeros()
 
     @override
     def needs_statistics(self, iteration: int) -> bool:

@@ -40,7 +40,6 @@ MAX_OPACITY = 1 - 2.0**-23  # largest opacity of copies: the largest in float32 
 
 NOISE_STEEPNESS = 100.0  # noise fades out over some 0.05 of opacity: the paper's equation 8
 
-
 _UNIT_OF_WORD = 2.0**-24
 """Scales the upper 24 bits of a random word, which float32 holds exactly, to [0, 1)."""
 
@@ -113,12 +112,11 @@ class MarkovChain(DensityStrategy):
 
     @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
-        """Relocate transparent Gaussians, and let the population grow.
+        """Replace transparent Gaussians, and let the population grow, by copies of the others.
 
-        Those that are too transparent are gone, and copies of others take their places, and those
-        of the growth: drawn in proportion to opacity among what remains. Rows end up as: Gaussians
-        that were not drawn, in their order and with their moments; those that were drawn; the
-        copies. The last two begin with moments of zero.
+        These are drawn in proportion to opacity. Rows end up as: Gaussians that were not drawn, in
+        their order and with their moments; those that were drawn; the copies. The last two begin
+        with moments of zero.
 
         Raises ``UserError`` if all are too transparent.
         """

@@ -1,14 +1,9 @@
-"""The last phase of a fit's population: down to a number of Gaussians, a few at a time.
-
-It comes after the strategy that lets the population grow. ``densify.prune.method`` chooses between
-the two strategies below.
-"""
+"""The phase after growth, ``densify.prune``: down to a number of Gaussians, a few at a time."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
@@ -33,43 +28,6 @@ MAX_PRESSURE = 1.0
 good within some ten iterations at four times the usual rate."""
 
 
-@dataclass(frozen=True)
-class PruneSchedule:
-    """Iterations after which Gaussians are removed, and the number that is to be left."""
-
-    start: int  # nothing changes until after this iteration
-    stop: int  # the last change
-    every: int  # iterations between two
-    to: int  # Gaussians that are left in the end
-
-    @staticmethod
-    def from_config(config: FitConfig) -> PruneSchedule:
-        """Return the schedule of a configuration, which may follow from the rest of it."""
-        prune = config.densify.prune
-        assert prune.to is not None, "a fit without it has no last phase"
-        return PruneSchedule(*config.densify.prune_window(config.iterations), prune.every, prune.to)
-
-    def contains(self, iteration: int) -> bool:
-        """Return whether an iteration belongs to the phase."""
-        return self.start < iteration <= self.stop
-
-    def is_due(self, iteration: int) -> bool:
-        """Return whether something changes after an iteration."""
-        due = iteration % self.every == 0 or iteration == self.stop
-        return self.contains(iteration) and due
-
-    def num_left(self, iteration: int, before: int) -> int:
-        """Return the number to be left after an iteration: each change removes the same share.
-
-        ``before`` (to / before)^s, s being the share of the phase that is over, of ``before``
-        Gaussians at the first change; ``to`` at its end.
-        """
-        if iteration >= self.stop or before <= self.to:
-            return self.to
-        share = (iteration - self.start) / (self.stop - self.start)
-        return round(before * (self.to / before) ** share)
-
-
 class Pruning(DensityStrategy):
     """A last phase; subclasses choose the Gaussians that are removed."""
 
@@ -79,13 +37,32 @@ class Pruning(DensityStrategy):
         return cls(config)
 
     def __init__(self, config: FitConfig) -> None:
-        self.phase = PruneSchedule.from_config(config)
         self.prune = config.densify.prune
+        assert self.prune.to is not None, "a fit without it has no last phase"
+        self.to = self.prune.to  # Gaussians that are left in the end
+        # Nothing changes until after the first iteration; the last change is after the second.
+        self.start, self.stop = config.densify.prune_window(config.iterations)
         self.num_before = 0  # Gaussians, at the first change
+
+    def contains(self, iteration: int) -> bool:
+        """Return whether an iteration belongs to the phase."""
+        return self.start < iteration <= self.stop
 
     @override
     def is_due(self, iteration: int) -> bool:
-        return self.phase.is_due(iteration)
+        due = iteration % self.prune.every == 0 or iteration == self.stop
+        return self.contains(iteration) and due
+
+    def goal(self, iteration: int, before: int) -> int:
+        """Return the number to be left after an iteration: each change removes the same share.
+
+        ``before`` (to / before)^s, s being the share of the phase that is over, of ``before``
+        Gaussians at the first change; ``to`` at its end.
+        """
+        if iteration >= self.stop or before <= self.to:
+            return self.to
+        share = (iteration - self.start) / (self.stop - self.start)
+        return round(before * (self.to / before) ** share)
 
 
 @STRATEGIES.register("importance")
@@ -103,12 +80,11 @@ class Importance(Pruning):
 
     @override
     def begin(self, population: Population) -> None:
-        float_type = type(population.value("means").array)
-        self.scores = dr.zeros(float_type, population.num_local_rows)
+        self.scores = population.zeros()
 
     @override
     def needs_statistics(self, iteration: int) -> bool:
-        return self.phase.contains(iteration)
+        return self.contains(iteration)
 
     @override
     def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
@@ -124,7 +100,7 @@ class Importance(Pruning):
         before = population.num_rows
         self.num_before = self.num_before or before
         scores = population.gather(self.scores)
-        count = min(before, self.phase.num_left(iteration, self.num_before))
+        count = min(before, self.goal(iteration, self.num_before))
         if count == before:
             return None
         report = keep_best(population, scores, count)
@@ -155,13 +131,12 @@ class NaturalSelection(Pruning):
 
     @override
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
-        phase = self.phase
-        under_pressure = self.num_left > phase.to and phase.contains(iteration)
+        under_pressure = self.num_left > self.to and self.contains(iteration)
         return {"logit_opacities": self.prune.opacity_rate if under_pressure else 1.0}
 
     @override
     def is_due(self, iteration: int) -> bool:
-        is_over = 0 < self.num_left <= self.phase.to
+        is_over = 0 < self.num_left <= self.to
         return super().is_due(iteration) and not is_over
 
     @override
@@ -171,13 +146,13 @@ class NaturalSelection(Pruning):
         The shift follows from the number to be left now, up to ``MAX_PRESSURE``. The last time,
         the least opaque are removed until few enough are left.
         """
-        logits, phase = population.host("logit_opacities"), self.phase
+        logits = population.host("logit_opacities")
         threshold = math.log(self.prune.opacity / (1 - self.prune.opacity))
         self.num_left = before = count = len(logits)
         self.num_before = self.num_before or before
-        surplus = before - phase.num_left(iteration, self.num_before)
-        if iteration == phase.stop:
-            count = min(before, phase.to)
+        surplus = before - self.goal(iteration, self.num_before)
+        if iteration == self.stop:
+            count = min(before, self.to)
         elif surplus > 0:
             highest_removed = np.sort(logits)[surplus - 1]
             pressure = min(max(highest_removed - threshold, 0.0), MAX_PRESSURE)

@@ -1,36 +1,31 @@
 """The interface of strategies that change the population, and the rows that they change.
 
 Each iteration, :class:`drgs.training.trainer.Trainer` passes statistics (:class:`StepInfo`) to the
-strategy and lets it act on the rows of the optimizer (:class:`Population`). Iterations are counted
-from 1. A strategy is a function of the configuration and of :meth:`DensityStrategy.state`: where a
-plan is revised, another one is made and given the state.
+strategy and lets it act on the rows of the optimizer
+(:class:`drgs.training.optimizer.Population`). Iterations are counted from 1. Where a plan is
+revised, another strategy is made and given :meth:`DensityStrategy.state`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import Any, Protocol, cast
 
 import drjit as dr
 import numpy as np
+from typing_extensions import override
 
 from drgs.config.density import DEFAULT_SCHEDULE
+from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
-from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
+from drgs.core.types import Array2f, Bool, Float, TensorXf
 from drgs.datasets.types import Dataset
-from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.results.history import DensityReport
-from drgs.training.optimizer import (
-    LeanAdam,
-    edit_rows,
-    num_rows,
-    replace_values,
-    set_values,
-    take_rows,
-)
+from drgs.training.optimizer import Population
 
 
 @dataclass(frozen=True)
@@ -51,116 +46,12 @@ class StepInfo:
 NOT_BEGUN: Any = None  # statistics before :meth:`DensityStrategy.begin`
 
 PixelWeight = Callable[[TensorXf, TensorXf], Float]
-"""Computes a plane, Float (H W,), from the rendered image and the photograph: tensors (H, W, 3) in
-display space."""
+"""Computes a plane, Float (H W,), of an image and its photograph (H, W, 3), display space."""
 
 
 def absolute_errors(image: TensorXf, photograph: TensorXf) -> Float:
     """Return the mean absolute difference of each pixel's channels: Float (H W,)."""
     return dr.mean(dr.abs(image - photograph), axis=2).array
-
-
-@dataclass(frozen=True)
-class Population:
-    """The rows of a fit, which a strategy may read and change.
-
-    A row is a Gaussian: its parameters, named as in ``gaussians.PARAMETER_NAMES``, and the moments
-    that Adam keeps of them. Everything is detached. Where several processes fit, each has some rows
-    (:class:`drgs.training.parallel.population.ShardedPopulation`).
-    """
-
-    optimizer: LeanAdam
-    prefix: str  # what precedes a parameter's name in the optimizer
-    extent: float  # of the scene, world units
-    seed: int
-
-    @property
-    def num_rows(self) -> int:
-        """The number of Gaussians at the moment."""
-        return num_rows(self.optimizer, self.prefix)
-
-    @property
-    def num_local_rows(self) -> int:
-        """The number of rows of :meth:`value`."""
-        return num_rows(self.optimizer, self.prefix)
-
-    @property
-    def first_row(self) -> int:
-        """The number of the first row of this process."""
-        return 0
-
-    def value(self, name: str) -> dr.ArrayBase:
-        """Return a parameter as it is at the moment, on the device: the rows of this process."""
-        return dr.detach(self.optimizer[self.prefix + name])
-
-    def host(self, name: str) -> np.ndarray:
-        """Return a parameter of all rows on the host, float64; waits for the device."""
-        return self.gather(self.value(name))
-
-    def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
-        """Return the values of all rows from those of this process: on the host, float64."""
-        return np.array(values, dtype=np.float64)
-
-    def local(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the rows of this process from those of all rows."""
-        return values
-
-    def rows(self, numbers: np.ndarray) -> UInt32:
-        """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
-        return from_host(self._index_type, numbers.astype(np.uint32))
-
-    def row_numbers(self) -> UInt32:
-        """Return the numbers of the rows of this process: UInt32."""
-        return dr.arange(self._index_type, self.num_local_rows)
-
-    @property
-    def _index_type(self) -> type:
-        return dr.uint32_array_t(type(self.value("means").array))
-
-    def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
-        """Return copies of some rows of every parameter by name; rows: (M,) ``UInt32``."""
-        return take_rows(self.optimizer, rows, self.prefix)
-
-    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
-        """Keep some rows in the order given and append others.
-
-        keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Kept rows
-        take their moments along, appended ones start with moments of zero.
-        """
-        edit_rows(self.optimizer, keep, append, self.prefix)
-
-    def replace(self, name: str, value: dr.ArrayBase) -> None:
-        """Give a parameter new values of the same shape, and moments of zero."""
-        replace_values(self.optimizer, name, value, self.prefix)
-
-    def set_values(self, name: str, value: dr.ArrayBase) -> None:
-        """Give a parameter new values of the same shape; its moments stay. Waits for nothing."""
-        set_values(self.optimizer, name, value, self.prefix)
-
-    def gather_terms(
-        self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
-    ) -> list[Float] | list[np.ndarray]:
-        """Return terms of the loss over all rows, detached.
-
-        terms: over the rows of this process; compute: computes them from parameters by name.
-        """
-        return [dr.detach(term) for term in terms]
-
-    def gather_gaussians(self, local: Gaussians) -> Gaussians:
-        """Return all Gaussians, from those of this process."""
-        return local
-
-    def gather_state(
-        self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
-    ) -> dict[str, np.ndarray]:
-        """Return a trainer's state with all rows, from that of this process."""
-        return state
-
-    def scatter_state(
-        self, state: Mapping[str, np.ndarray], is_by_row: Callable[[str], bool]
-    ) -> Mapping[str, np.ndarray]:
-        """Return the part of a whole state that this process has."""
-        return state
 
 
 def displace_means(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> TensorXf:
@@ -205,10 +96,7 @@ class DensityStrategy(Protocol):
     first (and half of stop), ``densify.stop`` at most the second; and ``optimizer.decay``."""
 
     def begin(self, population: Population) -> None:
-        """Start with the statistics of no views.
-
-        Called before the first iteration, and when others have changed the rows.
-        """
+        """Reset the statistics: before the first iteration, and when others change the rows."""
 
     def needs_statistics(self, iteration: int) -> bool:
         """Return whether :meth:`update_statistics` is called for this iteration."""
@@ -233,10 +121,7 @@ class DensityStrategy(Protocol):
         yield from ()
 
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
-        """Return factors of the learning rates of this iteration, by parameter.
-
-        A parameter that is named in one iteration is named in all.
-        """
+        """Return factors of the learning rates of this iteration, by parameter."""
         return {}
 
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
@@ -246,10 +131,9 @@ class DensityStrategy(Protocol):
         """
 
     def is_due(self, iteration: int) -> bool:
-        """Return whether :meth:`refine` is called after this iteration.
+        """Return whether :meth:`refine` is called after this iteration, and after the other calls.
 
-        It is called after :meth:`update_statistics` and :meth:`perturb`, when all is known to be
-        finite.
+        All numbers are known to be finite then.
         """
         return False
 
@@ -269,3 +153,106 @@ class DensityStrategy(Protocol):
         Called for an estimate, without :meth:`begin`.
         """
         return start
+
+
+def density_strategy(
+    config: FitConfig, dataset: Dataset | None = None, growth: DensityStrategy | None = None
+) -> DensityStrategy:
+    """Return the strategy of a fit: growth, and a last phase if there is one.
+
+    dataset: None for an estimate; growth: a strategy instead of ``densify.strategy``.
+    """
+
+    def make(name: str) -> DensityStrategy:
+        strategy = STRATEGIES.get(name, "densify.strategy")
+        section = section_of(strategy, config.extensions)
+        return strategy.value.from_config(config, dataset, section)
+
+    growth = make(config.densify.strategy) if growth is None else growth
+    if config.densify.prune.to is None:
+        return growth
+    return Phases([growth, make(config.densify.prune.method)])
+
+
+class Phases(DensityStrategy):
+    """Strategies that follow one another; where one changes rows, the others begin anew."""
+
+    def __init__(self, phases: Sequence[DensityStrategy]) -> None:
+        self.phases = phases
+        self.by_row = [name for phase in phases for name in phase.by_row]
+
+    @override
+    def begin(self, population: Population) -> None:
+        for phase in self.phases:
+            phase.begin(population)
+
+    @override
+    def needs_statistics(self, iteration: int) -> bool:
+        return any(phase.needs_statistics(iteration) for phase in self.phases)
+
+    @override
+    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
+        needed = [phase for phase in self.phases if phase.needs_statistics(iteration)]
+        return {k: v for phase in needed for k, v in phase.pixel_weights(iteration).items()}
+
+    @override
+    def update_statistics(self, step: StepInfo) -> None:
+        for phase in self.phases:
+            if phase.needs_statistics(step.iteration):
+                phase.update_statistics(step)
+
+    @override
+    def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
+        return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
+
+    @override
+    def rate_factors(self, iteration: int) -> Mapping[str, float]:
+        product: dict[str, float] = {}
+        for phase in self.phases:
+            for name, factor in phase.rate_factors(iteration).items():
+                product[name] = product.get(name, 1.0) * factor
+        return product
+
+    @override
+    def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
+        for phase in self.phases:
+            phase.perturb(population, iteration, means_lr)
+
+    @override
+    def is_due(self, iteration: int) -> bool:
+        return any(phase.is_due(iteration) for phase in self.phases)
+
+    @override
+    def refine(self, population: Population, iteration: int) -> DensityReport | None:
+        """Let the phases that are due act, one after the other; return the sum of the reports."""
+        total: DensityReport | None = None
+        for phase in self.phases:
+            report = phase.refine(population, iteration) if phase.is_due(iteration) else None
+            if report is not None:
+                for other in self.phases:
+                    if other is not phase:
+                        other.begin(population)
+                total = report if total is None else _sum(total, report)
+        return total
+
+    @override
+    def state(self) -> dict[str, np.ndarray]:
+        return {name: v for phase in self.phases for name, v in phase.state().items()}
+
+    @override
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        for phase in self.phases:
+            phase.restore(state)
+
+    @override
+    def max_num_gaussians(self, start: int, iterations: int) -> int:
+        """Return the largest number: each phase may begin with that of the one before."""
+        most = start
+        for phase in self.phases:
+            most = max(most, phase.max_num_gaussians(most, iterations))
+        return most
+
+
+def _sum(first: DensityReport, second: DensityReport) -> DensityReport:
+    counts = {name: count + getattr(second, name) for name, count in asdict(first).items()}
+    return DensityReport(**{**counts, "num_gaussians": second.num_gaussians})

@@ -1,4 +1,4 @@
-"""Random backgrounds behind transparent photographs. Imported for ``data.random_background``."""
+"""Random backgrounds behind transparent photographs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.core.types import TensorXf
 from drgs.datasets.types import Dataset, View
-from drgs.training.effects.base import FitState, TrainingEffect, as_tensor
+from drgs.training.effects.base import FitState, TrainingEffect, TrainingView, as_tensor
 from drgs.training.losses import prepare_target
-from drgs.training.views import TrainingView
 
 RANDOM_STREAM = 71  # tells the random numbers of backgrounds from others of the same seed
 

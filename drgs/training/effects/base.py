@@ -1,12 +1,10 @@
-"""Effects between rendering and the loss, and which of them take part in a fit.
-
-A :class:`TrainingEffect` takes part in each iteration, of which it knows a :class:`FitState`.
-"""
+"""Effects between rendering and the loss, and the views and the state of a fit that they see."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -21,7 +19,66 @@ from drgs.core.errors import UserError
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.integrator.types import SplatsPlugin
-from drgs.training.views import TrainingView
+from drgs.training.losses import Target, prepare_target
+
+
+class TrainingView:
+    """A photograph of the training split, at the size of one stage; in display space.
+
+    Targets and uploads are computed from the dataset when an iteration needs them, and stay on the
+    device while there is room: see :class:`drgs.training.steps.Stage`.
+    """
+
+    def __init__(
+        self,
+        view: View,
+        index: int,
+        sensor: mi.Sensor,
+        effects: Sequence[TrainingEffect],
+        window: tuple[int, float],
+    ) -> None:
+        """index: among the training views; window: width and sigma of SSIM's window, px."""
+        self.name, self.width, self.height = view.name, view.width, view.height
+        self.index, self.sensor = index, sensor
+        self.uploads = Uploads(view, effects)
+        self.replacement: Target | None = None  # an effect's
+        self._view, self._effects, self._window = view, effects, window
+
+    @cached_property
+    def counted_share(self) -> float:
+        """The share of pixels that are not masked."""
+        mask = self._view.mask
+        return 1.0 if mask is None else max(float(np.asarray(mask).mean()), 1e-10)
+
+    @cached_property
+    def photograph(self) -> Target:
+        """The photograph on the device."""
+        image = np.asarray(self._view.image)
+        for effect in self._effects:
+            image = effect.target_image(self._view, image)
+        return prepare_target(as_tensor(image), *self._window)
+
+    @property
+    def target(self) -> Target:
+        """The photograph that renderings are compared with, unless an effect replaces it."""
+        return self.photograph if self.replacement is None else self.replacement
+
+    def free(self) -> None:
+        """Free target and uploads; they are computed again when needed."""
+        self.__dict__.pop("photograph", None)
+        self.uploads.clear()
+
+
+class Uploads(dict[str, Any]):
+    """Device arrays of a view by effect, in any PyTree, made when they are needed."""
+
+    def __init__(self, view: View, effects: Sequence[TrainingEffect]) -> None:
+        super().__init__()
+        self._view, self._effects = view, {effect.name: effect for effect in effects}
+
+    def __missing__(self, name: str) -> object:
+        self[name] = upload = self._effects[name].upload(self._view)
+        return upload
 
 
 @dataclass(frozen=True)
@@ -46,10 +103,7 @@ class FitState:
 
 
 class TrainingEffect(Protocol):
-    """Base class of effects, which does nothing.
-
-    Images are tensors (H, W, C) in display space.
-    """
+    """Base class of effects, which does nothing; images are (H, W, C) in display space."""
 
     @classmethod
     def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
@@ -112,7 +166,7 @@ class TrainingEffect(Protocol):
         """Take a step, when the derivatives of all views of the fit's step are known.
 
         derivatives: of the step's loss, with respect to the view's :meth:`leaves`. Called in the
-        order of the views, some of which other processes may have rendered.
+        order of the views, on all processes.
         """
 
     def on_population_change(self, fit: FitState) -> None:

@@ -1,8 +1,8 @@
 """Training cameras that are optimised together with the splats.
 
-Imported when ``cameras.optimise`` is set. A view's camera is moved, in its own axes, by a rotation
-exp(turn) and a translation; all views share factors of the focal lengths and a shift of the
-principal point. Both poses of a camera that moves while it exposes are moved alike.
+A view's camera is moved, in its own axes, by a rotation exp(turn) and a translation; all views
+share factors of the focal lengths and a shift of the principal point. Both poses of a camera that
+moves while it exposes are moved alike.
 """
 
 from __future__ import annotations
@@ -28,14 +28,12 @@ from drgs.core.types import Array3f, Float
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
-from drgs.training.effects.base import FitState
-from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
-from drgs.training.views import TrainingView
+from drgs.training.effects.base import FitState, TrainingView
+from drgs.training.effects.view_parameters import OptimisedEffect
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
-MAX_FOCAL_FACTOR = 1000
-"""Largest factor, up or down, of a focal length that was known when the fit began."""
+MAX_FOCAL_FACTOR = 1000  # up or down
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class CameraRefinement(OptimisedEffect):
         # A rate of 0 leaves out what it belongs to.
         shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
         values = {name: np.zeros(shape) for name, shape in shapes.items()}
-        self.parameters = ViewParameters(values, rates | shared)
+        super().__init__(values, rates | shared)
         self.numbers: dict[int, dict[str, dr.ArrayBase]] = {}  # of the step's sensors, by view
 
     @override
@@ -93,14 +91,14 @@ class CameraRefinement(OptimisedEffect):
         self.numbers[view.index] = numbers = dr.detach(self._camera_of(view))
         if self._has_begun(fit):
             dr.enable_grad(numbers)
-        _put(view.sensor, numbers)
+        _set_sensor(view.sensor, numbers)
 
     def _has_begun(self, fit: FitState) -> bool:
         return fit.iterations_of_step[0] > self.first
 
     @override
     def place(self, view: TrainingView) -> None:
-        _put(view.sensor, dr.detach(self._camera_of(view)))
+        _set_sensor(view.sensor, dr.detach(self._camera_of(view)))
 
     @override
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
@@ -120,10 +118,10 @@ class CameraRefinement(OptimisedEffect):
                 dr.accum_grad(value, derivatives[name])
                 dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        self.parameters.step(view.index, fit.rate_decay)
+        self.step(view, fit.rate_decay)
 
     def _camera_of(self, view: TrainingView) -> dict[str, dr.ArrayBase]:
-        return self._camera(view.uploads[self.name], self.parameters.leaves(view.index))
+        return self._camera(view.uploads[self.name], self.parameters(view))
 
     @staticmethod
     def _camera(start: _Start, leaves: Mapping[str, Float]) -> dict[str, dr.ArrayBase]:
@@ -147,13 +145,11 @@ class CameraRefinement(OptimisedEffect):
 
     def refined_views(self, views: Sequence[View]) -> list[View]:
         """Return the training views with their cameras as they are now."""
-        numbers, result = self.parameters.numpy(), []
+        numbers, result = self.numpy(), []
         for index, view in enumerate(views):
-            row = {
-                name: cast(Float, mi.Float(v[min(index, len(v) - 1)]))
-                for name, v in numbers.items()
-            }
-            camera = self._camera(self.upload(view), row)
+            rows = {name: v[min(index, len(v) - 1)] for name, v in numbers.items()}
+            leaves = {name: cast(Float, mi.Float(row)) for name, row in rows.items()}
+            camera = self._camera(self.upload(view), leaves)
             values: dict[str, object] = {name: float(camera[name][0]) for name in INTRINSICS}
             if view.motion is not None:
                 close = _pose(camera["to_world_close"])
@@ -167,9 +163,9 @@ class CameraRefinement(OptimisedEffect):
 
         Raises :class:`UserError` for focal lengths that no camera has.
         """
-        shared = self.parameters.optimizers.keys() & {"log_focals", "shifts"}
-        found = self.parameters.numpy()
-        numbers, changes = {name: found[name][0].astype(np.float64) for name in shared}, {}
+        shared = self.optimizers.keys() & {"log_focals", "shifts"}
+        values, changes = self.numpy(), {}
+        numbers = {name: values[name][0].astype(np.float64) for name in shared}
         if "log_focals" in numbers:
             if np.abs(numbers["log_focals"]).max() > np.log(MAX_FOCAL_FACTOR):
                 raise UserError(
@@ -190,13 +186,13 @@ class CameraRefinement(OptimisedEffect):
     @override
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
+        cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
+        content = {"lens_change": asdict(self.lens_change), **cameras}
         with atomic_path(folder / CAMERAS) as temporary:
-            cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
-            found = {"lens_change": asdict(self.lens_change), **cameras}
-            temporary.write_text(json.dumps(found, indent=1) + "\n")
+            temporary.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def _put(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:
+def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:
     """Set a sensor's parameters."""
     params = mi.traverse(sensor)
     params["to_world"] = _transform(numbers["to_world"])

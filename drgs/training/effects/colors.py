@@ -1,10 +1,9 @@
 """Exposure and white balance: an affine colour transform for each training photograph.
 
-Imported when ``colors.lr`` is given. A rendering is transformed, y = A (r, g, b, 1), before it is
-compared with its photograph. A starts as the identity and is drawn to it; and since darker splats
-under brighter transforms would look the same, the mean of all photographs' transforms is the
-identity. New views are rendered without a transform. (The 3DGS reference's "exposure compensation"
-has neither bond.) The background behind a transparent photograph stays as it is.
+A rendering is transformed, y = A (r, g, b, 1), before it is compared with its photograph. A starts
+as the identity and is drawn to it; and since darker splats under brighter transforms would look the
+same, the mean of all photographs' transforms is the identity. (The 3DGS reference's "exposure
+compensation" has neither bond.) The background behind a transparent photograph stays as it is.
 """
 
 from __future__ import annotations
@@ -26,9 +25,8 @@ from drgs.core.files import atomic_path
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
-from drgs.training.effects.base import FitState, as_numbers, as_tensor
-from drgs.training.effects.view_parameters import OptimisedEffect, ViewParameters
-from drgs.training.views import TrainingView
+from drgs.training.effects.base import FitState, TrainingView, as_numbers, as_tensor
+from drgs.training.effects.view_parameters import OptimisedEffect
 
 IDENTITY = np.eye(3, 4).reshape(1, 12)  # the identity, row by row
 
@@ -50,7 +48,7 @@ class ColorCorrection(OptimisedEffect):
         self.weight = config.identity_weight
         assert config.lr is not None, "the effect is used where it is given"
         values = {"matrices": np.repeat(IDENTITY, num_views, axis=0)}
-        self.parameters = ViewParameters(values, {"matrices": config.lr})
+        super().__init__(values, {"matrices": config.lr})
         # What all have in common, and do without: not differentiated.
         self.common = cast(Float, dr.opaque(mi.Float, 0, IDENTITY.size))
         self.share = 1 / num_views
@@ -65,7 +63,7 @@ class ColorCorrection(OptimisedEffect):
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
-        self.matrix = self.parameters.leaves(view.index)["matrices"] - self.common
+        self.matrix = self.parameters(view)["matrices"] - self.common
 
     @override
     def adjust(self, image: TensorXf, view: TrainingView) -> TensorXf:
@@ -87,14 +85,14 @@ class ColorCorrection(OptimisedEffect):
         """Step the view's transform, and all a little back: their mean stays."""
         dr.set_grad(self.leaves(view), derivatives)
         before = self.numbers_of(view)["matrices"]
-        self.parameters.step(view.index, fit.rate_decay)
+        self.step(view, fit.rate_decay)
         after = self.numbers_of(view)["matrices"]
         self.common = self.common + (after - before) * self.share
         dr.eval(self.common)
 
     def transforms(self) -> np.ndarray:
         """Return the transforms of all training views, (V, 3, 4)."""
-        matrices = self.parameters.numpy()["matrices"] - np.array(self.common)
+        matrices = self.numpy()["matrices"] - np.array(self.common)
         return matrices.reshape(-1, 3, 4)
 
     @override
@@ -109,8 +107,8 @@ class ColorCorrection(OptimisedEffect):
     @override
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``colors.json``: the transform of each training view, 3 x 4, by name."""
-        found = zip(dataset.train, self.transforms(), strict=True)
-        by_view = {view.name: matrix.tolist() for view, matrix in found}
+        pairs = zip(dataset.train, self.transforms(), strict=True)
+        by_view = {view.name: matrix.tolist() for view, matrix in pairs}
         with atomic_path(folder / COLORS) as temporary:
             temporary.write_text(json.dumps(by_view, indent=1) + "\n")
 

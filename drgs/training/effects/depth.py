@@ -1,4 +1,4 @@
-"""Supervision by the depth that the data has. Imported where a view has it and it counts.
+"""Supervision by the depth that the data has.
 
 Dr.Jit differentiates a gather by adding atomically, in an order that no two runs share: here, as in
 ``colors.py``, operations on pixels have adjoints that scatter nothing.
@@ -18,8 +18,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.arrays import image_of, planes_of
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
-from drgs.training.effects.base import TrainingEffect, as_numbers
-from drgs.training.views import TrainingView
+from drgs.training.effects.base import TrainingEffect, TrainingView, as_numbers
 
 
 @EFFECTS.register("depth")
@@ -27,8 +26,7 @@ class DepthSupervision(TrainingEffect):
     """Penalises the difference between the composited depth and that of the data.
 
     The term is weight / extent times the mean of |D - A d| over the pixels whose depth d is known
-    and that no mask leaves out, D being the alpha-weighted sum of the splats' depths and A the
-    alpha.
+    and not masked, D being the alpha-weighted sum of the splats' depths and A the alpha.
     """
 
     name = "depth"
@@ -97,9 +95,8 @@ class _Split(dr.CustomOp):
 def depth_error(depths: TensorXf, target: Float, weights: Float) -> Float:
     """Return sum_i w_i |D_i - A_i d_i| over pixels, a Float of one value.
 
-    depths: (H, W, 2), the composited depth D and alpha A; target: d, Float (H * W,), in the units
-    of D; weights: w, Float (H * W,). The derivative of |x| at 0 is taken as 0. Not differentiated:
-    target and weights.
+    depths: (H, W, 2), D and A; target: d, Float (H * W,); weights: w, Float (H * W,). The
+    derivative of |x| at 0 is taken as 0. Not differentiated: target and weights.
     """
     return dr.custom(_DepthError, depths=depths, target=target, weights=weights)
 

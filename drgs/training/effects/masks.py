@@ -1,4 +1,4 @@
-"""Pixels that the dataset's masks leave out of a fit. Imported where a view has a mask."""
+"""Pixels that the dataset's masks leave out of a fit."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing_extensions import override
 from drgs.config.extensions import EFFECTS
 from drgs.core.types import TensorXf
 from drgs.datasets.types import View
-from drgs.training.effects.base import TrainingEffect, as_tensor
-from drgs.training.views import TrainingView
+from drgs.training.effects.base import TrainingEffect, TrainingView, as_tensor
 
 
 @EFFECTS.register("masks")

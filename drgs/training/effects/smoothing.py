@@ -1,4 +1,4 @@
-"""Keeps the 3D smoothing filter of a fit up to date. Imported for ``model.smoothing``."""
+"""Keeps the 3D smoothing filter of a fit up to date."""
 
 from __future__ import annotations
 

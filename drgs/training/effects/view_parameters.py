@@ -1,4 +1,4 @@
-"""Parameters of single training views, and steps of Adam that move no other view's."""
+"""Effects with parameters of single training views, and steps of Adam that move no other view's."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from drjit.opt import Adam
 from typing_extensions import override
 
 from drgs.core.types import Float
-from drgs.training.effects.base import TrainingEffect
+from drgs.training.effects.base import TrainingEffect, TrainingView
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
-from drgs.training.views import TrainingView
 
 
-class ViewParameters:
-    """A row of numbers for each view (or one row for all), by name; optimised when it is seen.
+class OptimisedEffect(TrainingEffect):
+    """An effect with rows of numbers by name, one for each view or one for all views.
 
     Each row has an optimizer of its own: whenever a view is seen for the first time, its first
-    steps are as long as the rate.
+    steps are as long as the rate. The numbers are checked, and part of checkpoints.
     """
 
     def __init__(self, values: Mapping[str, np.ndarray], rates: Mapping[str, float]) -> None:
@@ -32,32 +31,48 @@ class ViewParameters:
             for name, value in values.items()
         }
 
-    def leaves(self, index: int) -> dict[str, Float]:
+    def parameters(self, view: TrainingView) -> dict[str, Float]:
         """Return the numbers (K,) of a view, with derivatives enabled."""
         return {
-            name: cast(Float, optimizer[name]) for name, optimizer in self._of_view(index).items()
+            name: cast(Float, optimizer[name])
+            for name, optimizer in self._optimizers_of(view).items()
         }
 
-    def numbers(self, index: int) -> dict[str, Float]:
-        """Return the same without derivatives."""
-        return dr.detach(self.leaves(index))
-
-    def step(self, index: int, decay: float = 1.0) -> None:
+    def step(self, view: TrainingView, decay: float) -> None:
         """Move the view's numbers along their derivatives; decay: factor of the rates."""
-        for name, optimizer in self._of_view(index).items():
+        for name, optimizer in self._optimizers_of(view).items():
             optimizer.set_learning_rate({name: decay * self.rates[name]})
             optimizer.step()
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Return the numbers, (V, K) each."""
-        state = self.state()
-        return {name: state[f"{name}.value"] for name in self.optimizers}
+        rows = self._optimizer_rows()
+        return {name: rows[f"{name}.value"] for name in self.optimizers}
 
+    @override
+    def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
+        return self.parameters(view)
+
+    @override
+    def numbers_of(self, view: TrainingView) -> dict[str, Float]:
+        return dr.detach(self.parameters(view))
+
+    @override
     def values(self) -> dict[str, np.ndarray]:
-        """Return numbers by name, and their moments as ``NAME.m`` and ``NAME.v``; a row each."""
-        return {key.removesuffix(".value"): value for key, value in self.state().items()}
+        return {key.removesuffix(".value"): v for key, v in self._optimizer_rows().items()}
 
+    @override
     def state(self) -> dict[str, np.ndarray]:
+        return self._optimizer_rows()
+
+    @override
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        for name, optimizers in self.optimizers.items():
+            own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
+            for row, optimizer in enumerate(optimizers):
+                restore_optimizer(optimizer, {key: value[row] for key, value in own.items()})
+
+    def _optimizer_rows(self) -> dict[str, np.ndarray]:
         """Return numbers, moments and step counts, a row for each view."""
         result = {}
         for optimizers in self.optimizers.values():
@@ -65,38 +80,7 @@ class ViewParameters:
             result |= {key: np.stack([row[key] for row in rows]) for key in rows[0]}
         return result
 
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from :meth:`state`."""
-        for name, optimizers in self.optimizers.items():
-            own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
-            for row, optimizer in enumerate(optimizers):
-                restore_optimizer(optimizer, {key: value[row] for key, value in own.items()})
-
-    def _of_view(self, index: int) -> dict[str, Adam]:
-        return {name: rows[min(index, len(rows) - 1)] for name, rows in self.optimizers.items()}
-
-
-class OptimisedEffect(TrainingEffect):
-    """An effect whose ``parameters`` are optimised: they are checked, and part of checkpoints."""
-
-    parameters: ViewParameters
-
-    @override
-    def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
-        return self.parameters.leaves(view.index)
-
-    @override
-    def numbers_of(self, view: TrainingView) -> dict[str, Float]:
-        return self.parameters.numbers(view.index)
-
-    @override
-    def values(self) -> dict[str, np.ndarray]:
-        return self.parameters.values()
-
-    @override
-    def state(self) -> dict[str, np.ndarray]:
-        return self.parameters.state()
-
-    @override
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        self.parameters.restore(state)
+    def _optimizers_of(self, view: TrainingView) -> dict[str, Adam]:
+        return {
+            name: rows[min(view.index, len(rows) - 1)] for name, rows in self.optimizers.items()
+        }

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,18 +26,6 @@ NUM_SPINS, MAX_PAUSE_S = 50, 1e-3
 NO_ITERATION = 2**62  # iteration of an error that did not occur
 
 T = TypeVar("T")
-
-
-class Request(Protocol):
-    """A communication that has begun, and may not be done: see ``mpi4py.MPI.Request``."""
-
-    def Test(self) -> bool:
-        """Return whether it is done."""
-        ...
-
-
-Buffers = np.ndarray | list[np.ndarray]
-"""An array, or a list that begins with one and describes its parts."""
 
 
 class SingleProcess:
@@ -54,8 +42,8 @@ class SingleProcess:
     def Ibcast(self, array: np.ndarray, root: int) -> None:
         """Leave the array as it is."""
 
-    def Iallgather(self, sent: Buffers, received: Buffers, root: int = 0) -> None:
-        """Copy the numbers."""
+    def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
+        """Copy the numbers; each an array, or a list that begins with one: see :func:`_parts`."""
         sent, received = (b[0] if isinstance(b, list) else b for b in (sent, received))
         received[:] = sent
 
@@ -113,8 +101,7 @@ class Communicator:
         rows = np.ascontiguousarray(rows)
         counts = self.all_gather(np.array(len(rows)))
         gathered = np.empty((int(counts.sum()), *rows.shape[1:]), rows.dtype)
-        sizes = counts * _row_bytes(rows)
-        wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, sizes)))
+        wait(self.comm.Iallgatherv(_bytes(rows), _parts(gathered, counts)))
         return gathered
 
     def broadcast_numbers(self, numbers: ArrayLike) -> np.ndarray:
@@ -128,7 +115,7 @@ class Communicator:
         gathered = into = None
         if root == self.rank:
             gathered = np.empty((int(counts.sum()), *rows.shape[1:]), rows.dtype)
-            into = _parts(gathered, counts * _row_bytes(rows))
+            into = _parts(gathered, counts)
         wait(self.comm.Igatherv(_bytes(rows), into, root=root))
         return gathered
 
@@ -138,7 +125,7 @@ class Communicator:
         own = np.empty_like(like)
         parts = None
         if self.is_root:
-            parts = _parts(np.ascontiguousarray(rows), counts * _row_bytes(like))
+            parts = _parts(np.ascontiguousarray(rows), counts)
         wait(self.comm.Iscatterv(parts, _bytes(own)))
         return own
 
@@ -158,12 +145,10 @@ class Communicator:
 
     def exchange_rows(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Send rows to each rank, and return those from each rank."""
-        counts = self.all_gather(np.array([len(part) for part in parts]))[:, self.rank]
-        sent = np.concatenate(parts)
+        sent, num_sent = np.concatenate(parts), [len(part) for part in parts]
+        counts = self.all_gather(np.array(num_sent))[:, self.rank]
         received = np.empty((int(counts.sum()), *sent.shape[1:]), sent.dtype)
-        sizes = [part.nbytes for part in parts]
-        received_sizes = counts * _row_bytes(sent)
-        wait(self.comm.Ialltoallv(_parts(sent, sizes), _parts(received, received_sizes)))
+        wait(self.comm.Ialltoallv(_parts(sent, num_sent), _parts(received, counts)))
         return np.split(received, np.cumsum(counts)[:-1])
 
     def collective(self, call: Callable[[], T]) -> T:
@@ -188,17 +173,17 @@ class Communicator:
         text = self.broadcast_text("" if error is None else str(error), first)
         raise NonFiniteError(text, int(iteration)) if is_non_finite else UserError(text)
 
-    def send(self, array: np.ndarray, to: int, tag: int) -> Request:
+    def send(self, array: np.ndarray, to: int, tag: int) -> Any:
         """Begin to send an array, which must not change until the returned request is done."""
         return self.comm.Isend(_bytes(array), dest=to, tag=tag)
 
-    def receive(self, into: np.ndarray, source: int, tag: int) -> Request:
-        """Begin to receive into an array."""
+    def receive(self, into: np.ndarray, source: int, tag: int) -> Any:
+        """Begin to receive into an array; returns a request."""
         return self.comm.Irecv(_bytes(into), source=source, tag=tag)
 
 
-def wait(*requests: Request | None) -> None:
-    """Wait until all requests are done; None: a finished one."""
+def wait(*requests: Any) -> None:
+    """Wait until all ``mpi4py.MPI.Request`` are done; None: a finished one."""
     pending, polls = [request for request in requests if request is not None], 0
     while not all([request.Test() for request in pending]):
         polls += 1
@@ -211,10 +196,7 @@ def _bytes(array: np.ndarray) -> np.ndarray:
     return array.reshape(-1).view(np.uint8)
 
 
-def _parts(array: np.ndarray, sizes: Iterable[int]) -> list[object]:
-    """Return the memory of an array, divided among ranks; sizes: bytes."""
-    return [_bytes(array), [int(size) for size in sizes], None, "B"]
-
-
-def _row_bytes(rows: np.ndarray) -> int:
-    return rows.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
+def _parts(rows: np.ndarray, counts: Iterable[int]) -> list[object]:
+    """Return the memory of rows, divided among ranks; counts: rows of each rank."""
+    row_bytes = rows.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
+    return [_bytes(rows), [int(count) * row_bytes for count in counts], None, "B"]

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import add, or_
-from typing import cast
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +52,7 @@ from drgs.splatting.rendering import (
     weighted_sums,
 )
 from drgs.splatting.tiles import Footprints
-from drgs.training.parallel.communicator import Communicator, Request, wait
+from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.population import renderer_of
 from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
@@ -77,12 +77,6 @@ class LocalProjection:
     num_features: int
     num_keys: int
 
-    @staticmethod
-    def from_footprints(camera: Camera, pipeline: Pipeline, found: Footprints) -> LocalProjection:
-        """Keep the inputs of the derivatives of projected splats."""
-        counts = found.rows.width, found.num_features, found.num_keys
-        return LocalProjection(camera, pipeline, found.boxes, *counts)
-
     @property
     def num_rows(self) -> int:
         """Rows of this rank."""
@@ -93,11 +87,6 @@ class LocalProjection:
         """Bool by row: its box has tiles of the film."""
         t = types_of(self.boxes.Float)
         return self.boxes.load(dr.arange(t.UInt32, self.num_rows))[-1] > 0
-
-    @property
-    def num_gradients(self) -> int:
-        """Numbers of the derivatives with respect to geometry and features."""
-        return self.num_stored - self.num_keys
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -115,44 +104,28 @@ class LocalProjection:
         num_geometry = len(columns) - self.num_features
         return SplatGradients(columns[:num_geometry], columns[num_geometry:])
 
+    def pack(self, splats: Footprints, rows: UInt32) -> Blocks:
+        """Return the projected splats of some rows of this rank, (M,), on the host."""
+        count, float_type = dr.width(rows), splats.rows.Float
+        if count == 0:
+            return _empty_blocks(0, self.widths, float_type)
+        boxes, stored = (Rows.from_columns(each.load(rows)) for each in (splats.boxes, splats.rows))
+        depths = dr.gather(float_type, splats.depths, rows)
+        dr.eval(boxes, stored, depths)
+        flat = [*boxes.blocks, *stored.blocks, depths]
+        return [each.numpy().reshape(count, -1) for each in flat]
 
-@dataclass(frozen=True, eq=False)
-class PackedProjection:
-    """This rank's rows that are on the film of a view that another rank renders."""
-
-    local: LocalProjection
-    rows: UInt32  # (M,), ascending
-    count: int  # M
-    blocks: Blocks  # of these rows; empty once they are sent
-
-    @staticmethod
-    def from_footprints(local: LocalProjection, found: Footprints) -> PackedProjection:
-        """Pack the splats on the film. The host reads their number."""
-        rows = cast(UInt32, dr.compress(local.visible))
-        count, float_type = dr.width(rows), found.rows.Float
-        blocks = _empty_blocks(0, local.widths, float_type)
-        if count > 0:
-            boxes, stored = (
-                Rows.from_columns(each.load(rows)) for each in (found.boxes, found.rows)
-            )
-            depths = dr.gather(float_type, found.depths, rows)
-            dr.eval(boxes, stored, depths)
-            flat = [*boxes.blocks, *stored.blocks, depths]
-            blocks = [each.numpy().reshape(count, -1) for each in flat]
-        return PackedProjection(local, rows, count, blocks)
-
-    def unpack(self, blocks: Blocks, width: int) -> list[Float]:
-        """Return columns for all rows of this rank: numbers of those on the film, 0 for others."""
-        t = types_of(self.local.boxes.Float)
-        num_rows = self.local.num_rows
-        if self.count == 0:
-            return [dr.zeros(t.Float, num_rows) for _ in range(width)]
+    def unpack(self, rows: UInt32, blocks: Blocks, width: int) -> list[Float]:
+        """Return columns for all rows of this rank: the blocks' numbers of ``rows``, else 0."""
+        t, count = types_of(self.boxes.Float), dr.width(rows)
+        if count == 0:
+            return [dr.zeros(t.Float, self.num_rows) for _ in range(width)]
         nowhere = 0xFFFFFFFF
-        place = dr.full(t.UInt32, nowhere, num_rows)
-        dr.scatter(place, dr.arange(t.UInt32, self.count), self.rows)
+        place = dr.full(t.UInt32, nowhere, self.num_rows)
+        dr.scatter(place, dr.arange(t.UInt32, count), rows)
         dr.eval(place)
-        rows = Rows(tuple(wrap_numpy(t.Float, block) for block in blocks), width)
-        return rows.load(place, place != nowhere)
+        received = Rows(tuple(wrap_numpy(t.Float, block) for block in blocks), width)
+        return received.load(place, place != nowhere)
 
 
 def _empty_blocks(count: int, widths: Sequence[int], float_type: type) -> Blocks:
@@ -174,57 +147,21 @@ def _concatenate(parts: Sequence[Footprints]) -> Footprints:
     return Footprints(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)
 
 
-class ViewMessages:
-    """Messages between ranks about the views of a step, identified by place in the step and time.
-
-    Messages about the same view and time arrive in the order in which they are sent.
-    """
-
-    def __init__(self, comm: Communicator) -> None:
-        self.comm = comm
-        self._sending: list[tuple[list[Request], Blocks]] = []  # requests, and what they send
-
-    def send(self, blocks: Blocks, to: int, place: int, time: int) -> None:
-        """Begin to send rows to a rank."""
-        tag = place * MAX_SHUTTER_SAMPLES + time
-        self._sending.append(([self.comm.send(block, to, tag) for block in blocks], blocks))
-
-    def receive(self, into: Blocks, source: int, place: int, time: int) -> None:
-        """Wait for the next rows that a rank sends."""
-        tag = place * MAX_SHUTTER_SAMPLES + time
-        wait(*(self.comm.receive(block, source, tag) for block in into))
-
-    def finish(self) -> None:
-        """Wait until all has been sent."""
-        wait(*(request for requests, _ in self._sending for request in requests))
-        self._sending.clear()
-
-
 @dataclass(eq=False)
 class _View:
-    """A view of the step, with this rank's results."""
+    """A view of the step, with this rank's results; lists are by time."""
 
     view: StepView
     renderer: int  # the rank that renders it
-    counts: np.ndarray = field(
-        init=False
-    )  # (ranks, times): splats that each rank sends to the renderer
-    packed: list[PackedProjection] = field(default_factory=list)  # by time, for another renderer
-    local: list[LocalProjection] = field(default_factory=list)  # by time
-    frames: list[Frame] = field(default_factory=list)  # by time, until the backward pass has ended
-    gradients: list[SplatGradients] = field(default_factory=list)  # by time, of own rows; until
-    # they are added
+    counts: np.ndarray = field(init=False)  # (ranks, times): splats sent to the renderer
+    local: list[LocalProjection] = field(default_factory=list)
+    rows: list[UInt32] = field(default_factory=list)  # sent to another renderer, ascending
+    frames: list[Frame] = field(default_factory=list)  # until the backward pass has ended
+    gradients: list[SplatGradients] = field(default_factory=list)  # own rows, until they are added
     means2d: Array2f = field(init=False)  # derivatives with respect to own rows' places on the film
-    sums: dict[str, Float] = field(
-        default_factory=dict
-    )  # by name: see DensityStrategy.pixel_weights
+    sums: dict[str, Float] = field(default_factory=dict)  # see DensityStrategy.pixel_weights
     needs_camera: bool = False
     first_nonfinite: UInt32 = field(init=False)
-
-    def num_splats(self, rank: int, time: int) -> int:
-        """Return the number of splats that a rank contributes to the rendered view."""
-        own = self.local[time].num_rows if time < len(self.local) else 0
-        return own if rank == self.renderer else int(self.counts[rank, time])
 
 
 class ViewExchange:
@@ -238,12 +175,12 @@ class ViewExchange:
         comm: Communicator,
         integrator: SplatsPlugin,
         params: mi.SceneParameters,
-        prefix: str,
         views_per_step: int,
     ) -> None:
-        """params: hold those of the Gaussians, after ``prefix``."""
-        self.comm, self.integrator, self.params, self.prefix = comm, integrator, params, prefix
-        self.views_per_step, self.messages = views_per_step, ViewMessages(comm)
+        """params: the parameters of the Gaussians."""
+        self.comm, self.integrator, self.params = comm, integrator, params
+        self.views_per_step = views_per_step
+        self._sending: list[tuple[Any, np.ndarray]] = []  # requests, and what they send
         self._views: list[_View] = []
         self._current: _View | None = None  # is rendered now; None: between two steps
         self._num_added = 0  # views whose derivatives are in the parameters
@@ -263,18 +200,18 @@ class ViewExchange:
             if each.renderer != self.comm.rank:
                 place(each.view)
         cameras = [self._cameras(each.view) for each in self._views]
+        packed, own = [], []
         for each, in_time in zip(self._views, cameras, strict=True):
-            if each.renderer != self.comm.rank:
-                self._project(each, in_time)
-        own = [[p.count for p in v.packed] or [0] * len(t) for v, t in zip(self._views, cameras)]  # noqa: B905
-        counts = self.comm.all_gather(np.array([count for of_view in own for count in of_view]))
+            is_sent = each.renderer != self.comm.rank
+            packed.append(self._project(each, in_time) if is_sent else [])
+            own.append([dr.width(rows) for rows in each.rows] if is_sent else [0] * len(in_time))
+        counts = self.comm.all_gather(np.concatenate(own))
         ends = np.cumsum([len(of_view) for of_view in own])
-        for each, of_view in zip(self._views, np.split(counts, ends[:-1], axis=1), strict=True):
+        split = np.split(counts, ends[:-1], axis=1)
+        for each, of_view, blocks_in_time in zip(self._views, split, packed, strict=True):
             each.counts = of_view
-            for time, packed in enumerate(each.packed):
-                blocks = packed.blocks[:]
-                packed.blocks.clear()
-                self.messages.send(blocks, each.renderer, each.view.place, time)
+            for time, blocks in enumerate(blocks_in_time):
+                self._send(blocks, each.renderer, each, time)
 
     def own_views(self) -> Iterator[StepView]:
         """Yield the views that this rank renders; each is rendered before the next is requested."""
@@ -305,18 +242,15 @@ class ViewExchange:
         """
         for each, weights in zip(self._views, names, strict=True):
             if each.renderer != self.comm.rank:
-                self._receive(each, weights)
+                self._receive_results(each, weights)
         self._add_ready_views(is_end=True)
-        self.messages.finish()
-        return [
-            ViewGradients(
-                each.means2d,
-                reduce(or_, (local.visible for local in each.local)),
-                each.sums,
-                each.first_nonfinite,
-            )
-            for each in self._views
-        ]
+        wait(*(request for request, _ in self._sending))
+        self._sending.clear()
+        results = []
+        for each in self._views:
+            visible = reduce(or_, (local.visible for local in each.local))
+            results.append(ViewGradients(each.means2d, visible, each.sums, each.first_nonfinite))
+        return results
 
     def share_losses(self, losses: Mapping[int, ViewLoss]) -> list[ViewLoss]:
         """Return the losses of all views, by place in the step; losses: of views rendered here."""
@@ -346,7 +280,8 @@ class ViewExchange:
             return project_footprints(gaussians, camera, pipeline)
         time = len(each.local)
         own = project_footprints(gaussians, camera, pipeline)
-        local = LocalProjection.from_footprints(camera, pipeline, own)
+        counts = own.rows.width, own.num_features, own.num_keys
+        local = LocalProjection(camera, pipeline, own.boxes, *counts)
         each.local.append(local)
         parts = []
         for rank in range(self.comm.size):
@@ -354,7 +289,7 @@ class ViewExchange:
                 parts.append(own)
             elif (count := int(each.counts[rank, time])) > 0:
                 blocks = _empty_blocks(count, local.widths, own.rows.Float)
-                self.messages.receive(blocks, rank, each.view.place, time)
+                self._receive(blocks, rank, each, time)
                 parts.append(local.footprints(blocks))
         return _concatenate(parts)
 
@@ -378,23 +313,34 @@ class ViewExchange:
         camera = without_effects(camera_from_sensor(state.detach()), self.integrator.ignore)
         return cameras_in_time(camera)
 
-    def _project(self, each: _View, cameras: Sequence[Camera]) -> None:
-        """Project the rows of this rank for a view that another renders."""
+    def _project(self, each: _View, cameras: Sequence[Camera]) -> list[Blocks]:
+        """Project the rows of this rank for a view that another renders.
+
+        Returns those on its film, by time. The host reads their number.
+        """
+        packed = []
         each.needs_camera = read_sensor(each.view.view.sensor, self.integrator.near).is_attached
         with dr.suspend_grad():
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             for camera in cameras:
                 of_camera = with_effects(pipeline, gaussians, camera)
-                found = project_footprints(gaussians, camera, of_camera)
-                each.local.append(LocalProjection.from_footprints(camera, of_camera, found))
-                each.packed.append(PackedProjection.from_footprints(each.local[-1], found))
+                splats = project_footprints(gaussians, camera, of_camera)
+                counts = splats.rows.width, splats.num_features, splats.num_keys
+                local = LocalProjection(camera, of_camera, splats.boxes, *counts)
+                rows = cast(UInt32, dr.compress(local.visible))
+                each.local.append(local)
+                each.rows.append(rows)
+                packed.append(local.pack(splats, rows))
+        return packed
 
     def _divide(self, each: _View, time: int, columns: list[Float]) -> list[Float]:
         """Send numbers of a rendered view's splats to their ranks; return those of this rank."""
         if self.comm.size == 1:
             return columns
         ranks = range(self.comm.size)
-        ends = np.cumsum([each.num_splats(rank, time) for rank in ranks])
+        counts = each.counts[:, time].copy()
+        counts[self.comm.rank] = each.local[time].num_rows
+        ends = np.cumsum(counts)
         rows = Rows.from_columns(columns)
         dr.eval(rows)
         widths = block_widths(rows.width)
@@ -403,32 +349,38 @@ class ViewExchange:
         for rank, start, end in zip(ranks, starts, ends, strict=True):
             if rank != self.comm.rank and end > start:
                 part = [block[start:end] for block in blocks]
-                self.messages.send(part, rank, each.view.place, time)
+                self._send(part, rank, each, time)
         index_type = types_of(rows.Float).UInt32
         first = dr.opaque(index_type, int(starts[self.comm.rank]))
         return rows.load(dr.arange(index_type, each.local[time].num_rows) + first)
 
-    def _receive(self, each: _View, weights: Sequence[str]) -> None:
+    def _receive_results(self, each: _View, weights: Sequence[str]) -> None:
         """Receive derivatives and weighted sums of this rank's rows from the view's renderer."""
-        place, source = each.view.place, each.renderer
-        for time, packed in enumerate(each.packed):
-            width = packed.local.num_gradients
-            columns = self._receive_columns(packed, source, place, time, width)
-            each.gradients.append(packed.local.gradients(columns))
+
+        def receive_columns(time: int, width: int) -> list[Float]:
+            local, rows = each.local[time], each.rows[time]
+            count = dr.width(rows)
+            blocks = _empty_blocks(count, block_widths(width), local.boxes.Float)
+            if count > 0:
+                self._receive(blocks, each.renderer, each, time)
+            return local.unpack(rows, blocks, width)
+
+        times = range(len(each.local))
+        for time, local in enumerate(each.local):
+            columns = receive_columns(time, local.num_stored - local.num_keys)
+            each.gradients.append(local.gradients(columns))
         for name in weights:
-            sums = [
-                self._receive_columns(packed, source, place, time, 1)[0]
-                for time, packed in enumerate(each.packed)
-            ]
+            sums = [receive_columns(time, 1)[0] for time in times]
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
 
-    def _receive_columns(
-        self, packed: PackedProjection, source: int, place: int, time: int, width: int
-    ) -> list[Float]:
-        blocks = _empty_blocks(packed.count, block_widths(width), packed.local.boxes.Float)
-        if packed.count > 0:
-            self.messages.receive(blocks, source, place, time)
-        return packed.unpack(blocks, width)
+    def _send(self, blocks: Blocks, to: int, each: _View, time: int) -> None:
+        """Begin to send rows of a view; those of one view and time arrive in their order."""
+        tag = each.view.place * MAX_SHUTTER_SAMPLES + time
+        self._sending += [(self.comm.send(block, to, tag), block) for block in blocks]
+
+    def _receive(self, into: Blocks, source: int, each: _View, time: int) -> None:
+        tag = each.view.place * MAX_SHUTTER_SAMPLES + time
+        wait(*(self.comm.receive(block, source, tag) for block in into))
 
     def _add_ready_views(self, is_end: bool) -> None:
         """Add the derivatives of the next groups of views whose derivatives are all here.
@@ -474,9 +426,8 @@ class ViewExchange:
         with dr.suspend_grad():
             gaussians, found, of_cameras = dr.detach(self.integrator.gaussians), [], []
             for local, gradients in zip(each.local, each.gradients, strict=True):
-                of_view, of_rows = gradients_by_row(
-                    gaussians, local.camera, local.pipeline, gradients, of_camera=True
-                )
+                seen = local.camera, local.pipeline, gradients
+                of_view, of_rows = gradients_by_row(gaussians, *seen, of_camera=True)
                 found.append(of_view)
                 rows = np.stack([np.array(column) for column in of_rows], axis=1)
                 rows = self.comm.gather_rows(rows, each.renderer)
@@ -492,5 +443,5 @@ class ViewExchange:
             accumulate_in_sensor(self.integrator.ignore, state, of_cameras)
 
     def _accumulate(self, gradients: Gaussians) -> None:
-        for key, parameter in self.params.items():
-            dr.accum_grad(parameter, getattr(gradients, key.removeprefix(self.prefix)))
+        for name, parameter in self.params.items():
+            dr.accum_grad(parameter, getattr(gradients, name))

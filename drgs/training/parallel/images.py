@@ -1,8 +1,4 @@
-"""``mpiexec -n K drgs render``: processes share the images; rank 0 writes them.
-
-Every process reads what the command line names and finds the same cameras. Image k is rendered by
-rank k modulo K.
-"""
+"""``mpiexec -n K drgs render``: rank k modulo K renders image k; rank 0 writes them."""
 
 from __future__ import annotations
 

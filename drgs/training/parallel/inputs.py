@@ -1,9 +1,8 @@
 """Inputs of the processes of a fit: sent by rank 0, or read by each rank.
 
 Rank 0 reads the whole dataset of a fit. Each other rank reads the photographs of the views that it
-renders by itself, and of other views the cameras and sizes, from files' headers. What a rank reads
-is compared with rank 0: a stale copy on one machine would mix two datasets, and another version of
-a library would make the result depend on the number of processes.
+renders, and the sizes of others from files' headers. What it reads, and its libraries' versions,
+must be those of rank 0, or the result would depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ def share_inputs(
 ) -> tuple[FitConfig, Dataset]:
     """Return the configuration of rank 0, and the dataset with the photographs of this rank.
 
-    config, dataset: of rank 0, which gives the configuration completed, and all photographs; None
-    on other ranks.
+    config, dataset: without open values, and with all photographs; None on other ranks than 0.
 
     Raises ``UserError`` where a rank reads other photographs than rank 0, or has other versions.
     """

@@ -21,19 +21,18 @@ from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
 from drgs.core.types import Float, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.training.density.strategy import Population
-from drgs.training.optimizer import LeanAdam, take_rows
+from drgs.training.optimizer import LeanAdam, Population
 from drgs.training.parallel.communicator import Communicator
 
 
 def make_population(
-    optimizer: LeanAdam, prefix: str, extent: float, seed: int, comm: Communicator, total: int
+    optimizer: LeanAdam, extent: float, seed: int, comm: Communicator, total: int
 ) -> Population:
     """Return the rows of a fit; total: their number, of all processes."""
     if comm.size == 1:
-        return Population(optimizer, prefix, extent, seed)
+        return Population(optimizer, extent, seed)
     shard = Shard(total, comm.rank, comm.size)
-    return ShardedPopulation(optimizer, prefix, extent, seed, comm=comm, shard=shard)
+    return ShardedPopulation(optimizer, extent, seed, comm=comm, shard=shard)
 
 
 def local_gaussians(gaussians: Gaussians, comm: Communicator) -> Gaussians:
@@ -140,7 +139,7 @@ class ShardedPopulation(Population):
         place = np.argsort(owners, kind="stable")
         local = self.rows(wanted[owners == self.shard.rank] - self.first_row)
         taken = {}
-        for name, values in take_rows(self.optimizer, local, self.prefix).items():
+        for name, values in super().take(local).items():
             gathered = self.comm.all_gather_rows(np.array(values).reshape(values.shape))
             result = np.empty_like(gathered)
             result[place] = gathered
@@ -156,11 +155,10 @@ class ShardedPopulation(Population):
         move = self._row_moves(after, kept)
         first, end = (max(row - len(kept), 0) for row in (after.local.start, after.local.stop))
         optimizer.forget_moments()
-        for key in (key for key in optimizer.state if key.startswith(self.prefix)):
-            value, promoted, rate, (step, *moments, maximum) = optimizer.state[key]
+        for name, (value, promoted, rate, (step, *moments, maximum)) in optimizer.state.items():
             appended = np.empty((0, *value.shape[1:]), np.float32)
             if append is not None:
-                appended = np.array(append[key.removeprefix(self.prefix)])[first:end]
+                appended = np.array(append[name])[first:end]
             rows = np.concatenate([move(np.array(dr.detach(value))), appended])
             none = np.zeros_like(appended)
             first_moment, second_moment = (
@@ -174,7 +172,7 @@ class ShardedPopulation(Population):
             dr.make_opaque(new_value, first_moment, second_moment)
             dr.enable_grad(new_value)
             extra = step, first_moment, second_moment, maximum
-            optimizer.state[key] = new_value, promoted, rate, extra
+            optimizer.state[name] = new_value, promoted, rate, extra
         self.shard.total = after.total
 
     def _row_moves(self, after: Shard, kept: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:

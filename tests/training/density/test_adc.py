@@ -13,7 +13,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.training.density.adc import AdaptiveDensityControl
 from drgs.training.density.strategy import DensityReport, StepInfo
-from drgs.training.optimizer import make_optimizer, num_rows
 
 EARLY, LATE = 600, 3100  # before and after the first opacity reset of the default schedule
 
@@ -199,7 +198,7 @@ def test_last_gaussian_is_not_pruned_silently():
     optimizer = make([SMALL, SMALL], 0.001)
     with pytest.raises(UserError, match="iteration 600: every Gaussian would be pruned"):
         run(optimizer, [HIGH, 0])
-    assert num_rows(optimizer) == 2
+    assert rows_of(optimizer).num_rows == 2
 
 
 def test_all_gaussians_can_be_split():
@@ -211,18 +210,6 @@ def test_degree_0_has_no_higher_coefficients():
     optimizer = make([SMALL, LARGE], 0.5, sh_rows=0)
     assert run(optimizer, [HIGH, HIGH]).num_gaussians == 4
     assert "shN" not in optimizer
-
-
-def test_prefixed_parameters_are_found():
-    bare = make([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001])
-    rates = dict.fromkeys(PARAMETER_NAMES, 0.0)
-    optimizer = make_optimizer(dict(bare.items()), rates, "integrator.")
-    config, rows = DensifyConfig(), rows_of(optimizer, prefix="integrator.")
-    strategy = AdaptiveDensityControl(config, False, *statistics([HIGH] * 3))
-    report = strategy.densify_and_prune(rows, EARLY)
-    assert (report.cloned, report.split, report.pruned) == (1, 1, 1)
-    strategy.reset_opacities(rows)
-    assert num_rows(optimizer, "integrator.") == report.num_gaussians
 
 
 # ---- cap
@@ -304,7 +291,7 @@ def test_random_populations_follow_rules_and_cap(seed):
         norms.astype(float), scales, opacities, iteration == LATE, config
     )
     parents = [*kept, *cloned, *np.repeat(split, config.adc.split_count)]
-    assert report.num_gaussians == num_rows(optimizer) == len(parents)
+    assert report.num_gaussians == rows_of(optimizer).num_rows == len(parents)
     assert report.num_gaussians <= max(config.max_gaussians, len(kept))
     assert (report.cloned, report.split) == (len(cloned), len(split))
     assert report.pruned == num - len(kept) - len(split)

@@ -19,13 +19,13 @@ from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.training.density.budget import GrowthToNumber, halves
-from drgs.training.optimizer import make_optimizer, num_rows
+from drgs.training.optimizer import make_optimizer
 
 
 def strategy(optimizer, errors, first=None, **config):
     values = {"strategy": "budget", "start": 100, "stop": 1000, "every": 50, **config}
     made = GrowthToNumber(DensifyConfig.model_validate(values))
-    made.first = first or num_rows(optimizer)
+    made.first = first or rows_of(optimizer).num_rows
     made.errors = Float(np.asarray(errors, np.float32))
     return made
 
@@ -129,7 +129,7 @@ def test_growth_exceeds_neither_curve_nor_cap(seed, num, target, cap, iteration)
         return
     u = (iteration - 100) / 900
     on_curve = num + max(target - num, 0) * math.sqrt(u)
-    assert report.num_gaussians == num_rows(optimizer)
+    assert report.num_gaussians == rows_of(optimizer).num_rows
     assert report.num_gaussians <= max(num, min(on_curve + 1, cap))
     assert report.num_gaussians == num + report.num_added - report.pruned
     assert growth.max_num_gaussians(num, 1000) >= report.num_gaussians

@@ -13,7 +13,6 @@ from drgs.training.density.pruning import (
     MAX_PRESSURE,
     Importance,
     NaturalSelection,
-    PruneSchedule,
     keep_best,
 )
 
@@ -34,33 +33,33 @@ class Step:
 
 
 # ---- schedule
-def test_phase_follows_growth_and_takes_half_of_the_remaining_time():
-    schedule = PruneSchedule.from_config(config_of(to=100))
+def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
+    schedule = Importance(config_of(to=100))
     assert (schedule.start, schedule.stop) == (2000, 3000)
     config = FitConfig(data={"path": "."}, densify={"prune": {"to": 9}})
-    reference = PruneSchedule.from_config(config)
+    reference = Importance(config)
     assert (reference.start, reference.stop) == (15_000, 22_500)
     acting = [i for i in range(5000) if schedule.is_due(i)]
     assert acting == list(range(2050, 3001, 50))
 
 
-def test_configured_phase_begins_after_growth():
+def test_the_phase_can_be_named_and_comes_after_growth_wherever_that_ends():
     config = config_of(to=100, start=2500, stop=2730, every=100)
-    schedule = PruneSchedule.from_config(config)
+    schedule = Importance(config)
     assert [i for i in range(5000) if schedule.is_due(i)] == [2600, 2700, 2730]
-    later = PruneSchedule.from_config(with_changes(config, {"densify.stop": 2600}))
+    later = Importance(with_changes(config, {"densify.stop": 2600}))
     assert (later.start, later.stop) == (2600, 2730)
 
 
-def test_each_change_keeps_the_same_fraction_and_the_last_reaches_the_target():
-    schedule = PruneSchedule(start=1000, stop=1400, every=100, to=100)
-    wanted = [schedule.num_left(i, 1600) for i in (1100, 1200, 1300, 1400)]
+def test_each_change_leaves_the_same_share_and_the_last_one_the_number():
+    schedule = Importance(config_of(to=100, start=1000, stop=1400, grows_until=900))
+    wanted = [schedule.goal(i, 1600) for i in (1100, 1200, 1300, 1400)]
     assert wanted == [800, 400, 200, 100]
-    assert schedule.num_left(1100, 100) == 100
-    assert schedule.num_left(1100, 50) == 100
+    assert schedule.goal(1100, 100) == 100
+    assert schedule.goal(1100, 50) == 100
 
 
-def test_survivors_keep_their_order_and_moments():
+def test_the_best_stay_in_their_order_with_their_moments():
     optimizer = make([SIZE] * 6, 0.5)
     before = values(optimizer)
     former = {name: moments(optimizer, name) for name in PARAMETER_NAMES}
@@ -73,7 +72,7 @@ def test_survivors_keep_their_order_and_moments():
 
 
 # ---- natural selection
-def test_number_below_the_threshold_matches_the_number_to_prune():
+def test_as_many_fall_below_the_threshold_as_are_to_go():
     random = np.random.default_rng(0)
     opacities = random.uniform(0.005, 0.02, 200)
     optimizer = make([SIZE] * 200, opacities)
@@ -95,7 +94,7 @@ def test_number_below_the_threshold_matches_the_number_to_prune():
         np.testing.assert_array_equal(moment, expected[kept])
 
 
-def test_pressure_is_limited_and_then_prunes_nothing():
+def test_limited_pressure_may_prune_nothing():
     optimizer = make([SIZE] * 20, 0.5)
     phase = NaturalSelection(config_of(to=5))
     assert phase.refine(rows_of(optimizer), 2050) is None
@@ -103,7 +102,7 @@ def test_pressure_is_limited_and_then_prunes_nothing():
     np.testing.assert_allclose(logits, -MAX_PRESSURE, rtol=1e-6)
 
 
-def test_final_number_is_exact():
+def test_in_the_end_exactly_so_many_are_left():
     opacities = np.linspace(0.3, 0.9, 20)
     optimizer = make([SIZE] * 20, opacities)
     before = values(optimizer)["means"]
@@ -114,7 +113,7 @@ def test_final_number_is_exact():
     assert not any(phase.is_due(i) for i in range(5000))
 
 
-def test_population_below_the_target_is_unchanged():
+def test_fewer_than_that_are_left_alone():
     optimizer = make([SIZE] * 4, 0.5)
     before = values(optimizer)
     phase = NaturalSelection(config_of(to=5))
@@ -124,7 +123,7 @@ def test_population_below_the_target_is_unchanged():
         np.testing.assert_array_equal(value, before[name])
 
 
-def test_opacity_rate_is_raised_under_pressure():
+def test_opacities_are_faster_while_they_are_under_pressure():
     phase = NaturalSelection(config_of(to=5))
     optimizer = make([SIZE] * 20, 0.5)
 
@@ -139,7 +138,7 @@ def test_opacity_rate_is_raised_under_pressure():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_populations_reach_the_target(seed):
+def test_random_populations_end_with_the_number(seed):
     random = np.random.default_rng(seed)
     num, to = int(random.integers(4, 120)), int(random.integers(4, 60))
     method = (NaturalSelection, Importance)[seed % 2]
@@ -159,7 +158,7 @@ def test_random_populations_reach_the_target(seed):
 
 
 # ---- importance
-def test_least_visible_gaussians_of_the_phase_are_pruned():
+def test_those_that_show_least_in_the_phase_go():
     """Not since the last change: that is fewer views than there are."""
     optimizer = make([SIZE] * 8, 0.5)
     before = values(optimizer)["means"]
@@ -177,7 +176,7 @@ def test_least_visible_gaussians_of_the_phase_are_pruned():
 
 
 @pytest.mark.parametrize("method", [NaturalSelection, Importance])
-def test_phase_continues_from_its_state(method):
+def test_a_phase_resumes_from_its_state(method):
     def begun():
         phase = method(config_of(to=2))
         optimizer = make([SIZE] * 8, np.linspace(0.01, 0.6, 8))
@@ -215,12 +214,12 @@ def test_a_phase_that_would_end_before_it_begins_is_refused():
         ({"stop": 4001}, r"densify\.prune\.stop must be <= iterations \(4000\), got 4001"),
     ],
 )
-def test_phase_that_would_end_too_late_is_refused(values, message):
+def test_a_phase_that_would_not_be_over_in_time_is_refused(values, message):
     with pytest.raises(ValueError, match=message):
         config_of(to=5, **values)
 
 
-def test_phase_is_scaled_with_the_length_of_the_fit():
+def test_the_phase_keeps_its_share_of_a_longer_fit():
     config = with_iterations(config_of(to=5, start=2500, stop=3000), 8000)
     assert config.densify.prune_window(8000) == (5000, 6000)
     config = with_iterations(config_of(to=5), 8000)

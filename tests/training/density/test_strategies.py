@@ -13,9 +13,12 @@ from drgs.config.density import DensifyConfig
 from drgs.config.extensions import GROWTH
 from drgs.config.schema import FitConfig
 from drgs.training import trainer as trainer_module
-from drgs.training.density.registry import Phases, density_strategy
-from drgs.training.density.strategy import DensityReport, DensityStrategy
-from drgs.training.optimizer import set_values
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    Phases,
+    density_strategy,
+)
 from drgs.training.rates import revised_stops
 
 
@@ -149,7 +152,7 @@ def test_setting_values_keeps_moments_and_step_count():
     for name, entry in optimizer.state.items():
         assert all(now is then for now, then in zip(entry[1:], before[name], strict=True)), name
     with pytest.raises(ValueError, match=r"set_values\(\): means has shape \(3, 3\), the new valu"):
-        set_values(optimizer, "means", rows.take(dr.llvm.ad.UInt(0))["means"])
+        rows.set_values("means", rows.take(dr.llvm.ad.UInt(0))["means"])
 
 
 # ----------------------------------------------------------------------------------------------

@@ -137,7 +137,7 @@ def replanned(trainer):
 
 def test_unused_strategies_are_not_imported(monkeypatch):
     from drgs.config.extensions import STRATEGIES
-    from drgs.training.density.registry import density_strategy
+    from drgs.training.density.strategy import density_strategy
 
     names = {f"drgs.training.density.{module}" for module in MODULES}
     for strategy, expected in (
