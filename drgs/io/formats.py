@@ -175,7 +175,7 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
     if "smoothing" in gaussians and not extension.value.has_smoothing:
         raise UserError(
             f"the format {name} has no room for the smoothing of Gaussians: bake it into them "
-            "first, with drgs.effects.smoothing.baked or drgs export"
+            "first, with drgs.effects.smoothing.bake_smoothing or drgs export"
         )
     if not extension.value.allows_nonfinite:
         if not len(gaussians["means"]):
