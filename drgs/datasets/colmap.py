@@ -6,7 +6,7 @@ beside the model's folder) or, at a half, a quarter or an eighth of their size, 
 ``images_4``, ``images_8``; masks: see ``drgs.datasets.files``.
 
 Cameras are rendered with the lens that COLMAP found, without undistorting. Their intrinsics are
-scaled from the size that COLMAP saw to that of the photograph.
+scaled from the size in the model to that of the photograph.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class ColmapReader(DatasetReader):
 
     @override
     def image_files(self, config: DataConfig) -> list[Path]:
-        """Return the photographs of all images, as large as they are there."""
+        """Return the photographs of all images, at their stored size."""
         _, folder = require_model(config.path)
         widest = config.model_copy(update={"image_size": MAX_SIDE})
         return _images_and_files(widest, folder, read_model(folder), [])[1]

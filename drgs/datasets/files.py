@@ -1,4 +1,4 @@
-"""Files of a dataset: images whose names differ a little from those recorded, and masks.
+"""Files of a dataset: images with slightly different names than recorded, and masks.
 
 Programs change the case of names, convert photographs to another format, put the folder's name or a
 whole path of another machine before them, and separate folders by backslashes.
@@ -73,7 +73,7 @@ class FileKind:
     plural: str
     consequence: str = "left out"  # of a missing one
     remedy: str = "put them there"
-    suffixes: frozenset[str] = IMAGE_SUFFIXES  # that may stand for each other
+    suffixes: frozenset[str] = IMAGE_SUFFIXES  # interchangeable
     is_needed: bool = True  # an error where most are missing
 
 
@@ -135,7 +135,7 @@ class _FileFinder:
         return None
 
     def find_similar(self, name: str, suffixes: Collection[str]) -> list[Path]:
-        """Return files whose names differ from ``name`` in what programs change."""
+        """Return files whose names differ from ``name`` only in ways that programs change them."""
         parts = parts_of(name)
         first = max((index + 1 for index, part in enumerate(parts) if part == ".."), default=0)
         is_elsewhere = first > 0 or name[:1] in ("/", "\\") or name[1:2] == ":"
@@ -210,7 +210,7 @@ def masks_of(
         keys = key_of(name), _mask_key(name)
         chosen.append(next((by[k] for by in (exact, marked) for k in keys if k in by), None))
     used = set(chosen)
-    for index, name in enumerate(names):  # photographs whose masks are older than their format
+    for index, name in enumerate(names):  # photographs, for masks of older formats
         if chosen[index] is None and (file := loose.get(_mask_key(name))) not in used:
             chosen[index] = file
     without = [name for name, mask in zip(names, chosen, strict=True) if mask is None]
@@ -234,7 +234,7 @@ def without_masks(files: Sequence[Path]) -> list[Path]:
 
 
 def warn_of_unnamed_masks(folder: Path, notes: list[str]) -> None:
-    """Add a note where there are masks, but no ``mask_path``: none counts, as in nerfstudio."""
+    """Add a note on masks without ``mask_path``, which are ignored as in nerfstudio."""
     if files := _mask_files(folder):
         notes.append(
             f"{folder}: masks are not used, as no mask_path names them: "

@@ -105,7 +105,7 @@ def _max_width(width: int, height: int, sizes: Sequence[tuple[int, int]]) -> int
 
 
 def explain(folder: Path) -> str:
-    """Explain why a folder is no dataset, and what to do; without the folder's name."""
+    """Explain why a folder is no dataset, with a remedy; without the folder's name."""
     for below in folders_in(folder):
         if any((below / marker).is_file() for marker in MARKERS) or find_model(below):
             return f"holds a dataset in its folder {below.name}; give {shlex.quote(str(below))}"

@@ -40,7 +40,7 @@ DEPTH_BYTES = 24  # memory for a depth of an ``.npy`` file while it is converted
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Return a mask (H, W) float32: 1 where opaque and brighter than half, else 0; size: W, H.
 
-    Of a mask for a larger photograph, a pixel counts if all of its area does.
+    With a mask for a larger photograph, a pixel is valid if its whole area is.
     """
     stored = image_size(path)
     is_larger = stored[0] > size[0] and is_scaled(size, stored)
@@ -152,12 +152,12 @@ def downscaled_size(width: int, height: int, max_width: int | None) -> tuple[int
 
 
 def downscale_mask(mask: np.ndarray, max_width: int | None) -> np.ndarray:
-    """Return a mask (H, W) of 1 and 0: a pixel counts where all that it covers does."""
+    """Return a mask (H, W) of 1 and 0: 1 where all covered pixels are valid."""
     return (downscale(mask, max_width) > MIN_WHOLE_SHARE).astype(np.float32)
 
 
 def downscale_depth(depth: np.ndarray, max_width: int | None) -> np.ndarray:
-    """Return mean depths (H, W) of what each pixel covers; 0 where a part of that has none."""
+    """Return mean depths (H, W) over the covered pixels; 0 where one of them has none."""
     known = downscale((depth > 0).astype(np.float32), max_width)
     return np.where(known > MIN_WHOLE_SHARE, downscale(depth, max_width), 0).astype(np.float32)
 
@@ -251,7 +251,7 @@ def compact_mask(mask: np.ndarray) -> LazyImage:
 
 
 def check_memory(files: Sequence[Path], max_width: int | None) -> None:
-    """Raise :class:`UserError` where photographs, as they are kept, do not fit into memory."""
+    """Raise :class:`UserError` if the stored photographs do not fit into memory."""
     needed = 0
     for file in files:
         header = read_header(file)

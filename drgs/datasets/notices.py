@@ -65,7 +65,7 @@ class Notices:
         return found
 
     def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
-        """Return a note on photographs that are there more than once, or none."""
+        """Return a note on duplicate photographs, or none."""
         groups = [[*train, *test]]
         for key in (os.path.getsize, digest):
             groups = [part for group in groups for part in _group_duplicates(group, cache(key))]

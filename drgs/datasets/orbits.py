@@ -1,4 +1,4 @@
-"""Cameras on a circle around what was photographed, or around Gaussians."""
+"""Cameras on a circle around the photographed object, or around Gaussians."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LazyImage:
-    """An image whose numbers are computed at each access: by ``np.asarray`` or an index."""
+    """An image that is converted to floats at each access: by ``np.asarray`` or an index."""
 
     shape: tuple[int, ...]  # (H, W) or (H, W, 3)
     compute: Callable[[], np.ndarray]  # returns float32
@@ -117,7 +117,7 @@ class View(Viewpoint):
 
     image: Pixels  # (height, width, 3) float32, display space 0..1, opaque
     alpha: Pixels | None = None  # (height, width) float32: opacity
-    mask: Pixels | None = None  # (height, width) float32: 1 where a pixel counts, else 0
+    mask: Pixels | None = None  # (height, width) float32: 1 for valid pixels, else 0
     depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
     files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
 

@@ -2,7 +2,7 @@
 
 A point is spread over a disc, whose variance is added to the splat's covariance on the film; the
 opacity falls such that its integral stays, and the alpha at which it ends with it: many small
-splats far out of focus are as opaque as in focus. What is seen past a blurred edge needs rays.
+splats far out of focus are as opaque as in focus. Partial occlusion at blurred edges needs rays.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Defocused:
 
 @dataclass(frozen=True)
 class DimmedFalloff(GaussianFalloff):
-    """Falloff whose splats end as if undimmed; geometry: then the base-2 logarithm of dimming."""
+    """Falloff with the extent of the undimmed splat; last geometry: log2 of the dimming factor."""
 
     falloff: GaussianFalloff
 

@@ -32,9 +32,9 @@ from drgs.splatting.lanes import load_pixels
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A surface at each pixel: the nearest, or the next one that is seen through others."""
+    """A surface at each pixel: the nearest, or the next one visible through it."""
 
-    depth: Float  # (H * W,): as that of the splats, scene units; the largest where nothing is
+    depth: Float  # (H * W,) scene units, as the splats' depth; without a surface, the largest
     coverage: Float  # (H * W,) in [0, 1]: p, the part of all light that it stops
 
 

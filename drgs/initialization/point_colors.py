@@ -18,7 +18,7 @@ from drgs.datasets.types import View
 from drgs.initialization.film import is_projectable, to_camera, to_film
 
 MAX_VIEWS, MIN_VIEWS = 60, 8
-"""Numbers of views whose images are read: most points are seen by a third of them."""
+"""Number of views whose images are read: a third of them see most points."""
 
 MAX_BYTES = 1 << 27  # memory for colours: of a million points, fewer views are read
 
@@ -26,7 +26,7 @@ PIXEL_WIDTH, MAX_BEHIND = 1.5, 1.5
 """Width of a pixel of the z-buffer, and largest distance behind its depth of shown points, in
 distances of the points. In smaller pixels, points are seen through gaps of a surface."""
 
-MIN_ALPHA = 0.5  # less opaque pixels have mostly the colour of what is behind them
+MIN_ALPHA = 0.5  # less opaque pixels mostly show the background
 
 POINTS_PER_SORT = 1 << 13
 

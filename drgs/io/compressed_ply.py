@@ -11,7 +11,7 @@ and the largest position, logarithm of scale and base colour of each group; in t
   others in 10 bits each, from -1/sqrt(2) to 1/sqrt(2).
 
 The element ``sh`` has the harmonics above degree 0, in the order of the 3DGS reference, in steps of
-1/32 from -4 to 4; what is beyond is cut off. The header's comments are those of
+1/32 from -4 to 4; larger values are clamped. The header's comments are those of
 :mod:`drgs.io.ply`.
 """
 
@@ -54,7 +54,7 @@ BOUNDED = {
     "packed_scale": ("scale_x", "scale_y", "scale_z"),
     "packed_color": ("r", "g", "b"),
 }
-"""Names of what has bounds in ``chunk``, by the word that it is in."""
+"""Names with bounds in ``chunk``, by word."""
 
 QUATERNION_RANGE = 1 / np.sqrt(2)  # no component but the largest is beyond it
 SH_RANGE = 4.0
@@ -153,7 +153,7 @@ def _bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parts(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return where between the bounds of its group each value lies, from 0 to 1; (N, 3)."""
+    """Return each value relative to the bounds of its group, from 0 to 1; (N, 3)."""
     low, high = (np.repeat(side.astype(np.float64), CHUNK, axis=0) for side in (low, high))
     low, high = low[: len(values)], high[: len(values)]
     return np.clip((values - low) / np.where(high > low, high - low, 1), 0, 1)
@@ -184,7 +184,7 @@ def _require(
 
 
 def _dequantize(path: str | Path, rows: Mapping[str, np.ndarray], word: str) -> np.ndarray:
-    """Return the values (N, 3) of a word, which lie between the bounds of their groups."""
+    """Return the values (N, 3) of a word, between the bounds of their groups."""
     names, chunk = BOUNDED[word], rows["chunk"]
     parts = _unpack_words(rows["vertex"], word)[:, :3]
     if word == "packed_color" and "min_r" not in (chunk.dtype.names or ()):

@@ -9,8 +9,8 @@ with y up:
   linear (drafts of the extension had logarithms); ``:OPACITY``, from 0 to 1, after the sigmoid;
 - ``:SH_DEGREE_l_COEF_n``, the harmonics in the order and with the signs of the 3DGS reference.
 
-Colours are in display space, ``srgb_rec709_display``. What Gaussians are rendered with stands in
-the primitive's ``extras``, of which other programs know nothing. Keys of the JSON part that are not
+Colours are in display space, ``srgb_rec709_display``. Rendering settings are in the primitive's
+``extras``, which other programs ignore. Keys of the JSON part that are not
 named here are ignored.
 """
 

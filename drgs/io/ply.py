@@ -9,8 +9,8 @@ scales, unnormalised wxyz quaternion), and ``f_rest`` channel-major: all coeffic
 then of green, then of blue. K = (degree + 1)^2. Gaussians with a smoothing filter have one property
 more, ``filter_3D``, the filter's standard deviation, as in Mip-Splatting's files.
 
-What Gaussians are to be rendered with stands in comments of the header, a line for each value that
-viewers would not take by themselves, and so does an origin that is not the world's::
+Rendering settings that differ from those of viewers are comments of the header, a line each, and so
+is an origin other than the world's::
 
     comment drgs antialiased true
     comment drgs low_pass 0.1

@@ -15,7 +15,7 @@ MAX_LOGIT = 23 * math.log(2)
 
 MIN_LOGIT = -125 * math.log(2)  # of about the smallest: exp of less is no number in float32
 
-MIN_LOG_SCALE = -126 * math.log(2)  # of the smallest normal float32: what a scale of 0 becomes
+MIN_LOG_SCALE = -126 * math.log(2)  # of the smallest normal float32, for a scale of 0
 
 _REMAINING_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the other three components, by the index of one of four."""
@@ -44,7 +44,7 @@ def opacities_from_logits(logits: np.ndarray) -> np.ndarray:
 
 
 def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
-    """Return logits (N,) float32 of opacities (N,); 0 and 1 become what sigmoids tell apart."""
+    """Return logits (N,) float32 of opacities (N,); those of 0 and 1 are finite."""
     opacities = opacities.astype(np.float64)
     with np.errstate(divide="ignore"):
         logits = np.log(opacities) - np.log1p(-opacities)

@@ -12,7 +12,7 @@ header come the numbers of all Gaussians, attribute by attribute:
 - harmonics: (value + 1) 128 in 8 bits, coefficient by coefficient, rgb; those of degree 1 are
   rounded to 6 bits, higher ones to 5, which compresses better.
 
-What is out of range is cut off. Versions 2 and 3 are one gzip stream. Version 4 has a header in the
+Values out of range are clamped. Versions 2 and 3 are one gzip stream. Version 4 has a header in the
 clear and a Zstandard stream for each attribute, which the extra ``spz`` reads. Version 3 is
 written: every program reads it. The axes are right, up and back: y is up.
 

@@ -94,7 +94,7 @@ class Strategy:
 
 
 def target_of(config: FitConfig) -> int | None:
-    """Return the number of Gaussians that a fit grows to; None: its strategy knows none."""
+    """Return the number of Gaussians that a fit grows to; None: its strategy has none."""
     section = getattr(config.densify, config.densify.strategy, None)
     number = getattr(section, "gaussians", None)
     return None if number is None else min(number, config.densify.max_gaussians)
@@ -116,7 +116,7 @@ class Curve:
     """
 
     iterations: tuple[int, ...]
-    time: tuple[float, ...]  # in iterations as they are at the start
+    time: tuple[float, ...]  # in iterations of the initial Gaussians
     psnr: tuple[float, ...]  # dB, test views of the shipped scene
 
     def iterations_in(self, time: float) -> int:

@@ -94,7 +94,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
         raise UserError(f"{error}; {_remedy(path)}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _damaged_error(path, error) from None
-    # What one of them leaves to the dataset, the other has from there.
+    # A value that one leaves to the dataset is taken from the other.
     if all(with_decisions(config, past) != with_decisions(past, config) for past in (own, before)):
         raise UserError(
             f"{path}: belongs to another configuration than {folder / CONFIG}; {_remedy(path)}"
@@ -133,7 +133,7 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
 
 
 def check_same_data(folder: Path, where: Path, before: Fingerprint, now: Fingerprint) -> None:
-    """Raise UserError if the fingerprint of the data is not that of the checkpoint.
+    """Raise UserError if the data differ from the checkpoint's fingerprint.
 
     where: the dataset's folder; before: the checkpoint's fingerprint; now: the present one.
     """
@@ -195,7 +195,7 @@ def _check_tables(checkpoint: Checkpoint) -> None:
     _check_finite("history", history[:, :-1])  # the last, PSNR of test views, may be NaN
     _check_shape("density", density, (len(density), len(DENSITY_COLUMNS)), np.dtype(np.int64))
     if (density < 0).any() or not 0 <= wall_s < math.inf:
-        raise ValueError("density and wall_s must hold counts and seconds, got others")
+        raise ValueError("density and wall_s must hold counts and seconds")
 
 
 def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...], dtype: np.dtype) -> None:

@@ -53,7 +53,7 @@ class EventLog(Observer):
         """Write the last row, if the iteration has one; the history's clock is paused."""
         if done.row is not None:
             start = time.perf_counter()
-            self._write(history.rows[-1], history)  # with what was measured since
+            self._write(history.rows[-1], history)  # with the latest measurements
             self._writer.flush()
             history.leave_out(time.perf_counter() - start)
 

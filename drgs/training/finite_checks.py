@@ -1,4 +1,4 @@
-"""Errors for a fit whose numbers are no longer finite, before it saves them.
+"""Errors for non-finite numbers of a fit, before they are saved.
 
 A check waits for the device. So the trainer keeps the results of every iteration, and checks them
 when the host waits in any case. Errors name the first iteration with such a number.
@@ -39,7 +39,7 @@ class WatchedIteration:
 
     def faults(self) -> Iterator[str]:
         """Yield the values that are not finite; waits for the device."""
-        # First: what is wrong with them is wrong with all that follows.
+        # First, because all later numbers depend on them.
         for name, values in self.numbers.items():
             if (first := _first_nonfinite(np.array(values))) is not None:
                 yield f"{name} is {first[1]}"

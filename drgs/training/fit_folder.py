@@ -73,7 +73,7 @@ class FitFolder:
         return load_checkpoint(self.path, config)
 
     def claim(self, config: FitConfig, dataset: Dataset) -> None:
-        """Make the folder that of the fit, or raise ``UserError`` and leave it as it is."""
+        """Make the folder the fit's, or raise ``UserError`` and leave it unchanged."""
         self._keep()
         images = folder.image_names(dataset.test_split, [view.name for view in dataset.test])
         if self.overwrites:
@@ -181,7 +181,7 @@ class FitFolder:
         return "\n".join(lines)
 
     def finish(self, metrics: FitMetrics | None = None) -> None:
-        """Write ``metrics.json`` (None: it is there), and end the run: no checkpoint is left."""
+        """Write ``metrics.json`` (None: it exists), and end the run by removing the checkpoint."""
         if metrics is not None:
             with atomic_path(self.path / files.METRICS) as temporary:
                 temporary.write_text(json.dumps(metrics, indent=2) + "\n")

@@ -140,7 +140,7 @@ class Iteration:
 
 
 class Observer(Protocol):
-    """Follows a fit as it runs, whose bytes do not depend on it."""
+    """An observer of a running fit, without influence on its bytes."""
 
     def after_iteration(
         self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
@@ -174,7 +174,7 @@ class HeldOutQuality(Observer):
     """Measures the PSNR of a few test views on the way, for the curve of the report."""
 
     def __init__(self, views: Sequence[View]) -> None:
-        """views: those of the test split; none on other ranks than 0."""
+        """views: test views; none on other ranks than 0."""
         self._views = measured_views(views)
 
     @override

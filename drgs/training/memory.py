@@ -45,7 +45,7 @@ have about N (1 + FITTED_REACH sqrt(P / N))^2 entries. Counted in fits of the sh
 
 FITTED_SLOTS = 2.7  # slots of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits
 
-COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000  # enough to know entries and slots to a few per cent
+COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000  # estimates entries and slots to a few per cent
 
 MAX_RADIUS_PX = 1e6  # A larger radius covers any film
 
@@ -55,7 +55,7 @@ MIN_WIDTH_PX = 16  # no smaller images are advised
 
 MAX_TARGET_BYTES = 1 << 30
 """Most memory of targets and effects' uploads that stay on the device until their view is drawn
-again: those of 180 images of 400 x 400 px. To make them anew takes a tenth of an iteration."""
+again: 180 images of 400 x 400 px. Recomputing one takes a tenth of an iteration."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class FitMemory:
     """Bytes at the peak of a fit, by use."""
 
     process: int
-    photographs: int  # as they are kept
+    photographs: int  # as stored
     targets: int  # that would stay on the device if there were room for all
     gaussians: int
     splats: int  # entries and slots
@@ -208,7 +208,7 @@ def _refusal(
         f"({format_bytes(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
         f"{format_bytes(memory.gaussians)} for {part}{count:,} Gaussians, "
         f"{format_bytes(memory.splats + memory.pixels)} for an image of them), and may take "
-        f"{format_bytes(usable)}, nine tenths of what is available; {advice}"
+        f"{format_bytes(usable)}, nine tenths of the available memory; {advice}"
     )
 
 

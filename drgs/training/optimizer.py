@@ -127,7 +127,7 @@ def make_optimizer(
 ) -> LeanAdam:
     """Return an Adam optimizer (Kingma and Ba 2015) with a learning rate for each parameter.
 
-    parameters: tensors by name; those of zero size are left out.
+    parameters: tensors by name; empty ones are left out.
     rates: learning rate per step by name. A fixed rate of 0 is allowed.
     epsilon: 3DGS uses 1e-15, because gradients of a mean over pixels are far below 1e-8.
     """
@@ -174,7 +174,7 @@ class Population:
         return 0
 
     def value(self, name: str) -> dr.ArrayBase:
-        """Return a parameter as it is at the moment, on the device: the rows of this process."""
+        """Return the current values of a parameter, on the device: the rows of this process."""
         return dr.detach(self.optimizer[name])
 
     def host(self, name: str) -> np.ndarray:
@@ -182,11 +182,11 @@ class Population:
         return self.gather(self.value(name))
 
     def gather(self, values: dr.ArrayBase | np.ndarray) -> np.ndarray:
-        """Return the values of all rows from those of this process: on the host, float64."""
+        """Return the values of all rows, given those of this process: on the host, float64."""
         return np.array(values, dtype=np.float64)
 
     def local(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the rows of this process from those of all rows."""
+        """Return the values of this process's rows, given those of all rows."""
         return values
 
     def zeros(self) -> Float:
@@ -299,13 +299,13 @@ class Population:
         return [dr.detach(term) for term in terms]
 
     def gather_gaussians(self, local: Gaussians) -> Gaussians:
-        """Return all Gaussians, from those of this process."""
+        """Return all Gaussians, given those of this process."""
         return local
 
     def gather_state(
         self, state: dict[str, np.ndarray], is_by_row: Callable[[str], bool]
     ) -> dict[str, np.ndarray]:
-        """Return a trainer's state with all rows, from that of this process."""
+        """Return a trainer's state with all rows, given that of this process."""
         return state
 
     def scatter_state(
@@ -336,7 +336,7 @@ def pending_gradients(optimizer: Adam) -> dict[str, np.ndarray]:
 def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray]) -> None:
     """Continue from :func:`optimizer_state`, and :func:`pending_gradients` if there are any.
 
-    Bit by bit; rates stay as they are.
+    Bit by bit; rates do not change.
     """
     for name, (old, promoted, rate, (step, first, second, maximum)) in optimizer.state.items():
         value = type(old)(state[f"{name}.value"])

@@ -50,9 +50,9 @@ class ExponentialDecay:
 class LearningRates:
     """The rates of all parameters of the Gaussians, over the iterations.
 
-    The means' rate falls all the time; the others fall to ``decay`` times themselves, by the same
-    factor at every iteration, after the share ``decay_from`` of the iterations that follow coarse
-    stages.
+    The means' rate decays from the start; the others decay to ``decay`` times their initial value,
+    by a constant factor per iteration, after the share ``decay_from`` of the iterations that follow
+    coarse stages.
     """
 
     means: ExponentialDecay

@@ -87,7 +87,7 @@ class FitSession:
     """
 
     config: FitConfig | None
-    dataset: Dataset | None = None  # None: that of the configuration
+    dataset: Dataset | None = None  # None: the configured one
     folder: FitFolder | None = None  # for results and checkpoints
     uses_terminal: bool = False  # prints, draws progress, and takes Ctrl-C as a request to stop
     variant: str | None = None  # of Mitsuba; None: the active one
@@ -95,9 +95,9 @@ class FitSession:
     check_ranges: Callable[[], None] = lambda: None  # called after each iteration
     on_start: Callable[[FitSession], None] = lambda session: None  # before the first iteration
     comm: Communicator = field(default_factory=Communicator)
-    strategy: DensityStrategy | None = None  # of density; None: that of the configuration
-    effects: Sequence[TrainingEffect] = ()  # besides those of the configuration
-    loss: Loss | None = None  # None: that of the configuration
+    strategy: DensityStrategy | None = None  # None: the configured one
+    effects: Sequence[TrainingEffect] = ()  # besides the configured ones
+    loss: Loss | None = None  # None: the configured one
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
     criterion: StopCriterion = field(init=False, default_factory=StopCriterion)
@@ -166,7 +166,7 @@ class FitSession:
             plan = self._plan(gaussians, self.budget)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
         self.trainer = Trainer(self.config, self.dataset, gaussians, comm, *self._objects)
-        self.history = History()  # whose clock begins
+        self.history = History()  # starts its clock
         if comm.broadcast_numbers(checkpoint is not None):
             self._restore(checkpoint)
         return plan
@@ -300,9 +300,9 @@ class FitSession:
 class FitResult:
     """The result of a fit in memory."""
 
-    gaussians: Gaussians  # numpy arrays: what ``point_cloud.ply`` of the command contains
+    gaussians: Gaussians  # numpy arrays, as in the command's ``point_cloud.ply``
     history: tuple[HistoryRow, ...]  # as in ``history.csv``
-    trainer: Trainer  # goes on from here with ``trainer.step()``, renders with ``images(views)``
+    trainer: Trainer  # ``step()`` continues the fit, ``images(views)`` renders
 
 
 def train(

@@ -97,7 +97,7 @@ class Step:
     stage: Stage  # of the image size that is in use
     begins_stage: bool
     views: tuple[StepView, ...]  # by iteration
-    num_averaged: int  # views whose mean gradient the optimizer steps along
+    num_averaged: int  # batch size
     is_update: bool  # whether the optimizer steps at its end
 
     @property
@@ -137,13 +137,13 @@ def step_of(iteration: int, views_per_step: int, iterations: int) -> range:
     """
     first = (iteration - 1) // views_per_step * views_per_step + 1
     end = first + views_per_step
-    if iteration > iterations:  # a caller goes on with a fit that is done
+    if iteration > iterations:  # a caller continues a finished fit
         return range(max(first, iterations + 1), end)
     return range(first, min(end, iterations + 1))
 
 
 def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) -> int:
-    """Return the view of an iteration: every round visits all views in an order of its own.
+    """Return the view of an iteration: each round visits all views in a random order.
 
     With B views a step, the b-th iteration of each step draws from the views b, b + B, ... alone,
     in rounds of these: its process needs no other photographs.
@@ -176,7 +176,7 @@ class ViewLoss:
 
 
 class WholeGradients:
-    """Steps of one view, whose gradients ``dr.backward`` leaves in the parameters.
+    """Steps of one view, with the gradients that ``dr.backward`` stores in the parameters.
 
     Steps of several views use :class:`drgs.training.parallel.exchange.ViewExchange`.
     """

@@ -107,7 +107,7 @@ class Trainer:
     ) -> None:
         """gaussians: all, on each process; comm: None: this process alone.
 
-        density, loss: None: those of the configuration; effects: besides the configuration's.
+        density, loss: None: the configured ones; effects: besides the configured ones.
         """
         config = resolve_defaults(config, dataset)
         views_per_step = config.optimizer.views_per_step
@@ -173,7 +173,7 @@ class Trainer:
         return StepReport(step.last_iteration, self.num_gaussians, means_lr, report, tuple(views))
 
     def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
-        """Render a view, and add the derivatives of its loss to those of the step."""
+        """Render a view, and add the derivatives of its loss to the step's."""
         fit = self.fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before_render(fit, view.view)
@@ -360,7 +360,7 @@ class Trainer:
         return min(model.sh_degree, iteration // model.sh_increase_every)
 
     def gaussians(self) -> Gaussians:
-        """Return all Gaussians as numpy arrays; on other ranks than 0, those of the rank."""
+        """Return all Gaussians as numpy arrays; on other ranks than 0, the rank's own."""
         self.check()
         self.sync_scene()
         own = replace(dr.detach(self.integrator.gaussians).numpy(), origin=self.dataset.origin)
@@ -436,7 +436,7 @@ class Trainer:
         release_unused_memory()
 
     def reschedule(self, iterations: int, densify_stop: int) -> None:
-        """Move the end of the fit, and that of changes of the population, to other iterations.
+        """Change the last iteration of the fit, and of changes of the population.
 
         The configuration becomes one which would have given the fit so far. Raises ValueError where
         there is none.

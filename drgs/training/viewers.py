@@ -31,7 +31,10 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.parallel.inputs import share_gaussians
 from drgs.training.trainer import Trainer
 
-ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12  # of those of the fit: late iterations take longer
+ITERATIONS_SHARE, TIME_SHARE = (
+    0.08,
+    0.12,
+)  # share of the fit's iterations; late iterations take longer
 
 RATES = {
     "means_lr": 1.6e-5,
@@ -43,7 +46,7 @@ RATES = {
     "shN_lr": 4e-3,
     "decay": 0.1,
 }
-"""High, as few iterations have to do, and those of colours most of all."""
+"""Learning rates: high because there are few iterations, highest for colours."""
 
 NEGLIGIBLE_RATE = 1e-9  # rate of values that are to stay, where 0 is not a rate
 
@@ -65,7 +68,7 @@ class ForViewers:
 
 
 def num_iterations(config: FitConfig) -> int:
-    """Return the number of iterations that are added to those of a fit."""
+    """Return the number of extra iterations."""
     return math.ceil(ITERATIONS_SHARE * config.iterations)
 
 
@@ -96,7 +99,7 @@ def for_viewers(
         note = f"the Gaussians for viewers are not fitted any further: {error}"
         warnings.warn(UserNote(note), stacklevel=2)
         tuned = start
-    release_unused_memory()  # of what those iterations had
+    release_unused_memory()  # share of the time of those iterations
     gaussians = replace(tuned, rendered_with={name: DECLARED[name].default for name in others})
     return ForViewers(gaussians, further.model, trainer.dataset.background, trainer.effects)
 
@@ -113,7 +116,7 @@ def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
 
 
 def tuning(config: FitConfig) -> FitConfig:
-    """Return the configuration of the iterations that follow those of ``config``."""
+    """Return the configuration of the extra iterations after a fit with ``config``."""
     before = config.iterations
     total = before + num_iterations(config)
     kept = {"max_gaussians": config.densify.max_gaussians}

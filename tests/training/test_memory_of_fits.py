@@ -208,7 +208,7 @@ def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available)
     message = str(error.value)
     assert message.startswith("memory: the fit needs about 2.")
     assert (
-        ", and may take 1 GB, nine tenths of what is available; set densify.max_gaussians="
+        ", and may take 1 GB, nine tenths of the available memory; set densify.max_gaussians="
         in message
     )
     assert "\n" not in message and "1,000,000 Gaussians" in message

@@ -149,7 +149,7 @@ class AdaptiveDensityControl(DensityStrategy):
     def reset_opacities(self, population: Population) -> None:
         """Lower every opacity to at most ``reset_opacity`` and forget its moments.
 
-        What the photographs need regains opacity; what floats before the cameras is pruned.
+        Gaussians that the photographs support regain opacity; floaters are pruned.
         """
         opacity = self.config.adc.reset_opacity
         ceiling = math.log(opacity / (1 - opacity))
@@ -197,7 +197,7 @@ class AdaptiveDensityControl(DensityStrategy):
         candidate = (norms >= adc.grad_threshold) & ~transparent & np.isfinite(scales)
         candidate &= ~(small & too_large)  # a clone would be as large
 
-        # Room is what is left if every candidate survives, so that no choice can exceed it.
+        # Conservative: the remaining number if every candidate survives.
         survivors = np.count_nonzero(candidate | ~(transparent | too_large))
         rows = np.flatnonzero(candidate)
         rows = rows[np.argsort(-norms[rows], kind="stable")]

@@ -1,19 +1,17 @@
 """Growth to a number of Gaussians, the strategy ``budget``.
 
-The number is chosen, not what comes out of a threshold: it rises along a curve, and at each change
-there is room for some more. Those are split that see most of the errors that are left,
+The number of Gaussians is given: it grows along a curve, not by a threshold. At each change, the
+Gaussians with the largest sums of errors are split,
 
     s_i = sum over pixels of w_i(p) |C(p) - C*(p)|
 
-with the weights w of compositing, from every tenth view or so: the derivative of the image
-composited with the errors as cotangent, which the kernels of the adjoint compute anyway. What is
-split are the longest axes of those Gaussians, into two halves. What has become transparent is
-removed, and there are no opacity resets.
+with the weights w of compositing, measured in every tenth view by default: the adjoint's kernels
+compute s with the errors as cotangent. Two halves replace a Gaussian along its longest axis.
+Transparent Gaussians are removed, and there are no opacity resets.
 
-A known number with a curve of growth and the split along the longest axis are ideas of Improved-GS
-(Deng et al. 2025), the sum of errors is one of 3DGS densification by error (Rota Bulo et al. 2024,
-"Revising Densification in Gaussian Splatting"). Rows are chosen on the host. Nothing is random, and
-ties are broken by index.
+The curve of growth and the split along the longest axis are from Improved-GS (Deng et al. 2025),
+the sum of errors from Rota Bulo et al. 2024 ("Revising Densification in Gaussian Splatting"). Rows
+are chosen on the host. Nothing is random, and ties are broken by index.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ HALF_OFFSET = 1.35
 """Distance of the halves' means from the Gaussian's, in standard deviations of its longest axis."""
 
 HALF_LONG_SCALE, HALF_SHORT_SCALE = 0.55, 0.893
-"""Factors of the halves' scales: along that axis, and along the two others."""
+"""Factors of the halves' scales: along that axis, and along the other two."""
 
 HALF_OPACITY, HALF_OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
 """Factor of the halves' opacities, which overlap; and their range, so that logits stay small."""
@@ -107,7 +105,7 @@ class GrowthToNumber(DensityStrategy):
     def refine(self, population: Population, iteration: int) -> DensityReport:
         """Remove transparent Gaussians, and split those with the largest errors."""
         before, least = population.num_rows, self.config.budget.prune_opacity
-        keep = expit(population.host("logit_opacities")) >= least  # NaN counts as transparent
+        keep = expit(population.host("logit_opacities")) >= least  # NaN is transparent
         if not keep.any():
             raise UserError(
                 f"iteration {iteration}: every Gaussian would be pruned (opacity below densify."

@@ -1,9 +1,9 @@
 """The strategy ``mcmc``: relocation, noise and regularisers, up to a number of Gaussians.
 
 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): the Gaussians are
-samples of a distribution that the photographs define, and Adam's steps with noise are a walk
-through it. Nothing is cloned or split by a threshold. Gaussians that have become transparent are
-moved to where opaque ones are, such that the image changes as little as possible.
+samples of a distribution that the photographs define, and Adam's steps with noise are a random walk
+in it. There is no threshold for cloning or splitting. Transparent Gaussians are relocated to opaque
+ones, such that the image changes as little as possible.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class MarkovChain(DensityStrategy):
 
     @property
     def cap(self) -> int:
-        """Gaussians that the population grows to; one that starts with more stays as it is."""
+        """Final number of Gaussians; a larger initial population does not grow."""
         return min(self.config.mcmc.gaussians, self.config.max_gaussians)
 
     @override
@@ -112,7 +112,7 @@ class MarkovChain(DensityStrategy):
 
     @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
-        """Replace transparent Gaussians, and let the population grow, by copies of the others.
+        """Relocate transparent Gaussians to others, and add copies.
 
         These are drawn in proportion to opacity. Rows end up as: Gaussians that were not drawn, in
         their order and with their moments; those that were drawn; the copies. The last two begin

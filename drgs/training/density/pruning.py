@@ -71,7 +71,7 @@ class Importance(Pruning):
 
     A Gaussian's score is the sum of its weights T a (3DGS, equation 3) over the pixels of the
     images of the phase so far (as in Mini-Splatting, Fang and Wang 2024, section 4.2). Those of the
-    lowest scores are removed, a few at a time, so that the others can take over what they showed.
+    lowest scores are removed, a few at a time, so that the rest can compensate.
     Each image of the phase takes about half as long again.
     """
 
@@ -104,7 +104,7 @@ class Importance(Pruning):
         if count == before:
             return None
         report = keep_best(population, scores, count)
-        # Others' scores stay: few of the views were seen since the last change.
+        # The remaining scores are kept: few views were rendered since the last change.
         left = population.local(scores[best_rows(scores, count)])
         self.scores = from_host(type(self.scores), left)
         return report
@@ -123,8 +123,8 @@ class Importance(Pruning):
 class NaturalSelection(Pruning):
     """Lowers all opacities, and removes Gaussians that become transparent.
 
-    The derivatives of the loss raise again what is seen, all the faster as the opacities' rate is
-    higher meanwhile; what hardly matters falls below a threshold (GNS, Gaussian natural selection).
+    The loss raises the opacities of Gaussians that matter, at a higher learning rate; the others
+    fall below a threshold (GNS, Gaussian natural selection).
     """
 
     num_left = 0  # Gaussians after the last change

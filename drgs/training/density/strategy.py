@@ -69,7 +69,7 @@ def displace_means(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> Ten
 
 
 class DensityStrategy(Protocol):
-    """Base class of strategies, which leaves the population as it is.
+    """Base class of strategies, which does not change the population.
 
     Equal inputs give equal bytes: random numbers are functions of seed, iteration and row. Where
     several processes fit, each has a strategy with statistics of its own rows; decisions are made
@@ -96,7 +96,7 @@ class DensityStrategy(Protocol):
     first (and half of stop), ``densify.stop`` at most the second; and ``optimizer.decay``."""
 
     def begin(self, population: Population) -> None:
-        """Reset the statistics: before the first iteration, and when others change the rows."""
+        """Reset the statistics: at the start, and after changes by other strategies."""
 
     def needs_statistics(self, iteration: int) -> bool:
         """Return whether :meth:`update_statistics` is called for this iteration."""
@@ -175,7 +175,7 @@ def density_strategy(
 
 
 class Phases(DensityStrategy):
-    """Strategies that follow one another; where one changes rows, the others begin anew."""
+    """A sequence of strategies; if one changes rows, the others are reset."""
 
     def __init__(self, phases: Sequence[DensityStrategy]) -> None:
         self.phases = phases
@@ -246,7 +246,7 @@ class Phases(DensityStrategy):
 
     @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:
-        """Return the largest number: each phase may begin with that of the one before."""
+        """Return the largest number of all phases."""
         most = start
         for phase in self.phases:
             most = max(most, phase.max_num_gaussians(most, iterations))

@@ -17,7 +17,7 @@ from drgs.datasets.types import Dataset, View
 from drgs.training.effects.base import FitState, TrainingEffect, TrainingView, as_tensor
 from drgs.training.losses import prepare_target
 
-RANDOM_STREAM = 71  # tells the random numbers of backgrounds from others of the same seed
+RANDOM_STREAM = 71  # separates the random numbers of backgrounds from others of the same seed
 
 
 def set_background(integrator: mi.Integrator, color: np.ndarray) -> None:

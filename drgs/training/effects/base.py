@@ -83,7 +83,7 @@ class Uploads(dict[str, Any]):
 
 @dataclass(frozen=True)
 class FitState:
-    """State of a fit at one iteration, as effects may know it."""
+    """State of a fit at one iteration, for effects."""
 
     iteration: int  # from 1
     iterations_of_step: range
@@ -156,7 +156,7 @@ class TrainingEffect(Protocol):
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:
         """Return the optimised numbers of a view, attached, as :meth:`before_render` has them.
 
-        Where several processes fit, each knows the numbers of all views.
+        With several processes, each has the numbers of all views.
         """
         return {}
 
@@ -170,7 +170,7 @@ class TrainingEffect(Protocol):
         """
 
     def on_population_change(self, fit: FitState) -> None:
-        """Called when Gaussians were added or removed, before the integrator gets the others."""
+        """Called after Gaussians were added or removed, before the integrator is updated."""
 
     def finish(self, fit: FitState) -> None:
         """Called before the Gaussians are taken out."""
@@ -214,12 +214,12 @@ def training_effects(
         effects.append(extension.value.from_config(config, dataset, section))
     names = [effect.name for effect in effects]
     if "" in names or len({*names}) < len(names):
-        raise UserError(f"effects: each needs a name of its own, got {', '.join(names)}")
+        raise UserError(f"effects: names must be unique, got {', '.join(names)}")
     return effects
 
 
 def _is_shipped_used(name: str, config: FitConfig, dataset: Dataset) -> bool:
-    """Return whether a shipped effect takes part, whose module is imported only then."""
+    """Return whether a shipped effect is used; its module is imported only then."""
     views = dataset.train
     if name == "depth":
         return config.loss.depth_weight > 0 and any(view.depth is not None for view in views)

@@ -64,7 +64,7 @@ class CameraRefinement(OptimisedEffect):
         shapes = {"turns": (num_views, 3), "moves": (num_views, 3)}
         rates = {"turns": config.rotation_lr, "moves": config.translation_lr * extent}
         shared = {"log_focals": config.focal_lr, "shifts": config.principal_lr}
-        # A rate of 0 leaves out what it belongs to.
+        # A rate of 0 disables its parameter.
         shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
         values = {name: np.zeros(shape) for name, shape in shapes.items()}
         super().__init__(values, rates | shared)
@@ -87,7 +87,7 @@ class CameraRefinement(OptimisedEffect):
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
-        # What the sensor depends on are leaves: the rest of the chain is differentiated afterwards.
+        # The sensor's parameters are leaves; the rest of the chain is differentiated afterwards.
         self.numbers[view.index] = numbers = dr.detach(self._camera_of(view))
         if self._has_begun(fit):
             dr.enable_grad(numbers)
@@ -144,7 +144,7 @@ class CameraRefinement(OptimisedEffect):
         return poses | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
 
     def refined_views(self, views: Sequence[View]) -> list[View]:
-        """Return the training views with their cameras as they are now."""
+        """Return the training views with their current cameras."""
         numbers, result = self.numpy(), []
         for index, view in enumerate(views):
             rows = {name: v[min(index, len(v) - 1)] for name, v in numbers.items()}

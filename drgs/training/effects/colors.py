@@ -3,7 +3,7 @@
 A rendering is transformed, y = A (r, g, b, 1), before it is compared with its photograph. A starts
 as the identity and is drawn to it; and since darker splats under brighter transforms would look the
 same, the mean of all photographs' transforms is the identity. (The 3DGS reference's "exposure
-compensation" has neither bond.) The background behind a transparent photograph stays as it is.
+compensation" has neither constraint.) The background behind a transparent photograph is unchanged.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ColorCorrection(OptimisedEffect):
         assert config.lr is not None, "the effect is used where it is given"
         values = {"matrices": np.repeat(IDENTITY, num_views, axis=0)}
         super().__init__(values, {"matrices": config.lr})
-        # What all have in common, and do without: not differentiated.
+        # Mean change of all transforms, which is subtracted; not differentiated.
         self.common = cast(Float, dr.opaque(mi.Float, 0, IDENTITY.size))
         self.share = 1 / num_views
         self.matrix: Float  # (12,), of the view that is rendered
@@ -82,7 +82,7 @@ class ColorCorrection(OptimisedEffect):
     def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
-        """Step the view's transform, and all a little back: their mean stays."""
+        """Step the view's transform, and subtract the mean change from all."""
         dr.set_grad(self.leaves(view), derivatives)
         before = self.numbers_of(view)["matrices"]
         self.step(view, fit.rate_decay)

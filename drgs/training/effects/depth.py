@@ -23,7 +23,7 @@ from drgs.training.effects.base import TrainingEffect, TrainingView, as_numbers
 
 @EFFECTS.register("depth")
 class DepthSupervision(TrainingEffect):
-    """Penalises the difference between the composited depth and that of the data.
+    """Penalty on the difference between the composited depth and the data's.
 
     The term is weight / extent times the mean of |D - A d| over the pixels whose depth d is known
     and not masked, D being the alpha-weighted sum of the splats' depths and A the alpha.
@@ -45,7 +45,7 @@ class DepthSupervision(TrainingEffect):
 
     @override
     def upload(self, view: View) -> tuple[Float, Float] | None:
-        """Return depths, and weights of the pixels; None where a view has none that counts."""
+        """Return depths, and weights of the pixels; None for a view without any."""
         if view.depth is None:
             return None
         depth = np.asarray(view.depth)
@@ -71,7 +71,7 @@ class DepthSupervision(TrainingEffect):
 
 
 def split(image: TensorXf, count: int) -> tuple[TensorXf, TensorXf]:
-    """Return the first ``count`` channels of an image (H, W, C), and the others."""
+    """Return the first ``count`` channels of an image (H, W, C), and the rest."""
     return dr.custom(_Split, image=image, count=count)
 
 

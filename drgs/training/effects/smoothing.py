@@ -39,7 +39,7 @@ class TrainingSmoothing(TrainingEffect):
 
     @override
     def finish(self, fit: FitState) -> None:
-        """Set the filter of the means as they are; the fit continues with the former one."""
+        """Set the filter of the current means; the fit continues with the previous one."""
         fit.integrator.smoothing = _smoothing(fit)
 
     @override

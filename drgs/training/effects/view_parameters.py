@@ -19,7 +19,7 @@ from drgs.training.optimizer import make_optimizer, optimizer_state, restore_opt
 class OptimisedEffect(TrainingEffect):
     """An effect with rows of numbers by name, one for each view or one for all views.
 
-    Each row has an optimizer of its own: whenever a view is seen for the first time, its first
+    Each row has its own optimizer state: when a view is rendered for the first time, its first
     steps are as long as the rate. The numbers are checked, and part of checkpoints.
     """
 
@@ -73,7 +73,7 @@ class OptimisedEffect(TrainingEffect):
                 restore_optimizer(optimizer, {key: value[row] for key, value in own.items()})
 
     def _optimizer_rows(self) -> dict[str, np.ndarray]:
-        """Return numbers, moments and step counts, a row for each view."""
+        """Return values, moments and step counts, a row for each view."""
         result = {}
         for optimizers in self.optimizers.values():
             rows = [optimizer_state(optimizer) for optimizer in optimizers]

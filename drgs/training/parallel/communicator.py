@@ -1,7 +1,7 @@
 """The processes that share a fit, and the arrays that they exchange.
 
 Arrays travel by MPI's functions for buffers. No call blocks in C: a process that waits polls, so
-that it sees Ctrl-C, and leaves the cores of a crowded machine to the others.
+that it can handle Ctrl-C, and leaves the cores of a crowded machine to other processes.
 """
 
 # ruff: noqa: N802 (mpi4py's names)
@@ -40,7 +40,7 @@ class SingleProcess:
         return 1
 
     def Ibcast(self, array: np.ndarray, root: int) -> None:
-        """Leave the array as it is."""
+        """Do nothing: there is one process."""
 
     def Iallgather(self, sent: Any, received: Any, root: int = 0) -> None:
         """Copy the numbers; each an array, or a list that begins with one: see :func:`_parts`."""

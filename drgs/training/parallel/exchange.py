@@ -1,11 +1,11 @@
-"""Gradients of a step of several views, which one process computes or several share.
+"""Gradients of a step of several views, on one process or several.
 
-Every rank has some rows of the Gaussians, and renders some views of a step. It projects its rows
-for the cameras of all views; the splats that are on a view's film go to the rank that renders it,
-which bins and composites them behind one another. The derivatives with respect to these splats go
-back, and every rank takes those of its rows through the projection. Since rows are ordered by rank,
-and each rank adds up the views in their order, the bytes do not depend on the number of ranks. A
-rank that is alone sends nothing: its splats stay on the device.
+Every rank holds some rows of the Gaussians, and renders some views of a step. It projects its rows
+for the cameras of all views, and sends the visible splats to the rank that renders the view, which
+concatenates, bins and composites them. The derivatives of these splats are sent back, and every
+rank propagates those of its rows through the projection. Rows are ordered by rank, and each rank
+adds the views in their order, so the bytes do not depend on the number of ranks. A single rank
+sends nothing: its splats stay on the device.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from drgs.training.parallel.population import renderer_of
 from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
 VIEWS_AT_ONCE = 4
-"""Views whose derivatives one kernel adds up; it is longer, and takes longer to compile, with each.
+"""Number of views whose derivatives one kernel adds; each makes it longer to compile.
 """
 
 Blocks = list[np.ndarray]
@@ -180,14 +180,14 @@ class ViewExchange:
         """params: the parameters of the Gaussians."""
         self.comm, self.integrator, self.params = comm, integrator, params
         self.views_per_step = views_per_step
-        self._sending: list[tuple[Any, np.ndarray]] = []  # requests, and what they send
+        self._sending: list[tuple[Any, np.ndarray]] = []  # requests and their data
         self._views: list[_View] = []
         self._current: _View | None = None  # is rendered now; None: between two steps
-        self._num_added = 0  # views whose derivatives are in the parameters
+        self._num_added = 0  # views whose derivatives have been added
         integrator.use_projection(self)
 
     def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
-        """Project the rows of this rank for the views that others render.
+        """Project the rows of this rank for the views of other ranks.
 
         place: puts the sensor of such a view where it is now.
         """
@@ -259,7 +259,7 @@ class ViewExchange:
         numbers = np.zeros((len(self._views), 3))
         for place, found in losses.items():
             numbers[place] = float(found.loss[0]), float(found.squared_error[0]), found.counted
-        numbers = self.comm.all_gather(numbers).sum(axis=0)  # the others' are 0
+        numbers = self.comm.all_gather(numbers).sum(axis=0)  # 0 for other ranks
         loss, error = numbers[:, :2].astype(np.float32).T
         rows = zip(loss[:, None], error[:, None], numbers[:, 2], strict=True)
         return [ViewLoss(*row) for row in rows]
@@ -274,7 +274,7 @@ class ViewExchange:
     def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
         """Return the splats of all ranks, behind one another, as ``camera`` sees them.
 
-        Between two steps, those of this rank.
+        Between two steps, of this rank only.
         """
         if (each := self._current) is None:
             return project_footprints(gaussians, camera, pipeline)
@@ -374,7 +374,7 @@ class ViewExchange:
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
 
     def _send(self, blocks: Blocks, to: int, each: _View, time: int) -> None:
-        """Begin to send rows of a view; those of one view and time arrive in their order."""
+        """Start to send rows of a view; rows of one view and time arrive in their order."""
         tag = each.view.place * MAX_SHUTTER_SAMPLES + time
         self._sending += [(self.comm.send(block, to, tag), block) for block in blocks]
 
@@ -383,9 +383,9 @@ class ViewExchange:
         wait(*(self.comm.receive(block, source, tag) for block in into))
 
     def _add_ready_views(self, is_end: bool) -> None:
-        """Add the derivatives of the next groups of views whose derivatives are all here.
+        """Add the derivatives of the next groups of views that have arrived completely.
 
-        Those of cameras take all ranks, and wait for the end of the step.
+        Derivatives of cameras need all ranks, and wait for the end of the step.
         """
         while self._num_added < len(self._views):
             group = self._views[self._num_added :][:VIEWS_AT_ONCE]
@@ -406,7 +406,7 @@ class ViewExchange:
             self._num_added += len(group)
 
     def _add(self, group: Sequence[_View]) -> None:
-        """Add the derivatives of some views to those of the step."""
+        """Add the derivatives of some views to the step's."""
         with dr.suspend_grad():
             gaussians = dr.detach(self.integrator.gaussians)
             seen = [

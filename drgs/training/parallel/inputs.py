@@ -49,7 +49,7 @@ def share_inputs(
             return config, dataset
         names = [view.name for view in dataset.train]
         comm.broadcast_text(json.dumps([config.model_dump_json(), names, versions()]))
-        # Made while the others read.
+        # Computed while other ranks read.
         comm.broadcast_text(fingerprint_of(replace(dataset, test=())).to_bytes().decode())
         own = own_views(len(names), config.optimizer.views_per_step, comm.rank, comm.size)
         train = (v if i in own else without_images(v) for i, v in enumerate(dataset.train))
@@ -119,7 +119,7 @@ def check_views(comm: Communicator, dataset: Dataset, own: Collection[str], path
 def check_scene(
     comm: Communicator, scene: mi.Scene, views: Sequence[Viewpoint], files: Mapping[str, object]
 ) -> None:
-    """Raise ``UserError`` unless the scene and its views are those of rank 0.
+    """Raise ``UserError`` unless the scene and its views equal those of rank 0.
 
     files: for the message, the origin of ``cameras`` and ``background``, and of the ``model``.
     Called by all processes; returns when all have agreed.

@@ -108,7 +108,7 @@ class ShardedPopulation(Population):
     """
 
     comm: Communicator
-    shard: Shard  # what this process has
+    shard: Shard  # of this process
 
     @property
     @override
@@ -198,7 +198,7 @@ class ShardedPopulation(Population):
     ) -> list[np.ndarray]:
         """Return terms of the loss over all rows.
 
-        They are computed again: the sum of what the ranks have would be rounded otherwise.
+        They are computed again, because sums of the ranks' shares would round differently.
         """
         if not terms:
             return []
