@@ -160,13 +160,14 @@ def load_views(
             notices.inspect(file, pixels)
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
+        camera = intrinsics(frame, pixels.shape, size)  # first: raises for a wrong size
         image, alpha, mask, depth = (
             _read_images(config, frame, pixels) if is_read else _unread_images(frame, pixels, size)
         )
         return View(
             name,
             frame.values.transform_matrix,
-            *intrinsics(frame, pixels.shape, size),
+            *camera,
             *size,
             lens=None if config.ignore_distortion else lens_of(frame),
             motion=None if config.ignore_motion else motion_of(frame, config.shutter_samples),
