@@ -231,7 +231,7 @@ def test_smaller_images_are_advised_where_they_help(available):
 
 def test_nothing_is_advised_where_nothing_helps(available):
     available(100_000_000)
-    with pytest.raises(UserError, match=r"available; use fewer views and Gaussians$"):
+    with pytest.raises(UserError, match=r"available memory; use fewer views and Gaussians$"):
         room(config_of(1000, 1000), dataset_of(20, 20, 4))
 
 
