@@ -1,3 +1,5 @@
+"""Linters, formatter, spelling and layers, as configured in pyproject.toml."""
+
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -5,25 +7,24 @@ from importlib.util import find_spec
 import pytest
 from conftest import REPOSITORY
 
-COMMANDS = ["ruff check .", "ruff format --check .", "codespell_lib ."]
+LAYERS = "-c from importlinter.cli import lint_imports; exit(lint_imports(no_cache=True))"
+
+COMMANDS = {
+    "ruff check": ("ruff", "-m ruff check ."),
+    "ruff format": ("ruff", "-m ruff format --check ."),
+    "codespell": ("codespell_lib", "-m codespell_lib ."),
+    "import-linter": ("importlinter", LAYERS),
+}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_source_is_clean(command):
-    module, *arguments = command.split()
+@pytest.mark.parametrize("name", COMMANDS)
+def test_source_is_clean(name):
+    module, command = COMMANDS[name]
     if find_spec(module) is None:
         pytest.skip(f"{module} is not installed")
+    option, _, arguments = command.partition(" ")
+    arguments = [arguments] if option == "-c" else arguments.split()
     result = subprocess.run(
-        [sys.executable, "-m", module, *arguments],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
+        [sys.executable, option, *arguments], cwd=REPOSITORY, capture_output=True, text=True
     )
     assert result.returncode == 0, result.stdout + result.stderr
-
-
-def test_misspellings_are_found(tmp_path):
-    pytest.importorskip("codespell_lib")
-    (tmp_path / "a.txt").write_text("rec" + "ieve")
-    command = [sys.executable, "-m", "codespell_lib", str(tmp_path)]
-    assert subprocess.run(command, cwd=REPOSITORY, capture_output=True).returncode != 0
