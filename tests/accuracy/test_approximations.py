@@ -57,6 +57,7 @@ all_scenes = pytest.mark.parametrize("scene", ("random", "close"))
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_precisions
 @all_scenes
 @all_approximations
@@ -99,12 +100,14 @@ def test_order_converges_with_the_window():
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @all_scenes
 @all_approximations
 def test_gradients_equal_central_differences_of_the_reference(scene, name):
     check_gradients_equal_central_differences_of_the_reference(scene, name)
 
 
+@pytest.mark.slow
 @all_scenes
 @pytest.mark.parametrize(
     ("name", "precision"),
@@ -279,6 +282,7 @@ def kernels_in_a_new_process(run_python, blocked, **approximations):
     return run_python(program)
 
 
+@pytest.mark.slow
 def test_unused_approximation_costs_nothing(run_python):
     """Hash and operation count of the default's kernels, with all other modules out of reach."""
     import json
@@ -289,6 +293,7 @@ def test_unused_approximation_costs_nothing(run_python):
     assert whole == reduced and all(len(kernels) >= 3 for kernels in whole.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "approximations"),
     [

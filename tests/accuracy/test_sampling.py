@@ -442,6 +442,7 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
     return {"image": np.array(image), "tangent": np.array(tangent), **gradients}, len(frames)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch):
     monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})

@@ -216,6 +216,7 @@ def test_points_of_a_ray_project_to_its_pixel(precision, name):
     np.testing.assert_allclose(rays[shown], expected[shown], rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("kind", ["opencv", "fisheye", "thin prism"])
 def test_rays_of_extreme_lenses_are_found_and_finite(precision, kind):

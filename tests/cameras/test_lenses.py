@@ -107,6 +107,7 @@ DIFFERENCES = 1e-6
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rational", "fisheye", "orthographic"])
 def test_each_gradient_entry_equals_a_difference_of_the_reference(name, monkeypatch):
     """One splat is on the axis, one so far beside the film that its slopes may be clamped."""
@@ -130,6 +131,7 @@ def test_each_gradient_entry_equals_a_difference_of_the_reference(name, monkeypa
             assert_arrays_agree({**actual, parameter: 1.01 * values}, expected, DIFFERENCES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "antialiased"),
     [(name, False) for name in (*FORMS, "plain fisheye")] + [("rational", True), ("fisheye", True)],

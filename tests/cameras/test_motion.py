@@ -278,6 +278,7 @@ def kernel_gradients(case, precision, cotangents):
     return {n: np.mean([np.array(getattr(part, n)) for part in parts], 0) for n in PARAMETER_NAMES}
 
 
+@pytest.mark.slow
 @kinds_and_samples
 def test_gradients_equal_differences_of_the_reference(name, samples, monkeypatch):
     case = clear(case_of(name, samples=samples, threshold_width=1e-3))

@@ -188,6 +188,7 @@ def fails(capsys, command, *arguments):
     return capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, step_callbacks, capsys):
     """Across a change of the population, of the SH degree, and an opacity reset."""
     flags = []

@@ -61,6 +61,7 @@ def check(found):
     assert not mended, f"no failures any more: {mended}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", QUICK)
 def test_attacks_end_in_results_or_a_one_line_error(attack_folder, family):
     found = [a for a in attacks(family, attack_folder) if not a.risky and not a.is_long]

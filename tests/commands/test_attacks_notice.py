@@ -87,6 +87,7 @@ BREACHES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "message"), BREACHES.values(), ids=BREACHES)
 def test_forbidden_behaviour_is_detected(attack_folder, monkeypatch, command, message):
     monkeypatch.setattr("drgs.render.main", lambda words: command())

@@ -296,12 +296,14 @@ def run_process(*arguments):
     )
 
 
+@pytest.mark.slow
 def test_the_command_itself_refuses_a_damaged_point_cloud(scene):
     os.truncate(scene / "points.ply", 500)
     assert_refused(run_process(scene / "a.yml"), "points.ply: not a valid PLY file")
     assert not (scene / "out").exists()
 
 
+@pytest.mark.slow
 def test_earlier_result_is_kept(scene):
     first = run_command(scene / "a.yml")
     assert first.returncode == 0, first.stderr

@@ -465,6 +465,7 @@ def test_changed_import_of_a_python_scene_changes_its_fingerprint(tmp_path):
     assert dataset.fingerprint(path) != before
 
 
+@pytest.mark.slow
 def test_the_command_runs_as_a_module(ball, tmp_path):
     # No two whole numbers of similar size make 7: Mitsuba's sampler takes one path more.
     options = ["--views", "2", "--test-views", "1", "--size", "8", "8", "--spp", "7"]
@@ -482,6 +483,7 @@ def test_the_command_runs_as_a_module(ball, tmp_path):
 # The shipped scene
 
 
+@pytest.mark.slow
 def test_shipped_scene_fits_the_image_and_has_hundreds_of_parts():
     path = REPOSITORY / "scenes" / "brick_crane.py"
     scene = path_tracing.load_scene(path)

@@ -78,6 +78,7 @@ class Killed(BaseException):
     """An exception that ends the process without any cleaning up."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["before", "behind"])
 @pytest.mark.parametrize("number", range(FILES))
 def test_capture_killed_at_any_file_resumes_to_the_same_bytes(

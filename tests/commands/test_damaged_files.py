@@ -118,6 +118,7 @@ def assert_both_happen(refused):
 # Properties
 
 
+@pytest.mark.slow
 def test_damaged_ply_files_are_read_or_refused(tmp_path):
     path = tmp_path / "a.ply"
     refused = []
@@ -131,6 +132,7 @@ def test_damaged_ply_files_are_read_or_refused(tmp_path):
     assert_both_happen(refused)
 
 
+@pytest.mark.slow
 def test_damaged_transforms_files_are_read_or_refused(photographs):
     path = photographs / "transforms.json"
     content = path.read_bytes()
@@ -150,6 +152,7 @@ def test_damaged_transforms_files_are_read_or_refused(photographs):
     assert_both_happen(refused)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])
 def test_damaged_masks_are_read_or_refused(photographs, layout):
     """A mask contains only 0 and 1, whatever the file is, and its photograph is complete."""
@@ -182,6 +185,7 @@ def test_damaged_masks_are_read_or_refused(photographs, layout):
     assert_both_happen(refused)
 
 
+@pytest.mark.slow
 def test_strange_names_are_found_or_reported(photographs):
     """Names of photographs, masks, clouds and lists: only files are read, and none twice."""
     path, refused = photographs / "transforms.json", []
@@ -222,6 +226,7 @@ def test_strange_names_are_found_or_reported(photographs):
     assert 0.1 * COUNT < sum(refused) < 0.9 * COUNT
 
 
+@pytest.mark.slow
 def test_damaged_images_are_read_or_refused(tmp_path):
     path = tmp_path / "a.png"
     write_image(path, 0)
@@ -235,6 +240,7 @@ def test_damaged_images_are_read_or_refused(tmp_path):
     assert_both_happen(refused)
 
 
+@pytest.mark.slow
 def test_damaged_configurations_are_read_or_refused(tmp_path):
     path = tmp_path / "a.yml"
     values = FitConfig(data=DataConfig(path="x", background=(0, 0.5, 1))).model_dump(mode="json")

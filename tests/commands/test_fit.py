@@ -207,6 +207,7 @@ def make_trainer(config):
     return Trainer(config, dataset, initial_gaussians(config, dataset))
 
 
+@pytest.mark.slow
 def test_configuration_covers_every_change_within_a_fit(fitted, configuration):
     """The tests below compare the bytes of such fits, this one with those of a longer process."""
     config = load_config(configuration)
@@ -233,6 +234,7 @@ def test_configuration_covers_every_change_within_a_fit(fitted, configuration):
     assert (first.parent / "in_process.ply").read_bytes() == expected
 
 
+@pytest.mark.slow
 def test_the_resolved_configuration_gives_the_same_bytes_on_any_number_of_threads(fitted, tmp_path):
     """One thread, and the first fit's two. The configuration itself is fitted again above."""
     _, first = fitted
@@ -246,6 +248,7 @@ def test_the_resolved_configuration_gives_the_same_bytes_on_any_number_of_thread
     assert (tmp_path / "again" / "viewer.html").read_text() == page
 
 
+@pytest.mark.slow
 def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
     """Some moments of 30,000 Gaussians are denormal numbers from the start."""
     config = load_config(REPOSITORY / "scenes" / "lego_mini.yml")
@@ -277,6 +280,7 @@ def test_another_seed_gives_another_result(configuration):
     assert first[0] != other[0] and first[1] != other[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
 def test_stopped_fit_resumes_to_the_same_bytes(fitted, configuration, tmp_path, sent):
     """Ctrl-C saves and exits with 130; kill -9 loses what came after the last checkpoint."""

@@ -149,6 +149,7 @@ def moments_of(config, tmp_path, *budget):
 BUDGET = ("--budget", "60s")
 
 
+@pytest.mark.slow
 def test_fit_with_budget_killed_around_revised_plans_resumes(config, tmp_path):
     """Between the two files of a revision, and behind the last file."""
     names = moments_of(config, tmp_path, *BUDGET)
@@ -171,6 +172,7 @@ def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
     assert not assert_goes_on(config, tmp_path, count, behind, *budget)
 
 
+@pytest.mark.slow
 def test_fit_killed_while_writing_results_repeats_no_iteration(config, tmp_path):
     names = moments_of(config, tmp_path)
     assert run_crashing_fit(names.index("history.csv"), True, config, "--out", tmp_path / "out")[0]

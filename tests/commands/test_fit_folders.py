@@ -123,6 +123,7 @@ def test_configuration_edited_before_the_first_checkpoint_is_kept(stopped):
     assert path.read_text() == text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["notes.txt", "renders/mine.png", "renders/test/mine.png", "side_by_side/.mine"]
 )

@@ -70,6 +70,7 @@ def test_short_budget_skips_report_and_images(planned):
     assert planned(nothing, 7.0) == (1, nothing)
 
 
+@pytest.mark.slow
 def test_fit_without_a_report_writes_everything_else(tmp_path):
     """Everything else is there; no test view is measured on the way."""
     config, written = write_project(tmp_path), {}

@@ -110,6 +110,7 @@ def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page):
     assert files_of(tmp_path / "again") == files_of(out)
 
 
+@pytest.mark.slow
 def test_fit_ended_early_and_killed_writes_its_results_on_resume(
     tmp_path, viewer_page, monkeypatch
 ):

@@ -256,6 +256,7 @@ def check_gradients_are_the_transpose_of_the_tangents(arrays, tangents, name):
         assert abs(ahead - terms.sum()) <= 1e-11 * max(np.abs(terms).sum(), 1e-12), key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [{}, {"order": "pixel"}, {"sh_direction": "pixel", "sh_degree": 1}],
@@ -292,6 +293,7 @@ def test_grouping_channels_leaves_images_unchanged(monkeypatch, options):
         np.testing.assert_allclose(a, grouped_back[name], rtol=0, atol=atol, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_tangents_equal_differences_and_gradients_match_tangents(name):
     """Forward against differences, reverse against forward; one test, as they share kernels."""

@@ -186,6 +186,7 @@ def write_camera(path, begin, end=None, **says):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [None, 3])
 def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path, samples):
     """A global shutter that closes where it opened shows what one that stands still does."""

@@ -174,6 +174,7 @@ def test_unknown_scene_parameters_are_refused(tmp_path, capsys):
     assert message.startswith(f"{path}: ") and "colour" in message
 
 
+@pytest.mark.slow
 def test_module_runs_as_a_command(fit, tmp_path):
     result = subprocess.run(
         [sys.executable, "-m", "drgs.render", fit, "--orbit", "1", "--out", tmp_path / "out"],

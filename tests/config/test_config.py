@@ -192,6 +192,7 @@ def test_a_wrong_value_is_refused_with_file_key_expected_and_got(load, text, mes
     assert str(error.value) == f"scenes/x.yml: {message}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -244,6 +245,7 @@ def test_several_wrong_values_are_reported_in_one_line(load):
     )
 
 
+@pytest.mark.slow
 def test_a_long_list_of_wrong_values_is_cut(load):
     with pytest.raises(UserError) as error:
         load(MINIMAL + "".join(f"k{i}: 1\n" for i in range(50_000)))

@@ -29,6 +29,7 @@ def test_denormal_mode_is_set_and_restored():
     assert denormal() > 0
 
 
+@pytest.mark.slow
 def test_nearest_neighbours_of_equal_points_at_zero_are_found(run_python):
     """In another process: SciPy's tree ended it, as the least number above zero was zero."""
     result = run_python("""

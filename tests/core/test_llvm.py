@@ -191,6 +191,7 @@ print(mi.variant())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("major", [14, 15, 16])
 def test_an_old_library_is_refused_when_an_llvm_variant_is_chosen(run_python, major):
     """14 is turned down by Dr.Jit itself, the others by drgs; neither ends the process."""
@@ -204,12 +205,14 @@ def test_an_old_library_is_refused_when_an_llvm_variant_is_chosen(run_python, ma
     assert (variant, fallback) == ("None", "scalar_rgb")
 
 
+@pytest.mark.slow
 def test_a_missing_library_is_refused_when_an_llvm_variant_is_chosen(run_python):
     result = run_python(SET_VARIANT, DRJIT_LIBLLVM_PATH="/nonexistent")
     assert result.returncode == 0, result.stderr
     assert "found none that Dr.Jit can load (DRJIT_LIBLLVM_PATH=/nonexistent)" in result.stdout
 
 
+@pytest.mark.slow
 def test_a_usable_library_passes(run_python):
     result = run_python('import drgs, mitsuba as mi; mi.set_variant("llvm_ad_rgb"); print("ok")')
     assert (result.returncode, result.stdout) == (0, "ok\n"), result.stderr

@@ -91,6 +91,7 @@ def test_largest_available_images_are_used(tmp_path):
     assert load(tmp_path).train[0].width == 160
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
 def test_every_supported_lens_is_rendered(tmp_path, name):
     """Without undistorting; the coefficients are those of the file."""
@@ -113,6 +114,7 @@ def film_points(view, points):
     return np.array(camera.lens.project_point(camera, Array3f64(points.T))).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
 def test_points_project_like_in_colmap(tmp_path, name):
     """In double precision, over the image and somewhat beyond, to a few roundings of 1,000 px."""
@@ -126,6 +128,7 @@ def test_points_project_like_in_colmap(tmp_path, name):
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
 def test_real_points_project_to_their_observations():
     """Within the mean error that the model says of itself, through the reader of datasets."""

@@ -30,6 +30,7 @@ def test_photographs_are_scaled_by_an_integer_and_use_photos_yml(tmp_path):
         assert getattr(config, section) == getattr(example, section)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(4032, 3024), (3023, 4031), (901, 667), (41, 60001)])
 def test_widths_are_divided_by_the_smallest_sufficient_integer(tmp_path, size):
     write_dataset(tmp_path)

@@ -190,6 +190,7 @@ def separate_scene() -> tuple[reference.Gaussians, reference.Camera]:
 SAMPLED = {0.03125: (73, 53), 0.0625: (63, 42), 0.125: (51, 34), 0.25: (45, 28)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aperture_radius", SAMPLED)
 def test_defocused_image_approximates_many_aperture_samples(aperture_radius):
     """A disc and a Gaussian of its variance differ in shape, by the square of its area over the
@@ -260,6 +261,7 @@ def test_defocused_wall_keeps_alpha_and_colour():
     assert mean[0].min() > 0.1 and mean[0].max() < 0.3
 
 
+@pytest.mark.slow
 @both_precisions
 def test_defocused_wall_matches_the_reference(precision):
     """Which evaluates each splat at each pixel, up to the alpha at which it ends."""
@@ -337,6 +339,7 @@ def test_each_gradient_entry_equals_a_difference_of_the_reference():
             assert_arrays_agree({**actual, parameter: 1.01 * values}, expected, DIFFERENCES)
 
 
+@pytest.mark.slow
 @all_scenes
 def test_gradients_equal_differences_of_the_reference_along_a_direction(scene, monkeypatch):
     case = clear(case_of(scene, threshold_width=1e-3))

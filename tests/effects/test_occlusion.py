@@ -132,6 +132,7 @@ def test_transmittance_past_all_surfaces_follows_from_the_planes(case):
     np.testing.assert_allclose(rendered.transmittance.ravel(), transmittance * rest, atol=1e-15)
 
 
+@pytest.mark.slow
 @both_precisions
 @all_cases
 def test_gradients_equal_differences_of_the_reference(precision, case):

@@ -280,6 +280,7 @@ def outputs_of(case, gaussians) -> list[np.ndarray]:
     return [rendered.image, rendered.alpha, rendered.depth]
 
 
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_each_gradient_entry_equals_a_difference_of_the_reference(precision, antialiased):

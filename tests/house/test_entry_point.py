@@ -61,6 +61,7 @@ def test_installed_metadata_has_the_same_entry_point():
     assert {point.value for point in found} == {"drgs.plugins"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "program",
     [

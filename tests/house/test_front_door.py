@@ -31,6 +31,7 @@ def test_a_public_name_is_documented(name):
     assert name in drgs.__doc__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Gaussians", "rasterization"])
 def test_public_names_are_imported_lazily(run_python, name):
     result = run_python(LAZILY.format(name=name))
@@ -75,6 +76,7 @@ def shared_names(source, modules):
     return defined & modules
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(REPOSITORY)))
 def test_no_name_equals_its_module_or_package(file):
     assert not shared_names(file.read_text(), names_around(file))

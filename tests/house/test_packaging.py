@@ -72,6 +72,7 @@ def test_a_checkout_that_shadows_an_installed_package_finds_its_own_plugins(run_
     assert result.stdout.strip() == str(REPOSITORY / "plugins" / "__init__.py"), result.stderr
 
 
+@pytest.mark.slow
 def test_an_editable_install_wins_over_a_clone_of_the_same_name(tmp_path):
     """In the clone's parent folder, where the folder ``drgs`` could be a namespace package."""
     checkout = tmp_path / "drgs"

@@ -4,6 +4,7 @@ import ast
 from collections import Counter
 from pathlib import Path
 
+import pytest
 from conftest import REPOSITORY
 
 TESTS = REPOSITORY / "tests"
@@ -47,6 +48,7 @@ def last_name(module: str) -> str:
     return module.rpartition(".")[2]
 
 
+@pytest.mark.slow
 def test_no_file_imports_a_test_file():
     imported = {(path.name, m) for path in FILES for m in imported_modules(path)}
     assert len(imported) > 1000
@@ -66,4 +68,5 @@ def test_folders_mirror_the_packages():
     packages = {path.parent.name for path in (REPOSITORY / "drgs").glob("*/__init__.py")}
     folders = {path.name for path in TESTS.iterdir() if path.is_dir() and any(path.glob("*.py"))}
     assert folders <= packages | OTHER_FOLDERS
-    assert [path.name for path in TESTS.glob("test_*.py")] == ["test_gradients.py"]
+    names = {path.name for path in TESTS.glob("test_*.py")}
+    assert names == {"test_gradients.py", "test_laws.py"}

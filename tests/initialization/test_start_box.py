@@ -176,6 +176,7 @@ def test_derived_values_are_recorded():
     assert resolve_defaults(decided, dataset) == decided
 
 
+@pytest.mark.slow
 def test_photographs_are_downscaled_to_the_reference_width_by_default(photographs):
     from PIL import Image
     from support.datasets import edit

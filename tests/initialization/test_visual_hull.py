@@ -74,6 +74,7 @@ def test_small_object_in_a_large_box_has_as_many_points():
     assert np.linalg.norm(points - [0.3, 0.2, -0.1], axis=1).max() < 0.08
 
 
+@pytest.mark.slow
 def test_thin_pole_is_kept():
     """Its width is a fifth of a pixel and a fifteenth of a cube; beside it is a body."""
     pole = box((-0.004, 0.596, -1), (0.004, 0.604, 1))

@@ -175,6 +175,7 @@ def test_images_one_percent_brighter_differ(name):
     assert differing > 0.01
 
 
+@pytest.mark.slow
 @all_configs
 def test_forward_derivatives_equal_differences(kind):
     error_mean, error_max = errors_of_forward(kind, forward(kind))
@@ -183,6 +184,7 @@ def test_forward_derivatives_equal_differences(kind):
     assert error_max <= kind.error_max_threshold
 
 
+@pytest.mark.slow
 @all_configs
 def test_backward_derivatives_equal_differences(kind):
     error = error_of_backward(kind, backward(kind, weights_of(kind)))

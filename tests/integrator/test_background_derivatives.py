@@ -150,6 +150,7 @@ def factored(way, kind):
 BACKGROUND = "integrator.background.data"
 
 
+@pytest.mark.slow
 @all_kinds
 @pytest.mark.parametrize(
     "way", [*TWO_PATHS, "batch", "surface", "surface of the same", "splats of the same"]

@@ -61,6 +61,7 @@ def check(row, route):
     assert found.modes <= MODES, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row, route", CORE)
 def test_cells_equal_the_measured_errors(row, route):
     check(row, route)
@@ -86,6 +87,7 @@ def test_only_poses_lit_by_splats_are_partly_differentiated():
     assert rows == {"`to_world`, diffuse", "`to_world`, rough"}
 
 
+@pytest.mark.slow
 def test_poses_lit_by_other_surfaces_are_differentiated():
     """Along the rays that find it, which see it in the same solid angle."""
     to_world = identity().translate([0, 3, -3]).rotate([1, 0, 0], 45).scale(30)

@@ -101,6 +101,7 @@ def assert_mean(values, expected, missed):
     assert (z <= 4).all() and np.square(z).mean() <= 4, z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fog", "num_samples"), [*((fog, 4) for fog in FOGS), (FOGS[2], 1), (FOGS[7], 2)]
 )

@@ -300,6 +300,7 @@ MODULES = (
 )
 
 
+@pytest.mark.slow
 def test_scenes_without_shapes_or_to_world_skip_merging_modules(
     run_python,
 ):

@@ -82,6 +82,7 @@ def without_panes(name) -> np.ndarray:
     return rendered(*SCENES[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", [2.0, 0.05, -1.5], ids=["before", "amid", "behind"])
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("pane", PANES)

@@ -154,6 +154,7 @@ def shown() -> dict[str, str]:
     return dict(zip(PROGRAMS, parts, strict=False))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_the_last_line_names_the_cause(name):
     _, expected = PROGRAMS[name]

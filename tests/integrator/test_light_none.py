@@ -154,6 +154,7 @@ def imported_for(run_python, scenes) -> list[list[str]]:
     return json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_light_package_is_imported_only_if_a_scene_uses_it(run_python):
     nested = {"nested": {"type": "path"}}
     plain = [(s, light) for s in (False, True) for light in ({}, {"light": "none"})]

@@ -60,6 +60,7 @@ def images_by_light(probes="floor", **others):
     return *own, rendered("rays", **others)
 
 
+@pytest.mark.slow
 def test_mirror_matches_the_mirrored_camera(monkeypatch):
     """40 dB of the float64 reference, of which much is the noise of 64 paths: rays have 43."""
     monkeypatch.syspath_prepend(REPOSITORY / "scenes")
@@ -133,6 +134,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_flat_mirror_matches_traced_rays(kind):
     """46 dB, between texels; without light there are less than 24."""

@@ -325,6 +325,7 @@ def test_xml_and_dictionary_give_the_same_image(kind, tmp_path):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", ["render", "render_backward", "render_forward"])
 def test_dr_freeze_is_refused_without_side_effects(call):
     gc.collect()  # scenes of other tests that die while Dr.Jit records change its own message

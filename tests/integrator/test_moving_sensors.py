@@ -185,6 +185,7 @@ SENSOR_MODULES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "module"), SENSOR_MODULES.values(), ids=SENSOR_MODULES)
 def test_a_sensor_requires_its_module(run_python, sensor, module):
     """test_summary covers other sensors, and kernels without these modules."""

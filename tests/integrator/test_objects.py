@@ -217,6 +217,7 @@ def test_object_used_twice_receives_both_derivatives():
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(both).max())
 
 
+@pytest.mark.slow
 def test_gradient_descent_recovers_the_position_of_an_object():
     """One of two, turned by 12 degrees and moved by a fifth of a unit, from one image."""
     scene = load(nested())

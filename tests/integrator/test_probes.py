@@ -52,6 +52,7 @@ def test_mirror_ball_matches_traced_rays():
     assert errors[0] < 1e-3 < 0.02 < errors[1]
 
 
+@pytest.mark.slow
 def test_lamp_with_a_probe_is_dimmed_by_fog():
     """Fog before the lamp dims it by its alpha; up to 0.01, as rays with four times that."""
     rng = np.random.default_rng(1)
@@ -122,6 +123,7 @@ def test_probes_see_smoothed_gaussians():
     np.testing.assert_allclose(smoothed, render(wide, **settings), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_objects_too_close_to_splats_give_one_warning():
     """A splat is nearer to the middle than 1.25 radii; changes repeat no warning."""
     lines = []

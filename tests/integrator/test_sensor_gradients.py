@@ -316,6 +316,7 @@ def forward(loaded, **directions) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every_parameter
 def test_derivatives_equal_central_differences(name, parameter):
     """Backward of a weighted sum, and forward, of every pixel."""

@@ -67,6 +67,7 @@ def factors(scene):
 SKY = {"type": "constant"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("height", "radius"), [(1.0, 1.0), (0.5, 0.2), (2.0, 6.0)])
 def test_disc_blocks_its_solid_angle_of_the_sky(height, radius, monkeypatch):
     """1 - sin^2 of half the angle under which it is seen (Lambert)."""

@@ -61,6 +61,7 @@ def room():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_depth", [1, 2, 3, 8])
 def test_image_without_splats_matches_path(max_depth):
     """Within five standard errors everywhere, and within one and a bit on average."""
@@ -103,6 +104,7 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     assert expected.max() > 0.3
 
 
+@pytest.mark.slow
 def test_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
     """The pixel shows one point of the wall, from which the lamp is seen through every Gaussian."""
     rng = np.random.default_rng(1)
@@ -241,6 +243,7 @@ ROUNDING = 1e-5
 """Error of means of 64 samples up to 3, summed in single precision: 64 * 3 * 6e-8."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("furnace", FURNACES.values(), ids=FURNACES.keys())
 def test_bounces_in_a_furnace_of_fog_converge_to_its_radiance(furnace):
     """To the solution of its equation, each adding less than the albedo times the one before.
@@ -305,6 +308,7 @@ def test_glass_without_refraction_is_invisible():
     assert rendered.max() > 0.3
 
 
+@pytest.mark.slow
 def test_materials_and_lamps_have_derivatives_among_splats():
     """Central differences use images with many paths."""
     splats = gaussians([[0.3, 1.2, 0.5], [-0.8, 0.6, 0.4]], 0.4, 0.7, 0.8)

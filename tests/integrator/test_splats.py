@@ -207,6 +207,7 @@ for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "order",
     ["import drgs; mi.set_variant('llvm_ad_rgb')", "mi.set_variant('llvm_ad_rgb'); import drgs"],

@@ -60,6 +60,7 @@ print(digest.hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_image_and_gradients_have_the_same_bytes_in_every_process(run_python):
     """Whatever the number of threads."""
     results = [run_python(DIGEST.format(threads=threads)) for threads in (1, 2, 3)]
@@ -304,6 +305,7 @@ def test_a_new_view_needs_no_new_kernel():
     assert len(kernels) > 10 and all(kernel["cache_hit"] for kernel in kernels)
 
 
+@pytest.mark.slow
 def test_a_stale_frame_is_not_kept():
     loaded = Scene().load()
     mi.render(loaded)

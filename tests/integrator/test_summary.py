@@ -315,6 +315,7 @@ def test_effects_of_a_fit_are_ordered(changes, names):
     assert integrator_settings(effects) == {"aovs": "depth:depth, alpha:alpha"}
 
 
+@pytest.mark.slow
 def test_all_effects_work_in_one_fit():
     """And it learns, and goes on from a checkpoint to the same bytes."""
     dataset = rich_dataset()
@@ -406,6 +407,7 @@ def run_in_new_process(run_python, blocked=(), **changes) -> dict:
     return json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_kernels_are_the_same_without_effect_modules(run_python):
     """Hashes and operations of an image with its derivatives, and of a fit's iterations."""
     whole = run_in_new_process(run_python)
@@ -415,6 +417,7 @@ def test_kernels_are_the_same_without_effect_modules(run_python):
     assert all(len(kernels) > 30 for name, kernels in whole.items() if name != "imported")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "module"),
     [
@@ -486,6 +489,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.slow
 def test_each_effect_imports_its_own_modules(run_python, tmp_path):
     """In this order, what comes later knows what came before."""
     program = IMPORTS.format(

@@ -210,6 +210,7 @@ def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
     assert nested.count == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use", ["an image", "a gradient", "an image with gradients"])
 @pytest.mark.parametrize("with_shapes", [False, True])
 def test_unreferenced_scene_is_freed(use, with_shapes):

@@ -254,6 +254,7 @@ def test_fully_transparent_surfaces_are_invisible(bsdf):
     np.testing.assert_allclose(image, expected, rtol=0, atol=4e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nested", ["path", "prb"])
 @pytest.mark.parametrize("srgb_primitives", [True, False])
 def test_splats_between_windows_and_a_wall_are_visible(srgb_primitives, nested):

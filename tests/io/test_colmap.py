@@ -242,6 +242,7 @@ def test_truncated_binary_file_is_refused_at_any_length(tmp_path, model, name):
     assert "the end of the file was expected" in refusal(tmp_path)
 
 
+@pytest.mark.slow
 @each_format
 def test_damaged_files_are_read_or_refused_with_file_and_place(tmp_path, model, write):
     """Bytes are changed, left out or put in: nothing comes but a UserError with the place."""

@@ -74,6 +74,7 @@ def test_plugin_renders_the_file(installed, tmp_path):
     np.testing.assert_array_equal(*images)
 
 
+@pytest.mark.slow
 def test_commands_export_and_render_it(installed, tmp_path):
     blobs().save(tmp_path / "a.ply")
     status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
@@ -85,6 +86,7 @@ def test_commands_export_and_render_it(installed, tmp_path):
     assert list((tmp_path / "out").glob("**/*.png"))
 
 
+@pytest.mark.slow
 def test_help_and_messages_list_the_format(installed, tmp_path):
     _, text = drgs(installed, "export", "--help")
     assert "npz: NumPy's archive of arrays" in " ".join(text.split())
@@ -117,6 +119,7 @@ def test_errors_of_the_format_are_reported_with_its_name(installed, tmp_path, co
         Gaussians.load(tmp_path / "a.npz")
 
 
+@pytest.mark.slow
 def test_error_while_writing_ends_a_command_with_one_line(installed, tmp_path):
     module = installed / "npz_format.py"
     module.write_text(module.read_text().replace("return content.getvalue()", "return 1 / 0"))

@@ -57,6 +57,7 @@ def test_single_gaussian_survives_a_round_trip(tmp_path, each):
     assert_within(PRECISION[each.name], expected, Gaussians.load(path))
 
 
+@pytest.mark.slow
 @each_format
 @pytest.mark.parametrize("degree", [0, 3])
 def test_too_large_files_are_refused_before_allocation(tmp_path, monkeypatch, each, degree):

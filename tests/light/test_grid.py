@@ -115,6 +115,7 @@ def segment_transmittances(gaussians: splatting.Gaussians, rays: Rays, precision
 CLOUDS = [range(104), pytest.param(range(104, 1000), marks=pytest.mark.slow)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", CLOUDS, ids=["some", "many"])
 def test_rays_hit_the_same_gaussians_with_and_without_a_grid(seeds):
     """In double precision all that the reference meets, in single where that is well defined.

@@ -139,6 +139,7 @@ class Problem:
 some_views = pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[10]], ids=lambda v: v.name)
 
 
+@pytest.mark.slow
 @both_precisions
 @some_views
 def test_primary_rays_match_the_exact_image(precision, view):

@@ -81,6 +81,7 @@ def test_cube_map_lookup_is_a_bijection(precision):
     np.testing.assert_allclose(back, towards, atol=2e-6)
 
 
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("number", [0, 1])
 def test_probe_matches_rays_from_its_centre(precision, number):
@@ -103,6 +104,7 @@ def test_probe_matches_rays_from_its_centre(precision, number):
     np.testing.assert_allclose(color, expected.colors, atol=1.2e-3 + 1 / 255)
 
 
+@pytest.mark.slow
 def test_probe_shows_the_same_surface_off_its_centre():
     """A shell is seen without gaps: all is known, and where it is met decides about its colour.
 

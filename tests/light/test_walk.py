@@ -61,6 +61,7 @@ deviations, whose rounding of 6e-8 moves its alpha by 2e-3 of itself; of colours
 times as much."""
 
 
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize(
     ("count", "spread", "size"), [(1, 1, 0.5), (30, 1, 0.5), (1000, 1, 0.05), (3000, 0.3, 0.1)]

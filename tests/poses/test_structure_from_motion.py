@@ -85,6 +85,7 @@ def test_plain_images_have_no_cameras_and_leave_no_files(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png"}
 
 
+@pytest.mark.slow
 def test_photographs_without_a_mask_are_used(tmp_path):
     pytest.importorskip("pycolmap")
     names = ["a.png", "b.png", "c.png", "d.png"]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from drgs.reference import splatting as reference
 
 
+@pytest.mark.slow
 def test_image_agrees_with_gsplat(gsplat):
     gaussians, camera, expected, _ = gsplat
     rendered = reference.render(gaussians, camera, np.ones(3))
@@ -21,6 +23,7 @@ def test_image_agrees_with_gsplat(gsplat):
     assert marked[far].all()
 
 
+@pytest.mark.slow
 def test_gradients_agree_with_gsplat(gsplat):
     gaussians, camera, _, expected = gsplat
     gradients = reference.render_gradients(gaussians, camera, np.ones(3), expected["w"])

@@ -341,6 +341,7 @@ def test_prism_or_tangential_term_alone_folds_on_one_side():
     np.testing.assert_allclose(shown[:2], shown[2:], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_thin_prism_fisheyes_have_no_fold_within_their_angle():
     """The symmetric parts of difference quotients, in a disc of each of 40 lenses, are positive.
 

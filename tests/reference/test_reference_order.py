@@ -131,6 +131,7 @@ def test_entry_order_puts_a_large_splat_before_a_nearer_small_one():
         np.testing.assert_allclose(rendered.depth[4, 4], expected, rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0.0, 0.3])
 @pytest.mark.parametrize("stop", ["before", "after"])
 def test_ray_skips_splats_entered_within_a_step(step, stop):

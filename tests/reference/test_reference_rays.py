@@ -69,6 +69,7 @@ def test_default_model_matches_the_reference(antialiased, sh_degree):
     np.testing.assert_array_equal(rendered.near_threshold, expected.near_threshold)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model",
     [
@@ -95,6 +96,7 @@ def test_image_equals_a_loop_over_pixels(model):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("projection", ["ewa", "unscented", "exact"])
 @pytest.mark.parametrize(
     "change",
@@ -203,6 +205,7 @@ def test_region_is_the_crop_of_the_whole(model):
             )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.projection)
 def test_image_does_not_depend_on_tiling(model, monkeypatch):
     gaussians, camera = small_scene()

@@ -103,6 +103,7 @@ def test_small_scene_enters_every_branch():
         assert brute["num_stopped"] >= 3 and brute["num_clamped"] >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("sh_degree", [3, 1])
 def test_gradients_agree_with_central_differences(antialiased, sh_degree):

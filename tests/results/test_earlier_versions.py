@@ -40,6 +40,7 @@ def fitted(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_continued(fitted):
     assert_fits("--resume", fitted / "out", "--data", fitted / "data")
     after, header = Ply().read(fitted / "out" / "point_cloud.ply")

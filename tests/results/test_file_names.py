@@ -32,6 +32,7 @@ def test_file_names_are_unique():
     assert len(NAMES) == len(files.RESULTS) + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_file_names_are_written_in_one_module_only(path):
     known = ALLOWED_NAMES.get(path.relative_to(REPOSITORY).as_posix(), set())

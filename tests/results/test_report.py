@@ -186,6 +186,7 @@ def test_curves_are_drawn(out):
             assert (np.abs(panel.astype(int) - line).max(axis=2) < 8).sum() > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rows",
     [
@@ -346,6 +347,7 @@ def test_the_orbit_can_be_paused_and_honours_reduced_motion(page):
     assert ".orbit .moving, .orbit .pause" in reduced.partition("display: none")[0]
 
 
+@pytest.mark.slow
 def test_rendered_datasets_are_not_called_photographs(tmp_path, dataset, images, out, page):
     path, taken = tmp_path / "report.html", replace(dataset, rendered=False)
     orbit = (out / "orbit.webp").read_bytes()
@@ -407,6 +409,7 @@ def test_views_are_chosen_by_their_psnr(scores, expected):
     assert report.choose_views(scores) == expected
 
 
+@pytest.mark.slow
 def test_external_text_is_escaped(tmp_path, dataset, images, out):
     hostile = "</pre><script>alert(1)</script>"
     test = tuple(replace(view, name=f"<b>{view.name}") for view in dataset.test)
@@ -425,6 +428,7 @@ def test_external_text_is_escaped(tmp_path, dataset, images, out):
     assert "<b>r_0" in "".join(page.text)
 
 
+@pytest.mark.slow
 def test_image_equal_to_its_photograph_has_infinite_psnr(tmp_path, dataset, out):
     equal = replace(dataset, test=dataset.test[:1])
     report.write_report(

@@ -87,6 +87,7 @@ def kernels_in_a_new_process(run_python, degree, rule, features, forbidden=None)
 PLAIN = {"rule": "projection.plain_opacity", "features": "(rendering.color_features,)"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degree", "forbidden"),
     [(0, UNUSED_AT_DEGREE_0), (1, UNUSED_AT_DEGREE_1)],
@@ -99,6 +100,7 @@ def test_kernels_are_the_same_without_unused_modules(run_python, degree, forbidd
     assert all(len(kernels) >= 3 for kernels in whole.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degree", "change", "used"),
     [

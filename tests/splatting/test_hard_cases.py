@@ -87,6 +87,7 @@ def test_bound_distinguishes_textbook_from_stable_formulas():
     assert (error > allowed(case.name)[0]["image"]).mean() > 0.05
 
 
+@pytest.mark.slow
 @all_families
 def test_reference_gradient_is_the_slope_of_the_reference(name):
     """Central differences along a random direction of all parameters.

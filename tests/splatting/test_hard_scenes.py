@@ -44,6 +44,7 @@ ORDINARY = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ORDINARY, ids=lambda case: case.name)
 def test_ten_thousand_gaussians_match_the_reference_in_float32(case):
     """Images within 2e-5 of the reference, gradients within 1e-4, cosines above 0.99999.
@@ -92,6 +93,7 @@ def planes_and_gradients(gaussians, case, precision):
     return planes, vars(reference_gaussians(gradients.parameters))
 
 
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -81,6 +81,7 @@ def test_an_empty_view_is_the_background_and_has_no_gradient(precision):
     assert not any(value.any() for value in gradients.values())
 
 
+@pytest.mark.slow
 @both_precisions
 def test_million_gaussians_in_one_pixel_match_the_reference(precision):
     """The pixel stops after some 2,130 layers of alpha 1.1 / 255: the nearest 3,000 are all.

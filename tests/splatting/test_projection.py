@@ -129,6 +129,7 @@ def project_gradients(case, precision, weights) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.slow
 @both_precisions
 @all_cases
 def test_gradients_equal_the_reference(precision, case):

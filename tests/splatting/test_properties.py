@@ -83,6 +83,7 @@ TURNED = 8 * 3.3 * 20
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), seeds)
@@ -97,6 +98,7 @@ def test_result_is_invariant_to_row_order(precision, case, seed):
     assert_equal(permuted, replace(result, gradients=gradients))
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), seeds)
@@ -112,6 +114,7 @@ def test_negated_and_scaled_quaternions_are_the_same_rotations(precision, case, 
     assert_equal(result_of(case, precision, weights, scaled), replace(result, gradients=gradients))
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), st.floats(-10, 0.99), seeds)
@@ -129,6 +132,7 @@ def test_gaussian_before_the_near_plane_is_ignored(precision, case, depth, seed)
     assert_equal(result_of(case, precision, weights, added), replace(result, gradients=gradients))
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases([(0, False), (3, False)]), st.integers(-20, 20))
@@ -162,6 +166,7 @@ def scaled_result(result, factor) -> Result:
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(KINDS[:2]), seeds)
@@ -199,6 +204,7 @@ def hamilton_product(quat) -> np.ndarray:
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), st.floats(-10, 10))
@@ -224,6 +230,7 @@ def test_image_is_invariant_to_scaling(precision, case, exponent):
     assert_agree(actual, expected, scaled.quats, undecided, MOVED * ROUNDOFF[precision])
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), seeds)
@@ -240,6 +247,7 @@ def test_quaternions_of_any_norm_are_rotations(precision, case, seed):
     assert_agree(actual, expected, scaled.quats, undecided, TURNED * ROUNDOFF[precision])
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases())
@@ -257,6 +265,7 @@ def test_gradients_of_quaternions_are_orthogonal_to_them(precision, case):
     assert np.abs(along).max() <= 400 * ROUNDOFF[precision] * np.abs(terms).max()
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), seeds)

@@ -303,6 +303,7 @@ CAMERA_CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CAMERA_CASES, ids=lambda case: case.name)
 def test_camera_gradients_of_two_frames_equal_differences_of_the_reference(case):
     check_camera_gradients_of_two_frames_equal_differences_of_the_reference(case)

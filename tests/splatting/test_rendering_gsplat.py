@@ -82,6 +82,7 @@ def test_gradients_agree_with_gsplat(precision, gsplat):
         assert np.linalg.norm(ours - theirs) <= 1e-3 * np.linalg.norm(theirs), name
 
 
+@pytest.mark.slow
 @both_precisions
 def test_gsplat_scene_agrees_with_the_reference(precision, gsplat, gsplat_marked):
     """10,000 Gaussians at 400 x 400: nothing but marked pixels may differ, at most 16 of them."""

@@ -113,6 +113,7 @@ def window_of(camera, piece, precision):
     )
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), sizes, sizes)
@@ -137,6 +138,7 @@ def test_crop_windows_compose_the_whole_image(precision, case, x, y):
     assert_agree(actual, expected, case.gaussians.quats, undecided, CROPPED * ROUNDOFF[precision])
 
 
+@pytest.mark.slow
 @examples
 @given(plugin_scenes(), sizes, sizes)
 def test_crop_windows_of_a_mitsuba_film_compose_the_whole_image(scene, x, y):
@@ -155,6 +157,7 @@ def test_crop_windows_of_a_mitsuba_film_compose_the_whole_image(scene, x, y):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @examples
 @given(plugin_scenes())
 def test_white_minus_black_image_is_the_transmittance(scene):
@@ -192,6 +195,7 @@ def test_images_are_linear_in_the_features_and_weights_add_up_to_alpha(precision
     assert np.abs(of_one - (1 - transmittance)).max() <= tolerance
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(least=2), seeds)
@@ -220,6 +224,7 @@ def test_scene_is_its_front_composited_over_its_back(precision, case, seed):
     assert_arrays_agree(composed, {name: whole[name] for name in composed}, tolerance)
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), seeds)

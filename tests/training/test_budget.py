@@ -381,6 +381,7 @@ def test_budget_needs_its_own_folder(fitted, scene, capsys):
     assert "must be new or empty for a fit with --budget" in error and "--overwrite" in error
 
 
+@pytest.mark.slow
 def test_too_short_budget_leaves_no_files(scene, capsys):
     with pytest.raises(SystemExit) as stopped:
         fit.main([str(scene / "scene.yml"), "--out", str(scene / "short"), "--budget", "1s"])

@@ -277,6 +277,7 @@ def errors(view, true) -> tuple[float, float]:
     return float(angle), float(np.linalg.norm(view.center - true.center))
 
 
+@pytest.mark.slow
 def test_disturbed_camera_is_recovered_with_true_gaussians():
     """Two degrees and a fiftieth of its distance away."""
     true = fits.plain_dataset().train[2]
@@ -297,6 +298,7 @@ def test_disturbed_camera_is_recovered_with_true_gaussians():
     assert end < 0.05 * start
 
 
+@pytest.mark.slow
 def test_wrong_focal_length_and_principal_point_are_recovered():
     true = fits.plain_dataset().train[2]
     disturbed = moved(true, log_focals=(0.04, 0.03), shifts=(0.02, -0.015))
@@ -318,6 +320,7 @@ def test_wrong_focal_length_and_principal_point_are_recovered():
     np.testing.assert_allclose(found.camera_to_world, disturbed.camera_to_world, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_refined_cameras_make_better_images():
     """Training cameras are disturbed; held-out cameras, which see the blobs, are right."""
     rng = np.random.default_rng(6)
@@ -439,11 +442,13 @@ def test_dataset_without_refined_cameras_is_unchanged(tmp_path):
     assert refined_dataset(dataset, tmp_path) is dataset
 
 
+@pytest.mark.slow
 def test_a_fit_resumes_to_the_same_bytes():
     coarse = [{"until": 5, "factor": 2}]
     fits.assert_resumes_to_the_same_bytes(lambda: make_trainer(**ALL_RATES, coarse=coarse), 4, 5)
 
 
+@pytest.mark.slow
 def test_a_fit_with_smoothing_resumes_to_the_same_bytes():
     """The filter depends on where all cameras are, also on those not seen since."""
 

@@ -212,6 +212,7 @@ def test_the_mean_of_all_transforms_is_the_identity():
     assert np.abs(matrices - IDENTITY).max() > 0.02
 
 
+@pytest.mark.slow
 def test_common_colour_change_is_attributed_to_the_splats():
     """Photographs that are all darker by the same factor change no transform.
 
@@ -294,6 +295,7 @@ def exposed_dataset():
     return replace(dataset, train=tuple(views))
 
 
+@pytest.mark.slow
 def test_transforms_improve_fits_with_varying_exposure():
     """Measured on held-out photographs of one exposure, without a transform."""
     quality = {}

@@ -150,6 +150,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("damage", "message"), DAMAGE.values(), ids=DAMAGE)
 def test_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
     damage(checkpoint)

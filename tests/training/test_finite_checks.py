@@ -83,6 +83,7 @@ def poison_value(trainer, name, value=np.nan, row=ROW):
 DEGREE_1_AT_ONCE = {"sh_degree": 1, "sh_increase_every": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 def test_nonfinite_gradient_is_named_although_detected_later(monkeypatch, name):
     trainer = make_trainer(model=DEGREE_1_AT_ONCE)
@@ -239,6 +240,7 @@ def poison_effect(trainer, name, index, value, part="value"):
     return f"in row {index} (view r_{index})" if rows > 1 else "in row 0 (all views)"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["value", "m", "v"])
 @pytest.mark.parametrize("name", EFFECTS)
 def test_nonfinite_parameters_of_an_effect_are_named(name, part):
@@ -407,6 +409,7 @@ def fails(capsys, *arguments):
     return line.removeprefix("error: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [spoil_photograph, spoil_value])
 def test_stopped_fit_keeps_the_last_good_checkpoint_and_resumes(
     monkeypatch, capsys, tmp_path, configuration, saved, spoil

@@ -38,6 +38,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_train_gives_the_bytes_of_the_command(folder):
     """From a file, from nested mappings, and from a configuration with its dataset."""
     fit.main([str(folder / "a.yml"), "--out", str(folder / "out")])

@@ -199,6 +199,7 @@ def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
             memory.room_for_targets(*arguments)
 
 
+@pytest.mark.slow
 def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
     """The advised number fits, and a quarter more does not."""
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)

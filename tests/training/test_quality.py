@@ -39,6 +39,7 @@ def test_few_evenly_spaced_views_are_measured(count, expected):
     assert list(chosen) == (expected or [0, 3, 7, 10, 14, 17, 21, 24])
 
 
+@pytest.mark.slow
 def test_measuring_does_not_change_the_fit():
     """With densification, a filter that follows the means, and random backgrounds."""
     changes = {

@@ -25,6 +25,7 @@ def rates_of(trainer):
     }
 
 
+@pytest.mark.slow
 def test_rates_decay_to_a_fraction_after_a_share_of_the_fit():
     trainer = make_trainer(optimizer={"decay": 0.1, "decay_from": 0.4}, densify=FIXED_POPULATION)
     rates = []
@@ -44,6 +45,7 @@ def test_rates_decay_to_a_fraction_after_a_share_of_the_fit():
     )
 
 
+@pytest.mark.slow
 def test_rates_are_constant_without_a_decay():
     trainer = make_trainer(densify=FIXED_POPULATION, optimizer={"decay": 1.0})
     before = rates_of(trainer)
@@ -55,6 +57,7 @@ def test_rates_are_constant_without_a_decay():
     }
 
 
+@pytest.mark.slow
 def test_revised_plan_keeps_past_rates():
     changes = {"optimizer": {"decay": 0.1, "decay_from": 0.2}, "densify": FIXED_POPULATION}
     trainer = make_trainer(**changes)
@@ -108,6 +111,7 @@ def test_step_of_several_views_uses_their_mean_gradient():
     assert np.abs(got - before.ravel()).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped", [26, 27, 28, 29])
 def test_fit_resumed_within_a_step_continues_to_the_same_bytes(stopped):
     uninterrupted, first = (

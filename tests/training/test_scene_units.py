@@ -83,6 +83,7 @@ def fit_at_unit_scale(case: str):
     return images_and_result(case, photographed())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 @pytest.mark.parametrize("case", CASES)
 def test_fit_is_invariant_to_units(case, unit):
@@ -95,6 +96,7 @@ def test_fit_is_invariant_to_units(case, unit):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["budget", "refined cameras", "visual hull"])
 def test_fit_is_invariant_to_the_origin(case, tmp_path):
     """From files, whose cameras are in Earth-centred coordinates."""

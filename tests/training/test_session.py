@@ -36,6 +36,7 @@ def test_session_without_a_folder_writes_and_prints_nothing(tmp_path, capsys):
     np.testing.assert_array_equal(session.trainer.gaussians().means, fitted.means)
 
 
+@pytest.mark.slow
 def test_budget_too_short_is_refused_before_creating_the_trainer(tmp_path):
     config = load_config(write_project(tmp_path))
     session = FitSession(config, budget=Budget(seconds=1.0, end=0.0))

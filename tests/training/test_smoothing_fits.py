@@ -114,6 +114,7 @@ def test_coarse_stages_have_wider_filters():
     np.testing.assert_allclose(widths[2], widths[1] / 2, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pause", [3, 4, 5, 11])
 def test_resumed_fit_ends_with_the_same_bytes(pause):
     """Just before a change of the population, at it, after it, and later."""

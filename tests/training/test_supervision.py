@@ -142,6 +142,7 @@ def test_masked_pixels_do_not_affect_a_fit():
     assert states[0] == states[1]
 
 
+@pytest.mark.slow
 def test_masks_keep_distractors_out_of_test_views():
     """With the masks, held-out views are about as good as from unspoiled photographs."""
     quality = {}
@@ -356,6 +357,7 @@ def test_view_with_all_known_depths_masked_has_no_penalty():
     assert trainer.views[1].uploads["depth"] is not None
 
 
+@pytest.mark.slow
 def test_depth_supervision_recovers_depths():
     """From few views that are close to each other, where colours say little about depth."""
     errors = {}
@@ -525,6 +527,7 @@ def test_random_color_needs_no_new_kernel():
     fits.assert_no_new_kernels(random_trainer())
 
 
+@pytest.mark.slow
 def test_random_background_makes_background_coloured_splats_opaque():
     """White before white: only another background tells how opaque they are."""
     start = replace(

@@ -38,6 +38,7 @@ def test_sh_degree_increases_by_one_at_fixed_intervals():
     assert degrees == [0, 0, 1, 1, 1, 2, 2, 2, 2, 2]
 
 
+@pytest.mark.slow
 def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population(monkeypatch):
     """Kernels by hash, as Dr.Jit's caches do: what they hold from other runs does not matter."""
 
@@ -113,6 +114,7 @@ def test_gaussians_are_returned_as_plain_numpy_arrays():
         assert len(getattr(gaussians, name)) == 40
 
 
+@pytest.mark.slow
 def test_first_frame_takes_15_seconds_cold_and_3_seconds_warm_at_most(run_python, tmp_path):
     """Without and with a kernel cache (it lives in the home folder), import included."""
     points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
@@ -214,6 +216,7 @@ def test_a_trainer_restored_within_the_coarse_stages_continues_to_the_same_bytes
         assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [{"sh_degree": 0}, {"sh_degree": 1, "antialiased": True}])
 def test_other_models_reduce_the_loss(model):
     """Degree 0 has no shN parameter at all; antialiasing changes the opacities' gradient."""

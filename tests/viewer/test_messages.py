@@ -107,6 +107,7 @@ def test_camera_message_must_be_finite_with_a_direction():
     assert not valid(CAMERA, type="ShareUrlRequest")
 
 
+@pytest.mark.slow
 def test_invalid_messages_have_no_effect_and_print_nothing(server, capfd):
     TrainingPage(
         server, RenderRequests(), StartView.from_views(true_dataset().train), Approximations()
@@ -156,6 +157,7 @@ def is_closed(connection):
         return True
 
 
+@pytest.mark.slow
 def test_flood_of_connections_leaves_room_for_files_and_clients(server, capfd):
     address = "127.0.0.1", server.get_port()
     flood = [socket.create_connection(address) for _ in range(3 * MAX_CONNECTIONS)]
@@ -222,6 +224,7 @@ def test_page_of_another_version_is_refused_silently(server, protocol, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_fit_with_hostile_clients_has_the_same_bytes(server, capfd):
     settings = {"iterations": 40, "densify__start": 2, "densify__stop": 30, "densify__every": 5}
     dataset = true_dataset()

@@ -123,6 +123,7 @@ def make_scene_of(trainer):
     return make_scene(trainer.gaussians(), trainer.config.model, (1.0, 1.0, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end_at", [1, 5, 8])
 def test_fit_ended_early_equals_a_fit_of_fewer_iterations(end_at):
     """And its configuration, fitted again from the start, gives its bytes."""

@@ -164,6 +164,7 @@ GROWING = {
 }
 
 
+@pytest.mark.slow
 def test_errors_are_accumulated_in_scheduled_iterations(variant):
     trainer = make_trainer(densify=GROWING)
     gathered = []
@@ -191,6 +192,7 @@ def test_each_change_has_accumulated_errors(every, stop, error_every):
     assert seen == 0
 
 
+@pytest.mark.slow
 def test_fit_grows_along_the_curve_and_resumes_to_the_same_bytes(variant):
     uninterrupted, first = make_trainer(densify=GROWING), make_trainer(densify=GROWING)
     counts = []
@@ -219,6 +221,7 @@ def test_target_is_reached_with_coarse_images_until_the_end_of_growth():
     ]
 
 
+@pytest.mark.slow
 def test_coarse_images_have_fewer_gaussians_and_a_constant_means_rate(variant):
     coarse = [{"until": 9, "factor": 4}, {"until": 17, "factor": 2}]
     trainer, counts, rates = make_trainer(densify=GROWING, coarse=coarse), [], []

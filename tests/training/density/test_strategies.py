@@ -239,6 +239,7 @@ def test_every_configured_strategy_is_created():
     assert len(made) == len(GROWTH) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "densify",
     [

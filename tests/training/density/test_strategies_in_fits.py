@@ -67,6 +67,7 @@ def pauses():
         yield pytest.param(name, 5, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "pause"), list(pauses()))
 def test_fit_resumes_to_the_same_bytes_from_any_iteration(name, pause):
     whole = make_trainer(name)
@@ -97,6 +98,7 @@ def test_mcmc_learns():
     assert fits.test_psnr(trainer, dataset) > before + 2
 
 
+@pytest.mark.slow
 def test_revised_plan_keeps_a_phase_that_has_begun():
     trainer = fits.steps(make_trainer("selection", densify__prune__stop=None), 17)
     assert trainer.config.densify.prune_window(30) == (14, 22)
@@ -108,6 +110,7 @@ def test_revised_plan_keeps_a_phase_that_has_begun():
     assert early.config.densify.prune_window(60) == (30, 48)
 
 
+@pytest.mark.slow
 def test_revised_plan_with_a_future_phase_equals_a_plan_from_the_start():
     """The phase would have begun before the revision, had it been planned so."""
     window = {"densify__prune__start": 20, "densify__prune__stop": 26}
@@ -123,6 +126,7 @@ def test_revised_plan_with_a_future_phase_equals_a_plan_from_the_start():
     }
 
 
+@pytest.mark.slow
 def test_phase_without_time_is_skipped():
     trainer = fits.steps(make_trainer("selection", densify__prune__start=20), 16)
     trainer.reschedule(16, 14)
@@ -153,6 +157,7 @@ def test_unused_strategies_are_not_imported(monkeypatch):
         assert imported == expected
 
 
+@pytest.mark.slow
 def test_steps_of_several_views_begin_after_the_last_density_change():
     trainer = make_trainer("selection", optimizer__views=5, optimizer__views_from=0.0)
     views = []

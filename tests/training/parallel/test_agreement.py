@@ -62,6 +62,7 @@ def fitted(copies, out, size=2):
     return parallel_processes.run(size, words, cwd=copies[0], on_second=f"cd {copies[1]}")
 
 
+@pytest.mark.slow
 def test_differing_photograph_of_one_process_is_refused(copies, tmp_path):
     shutil.copy(copies[1] / "train" / "r_0.png", copies[1] / "train" / "r_1.png")
     status, _, errors = fitted(copies, tmp_path / "out")
@@ -71,6 +72,7 @@ def test_differing_photograph_of_one_process_is_refused(copies, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_photographs_that_another_process_reads_may_differ(copies, tmp_path):
     """So may test photographs, which rank 0 reads."""
     for name in ("train/r_0.png", "train/r_2.png", "test/r_0.png", "test/r_1.png"):
@@ -104,6 +106,7 @@ def test_views_are_compared_with_rank_0(agreement, copies, monkeypatch, change, 
         check()
 
 
+@pytest.mark.slow
 def test_images_of_different_files_are_refused(tmp_path):
     """A different background is refused; then a different model with the same background."""
     here, there, out = (tmp_path / name for name in ("first", "second", "out"))

@@ -56,6 +56,7 @@ def assert_all_end(word):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_distributed_fit_is_the_same(config, tmp_path):
     path = config()
     status, output, errors = parallel_processes.run(2, command(path, "--out", tmp_path / "two"))
@@ -67,6 +68,7 @@ def test_distributed_fit_is_the_same(config, tmp_path):
     assert metrics["config"]["optimizer"]["views_per_step"] == 4
 
 
+@pytest.mark.slow
 def test_too_many_processes_are_reported_once(config, tmp_path):
     status, _, errors = parallel_processes.run(
         3, command(config(views=2), "--out", tmp_path / "out")
@@ -77,6 +79,7 @@ def test_too_many_processes_are_reported_once(config, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -96,6 +99,7 @@ def test_unsupported_options_are_reported_once(config, tmp_path, words, message)
     assert message in errors
 
 
+@pytest.mark.slow
 def test_wrong_command_line_is_reported_once(tmp_path):
     status, _, errors = parallel_processes.run(2, command("nothing.yml", "--out", tmp_path / "out"))
     assert status == 2 and errors.count("error: ") == 1
@@ -104,6 +108,7 @@ def test_wrong_command_line_is_reported_once(tmp_path):
 MISSING = "ModuleNotFoundError('No module named mpi4py', name='mpi4py')"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("on_second", "message"),
     [
@@ -124,6 +129,7 @@ def test_failure_of_one_process_is_reported_once_and_ends_all(config, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_unexpected_error_of_one_process_prints_one_traceback_and_ends_all(config, tmp_path):
     failing = parallel_processes.failing_import(
         tmp_path, "drgs.training.parallel.exchange", "RuntimeError('a bug')"
@@ -135,6 +141,7 @@ def test_unexpected_error_of_one_process_prints_one_traceback_and_ends_all(confi
     assert errors.endswith("RuntimeError: a bug\n")
 
 
+@pytest.mark.slow
 def test_single_process_command_is_refused_once(tmp_path):
     model = parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply"
     words = ["-m", "drgs.export", model, "--out", tmp_path / "a.spz"]

@@ -44,6 +44,7 @@ def test_rank_is_read_from_launcher_variables(monkeypatch):
     assert process_number() == 2
 
 
+@pytest.mark.slow
 def test_single_process_does_not_import_the_parallel_package(run_python, tmp_path):
     code = (
         "import sys; sys.modules['mpi4py'] = None\n"
@@ -54,6 +55,7 @@ def test_single_process_does_not_import_the_parallel_package(run_python, tmp_pat
     assert run_python(code).stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_mpiexec_without_the_extra_is_refused(run_python):
     code = (
         "import sys; sys.modules['mpi4py'] = None\n"
@@ -65,6 +67,7 @@ def test_mpiexec_without_the_extra_is_refused(run_python):
     assert "mpiexec: needs mpi4py" in result.stderr and "drgs[mpi]" in result.stderr
 
 
+@pytest.mark.slow
 def test_launcher_of_another_mpi_is_refused(run_python):
     """Each of its processes would fit alone, into the same folder."""
     pytest.importorskip("mpi4py", reason="the extra mpi is not installed")

@@ -70,6 +70,7 @@ EFFECTS = {
 }
 
 
+@pytest.mark.slow
 def test_two_processes_grow_the_same_population_as_one():
     assert_the_same(settings(**STRATEGIES["budget"]), [2])
 
@@ -96,6 +97,7 @@ def test_late_steps_of_more_views_give_the_same_bytes():
     assert_the_same(settings(**late, densify__start=1), [2, 3])
 
 
+@pytest.mark.slow
 def test_nonfinite_value_is_reported_by_all_processes():
     alone = fits.make_trainer(fits.plain_dataset(), optimizer__views_per_step=4)
     expected = parallel_processes.spoiled(alone, 17)
@@ -113,6 +115,7 @@ REFINED = {
 }
 
 
+@pytest.mark.slow
 def test_refined_cameras_give_the_same_bytes():
     """Derivatives of a camera are summed over all processes in one place."""
     assert_the_same(settings(**REFINED), [3])

@@ -1,5 +1,6 @@
 """``mpiexec -n K python -m drgs.render``: the same files."""
 
+import pytest
 from support import parallel_processes
 
 MODEL = parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply"
@@ -10,6 +11,7 @@ def rendered(size, out, *words):
     return parallel_processes.run(size, command)
 
 
+@pytest.mark.slow
 def test_mitsuba_scene_is_refused(tmp_path):
     scene = parallel_processes.REPOSITORY / "scenes" / "hybrid.xml"
     status, _, errors = parallel_processes.run(
@@ -23,6 +25,7 @@ def files_of(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".json"}
 
 
+@pytest.mark.slow
 def test_processes_share_the_frames_of_an_orbit(tmp_path):
     outputs = []
     for size in (1, 3):
@@ -34,6 +37,7 @@ def test_processes_share_the_frames_of_an_orbit(tmp_path):
     assert one == three and len(one) == 7  # frames, and two animations
 
 
+@pytest.mark.slow
 def test_errors_are_reported_by_one_process(tmp_path):
     (tmp_path / "orbit_002.png").write_text("mine")
     status, _, errors = rendered(2, tmp_path)

@@ -1,0 +1,290 @@
+"""Laws of rendering, for tests of your own lenses, projections, falloffs and orders.
+
+A :class:`Case` is a small random scene with a lens, approximations and effects. Each law checks one
+property of its image and its derivatives, and raises AssertionError with the numbers if it does not
+hold, as ``torch.autograd.gradcheck`` does::
+
+    from drgs.testing import LAWS, Case
+
+    @pytest.mark.parametrize("law", LAWS)
+    def test_my_lens(law):
+        law(Case("my lens", lens=MyLens(0.3)))
+
+``reference`` is an independent computation of the image in numpy. With it, images and derivatives
+are compared with that computation; without it, derivatives are compared with differences of the
+kernels' own images in double precision. The planes of an image are transmittance, red, green, blue
+and depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, cast
+
+import drjit as dr
+import numpy as np
+from drjit.llvm import ad as llvm
+from scipy.spatial.transform import Rotation
+
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.cameras.camera import Aperture, Camera, Shutter, cameras_in_time
+from drgs.cameras.lens import PINHOLE, Lens
+from drgs.config.approximations import Approximations
+from drgs.effects.compose import with_effects
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.splatting import rendering
+from drgs.splatting.rendering import Frame, color_features, depth_feature
+
+Values = Mapping[str, np.ndarray]  # parameters of Gaussians by name, float64
+
+Reference = Callable[["Case", Values], tuple[np.ndarray, np.ndarray]]
+"""Maps a case and its Gaussians to planes (P, H * W), the first P of the five, and to a mask
+(H * W,) of pixels so near a threshold that a small step or single precision may cross it."""
+
+SMOOTH = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
+"""Approximations of cases without a reference, whose images are then smooth."""
+
+TRANSPOSE_TOLERANCE = 1e-11  # of sums of thousands of terms, relative to their absolute values
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A scene to check laws on. Lengths are in scene units, tolerances relative."""
+
+    name: str
+    lens: Lens = PINHOLE
+    approximations: Mapping[str, Any] = field(default_factory=dict)  # see Approximations
+    aperture: tuple[float, float] | None = None  # radius, focus distance
+    shutter: Callable[[Camera], Shutter] | None = None  # given the camera at time 0
+    smoothing: float | None = None  # standard deviation of the 3D filter
+    reference: Reference | None = None
+    scene: Callable[[Case], Values] | None = None  # None: random Gaussians before the camera
+    degree: int = 1
+    count: int = 40
+    width: int = 37
+    height: int = 29
+    focal: float = 26.0  # px
+    seed: int = 0
+    step: float = 1e-6  # of differences
+    image_tolerance: float = 1e-11  # of the largest value
+    gradient_tolerance: float = 1e-6  # of the sum of absolute terms
+    single_tolerance: float = 1e-4  # of the largest value, float32 against float64
+
+    @cached_property
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3, 3), world to camera, and centre (3,), world."""
+        rng = np.random.default_rng(self.seed)
+        rotation = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+        return single(rotation), single(rng.normal(size=3))
+
+    @property
+    def K(self) -> np.ndarray:  # noqa: N802  as in gsplat
+        """Intrinsics (3, 3), px; the principal point is not in the centre."""
+        x, y = single(np.array([0.46, 0.53]) * [self.width, self.height])
+        return np.array([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]])
+
+    @cached_property
+    def values(self) -> Values:
+        """Parameters of the Gaussians, the same in both precisions."""
+        return (self.scene or random_scene)(self)
+
+    @cached_property
+    def reference_image(self) -> tuple[np.ndarray, np.ndarray]:
+        """The result of ``reference``."""
+        assert self.reference is not None, f"{self.name}: has no reference"
+        return self.reference(self, self.values)
+
+    @property
+    def near_threshold(self) -> np.ndarray:
+        """Pixels near a threshold, (H * W,)."""
+        size = self.width * self.height
+        return np.zeros(size, bool) if self.reference is None else self.reference_image[1]
+
+    def camera(self, Float: type = llvm.Float64) -> Camera:
+        """Return the camera, no number of which is a literal of kernels."""
+        size = (self.width, self.height, 0.25)
+        camera = Camera.create(Float, *self.pose, self.K, *size, lens=self.lens)
+        if self.aperture is not None:
+            radius, distance = (dr.opaque(Float, number) for number in self.aperture)
+            camera = replace(camera, aperture=Aperture(radius, distance))
+        if self.shutter is not None:
+            camera = replace(camera, shutter=self.shutter(camera))
+        dr.make_opaque(camera)
+        return camera
+
+    def frames(self, values: Values, Float: type = llvm.Float64) -> tuple[Gaussians, list[Frame]]:
+        """Render; return the Gaussians, and a frame for each time of the shutter."""
+        gaussians, camera = self._gaussians(values, Float), self.camera(Float)
+        given = self.approximations if self.reference else {**SMOOTH, **self.approximations}
+        features = (color_features, depth_feature)
+        pipeline = pipeline_of(Approximations(**given), self.degree, features)
+        pipeline = with_effects(pipeline, gaussians, camera)
+        times = cameras_in_time(camera)
+        return gaussians, [rendering.render(gaussians, each, pipeline) for each in times]
+
+    def _gaussians(self, values: Values, Float: type) -> Gaussians:
+        TensorXf = llvm.TensorXf if Float is llvm.Float else llvm.TensorXf64
+        fields: dict[str, Any] = dict(values)
+        gaussians = Gaussians(**fields)
+        if self.smoothing is not None:
+            gaussians = replace(gaussians, smoothing=np.full(self.count, self.smoothing))
+        return gaussians.to(TensorXf)
+
+    def planes(self, values: Values, Float: type = llvm.Float64) -> np.ndarray:
+        """Return the planes (5, H * W) of the kernels' image."""
+        _, frames = self.frames(values, Float)
+        return np.mean([_arrays(frame.planes()) for frame in frames], axis=0)
+
+    def gradients(
+        self, values: Values, weights: np.ndarray, Float: type = llvm.Float64
+    ) -> dict[str, np.ndarray]:
+        """Return derivatives of sum(weights * planes), weights (5, H * W)."""
+        gaussians, frames = self.frames(values, Float)
+        total: dict[str, Any] = dict.fromkeys(PARAMETER_NAMES, 0.0)
+        d_planes = [Float(plane / len(frames)) for plane in weights]
+        for frame in frames:
+            found = rendering.frames_adjoint(gaussians, [frame], [d_planes]).parameters
+            for name in PARAMETER_NAMES:
+                total[name] = total[name] + np.array(getattr(found, name), np.float64)
+        return total
+
+    def tangent(self, values: Values, tangents: Values) -> np.ndarray:
+        """Return the directional derivative of the planes, (5, H * W)."""
+        gaussians, frames = self.frames(values)
+        direction = self._gaussians(tangents, llvm.Float64)
+        found = [rendering.frames_tangent(gaussians, [frame], direction)[0] for frame in frames]
+        return np.mean([_arrays(planes) for planes in found], axis=0)
+
+
+def single(values: Any) -> np.ndarray:
+    """Return values rounded to float32, as float64."""
+    return np.asarray(values, np.float32).astype(np.float64)
+
+
+def _arrays(planes: list) -> np.ndarray:
+    return np.array([np.array(plane, np.float64) for plane in planes])
+
+
+def _rays(case: Case, film: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return origins and directions (N, 3), camera axes, at places (N, 2) px, and validity (N,)."""
+    x, y = (cast("Any", llvm.Float64(column)) for column in film.T)
+    origin, ray, is_seen = case.camera().look_through(x, y)
+    shape = len(film), 3
+    starts = np.broadcast_to(np.array(origin, np.float64).T, shape)
+    directions = np.broadcast_to(np.array(ray, np.float64).T, shape)
+    return starts, directions, np.broadcast_to(np.array(is_seen), len(film))
+
+
+def random_scene(case: Case) -> Values:
+    """Return Gaussians of a fraction of a pixel to a fifth of the film, on and around the film."""
+    rng, n = np.random.default_rng(case.seed + 1), case.count
+    film = rng.uniform(-0.1, 1.1, (n, 2)) * [case.width, case.height]
+    origin, ray, is_seen = _rays(case, film)
+    _, axis, _ = _rays(case, case.K[None, :2, 2])  # instead of rays beyond the lens model
+    ray = np.where(is_seen[:, None], ray, axis)
+    distance = rng.uniform(1.0, 4.0, n)[:, None]
+    points = origin + ray / np.linalg.norm(ray, axis=1, keepdims=True) * distance
+    sizes = np.minimum(rng.lognormal(np.log(1.5), 0.9, (n, 3)), 0.2 * case.width)
+    rotation, center = case.pose
+    return {
+        "means": single(points @ rotation + center),
+        "quats": single(rng.normal(size=(n, 4)) * rng.uniform(0.2, 5.0, (n, 1))),
+        "log_scales": single(np.log(sizes * distance / case.focal)),
+        "logit_opacities": single(rng.normal(0.5, 1.2, n)),
+        "sh0": single(rng.normal(0, 1, (n, 1, 3))),
+        "shN": single(rng.normal(0, 0.3, (n, (case.degree + 1) ** 2 - 1, 3))),
+    }
+
+
+def _weights(case: Case) -> np.ndarray:
+    """Return random weights (5, H * W) of a loss; zero near thresholds and without a reference."""
+    planes = 5 if case.reference is None else len(case.reference_image[0])
+    weights = single(np.random.default_rng(2).normal(size=(5, case.width * case.height)))
+    weights[planes:] = 0
+    return weights * ~case.near_threshold
+
+
+def _direction(case: Case) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(3)
+    return {name: single(rng.normal(size=value.shape)) for name, value in case.values.items()}
+
+
+def image_equals_reference(case: Case) -> None:
+    """The kernels' image in double precision is the reference's; nothing without a reference."""
+    if case.reference is None:
+        return
+    expected, marked = case.reference_image
+    assert marked.mean() < 0.02, f"{case.name}: {marked.mean():.1%} of the pixels near a threshold"
+    actual = case.planes(case.values)
+    for k, plane in enumerate(expected):
+        error = np.abs(actual[k] - plane)[~marked].max() / np.abs(plane).max()
+        assert error <= case.image_tolerance, f"{case.name}: plane {k} is off by {error:.1e}"
+
+
+def gradients_equal_differences(case: Case) -> None:
+    """Derivatives along a direction of each parameter are differences of the reference."""
+    weights, direction = _weights(case), _direction(case)
+    gradients = case.gradients(case.values, weights)
+
+    def loss(name: str, step: float) -> float:
+        moved = {**case.values, name: case.values[name] + step * direction[name]}
+        planes = case.planes(moved) if case.reference is None else case.reference(case, moved)[0]
+        return float(np.sum(weights[: len(planes)] * planes))
+
+    for name in PARAMETER_NAMES:
+        terms = direction[name] * gradients[name]
+        expected = (loss(name, case.step) - loss(name, -case.step)) / (2 * case.step)
+        error = abs(terms.sum() - expected) / np.abs(terms).sum()
+        assert error <= case.gradient_tolerance, f"{case.name}: {name} is off by {error:.1e}"
+
+
+def adjoint_is_transpose(case: Case) -> None:
+    """Forward and reverse mode agree: <J v, w> = <v, J^T w>."""
+    weights, direction = _weights(case), _direction(case)
+    left = weights * case.tangent(case.values, direction)
+    gradients = case.gradients(case.values, weights)
+    right = [direction[name] * gradients[name] for name in PARAMETER_NAMES]
+    size = np.abs(left).sum() + sum(np.abs(terms).sum() for terms in right)
+    error = abs(left.sum() - sum(terms.sum() for terms in right)) / size
+    assert error <= TRANSPOSE_TOLERANCE, f"{case.name}: <J v, w> and <v, J^T w> differ: {error:.1e}"
+
+
+def bytes_are_reproducible(case: Case) -> None:
+    """Image and gradients in single precision have the same bytes again, on one thread and two."""
+    weights, threads, found = _weights(case), dr.thread_count(), set()
+    try:
+        for count in (1, 2, 2):
+            dr.set_thread_count(count)
+            gradients = case.gradients(case.values, weights, llvm.Float)
+            planes = case.planes(case.values, llvm.Float)
+            found.add((planes.tobytes(), *(gradients[n].tobytes() for n in PARAMETER_NAMES)))
+    finally:
+        dr.set_thread_count(threads)
+    assert len(found) == 1, f"{case.name}: bytes differ between runs or numbers of threads"
+
+
+def single_precision_is_accurate(case: Case) -> None:
+    """Image and gradients in single precision are within ``single_tolerance`` of double."""
+    weights, kept = _weights(case), ~case.near_threshold
+    pairs = {
+        "image": (case.planes(case.values, llvm.Float)[:, kept], case.planes(case.values)[:, kept])
+    }
+    precise = case.gradients(case.values, weights)
+    rounded = case.gradients(case.values, weights, llvm.Float)
+    pairs |= {name: (rounded[name], precise[name]) for name in PARAMETER_NAMES}
+    for name, (actual, expected) in pairs.items():
+        error = np.abs(actual - expected).max(initial=0) / max(
+            np.abs(expected).max(initial=0), 1e-300
+        )
+        assert error <= case.single_tolerance, f"{case.name}: {name} is off by {error:.1e}"
+
+
+LAWS = (
+    image_equals_reference,
+    gradients_equal_differences,
+    adjoint_is_transpose,
+    bytes_are_reproducible,
+    single_precision_is_accurate,
+)
