@@ -119,6 +119,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, scene, name):
     check_adjoint_is_the_transpose_of_the_tangent(precision, scene, name)
 
 
+@pytest.mark.slow
 @all_scenes
 @all_approximations
 def test_single_precision_gradients_equal_double_precision(scene, name):
@@ -128,6 +129,7 @@ def test_single_precision_gradients_equal_double_precision(scene, name):
     assert_arrays_agree(problem.kernel_gradients(FLOAT32, weights), expected, GRADIENTS[FLOAT32])
 
 
+@pytest.mark.slow
 @all_approximations
 def test_same_bytes_in_every_run(name):
     problem = Problem(name, "random")

@@ -141,6 +141,7 @@ def rounded_axes(seed):
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
 @pytest.mark.parametrize("name", SMALL)
 def test_image_and_gradients_are_within_the_bound(name, approximation):
@@ -162,6 +163,7 @@ def test_image_and_gradients_are_within_the_bound(name, approximation):
     assert max(ratios.values()) <= 1, ratios
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_all_approximations_together_stay_finite(name):
     case = FAMILIES[name]

@@ -126,6 +126,7 @@ def direction_of_pixels(case) -> np.ndarray:
     return world / np.linalg.norm(world, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "precision"),
     [*((name, FLOAT64) for name in FORMS), ("rational", FLOAT32)],
@@ -237,6 +238,7 @@ def needles(case, rng):
     return gaussians_at_points(case, rng, camera, points, sizes, logits), camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "approximations"),
     [

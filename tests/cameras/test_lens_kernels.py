@@ -222,6 +222,7 @@ def test_each_coefficient_of_a_fisheye_adds_operations():
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "shape", "precision"),
     [(name, ewa, precision) for name in FORMS for precision in (FLOAT32, FLOAT64)]

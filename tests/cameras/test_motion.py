@@ -154,6 +154,7 @@ def test_static_camera_renders_the_plain_image(precision, samples):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_precisions
 @all_kinds
 def test_rolling_shutter_matches_splats_at_the_time_of_their_row(precision, name):

@@ -203,6 +203,7 @@ def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, step_callba
         assert plain == checked, name
 
 
+@pytest.mark.slow
 def test_fit_stops_at_out_of_range_access_and_keeps_the_last_checkpoint(
     scene, tmp_path, step_callbacks, capsys
 ):

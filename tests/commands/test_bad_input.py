@@ -240,6 +240,7 @@ WRONG_INPUTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("damage", "message"), WRONG_INPUTS.values(), ids=WRONG_INPUTS)
 def test_wrong_input_ends_with_status_2_and_one_line(scene, capsys, damage, message):
     damage(scene)

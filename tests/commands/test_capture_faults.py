@@ -105,6 +105,7 @@ def test_capture_killed_at_any_file_resumes_to_the_same_bytes(
     assert contents(out) == captured
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(FILES))
 def test_full_disk_is_reported_in_one_line_and_the_capture_resumes(
     ball, captured, tmp_path, monkeypatch, number

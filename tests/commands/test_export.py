@@ -145,6 +145,7 @@ def test_smoothing_is_baked_in(tmp_path):
     np.testing.assert_allclose(found.opacities, gaussians.opacities * kept, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_usd_is_written_if_openusd_is_installed(model):
     pxr = pytest.importorskip("pxr.UsdVol")
     from pxr import Usd, UsdGeom

@@ -265,6 +265,7 @@ def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
             assert results[threads][name].tobytes() == values.tobytes(), (name, threads)
 
 
+@pytest.mark.slow
 def test_another_seed_gives_another_result(configuration):
     """The seed chooses the initial points and the order of the views."""
     results = []

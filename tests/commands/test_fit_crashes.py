@@ -183,6 +183,7 @@ def test_fit_killed_while_writing_results_repeats_no_iteration(config, tmp_path)
         assert (tmp_path / "out" / name).read_bytes() == expected, name
 
 
+@pytest.mark.slow
 def test_half_removed_run_is_not_finished(config, tmp_path):
     out = tmp_path / "out"
     assert_fits(config, "--out", out)

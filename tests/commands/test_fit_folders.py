@@ -216,6 +216,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", CHANGES)
 def test_fit_with_changed_data_is_not_continued(stopped, text):
     CHANGES[text](stopped / "data")
@@ -260,6 +261,7 @@ def test_moved_data_is_reported(stopped, projects, tmp_path):
     assert_as_uninterrupted(stopped, projects)
 
 
+@pytest.mark.slow
 def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     config = write_project(tmp_path, init={"point_cloud": "data/points.ply"})
     blobs().save(tmp_path / "data" / "points.ply")
@@ -272,6 +274,7 @@ def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     assert found.init.point_cloud == tmp_path / "elsewhere" / "points.ply"
 
 
+@pytest.mark.slow
 def test_path_may_be_edited_by_hand(stopped, projects, tmp_path):
     (stopped / "data").rename(tmp_path / "elsewhere")
     path = stopped / "out" / "config.yml"

@@ -88,6 +88,7 @@ def test_plugin_renders_the_file_like_the_fit(fitted):
     np.testing.assert_array_equal(np.clip(np.array(by_name), 0, 1), expected)
 
 
+@pytest.mark.slow
 def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     """Stopped when its iterations are done, with what is for viewers still to come."""
     out, _ = fitted
@@ -116,6 +117,7 @@ def test_fit_with_viewer_approximations_writes_one_file(tmp_path, monkeypatch):
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None
 
 
+@pytest.mark.slow
 def test_foreign_file_is_not_replaced(tmp_path, monkeypatch):
     without_images(monkeypatch)
     config = write_project(tmp_path)

@@ -85,6 +85,7 @@ def files_of(out):
     return {path.relative_to(out): path.read_bytes() for path in paths}
 
 
+@pytest.mark.slow
 def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, viewer_page):
     config, screens = write_project(tmp_path), viewer_page()
     outcome = assert_fits(config, "--out", tmp_path / "watched", "--view")
@@ -96,6 +97,7 @@ def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, viewer_
     assert first.replace("watched", "alone") == second
 
 
+@pytest.mark.slow
 def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page):
     config, out = write_project(tmp_path), tmp_path / "out"
     viewer_page(end_at=4)

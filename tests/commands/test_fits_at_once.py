@@ -27,6 +27,7 @@ def project(tmp_path, monkeypatch):
     return write_project(tmp_path)
 
 
+@pytest.mark.slow
 def test_folder_in_use_by_another_fit_is_refused(project, tmp_path, monkeypatch):
     """Whether it is resumed, replaced or begun again; afterwards it goes on."""
     out = tmp_path / "out"

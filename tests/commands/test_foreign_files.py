@@ -66,6 +66,7 @@ def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
     assert_ends_well(render.main, scene, "--out", tmp_path)
 
 
+@pytest.mark.slow
 def test_own_images_are_replaced_unless_modified(fitted, tmp_path):
     out = tmp_path / "out"
     for way in VIEWS:
@@ -93,6 +94,7 @@ def test_folder_in_use_by_another_command_is_refused(fitted, tmp_path, monkeypat
     assert refused and visible(out) == {"r_0.png", "r_1.png", "metrics.json"}
 
 
+@pytest.mark.slow
 def test_images_of_an_interrupted_command_are_replaced(fitted, tmp_path, monkeypatch):
     expected, out = tmp_path / "whole", tmp_path / "out"
     assert_ends_well(render.main, fitted, "--out", expected)

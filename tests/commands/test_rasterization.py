@@ -340,6 +340,7 @@ def test_extreme_values_have_finite_gradients():
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_image_and_gradients_agree_with_gsplat():
     if not GSPLAT.is_dir():
         pytest.skip("needs the gsplat reference data beside the repository")

@@ -75,6 +75,7 @@ def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
         assert (tmp_path / "fit" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimised", [True, False])
 def test_refined_cameras_are_used_or_mentioned(tmp_path, capsys, optimised):
     """Whether the fit's folder or its PLY file is named, as its configuration says."""

@@ -43,6 +43,7 @@ def test_single_file_is_rendered_with_its_header(files, capsys):
     assert "set by the file" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_header_overrides_configuration_and_set_overrides_header(files, capsys):
     ply, config = files / "run" / "point_cloud.ply", files / "plain.yml"
     own = shown(files, "a", files / "run")

@@ -124,6 +124,7 @@ def test_parameters_of_a_scene_file_can_be_given(tmp_path):
     np.testing.assert_array_equal(*images)
 
 
+@pytest.mark.slow
 def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
     """Some pixels show what is seen there without the model, others do not."""
     path = REPOSITORY / "scenes" / "hybrid.xml"

@@ -50,6 +50,7 @@ def test_stored_rows_are_loaded_unchanged(precision, count):
 
 
 # Arrays of one to five rows of 9, 11 and 45 numbers end anywhere in a packet.
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("num_rows", [1, 2, 3, 4, 5])
 @pytest.mark.parametrize("width", [1, 3, 4, 6, 9, 11, 24, 45])

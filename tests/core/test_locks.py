@@ -48,6 +48,7 @@ def _keep(folder, pipe):
         pipe.recv()
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_no_lock(tmp_path):
     ours, theirs = multiprocessing.get_context("spawn").Pipe()
     process = multiprocessing.get_context("spawn").Process(target=_keep, args=(tmp_path, theirs))

@@ -64,6 +64,7 @@ def test_folder_names_are_case_insensitive(tmp_path):
     assert load(tmp_path, downscale=2).train[0].width == 320
 
 
+@pytest.mark.slow
 def test_intrinsics_follow_the_image_size(tmp_path):
     write_dataset(tmp_path)
     for factor in (2, 4):
@@ -184,6 +185,7 @@ def test_masks_are_found_beside_their_images(tmp_path):
     assert dataset.ignored == ("masks",) and notes == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pattern",
     [

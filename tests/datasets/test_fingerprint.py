@@ -59,6 +59,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", CHANGES)
 def test_changes_of_a_frame_are_named(rich, text):
     function = CHANGES[text]

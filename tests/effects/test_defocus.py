@@ -242,6 +242,7 @@ def planes_of_wall(precision=FLOAT64, pipeline=None) -> np.ndarray:
     return planes_of(render_composed(device, camera, pipeline or rendering.Pipeline(0)))
 
 
+@pytest.mark.slow
 def test_defocused_wall_keeps_alpha_and_colour():
     """A mean of many pinhole images has the same alpha and colour.
 
@@ -347,6 +348,7 @@ def test_gradients_equal_differences_of_the_reference_along_a_direction(scene, m
     check_against_differences(case, kernel_gradients, DIFFERENCES)
 
 
+@pytest.mark.slow
 @both_precisions
 @all_scenes
 def test_adjoint_is_the_transpose_of_the_tangent(precision, scene):
@@ -372,6 +374,7 @@ APPROXIMATIONS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approximations", APPROXIMATIONS.values(), ids=APPROXIMATIONS)
 def test_gradients_with_other_approximations_equal_central_differences(approximations):
     """Gradients of Gaussians and aperture; nothing is cut, so nothing jumps."""

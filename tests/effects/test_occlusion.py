@@ -174,6 +174,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, case):
     assert abs(left.sum() - sum(r.sum() for r in right)) <= limit * size
 
 
+@pytest.mark.slow
 def test_surface_occludes_each_group_of_features(monkeypatch):
     """Two planes at a time, and the weights in front with each."""
     monkeypatch.setitem(feature_groups.FEATURES_AT_ONCE, 8, 2)

@@ -235,6 +235,7 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_programs_in_the_documents_run(folder, run_python):
     """Each page's one after the other, as if they were pasted, then its scenes in XML."""
     program = []

@@ -70,34 +70,6 @@ def test_both_forms_of_the_projected_covariance_are_documented():
     assert "scenes/images/tiles.png" in text
 
 
-PATHS = sorted(
-    path for folder in ("drgs", "plugins", "scenes") for path in (REPOSITORY / folder).rglob("*.py")
-)
-
-INVENTED = {"R", "added", "bright", "sharp"}
-"""Names that said nothing of what they stood for; R is a rotation, in equations alone."""
-
-
-def invented(source):
-    names = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            names.add(node.id)
-        elif isinstance(node, (ast.FunctionDef, ast.arg)):
-            names.add(getattr(node, "name", None) or node.arg)
-    return names & INVENTED
-
-
-def test_no_function_and_no_variable_has_an_invented_name():
-    found = {str(path.relative_to(REPOSITORY)): invented(path.read_text()) for path in PATHS}
-    # Rows that the optimizer adds: there it is what they are.
-    assert {p: n for p, n in found.items() if n} == {"drgs/training/optimizer.py": {"added"}}
-
-
-def test_invented_name_is_found():
-    assert invented("def added(R):\n    sharp = 2") == {"added", "R", "sharp"}
-
-
 # ----------------------------------------------------------------------------------------------
 # Limits
 # ----------------------------------------------------------------------------------------------

@@ -295,6 +295,7 @@ def test_starting_gaussians_can_be_written(blender, tmp_path):
 
 
 # The real data
+@pytest.mark.slow
 def test_lego_is_read(lego_folder):
     dataset = load(lego_folder, image_size=200)
     assert (len(dataset.train), len(dataset.test), dataset.test_split) == (100, 100, "val")

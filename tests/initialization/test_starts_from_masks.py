@@ -63,6 +63,7 @@ def test_fit_with_alpha_images_starts_on_the_visual_hull(masks):
         assert np.abs(start.colors - colors_at(start.means)).mean() < 0.05
 
 
+@pytest.mark.slow
 def test_starting_gaussians_have_the_colours_opacity_and_scale(masks):
     start = start_of(config(), masks)
     g = initial_gaussians(config(opacity=0.3, scale=0.5), masks)

@@ -62,6 +62,7 @@ def test_every_image_is_opaque_at_hull_points(views, request):
     assert np.all([opaque_at(view, points) for view in views])
 
 
+@pytest.mark.slow
 def test_the_number_of_points_is_never_exceeded_and_nearly_reached(ball):
     for count in (50, 400, 3000):
         assert 0.6 * count <= len(carved(ball, count)) <= count
@@ -84,12 +85,14 @@ def test_thin_pole_is_kept():
     assert np.diff(np.sort([-1, *near[:, 2], 1])).max() < 0.25
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_points(ball):
     first = carved(ball, 300)
     np.testing.assert_array_equal(carved(ball, 300), first)
     assert not np.array_equal(carved(ball, 300, seed=1), first)
 
 
+@pytest.mark.slow
 def test_carving_uses_little_memory(ball):
     """The limit is a chunk of cubes, and some numbers of each cube."""
     silhouettes = silhouettes_of(ball)
@@ -100,6 +103,7 @@ def test_carving_uses_little_memory(ball):
     assert peak < 20e6
 
 
+@pytest.mark.slow
 def test_noisy_silhouettes_use_little_memory(ball):
     rng = np.random.default_rng(2)
     noisy = [replace(v, alpha=rng.uniform(0, 1, v.alpha.shape).astype(np.float32)) for v in ball]

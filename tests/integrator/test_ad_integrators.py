@@ -151,6 +151,7 @@ def error_of_backward(kind, actual) -> float:
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IMAGES)
 def test_images_equal_the_stored_ones(name):
     """The second, which is as the first: nothing is left behind by one that it could show.

@@ -164,6 +164,7 @@ def test_gaussian_with_nonfinite_feature_is_not_drawn():
 NAMES = (*PARAMETER_NAMES, "feature_mine")
 
 
+@pytest.mark.slow
 def test_gradients_equal_differences_of_the_reference():
     """Along a random direction of each parameter, with weights on the extra channels alone."""
     scene = clear(Scene())
@@ -221,6 +222,7 @@ def test_forward_mode_is_the_transpose_of_the_gradients():
     assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
 
 
+@pytest.mark.slow
 def test_features_are_trained():
     """Until they show what they are to show; the image stays."""
     scene = clear(Scene())

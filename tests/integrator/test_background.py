@@ -104,6 +104,7 @@ def gaussians_in_front(camera):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_emitters
 @pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
 @all_cameras

@@ -145,6 +145,7 @@ def test_an_opencv_lens_without_coefficients_is_a_pinhole():
     np.testing.assert_allclose(np.array(ray.d), np.array(expected.d), rtol=0, atol=2e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
 def test_gradients_of_an_image_reach_the_calibration(sensor):
     """Against central differences in single precision; some slopes are clamped."""

@@ -231,6 +231,7 @@ def test_shipped_model_is_the_output_of_its_program(monkeypatch):
     np.testing.assert_allclose(np.abs(cosines), 1, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_shipped_scene_is_compared_with_volprim(monkeypatch, tmp_path, capsys):
     """On a film so small that the low-pass of 0.3 px^2 shows: 24 dB; a mirrored one has 10."""
     monkeypatch.syspath_prepend(SCENES)

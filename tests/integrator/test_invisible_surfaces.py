@@ -104,6 +104,7 @@ def sensor_of(kind, origin) -> dict:
     return sensor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["batch", "thinlens", "aov"])
 def test_every_sensor_sees_windows(kind):
     """Images equal a pinhole's alone: two sensors side by side, one without a window; and

@@ -143,6 +143,7 @@ def test_flat_mirror_matches_traced_rays(kind):
     assert metrics.psnr(none, rays) < 24
 
 
+@pytest.mark.slow
 def test_rough_and_nested_mirrors_use_the_mirrored_camera():
     """Both are approximate; from the middles of the objects, there are 25 and 29 dB."""
     rough = {"floor": floor(bsdf={"type": "roughconductor", "alpha": 0.1})}
@@ -152,6 +153,7 @@ def test_rough_and_nested_mirrors_use_the_mirrored_camera():
         assert metrics.psnr(none, rays) < 24
 
 
+@pytest.mark.slow
 def test_mirror_images_are_cached_until_the_scene_changes(monkeypatch):
     counts, render = [], Mirrors.render
     monkeypatch.setattr(Mirrors, "render", lambda *values: counts.append(1) or render(*values))

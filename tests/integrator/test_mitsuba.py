@@ -129,6 +129,7 @@ def tilted_plane(camera) -> tuple[np.ndarray, float, np.ndarray]:
     return axes[2], float(axes[2] @ middle), to_world
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seen", SENSORS.values(), ids=SENSORS)
 def test_depth_of_a_plane_matches_rays_for_every_sensor(seen):
     """Without a splat in sight."""

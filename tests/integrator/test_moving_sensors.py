@@ -70,6 +70,7 @@ class PluginCase(MovingCase):
     background = property(lambda self: np.zeros(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: f"{s.name}, {s.shutter}")
 def test_calibrated_sensor_image_matches_the_reference(variant, sensor):
     gaussians, rendered = clear_gaussians(
@@ -86,6 +87,7 @@ def replace_samples(sensor) -> dict:
     return sensor.dictionary(shutter_samples=SAMPLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
 def test_gradients_add_up_over_the_times(variant, sensor):
     """Gradients of mi.render in single precision, against differences of the float64 reference."""
@@ -127,6 +129,7 @@ def test_sharing_kernels_among_poses_changes_no_byte(variant, monkeypatch):
         np.testing.assert_array_equal(results[1][name], expected, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", SENSORS[:2], ids=lambda s: f"{s.name}, {s.shutter}")
 def test_forward_derivatives_of_a_moving_camera_are_the_transpose(variant, sensor):
     gaussians, _ = clear_gaussians(sensor, lambda gaussians: image_by_reference(sensor, gaussians))

@@ -346,6 +346,7 @@ def test_forward_and_backward_derivatives_are_transposed(name):
     assert np.abs(products).max() > 100 * allowed
 
 
+@pytest.mark.slow
 @all_cases
 def test_two_images_have_twice_the_derivatives_of_one(name):
     """Two passes differentiate the inputs of the sensor's parameters; sums of the same terms."""

@@ -83,6 +83,7 @@ def test_disc_blocks_its_solid_angle_of_the_sky(height, radius, monkeypatch):
     np.testing.assert_allclose(higher, factor[:, None, :] * np.ones_like(higher), rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pane", [None, 3.0, 1.0], ids=["alone", "pane above", "pane below"])
 def test_object_before_a_lamp_casts_a_shadow(pane):
     """Sharply, as it is a point: behind the edge of the shadow all is as it was. A pane that lets

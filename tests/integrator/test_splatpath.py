@@ -76,6 +76,7 @@ def test_image_without_splats_matches_path(max_depth):
     assert deviation.max() < 6 and np.sqrt((deviation**2).mean()) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_sky", [False, True])
 def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     """Exactly: all splats are composited, and one path is as good as many."""
@@ -139,6 +140,7 @@ def test_fog_before_a_lamp_darkens_a_wall_by_its_alpha():
     np.testing.assert_allclose(ratio[clear], seen.transmittances[clear], atol=0.02)
 
 
+@pytest.mark.slow
 def test_white_furnace_is_white():
     """White splats before a white sky around a white ball: none can be told from the others."""
     rng = np.random.default_rng(2)

@@ -244,6 +244,7 @@ print(max(errors[name] for name in ("image", *gradients)))
 """
 
 
+@pytest.mark.slow
 def test_image_and_gradients_on_a_gpu(run_python):
     result = run_python(CUDA)
     if "no CUDA" in result.stderr:

@@ -40,6 +40,7 @@ def channels_of(scene, kinds) -> np.ndarray:
     return np.stack([planes[kind] for kind in kinds], axis=-1)[scene.view.window]
 
 
+@pytest.mark.slow
 @both_color_spaces
 @pytest.mark.parametrize(("pixel_format", "count"), [("rgb", 3), ("rgba", 4)])
 @pytest.mark.parametrize("view", [VIEWS[1], VIEWS[13]], ids=lambda view: view.name)

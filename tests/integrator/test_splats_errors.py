@@ -200,6 +200,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", REFUSED)
 def test_wrong_properties_are_refused_in_one_line(case):
     changes, expected = REFUSED[case]

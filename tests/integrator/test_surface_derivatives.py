@@ -149,12 +149,14 @@ NESTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["backward", "forward"])
 @pytest.mark.parametrize("nested", NESTED)
 def test_camera_derivatives_with_surfaces_are_refused_by_name(nested, mode):
     check_refused("perspective", ["to_world"], NESTED[nested], mode)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SENSORS)
 def test_camera_derivatives_with_surfaces_are_refused_for_every_sensor(kind):
     check_refused(kind, SENSORS[kind][1], {}, "backward")

@@ -69,6 +69,7 @@ def covered_by(wall, camera, count=32) -> np.ndarray:
     return share / count**2
 
 
+@pytest.mark.slow
 def test_edges_of_a_wall_match_ray_coverage():
     """Pixels that it covers are as before it, others as without it, those at its edge between."""
     scene, wall = apart(SCENE), Wall(half=0.5)
@@ -245,6 +246,7 @@ def masked(opacity) -> dict:
     return {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse"}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bsdf", [{"type": "null"}, masked(0.0)], ids=["null", "mask"])
 def test_fully_transparent_surfaces_are_invisible(bsdf):
     scene = apart(SCENE)
@@ -314,6 +316,7 @@ def repeated(shape) -> dict:
     return {"group": group, "copy": {"type": "instance", "of": {"type": "ref", "id": "group"}}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_shapes", [False, True])
 def test_instances_are_surfaces(with_shapes):
     """Seen, moved with what they repeat, and differentiated, as if they were the shape itself."""

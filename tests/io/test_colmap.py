@@ -113,6 +113,7 @@ def test_every_model_is_read_like_colmap(tmp_path, pycolmap):
             assert_as_colmap_reads(pycolmap, write(tmp_path / name / kind, model))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
 def test_real_model_is_read_like_colmap(tmp_path, pycolmap):
     assert_as_colmap_reads(pycolmap, REAL_MODEL)
@@ -231,6 +232,7 @@ def test_a_folder_without_a_model_is_refused(tmp_path):
     assert "is no model of COLMAP: there are neither cameras.bin" in refusal(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_truncated_binary_file_is_refused_at_any_length(tmp_path, model, name):
     path = write_binary(tmp_path, model) / f"{name}.bin"

@@ -127,6 +127,7 @@ def test_compressed_file_is_recognised_without_its_suffix(tmp_path):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @checked
 @pytest.mark.filterwarnings("ignore:.*(infinite logits|extensions of a vendor)")
 def test_damaged_files_are_read_or_refused_by_file(tmp_path, each):

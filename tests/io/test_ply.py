@@ -261,6 +261,7 @@ def test_a_header_without_an_end_is_refused(tmp_path):
         read_points(path)
 
 
+@pytest.mark.slow
 def test_reading_and_writing_needs_no_libllvm(tmp_path, run_python):
     random_gaussians(2, 1).save(tmp_path / "a.ply")
     code = f"""

@@ -195,6 +195,7 @@ def test_plugin_image_matches_rays_of_the_sensor(view):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("splats", SCENES.values(), ids=SCENES.keys())
 def test_primary_rays_match_volprim(splats):
     """Within rounding, as the image of ``splats`` is but for what is derived there."""

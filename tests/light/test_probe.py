@@ -139,6 +139,7 @@ def test_mip_levels_are_means_of_the_finer_level():
         np.testing.assert_allclose(seen(places, axis, sign, 5), np.mean(finer, 0), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_rays_end_before_surfaces_beyond_their_length():
     probes = probes_of(shell(), FLOAT32)
     towards = directions(300, 9)

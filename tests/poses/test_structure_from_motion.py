@@ -38,6 +38,7 @@ def placed(tmp_path_factory):
     return folder, found, poses, watched
 
 
+@pytest.mark.slow
 def test_true_cameras_are_recovered(placed):
     """Up to a similarity. Features are found to a tenth of a pixel: an angle of 3e-4."""
     folder, found, poses, _ = placed
@@ -62,6 +63,7 @@ def test_true_cameras_are_recovered(placed):
     assert np.abs(scale * around - true).max() < 0.005 * np.linalg.norm(true, axis=1).max()
 
 
+@pytest.mark.slow
 def test_progress_of_every_step_is_reported(placed):
     _, _, _, watched = placed
     for what, total in (("photograph", 7), ("pair of photographs", 21), ("camera", 7)):
@@ -69,6 +71,7 @@ def test_progress_of_every_step_is_reported(placed):
         assert steps[-1] == (what, total, total)
 
 
+@pytest.mark.slow
 def test_only_the_model_is_left(placed):
     folder, _, _, _ = placed
     assert {path.name for path in folder.iterdir()} == {*NAMES, "sparse"}
@@ -76,6 +79,7 @@ def test_only_the_model_is_left(placed):
     assert files == {*sfm.MODEL_FILES, ".drgs-poses.json"}
 
 
+@pytest.mark.slow
 def test_plain_images_have_no_cameras_and_leave_no_files(tmp_path):
     pytest.importorskip("pycolmap")
     for k in range(3):

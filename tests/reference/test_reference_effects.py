@@ -186,6 +186,7 @@ def test_plane_in_focus_is_the_same_from_the_whole_aperture():
     np.testing.assert_allclose(alpha, rendered.alpha, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aperture_radius", [0.05, 0.1, 0.2])
 def test_defocused_image_is_the_mean_of_many_pinholes(aperture_radius):
     """One splat of variance v = 4.3 px^2, spread over a disc of radius R = 1, 2 or 4 px.

@@ -186,6 +186,7 @@ def test_tangential_lens_is_invertible_within_its_radius(k1):
     assert steps[0] @ toward > 0 and (steps[1] @ toward < 0) == (k1 < 0)
 
 
+@pytest.mark.slow
 def test_tangential_lenses_have_no_fold_within_their_radius():
     """The determinants of difference quotients, in a disc of each of 40 lenses, are positive."""
     ended = 0

@@ -154,6 +154,7 @@ def test_opaque_splat_without_a_clamp_has_zero_transmittance():
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_color_of_a_pixel_uses_its_ray_direction(degree):
     """One splat over a wide film; some of its colours are clamped to zero."""

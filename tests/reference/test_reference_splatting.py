@@ -114,6 +114,7 @@ def test_gradients_agree_with_central_differences(antialiased, sh_degree):
     assert not analytic["shN"][:, (sh_degree + 1) ** 2 - 1 :].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*PARAMETERS, "background"])
 def test_gradient_check_fails_when_a_gradient_is_one_percent_too_large(name):
     analytic, numeric = small_scene_gradients(True, 3)

@@ -66,14 +66,17 @@ def test_shape_images_are_written_to_the_current_folder(script):
     assert script("compare_shapes") == {"out/shapes.png"}
 
 
+@pytest.mark.slow
 def test_knot_is_written_to_the_current_folder(script):
     assert script("knot") == {"out/knot.ply"}
 
 
+@pytest.mark.slow
 def test_tile_image_is_written_to_the_current_folder(script):
     assert script("draw_tiles") == {"out/tiles.png"}
 
 
+@pytest.mark.slow
 def test_flat_mirror_table_is_only_printed(script, capsys):
     assert script("flat_mirror", "--size", 8, "--splats", 20) == set()
     assert capsys.readouterr().out.count("\n") == 6

@@ -78,6 +78,7 @@ def test_planes_equal_the_reference(precision, scene):
     assert_arrays_agree(scene.kernel_planes(precision), scene.reference_planes(), PLANES[precision])
 
 
+@pytest.mark.slow
 @both_precisions
 @all_scenes
 def test_gradients_equal_the_reference(precision, scene):
@@ -170,6 +171,7 @@ def test_alpha_is_cut_at_its_threshold(precision, factor, seen):
     assert (planes["transmittance"][0, 0] < 1) == seen
 
 
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65, 200])
 def test_lists_around_32_entries_match_the_reference(precision, count):

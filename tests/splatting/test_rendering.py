@@ -72,6 +72,7 @@ def test_image_equals_the_reference(precision, case):
     assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
 
 
+@pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -108,6 +109,7 @@ def test_stacked_scenes_stop_pixels_and_clamp_alphas():
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_precisions
 @all_cases
 def test_gradients_equal_the_reference(precision, case):
@@ -280,6 +282,7 @@ def test_an_opacity_that_underflows_to_zero_has_no_gradient(precision, logit):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_precisions
 @all_cases
 def test_adjoint_is_the_transpose_of_the_tangent(precision, case):

@@ -57,6 +57,7 @@ def thread_count():
     dr.set_thread_count(before)
 
 
+@pytest.mark.slow
 @both_precisions
 def test_every_run_gives_the_same_bytes_on_any_number_of_threads(precision, thread_count):
     runs = []

@@ -101,6 +101,7 @@ def test_tiles_cover_the_film(size, columns, rows_):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both_precisions
 @all_cases
 def test_entries_cover_every_pair_that_the_reference_accepts(precision, case):

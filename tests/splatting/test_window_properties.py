@@ -176,6 +176,7 @@ def test_white_minus_black_image_is_the_transmittance(scene):
     assert (error <= ROUNDOFF[FLOAT32] * white[..., :3]).all()
 
 
+@pytest.mark.slow
 @both_precisions
 @examples
 @given(cases(), seeds)

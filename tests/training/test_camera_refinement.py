@@ -191,6 +191,7 @@ def test_intrinsics_with_zero_rates_are_left_out():
     assert set(effect_of(only_focal).numpy()) == {"turns", "moves", "log_focals"}
 
 
+@pytest.mark.slow
 def test_only_the_current_view_and_shared_intrinsics_change():
     """The numbers and the moments of all other views stay, bit by bit."""
     trainer = make_trainer(**ALL_RATES)
@@ -461,6 +462,7 @@ def test_a_fit_with_smoothing_resumes_to_the_same_bytes():
     fits.assert_resumes_to_the_same_bytes(make, 6, 5)
 
 
+@pytest.mark.slow
 def test_filter_uses_refined_cameras():
     """Also after a coarse stage, before its views were seen again."""
     trainer = make_trainer(
@@ -478,6 +480,7 @@ def test_filter_uses_refined_cameras():
     )
 
 
+@pytest.mark.slow
 def test_two_fits_have_the_same_bytes():
     """Derivatives of a camera are sums over all splats: in the same order in every run."""
     first, second = (fits.steps(make_trainer(**ALL_RATES), 7) for _ in range(2))

@@ -202,6 +202,7 @@ def test_view_seen_later_starts_with_the_full_rate():
     np.testing.assert_allclose(np.abs(values - IDENTITY), 3e-2, atol=4e-7)
 
 
+@pytest.mark.slow
 def test_the_mean_of_all_transforms_is_the_identity():
     """After any iteration; rounding of numbers of 1."""
     trainer = make_trainer(colors__lr=3e-2)

@@ -91,6 +91,7 @@ def assert_agree(out):
         assert [v for _, v in curves[tag]] == pytest.approx([v for _, v in curve], rel=1e-5)
 
 
+@pytest.mark.slow
 @needs_tensorboardx
 def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path):
     config = write_project(tmp_path)
@@ -103,6 +104,7 @@ def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path):
     assert EVENTS in json.loads((tmp_path / "with" / ".drgs-fit.json").read_text())["files"]
 
 
+@pytest.mark.slow
 @needs_tensorboardx
 def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(tmp_path, monkeypatch):
     config, out = write_project(tmp_path), tmp_path / "out"
@@ -118,6 +120,7 @@ def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(tmp_path, m
     assert not (out / TENSORBOARD).exists()
 
 
+@pytest.mark.slow
 @needs_tensorboardx
 def test_foreign_file_in_the_folder_is_kept(tmp_path):
     config, out = write_project(tmp_path), tmp_path / "out"

@@ -143,6 +143,7 @@ def test_effect_applies_depending_on_the_dataset(examples, monkeypatch):
         assert [effect.name for effect in effects if effect.name != "depth"] == used
 
 
+@pytest.mark.slow
 def test_objects_and_names_give_the_same_bytes(examples):
     """Objects: an effect, a strategy and a loss."""
     config = configured()
@@ -161,6 +162,7 @@ def test_objects_and_names_give_the_same_bytes(examples):
         np.testing.assert_array_equal(getattr(given, name), getattr(named, name))
 
 
+@pytest.mark.slow
 def test_fit_resumes_from_a_checkpoint_to_the_same_bytes():
     def trainer():
         return fits.Trainer(configured(), fits.plain_dataset(), fits.disturbed_blobs())

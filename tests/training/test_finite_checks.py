@@ -184,6 +184,7 @@ def test_restored_trainer_has_no_fault(monkeypatch):
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_nonfinite_value_is_named(name, value):
@@ -255,6 +256,7 @@ def test_nonfinite_parameters_of_an_effect_are_named(name, part):
         assert str(error.value) == f"after iteration 2: {shown} is inf {where}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EFFECTS)
 def test_nonfinite_iteration_names_the_effect_that_caused_it(name):
     trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
@@ -278,6 +280,7 @@ def test_check_values_names_the_first_row_of_any_shape():
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_guards_do_not_change_the_bytes_of_a_fit(monkeypatch):
     """Across changes of the population and an opacity reset."""
     changes = {

@@ -84,6 +84,7 @@ def adam_and_ours(num):
     return plain, make_optimizer(values, RATES)
 
 
+@pytest.mark.slow
 def test_steps_are_those_of_adam_and_use_large_gradients_up():
     num = 25_000
     plain, ours = adam_and_ours(num)

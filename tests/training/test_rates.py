@@ -76,6 +76,7 @@ def test_revised_plan_keeps_past_rates():
 AVERAGED_VIEWS = {"views": 3, "views_from": 0.5, "decay": 1.0}
 
 
+@pytest.mark.slow
 def test_step_of_several_views_uses_their_mean_gradient():
     """Iterations 27, 28, 29 -> a step at 30: Adam by hand, from gradients of single views."""
     trainer = make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION)

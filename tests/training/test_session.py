@@ -26,6 +26,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
+@pytest.mark.slow
 def test_session_without_a_folder_writes_and_prints_nothing(tmp_path, capsys):
     config = load_config(write_project(tmp_path))
     before, session = contents(tmp_path), FitSession(config)
@@ -73,6 +74,7 @@ class Squares(Loss):
         return dr.mean(dr.square(image.array - target.image.array))
 
 
+@pytest.mark.slow
 def test_other_trainers_of_a_session_get_copies_of_its_objects(tmp_path):
     """A rehearsal gets all of them; Gaussians for viewers, whose number stays, no strategy."""
     config, effect = load_config(write_project(tmp_path)), Counted()

@@ -44,6 +44,7 @@ def test_targets_are_cached_within_the_memory_limit(monkeypatch):
         assert indices_on_device(trainer) == [set(seen[:2])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [{}, {"data__random_background": True, "colors__lr": 0.02}])
 def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
     """Nor on effects that upload something of a view."""

@@ -422,6 +422,7 @@ def colors(trainer, count):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_random_colors_depend_on_seed_and_iteration_only():
     first, again, other = (colors(random_trainer(seed=seed), 5) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
@@ -431,6 +432,7 @@ def test_random_colors_depend_on_seed_and_iteration_only():
     np.testing.assert_array_equal(colors(begun, 2), first[3:])
 
 
+@pytest.mark.slow
 def test_random_colors_are_uniform_in_the_cube():
     """Their means and variances are those of uniform numbers: 1/2 and 1/12."""
     trainer = random_trainer()

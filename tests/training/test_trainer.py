@@ -147,6 +147,7 @@ assert dr.all(dr.isfinite(image.array))
     assert time.perf_counter() - started < 3
 
 
+@pytest.mark.slow
 def test_restored_trainer_continues_to_the_same_bytes():
     """Across a change of the population, an opacity reset and a change of the SH degree."""
     changes = {

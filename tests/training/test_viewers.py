@@ -39,6 +39,7 @@ def psnr_in_viewers(gaussians, dataset):
     return np.mean([decibels(image, view.image) for image, view in pairs])
 
 
+@pytest.mark.slow
 def test_iterations_improve_images_of_viewers(monkeypatch):
     monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 1.0)
     trainer, dataset, gaussians = ended_fit()

@@ -108,6 +108,7 @@ def test_unsupported_combination_is_refused_in_one_line(scene):
 NUMBERS = {"opencv": {"k1": 0.1}, "fisheye": {"k1": 0.1}, "thin lens": {"aperture": 0.03}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", VIEWER_LENSES)
 def test_every_content_is_rendered_through_every_lens(scene, lens):
     """But for the projection ``exact``, which only pinholes and thin lenses have."""

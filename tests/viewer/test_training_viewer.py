@@ -90,6 +90,7 @@ def requests():
         yield FrameRequest(eye, 40, 30, content=content, approximations=approximations, **lens)
 
 
+@pytest.mark.slow
 def test_fit_with_a_viewer_has_the_same_bytes():
     dataset, queue, asked = true_dataset(), RenderRequests(), requests()
     alone = make_trainer(dataset, **EVERYTHING)
@@ -153,6 +154,7 @@ def test_ending_before_the_start_or_after_the_end_has_no_effect():
     assert trainer.iteration == 3 and trainer.config.iterations == config.iterations
 
 
+@pytest.mark.slow
 def test_pause_stops_fit_and_clock_and_serves_requests():
     dataset, queue, during = plain_dataset(), RenderRequests(), []
     trainer = make_trainer(dataset, iterations=4)

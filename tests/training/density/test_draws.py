@@ -20,6 +20,7 @@ def test_rows_are_sampled_in_proportion_to_weights():
         assert not counts[weights == 0].any()
 
 
+@pytest.mark.slow
 def test_mean_count_over_many_keys_is_the_weight():
     # Fewer draws than rows: each row is drawn once or not at all, with probability 20 w. Of 4000
     # keys, six standard deviations of the mean of such a variable.
