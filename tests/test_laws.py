@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 import pytest
 from support.approximation_checks import APPROXIMATIONS
+from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES, kernel_lens
 
 from drgs.cameras.motion import MotionBlur, RollingShutter
@@ -28,10 +29,10 @@ from drgs.testing import (
     bytes_are_reproducible,
     gradients_equal_differences,
     image_equals_reference,
+    laws_of,
     single_precision_is_accurate,
 )
 
-MARKED = 1e-4  # relative distance from a threshold within which single precision may cross it
 MOTION_SAMPLES = 3
 PINHOLE = effects.Pinhole()
 
@@ -56,7 +57,7 @@ def by_rays(case, values):
     """Approximations of a pinhole's image; the depth of other orders is the peaks'."""
     model = rays.ImageModel(**{k: v for k, v in case.approximations.items() if k in MODEL_FIELDS})
     image = partial(rays.render, camera=reference_camera(case), model=model)
-    planes, marked = planes_of(image(reference.Gaussians(**values), threshold_width=MARKED))
+    planes, marked = planes_of(image(reference.Gaussians(**values), threshold_width=NEAR_THRESHOLD))
     return planes if model.order == "center" else planes[:4], marked
 
 
@@ -76,7 +77,7 @@ def by_effects(case, values, lens=PINHOLE):
     return planes_of(
         effects.render(
             reference.Gaussians(**values), reference_camera(case), lens, np.zeros(3), antialiased,
-            defocus, case.degree, MARKED,
+            defocus, case.degree, NEAR_THRESHOLD,
         )
     )  # fmt: skip
 
@@ -105,11 +106,10 @@ def shutter(kind, *arguments):
 
 def by_motion(case, values, lens=PINHOLE):
     cameras = reference_camera(case), close_camera(case)
-    render = effects.render_rolling_shutter
-    if case.name.startswith("motion blur"):
-        render = partial(effects.render_motion_blur, num_samples=MOTION_SAMPLES)
     gaussians = reference.Gaussians(**values)
-    return planes_of(render(gaussians, *cameras, background=np.zeros(3), lens=lens))
+    return planes_of(
+        effects.render_motion_blur(gaussians, *cameras, MOTION_SAMPLES, np.zeros(3), lens)
+    )
 
 
 # ----------------------------------------------------------------------------------------------
@@ -118,6 +118,7 @@ def by_motion(case, values, lens=PINHOLE):
 
 ALL_LENSES = {"pinhole": PINHOLE, **LENSES}
 
+# px: films of fisheyes reach beyond 90 degrees from the axis; that of parallel rays is 3 units.
 FOCAL = {effects.Fisheye: 10.0, effects.ThinPrismFisheye: 10.0, effects.Orthographic: 12.0}
 
 
@@ -140,7 +141,7 @@ EFFECTS = {
     "rolling shutter": (None, {"shutter": shutter(RollingShutter)}),
 }
 
-NO_SENSOR = "no sensor has both"
+NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
 HOLES = {
     ("thin lens", "orthographic"): "parallel rays meet in no aperture",
     **{("thin lens", name): NO_SENSOR for name in ("plain fisheye", "fisheye", "thin prism")},
@@ -174,14 +175,18 @@ def is_quick(case) -> bool:
     return lens in QUICK if first == "no effect" else lens == "rational"
 
 
-PARAMETERS = [
-    pytest.param(case, id=case.name, marks=[] if is_quick(case) else pytest.mark.slow)
+PAIRS = [
+    pytest.param(
+        *(case, law),
+        id=f"{case.name}-{law.__name__}",
+        marks=[] if is_quick(case) else pytest.mark.slow,
+    )
     for case in CASES
+    for law in laws_of(case)
 ]
 
 
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
-@pytest.mark.parametrize("case", PARAMETERS)
+@pytest.mark.parametrize(("case", "law"), PAIRS)
 def test_law_holds(case, law):
     law(case)
 
