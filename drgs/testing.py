@@ -34,10 +34,12 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Aperture, Camera, Shutter, cameras_in_time
 from drgs.cameras.lens import PINHOLE, Lens
 from drgs.config.approximations import Approximations
+from drgs.core.arrays import from_host
+from drgs.core.errors import UnsupportedError
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting import rendering
-from drgs.splatting.rendering import Frame, color_features, depth_feature
+from drgs.splatting.rendering import Frame, Pipeline, color_features, depth_feature
 
 Values = Mapping[str, np.ndarray]  # parameters of Gaussians by name, float64
 
@@ -125,13 +127,26 @@ class Case:
         dr.make_opaque(camera)
         return camera
 
+    @property
+    def pipeline(self) -> Pipeline:
+        """The pipeline without effects."""
+        given = self.approximations if self.reference else {**SMOOTH, **self.approximations}
+        features = (color_features, depth_feature)
+        return pipeline_of(Approximations(**given), self.degree, features)
+
+    @property
+    def is_differentiable_in_camera(self) -> bool:
+        """Whether the pipeline has derivatives with respect to the camera."""
+        try:
+            self.pipeline.model.check_differentiable_in_camera()
+        except UnsupportedError:
+            return False
+        return True
+
     def frames(self, values: Values, Float: type = llvm.Float64) -> tuple[Gaussians, list[Frame]]:
         """Render; return the Gaussians, and a frame for each time of the shutter."""
         gaussians, camera = self._gaussians(values, Float), self.camera(Float)
-        given = self.approximations if self.reference else {**SMOOTH, **self.approximations}
-        features = (color_features, depth_feature)
-        pipeline = pipeline_of(Approximations(**given), self.degree, features)
-        pipeline = with_effects(pipeline, gaussians, camera)
+        pipeline = with_effects(self.pipeline, gaussians, camera)
         times = cameras_in_time(camera)
         return gaussians, [rendering.render(gaussians, each, pipeline) for each in times]
 
@@ -141,7 +156,8 @@ class Case:
         gaussians = Gaussians(**fields)
         if self.smoothing is not None:
             gaussians = replace(gaussians, smoothing=np.full(self.count, self.smoothing))
-        return gaussians.to(TensorXf)
+        gaussians = gaussians.to(TensorXf)
+        return replace(gaussians, logit_opacities=from_host(Float, gaussians.logit_opacities))
 
     def planes(self, values: Values, Float: type = llvm.Float64) -> np.ndarray:
         """Return the planes (5, H * W) of the kernels' image."""
@@ -154,7 +170,7 @@ class Case:
         """Return derivatives of sum(weights * planes), weights (5, H * W)."""
         gaussians, frames = self.frames(values, Float)
         total: dict[str, Any] = dict.fromkeys(PARAMETER_NAMES, 0.0)
-        d_planes = [Float(plane / len(frames)) for plane in weights]
+        d_planes = [from_host(Float, plane / len(frames)) for plane in weights]
         for frame in frames:
             found = rendering.frames_adjoint(gaussians, [frame], [d_planes]).parameters
             for name in PARAMETER_NAMES:
@@ -245,8 +261,34 @@ def gradients_equal_differences(case: Case) -> None:
     for name in PARAMETER_NAMES:
         terms = direction[name] * gradients[name]
         expected = (loss(name, case.step) - loss(name, -case.step)) / (2 * case.step)
-        error = abs(terms.sum() - expected) / np.abs(terms).sum()
+        error = abs(terms.sum() - expected) / (np.abs(terms).sum() or 1)
         assert error <= case.gradient_tolerance, f"{case.name}: {name} is off by {error:.1e}"
+
+
+def camera_gradients_equal_differences(case: Case) -> None:
+    """Derivatives along a direction of pose, focal lengths, lens, aperture and shutter.
+
+    They equal differences of the kernels' own images, whose values another law checks.
+    """
+    weights = _weights(case)
+    gaussians, frames = case.frames(case.values)
+    for frame in frames:
+        d_planes = [llvm.Float64(plane) for plane in weights]
+        found = rendering.frames_adjoint(gaussians, [frame], [d_planes], of_camera=True).camera
+        gradient = _arrays(found or []).ravel()
+        direction = single(np.random.default_rng(3).normal(size=len(gradient)))
+
+        def loss(step: float, frame: Frame = frame, direction: np.ndarray = direction) -> float:
+            steps = iter(step * direction)
+            camera = frame.camera.map_numbers(lambda number: number + next(steps))
+            dr.make_opaque(camera)
+            planes = rendering.render(gaussians, camera, frame.pipeline).planes()
+            return float(np.sum(weights * _arrays(planes)))
+
+        expected = (loss(case.step) - loss(-case.step)) / (2 * case.step)
+        terms = direction * gradient
+        error = abs(terms.sum() - expected) / np.abs(terms).sum()
+        assert error <= case.gradient_tolerance, f"{case.name}: camera is off by {error:.1e}"
 
 
 def adjoint_is_transpose(case: Case) -> None:
@@ -293,6 +335,7 @@ def single_precision_is_accurate(case: Case) -> None:
 LAWS = (
     image_equals_reference,
     gradients_equal_differences,
+    camera_gradients_equal_differences,
     adjoint_is_transpose,
     bytes_are_reproducible,
     single_precision_is_accurate,
@@ -300,5 +343,13 @@ LAWS = (
 
 
 def laws_of(case: Case) -> list[Callable[[Case], None]]:
-    """Return the laws that apply to a case: without a reference, all but that of its image."""
-    return [law for law in LAWS if case.reference or law is not image_equals_reference]
+    """Return the laws that apply to a case.
+
+    Without a reference, these are all but that of its image; colours along each pixel's ray have no
+    derivatives with respect to the camera.
+    """
+    applies = {
+        image_equals_reference: case.reference is not None,
+        camera_gradients_equal_differences: case.is_differentiable_in_camera,
+    }
+    return [law for law in LAWS if applies.get(law, True)]

@@ -7,172 +7,66 @@ covered by one line of a table below.
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
-from functools import partial
+from dataclasses import fields, is_dataclass, replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
-from support.approximation_checks import APPROXIMATIONS
-from support.helpers import NEAR_THRESHOLD
-from support.lens_scenes import LENSES, kernel_lens
+from drjit.llvm import ad as llvm
+from support.cases import (
+    ALL_LENSES,
+    APPROXIMATIONS,
+    CASES,
+    EFFECTS,
+    HOLES,
+    OF_SCENES,
+    SCENE_HOLES,
+    SCENES,
+    by_rays,
+)
+from support.views import tensors
 
+import drgs
+from drgs.accuracy import pipeline
+from drgs.cameras.camera import Aperture, Camera
+from drgs.cameras.fisheye import Fisheye
+from drgs.cameras.lens import LENSES
 from drgs.cameras.motion import MotionBlur, RollingShutter
-from drgs.core.arrays import types_of
-from drgs.reference import effects, rays
+from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
+from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.splatting import footprint, projection
 from drgs.splatting.footprint import GaussianFalloff
 from drgs.testing import (
     LAWS,
-    Case,
     adjoint_is_transpose,
     bytes_are_reproducible,
+    camera_gradients_equal_differences,
     gradients_equal_differences,
     image_equals_reference,
     laws_of,
+    single,
     single_precision_is_accurate,
 )
 
-MOTION_SAMPLES = 3
-PINHOLE = effects.Pinhole()
-
-
-# ----------------------------------------------------------------------------------------------
-# References
-# ----------------------------------------------------------------------------------------------
-
-
-def reference_camera(case) -> reference.Camera:
-    (rotation, center), K = case.pose, case.K
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    return reference.Camera(rotation, center, fx, fy, cx, cy, case.width, case.height, 0.25)
-
-
-def planes_of(rendered) -> tuple[np.ndarray, np.ndarray]:
-    images = [rendered.transmittance, *np.moveaxis(rendered.image, -1, 0), rendered.depth]
-    return np.reshape(images, (5, -1)), rendered.near_threshold.ravel()
-
-
-def by_rays(case, values):
-    """Approximations of a pinhole's image; the depth of other orders is the peaks'."""
-    model = rays.ImageModel(**{k: v for k, v in case.approximations.items() if k in MODEL_FIELDS})
-    image = partial(rays.render, camera=reference_camera(case), model=model)
-    planes, marked = planes_of(image(reference.Gaussians(**values), threshold_width=NEAR_THRESHOLD))
-    return planes if model.order == "center" else planes[:4], marked
-
-
-MODEL_FIELDS = set(rays.ImageModel.__dataclass_fields__)
-
-
-def by_effects(case, values, lens=PINHOLE):
-    """Lenses, with an aperture and a smoothing filter."""
-    if case.smoothing is not None:
-        rates = np.full(case.count, np.sqrt(effects.SMOOTHING_VARIANCE) / case.smoothing)
-        given = values["log_scales"], values["logit_opacities"], rates
-        scales, opacities = effects.smoothing_filter(*given)
-        logits = np.log(opacities / (1 - opacities))
-        values = {**values, "log_scales": np.log(scales), "logit_opacities": logits}
-    defocus = case.aperture and effects.ThinLens(*case.aperture)
-    antialiased = case.approximations.get("antialiased", False)
-    return planes_of(
-        effects.render(
-            reference.Gaussians(**values), reference_camera(case), lens, np.zeros(3), antialiased,
-            defocus, case.degree, NEAR_THRESHOLD,
-        )
-    )  # fmt: skip
-
-
-TRAVEL, TURN = np.array([0.125, -0.0625, 0.03125]), np.array([0.03125, 0.0625, -0.09375])
-
-
-def close_camera(case) -> reference.Camera:
-    """The camera when the shutter closes: moved by TRAVEL (world), turned by TURN (camera axes)."""
-    camera = reference_camera(case)
-    angle = np.linalg.norm(TURN)
-    quat = np.array([[np.cos(angle / 2), *(np.sin(angle / 2) * TURN / angle)]])
-    rotation = reference.quat_to_rotation(quat)[0] @ camera.rotation
-    return replace(camera, rotation=rotation, center=camera.center + TRAVEL)
-
-
-def shutter(kind, *arguments):
-    """Make the shutter of a camera."""
-
-    def make(camera):
-        Array3f = types_of(type(camera.near)).Array3f
-        return kind(Array3f(*map(float, TRAVEL)), Array3f(*map(float, TURN)), *arguments)
-
-    return make
-
-
-def by_motion(case, values, lens=PINHOLE):
-    cameras = reference_camera(case), close_camera(case)
-    gaussians = reference.Gaussians(**values)
-    return planes_of(
-        effects.render_motion_blur(gaussians, *cameras, MOTION_SAMPLES, np.zeros(3), lens)
-    )
-
-
-# ----------------------------------------------------------------------------------------------
-# The matrix
-# ----------------------------------------------------------------------------------------------
-
-ALL_LENSES = {"pinhole": PINHOLE, **LENSES}
-
-# px: films of fisheyes reach beyond 90 degrees from the axis; that of parallel rays is 3 units.
-FOCAL = {effects.Fisheye: 10.0, effects.ThinPrismFisheye: 10.0, effects.Orthographic: 12.0}
-
-
-def with_lens(name, effect, reference_of, **options) -> Case:
-    """A case with a lens of the reference and of the kernels."""
-    lens = ALL_LENSES[name]
-    if name != "pinhole":
-        options["lens"] = kernel_lens(lens)
-    options.setdefault("focal", FOCAL.get(type(lens), 26.0))
-    found = reference_of and partial(reference_of, lens=lens)
-    return Case(f"{effect}, {name}", reference=found, **options)
-
-
-EFFECTS = {
-    "no effect": (by_effects, {}),
-    "antialiased": (by_effects, {"approximations": {"antialiased": True}}),
-    "thin lens": (by_effects, {"aperture": (0.0625, 2.0)}),
-    "smoothing": (by_effects, {"smoothing": 0.0625}),
-    "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
-    "rolling shutter": (None, {"shutter": shutter(RollingShutter)}),
+QUICK = {
+    *("no effect, pinhole", "no effect, rational", "no effect, thin prism"),
+    *("no effect, orthographic", "default, edges", "default, stacked", "default, degree 1 of 3"),
+    *(f"{effect}, rational" for effect in EFFECTS),
+    *(f"{name}, pinhole" for name in ("exact", "unscented", "pixel order", "pixel colours")),
+    *(f"{name}, pinhole" for name in ("other cuts", "no low-pass")),
 }
+"""Cases of the default tests; those of combinations are slow tests."""
 
-NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
-HOLES = {
-    ("thin lens", "orthographic"): "parallel rays meet in no aperture",
-    **{("thin lens", name): NO_SENSOR for name in ("plain fisheye", "fisheye", "thin prism")},
-}
-"""Cells of the matrix without a case, and the reason."""
 
-CASES = [
-    *(
-        with_lens(lens, effect, reference_of, **options)
-        for effect, (reference_of, options) in EFFECTS.items()
-        for lens in ALL_LENSES
-        if (effect, lens) not in HOLES
-    ),
-    *(
-        Case(f"{name}, pinhole", approximations=options, reference=by_rays)
-        for name, options in APPROXIMATIONS.items()
-    ),
-]
-
-QUICK = (
-    *("pinhole", "rational", "thin prism", "orthographic"),
-    *("exact", "unscented", "pixel order", "pixel colours", "other cuts", "no low-pass"),
-)
-"""Lenses and approximations of the default tests; combinations with others are slow tests."""
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
 
 
 def is_quick(case) -> bool:
-    first, _, lens = case.name.rpartition(", ")
-    if first in APPROXIMATIONS:
-        return first in QUICK
-    return lens in QUICK if first == "no effect" else lens == "rational"
+    return case.name in QUICK
 
 
 PAIRS = [
@@ -193,53 +87,260 @@ def test_law_holds(case, law):
 
 def test_matrix_has_a_case_or_a_reason_in_each_cell():
     names = {case.name for case in CASES}
-    print("\n" + " " * 16 + " ".join(f"{lens[:12]:12}" for lens in ALL_LENSES))
-    for effect in EFFECTS:
-        marks = ["x" if f"{effect}, {lens}" in names else "-" for lens in ALL_LENSES]
-        print(f"{effect:16}" + " ".join(f"{mark:12}" for mark in marks))
-        for lens, mark in zip(ALL_LENSES, marks, strict=True):
-            assert (mark == "-") == ((effect, lens) in HOLES)
-    print(*(f"- {effect}, {lens}: {reason}" for (effect, lens), reason in HOLES.items()), sep="\n")
-    print("with a pinhole:", *(f"{name};" for name in APPROXIMATIONS))
+    tables = {
+        "effects": (ALL_LENSES, EFFECTS, HOLES),
+        "scenes": (SCENES, OF_SCENES, SCENE_HOLES),
+        "approximations": (("pinhole",), APPROXIMATIONS, {}),
+    }
+    for table, (columns, rows, holes) in tables.items():
+        print(f"\n{table:22}" + " ".join(f"{column[:12]:12}" for column in columns))
+        for row in rows:
+            marks = ["x" if f"{row}, {column}" in names else "-" for column in columns]
+            print(f"{row:22}" + " ".join(f"{mark:12}" for mark in marks))
+            found = {(row, c) for c, mark in zip(columns, marks, strict=True) if mark == "-"}
+            assert found == {cell for cell in holes if cell[0] == row}
+        print(
+            *(f"- {row}, {column}: {reason}" for (row, column), reason in holes.items()), sep="\n"
+        )
     without = sorted(case.name for case in CASES if case.reference is None)
     print("without a reference, by differences of the kernels:", "; ".join(without))
+
+
+@pytest.mark.parametrize("registry", [LENSES, PROJECTIONS, ORDERS, FALLOFFS], ids=lambda r: r.kind)
+def test_shipped_extensions_are_in_the_matrix(registry):
+    used = {case.lens.kind for case in CASES}
+    for selected in (Approximations(**case.approximations) for case in CASES):
+        used |= {selected.projection, selected.order, selected.falloff}
+    assert set(registry.shipped_names) <= used
+
+
+# ----------------------------------------------------------------------------------------------
+# Entry points: mi.render, the batch sensor and drgs.rasterization
+# ----------------------------------------------------------------------------------------------
+
+CALIBRATED = [
+    *(case for case in CASES if case.name.startswith(("no effect", "antialiased"))),
+    *(case for case in CASES if case.reference is by_rays and case.count > 1),
+]
+"""Cases with a sensor whose numbers are the case's; others compute theirs from matrices."""
+CALIBRATED = [case for case in CALIBRATED if case.degree and case.lens.kind]
+
+PINHOLES = [case for case in CALIBRATED if case.lens.kind == "pinhole"]
+
+
+def some(cases):
+    """The first of a few kinds by default, all with the slow tests."""
+    return [
+        pytest.param(case, id=case.name, marks=[] if is_quick(case) else pytest.mark.slow)
+        for case in cases
+    ]
+
+
+def mitsuba_scene(case, sensors=1) -> mi.Scene:
+    """The case with a ``calibrated`` sensor, or with several of them in a ``batch``."""
+    rotation, center = case.pose
+    to_world = np.eye(4)
+    to_world[:3] = np.column_stack([rotation.T * [-1, -1, 1], center])
+    lens = getattr(case.reference, "keywords", {}).get("lens")
+    coefficients = {n: v for n, v in (vars(lens) if lens else {}).items() if v}
+    film = {
+        "type": "hdrfilm", "width": case.width, "height": case.height, "pixel_format": "rgb",
+        "component_format": "float32", "rfilter": {"type": "box"},
+    }  # fmt: skip
+    K = case.K
+    sensor = {
+        "type": "calibrated", "lens": case.lens.kind, **coefficients, "near_clip": 0.25,
+        "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "film": film,
+        "to_world": mi.ScalarTransform4f(to_world),
+        "sampler": {"type": "independent", "sample_count": 1},
+    }  # fmt: skip
+    if sensors > 1:
+        film = {**film, "width": sensors * case.width}
+        parts = {f"sensor{k}": sensor for k in range(sensors)}
+        sensor = {"type": "batch", "film": film, "sampler": sensor["sampler"], **parts}
+    integrator = {
+        "type": "splats", "srgb_primitives": False, "sh_degree": case.degree,
+        **case.approximations, **tensors(reference.Gaussians(**case.values)),
+    }  # fmt: skip
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+
+
+def color_weights(case) -> np.ndarray:
+    """Weights (5, H * W) of a loss of the colours alone."""
+    weights = single(np.random.default_rng(4).normal(size=(5, case.width * case.height)))
+    return weights * np.array([[0], [1], [1], [1], [0]])
+
+
+@pytest.mark.parametrize("case", some(CALIBRATED))
+def test_mitsuba_gives_the_same_bytes(case):
+    scene, shape = mitsuba_scene(case), (case.height, case.width, 3)
+    params = mi.traverse(scene)
+    for name in PARAMETER_NAMES:
+        dr.enable_grad(params[f"integrator.{name}"])
+    image, weights = mi.render(scene, params), color_weights(case)
+    weighted = image * mi.TensorXf(np.reshape(weights[1:4].T, shape))
+    dr.backward(dr.sum(weighted, axis=None))
+    planes = case.planes(case.values, llvm.Float)
+    np.testing.assert_array_equal(np.array(image), np.reshape(planes[1:4].T, shape))
+    for name, expected in case.gradients(case.values, weights, llvm.Float).items():
+        found = np.array(dr.grad(params[f"integrator.{name}"]))
+        np.testing.assert_array_equal(found, expected, name)
+
+
+@pytest.mark.parametrize("case", some(CALIBRATED))
+def test_batch_gives_the_same_bytes(case):
+    alone, both = (np.array(mi.render(mitsuba_scene(case, count))) for count in (1, 2))
+    np.testing.assert_array_equal(both, np.concatenate([alone, alone], axis=1))
+
+
+@pytest.mark.parametrize("case", some(PINHOLES))
+def test_rasterization_gives_the_same_image(case):
+    """Equal to rounding: the centre of the camera and the parameters are computed from others."""
+    rotation, center = case.pose
+    viewmat = np.eye(4)
+    viewmat[:3] = np.column_stack([rotation, -rotation @ center])
+    values, options = case.values, dict(case.approximations)
+    mode = "antialiased" if options.pop("antialiased", False) else "classic"
+    low_pass = {"eps2d": options.pop("low_pass")} if "low_pass" in options else {}
+    image, alpha, _ = drgs.rasterization(
+        values["means"], values["quats"], np.exp(values["log_scales"]),
+        1 / (1 + np.exp(-values["logit_opacities"])),
+        np.concatenate([values["sh0"], values["shN"]], axis=1), viewmat[None], case.K[None],
+        case.width, case.height, near_plane=0.25, sh_degree=case.degree, render_mode="RGB+D",
+        rasterize_mode=mode, **low_pass, **options,
+    )  # fmt: skip
+    planes, kept = case.planes(values), ~case.near_threshold
+    found = np.concatenate([1 - alpha[0], image[0]], axis=-1).reshape(-1, 5).T
+    np.testing.assert_allclose(found[:, kept], planes[:, kept], atol=1e-11 * np.abs(planes).max())
+
+
+# ----------------------------------------------------------------------------------------------
+# Kernels: no trace of what a case does not use
+# ----------------------------------------------------------------------------------------------
+
+REPLACED_KERNELS = {
+    **{"no effect": 0, "antialiased": 2, "smoothing": 2, "unscented": 3, "wide low-pass": 2},
+    **{"other cuts": 6, "rolling shutter": 6, "thin lens": 8, "exact": 11, "pixel colours": 12},
+    "motion blur": 3,
+}
+"""Kernels of an image and its gradients, of some 38, that are not those of a plain case: for most,
+projection and its adjoint; and what reads the cuts, the time, the ray or the colour of a pixel."""
+
+
+def kernels_of(case) -> set[int]:
+    """Hashes of the kernels of an image and its gradients."""
+    weights, values = np.ones((5, case.width * case.height)), case.values
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        case.gradients(values, weights, llvm.Float)
+        return {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+
+
+WITH_PINHOLE = {case.name.removesuffix(", pinhole"): case for case in CASES}
+
+
+@pytest.mark.parametrize("effect", REPLACED_KERNELS)
+def test_effects_leave_other_kernels_as_they_are(effect):
+    plain, kernels = (kernels_of(WITH_PINHOLE[name]) for name in ("no effect", effect))
+    assert len(plain) > 25
+    assert len(plain - kernels) <= REPLACED_KERNELS[effect]
+
+
+def nudged(value):
+    """The value with its numbers changed by a millionth: as many splats, tiles and pairs."""
+    if isinstance(value, float):
+        return value * (1 + 1e-6)
+    if isinstance(value, tuple):
+        return tuple(map(nudged, value))
+    if is_dataclass(value):
+        return replace(value, **{f.name: nudged(getattr(value, f.name)) for f in fields(value)})
+    return value
+
+
+@pytest.mark.parametrize("case", some(CASES))
+def test_kernels_do_not_depend_on_numbers(case):
+    """Another view, lens or filter compiles nothing."""
+    numbers = {name: nudged(getattr(case, name)) for name in ("lens", "aperture", "smoothing")}
+    other = replace(case, focal=nudged(case.focal), **numbers)
+    assert kernels_of(other) == kernels_of(case)
 
 
 # ----------------------------------------------------------------------------------------------
 # Broken kernels
 # ----------------------------------------------------------------------------------------------
 
-factor_conic, short = projection.factor_conic, footprint.exp2_short
+factor_conic, short, compensated = (
+    projection.factor_conic, footprint.exp2_short, projection.compensated_opacity
+)  # fmt: skip
 derivatives, tangent = GaussianFalloff.derivatives, GaussianFalloff.tangent
 moments, runs = GaussianFalloff.moments, itertools.count()
+numbers, variance, cameras = Camera.numbers, Aperture.variance, MotionBlur.cameras
+seen_at, camera_of = Fisheye.project_point, RollingShutter.camera_of
 
 BROKEN = {
-    image_equals_reference: (
-        *(projection, "factor_conic"),
-        lambda mean, x, y, low: factor_conic(mean, x, y, 0 * low),  # no low-pass
+    "no low-pass": (
+        *("no effect, pinhole", image_equals_reference, projection, "factor_conic"),
+        lambda mean, x, y, low: factor_conic(mean, x, y, 0 * low),
     ),
-    gradients_equal_differences: (
-        *(GaussianFalloff, "derivatives"),
+    "a derivative of 1.01": (
+        *("no effect, pinhole", gradients_equal_differences, GaussianFalloff, "derivatives"),
         lambda *a: [1.01 * d for d in derivatives(*a)],
     ),
-    adjoint_is_transpose: (
-        *(GaussianFalloff, "tangent"),
+    "derivatives of the camera in another order": (
+        *("no effect, pinhole", camera_gradients_equal_differences, Camera, "numbers"),
+        lambda camera: numbers(camera)[::-1],
+    ),
+    "a tangent of 1.01": (
+        *("no effect, pinhole", adjoint_is_transpose, GaussianFalloff, "tangent"),
         lambda *a: [1.01 * d for d in tangent(*a)],
     ),
-    bytes_are_reproducible: (
-        *(GaussianFalloff, "moments"),
+    "sums that change from run to run": (
+        *("no effect, pinhole", bytes_are_reproducible, GaussianFalloff, "moments"),
         lambda *a: [m * (1 + 1e-6 * next(runs)) for m in moments(*a)],
     ),
-    single_precision_is_accurate: (
-        *(footprint, "exp2_short"),
+    "an exponential that is too short": (
+        *("no effect, pinhole", single_precision_is_accurate, footprint, "exp2_short"),
         lambda x: 1.001 * short(x),
     ),
+    # Features
+    "an aperture one percent too large": (
+        *("thin lens, pinhole", image_equals_reference, Aperture, "variance"),
+        lambda *a: 1.02 * variance(*a),
+    ),
+    "a coefficient of the fisheye left out": (
+        *("no effect, fisheye", image_equals_reference, Fisheye, "project_point"),
+        lambda lens, *a: seen_at(replace(lens, radial_terms=lens.radial_terms[:-1]), *a),
+    ),
+    "motion blur with one time": (
+        *("motion blur, pinhole", image_equals_reference, MotionBlur, "cameras"),
+        lambda *a: cameras(*a)[:1],
+    ),
+    "a rolling shutter whose turn has no derivative": (
+        *(
+            "rolling shutter, pinhole",
+            camera_gradients_equal_differences,
+            RollingShutter,
+            "camera_of",
+        ),
+        lambda shutter, *a: camera_of(replace(shutter, turn=dr.detach(shutter.turn)), *a),
+    ),
+    "antialiasing without its derivative": (
+        *("antialiased, pinhole", gradients_equal_differences, pipeline, "compensated_opacity"),
+        lambda opacity, *a: opacity * dr.detach(compensated(opacity, *a) / opacity),
+    ),
 }
-"""For each law, a kernel that breaks it."""
+"""Mistakes in kernels and features by name: the case and the law that find them, what is replaced,
+and by what."""
 
 
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
-def test_broken_kernel_violates_the_law(law, monkeypatch):
-    monkeypatch.setattr(*BROKEN[law])
-    with pytest.raises(AssertionError, match="broken"):
-        law(Case("broken", reference=by_effects))
+@pytest.mark.parametrize("name", BROKEN)
+def test_mistake_violates_its_law(name, monkeypatch):
+    case_name, law, *replacement = BROKEN[name]
+    case = next(case for case in CASES if case.name == case_name)
+    monkeypatch.setattr(*replacement)
+    with pytest.raises(AssertionError, match=case_name):
+        law(replace(case, name=case_name))  # without the results of the case before
+
+
+def test_mistakes_violate_all_laws():
+    assert {law for _, law, *_ in BROKEN.values()} == set(LAWS)

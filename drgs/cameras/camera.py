@@ -6,6 +6,7 @@ sensor's transform is never read back to the host.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, ClassVar, Protocol
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from drgs.cameras.lens import PINHOLE, CameraParameters, Lens
 from drgs.core.arrays import types_of
-from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar, UInt32
+from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
 
 MAX_RAY_ERROR_PX = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
@@ -164,7 +165,13 @@ class Camera(CameraParameters):
 
     def numbers(self) -> list[Float]:
         """Return pose, focal lengths, principal point and lens as Float, in a fixed order."""
-        return [n for name in _DIFFERENTIABLE for n in _numbers_of(getattr(self, name))]
+        found: list[Float] = []
+        self.map_numbers(lambda number: found.append(number) or number)
+        return found
+
+    def map_numbers(self, function: Callable[[Float], Float]) -> Camera:
+        """Return the camera with ``function`` applied to each of its :meth:`numbers`, in order."""
+        return replace(self, **{n: _map(getattr(self, n), function) for n in _DIFFERENTIABLE})
 
     def by_lane(self, width: int) -> Camera:
         """Return the camera with these numbers stored for each of ``width`` lanes.
@@ -172,9 +179,7 @@ class Camera(CameraParameters):
         The derivatives of all lanes are then separate, and can be summed in a fixed order.
         """
         lanes = dr.zeros(types_of(type(self.near)).UInt32, width)
-        return replace(
-            self, **{name: _gather_lanes(getattr(self, name), lanes) for name in _DIFFERENTIABLE}
-        )
+        return self.map_numbers(lambda number: dr.gather(type(number), number, lanes))
 
     def with_lens(self, lens: Lens) -> Camera:
         """Return the same camera with another lens."""
@@ -191,22 +196,18 @@ def _disc(count: int) -> np.ndarray:
 _DIFFERENTIABLE = ("rotation", "center", "focal", "principal", "lens", "aperture", "shutter")
 
 
-def _numbers_of(value: Any) -> list[Float]:
-    if is_dataclass(value):
-        return [n for f in fields(value) for n in _numbers_of(getattr(value, f.name))]
-    if dr.is_array_v(value) and dr.depth_v(value) == 1:
-        return [value]
-    is_sequence = isinstance(value, tuple) or dr.is_array_v(value)
-    return [n for item in value for n in _numbers_of(item)] if is_sequence else []
-
-
-def _gather_lanes(value: object, lanes: UInt32) -> object:
+def _map(value: Any, function: Callable[[Float], Float]) -> Any:
+    """Apply ``function`` to the floating point numbers of fields, tuples, vectors and matrices."""
     if is_dataclass(value) and not isinstance(value, type):
-        changes = {f.name: _gather_lanes(getattr(value, f.name), lanes) for f in fields(value)}
+        changes = {f.name: _map(getattr(value, f.name), function) for f in fields(value)}
         return replace(value, **changes)
     if isinstance(value, tuple):
-        return tuple(_gather_lanes(item, lanes) for item in value)
-    return dr.gather(type(value), value, lanes) if dr.is_array_v(value) else value
+        return tuple(_map(item, function) for item in value)
+    if not dr.is_array_v(value):
+        return value
+    if dr.depth_v(value) == 1:
+        return function(value)
+    return type(value)([_map(item, function) for item in value])
 
 
 def cameras_in_time(camera: Camera) -> list[Camera]:

@@ -1,0 +1,296 @@
+"""The cases on which the laws of rendering are checked, and their references.
+
+A new scene, lens, effect or approximation is one line of a table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drgs.cameras.motion import MotionBlur, RollingShutter
+from drgs.core.arrays import types_of
+from drgs.reference import effects, rays
+from drgs.reference import splatting as reference
+from drgs.testing import Case, Values, single
+from support.helpers import NEAR_THRESHOLD
+from support.lens_scenes import LENSES, kernel_lens
+
+MOTION_SAMPLES = 3
+PINHOLE = effects.Pinhole()
+
+
+# ----------------------------------------------------------------------------------------------
+# References
+# ----------------------------------------------------------------------------------------------
+
+
+def reference_camera(case) -> reference.Camera:
+    (rotation, center), K = case.pose, case.K
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    return reference.Camera(rotation, center, fx, fy, cx, cy, case.width, case.height, 0.25)
+
+
+def planes_of(rendered) -> tuple[np.ndarray, np.ndarray]:
+    images = [rendered.transmittance, *np.moveaxis(rendered.image, -1, 0), rendered.depth]
+    return np.reshape(images, (5, -1)), rendered.near_threshold.ravel()
+
+
+def by_rays(case, values):
+    """Approximations of a pinhole's image; the depth of other orders is the peaks'."""
+    given = {k: v for k, v in case.approximations.items() if k in MODEL_FIELDS}
+    model = rays.ImageModel(**given, sh_degree=case.degree)
+    image = partial(rays.render, camera=reference_camera(case), model=model)
+    planes, marked = planes_of(image(reference.Gaussians(**values), threshold_width=NEAR_THRESHOLD))
+    return planes if model.order == "center" else planes[:4], marked
+
+
+MODEL_FIELDS = set(rays.ImageModel.__dataclass_fields__)
+
+
+def by_effects(case, values, lens=PINHOLE):
+    """Lenses, with an aperture and a smoothing filter."""
+    if case.smoothing is not None:
+        rates = np.full(case.count, np.sqrt(effects.SMOOTHING_VARIANCE) / case.smoothing)
+        given = values["log_scales"], values["logit_opacities"], rates
+        scales, opacities = effects.smoothing_filter(*given)
+        logits = np.log(opacities / (1 - opacities))
+        values = {**values, "log_scales": np.log(scales), "logit_opacities": logits}
+    defocus = case.aperture and effects.ThinLens(*case.aperture)
+    antialiased = case.approximations.get("antialiased", False)
+    return planes_of(
+        effects.render(
+            reference.Gaussians(**values), reference_camera(case), lens, np.zeros(3), antialiased,
+            defocus, case.degree, NEAR_THRESHOLD,
+        )
+    )  # fmt: skip
+
+
+TRAVEL, TURN = np.array([0.125, -0.0625, 0.03125]), np.array([0.03125, 0.0625, -0.09375])
+
+
+def close_camera(case) -> reference.Camera:
+    """The camera when the shutter closes: moved by TRAVEL (world), turned by TURN (camera axes)."""
+    camera = reference_camera(case)
+    angle = np.linalg.norm(TURN)
+    quat = np.array([[np.cos(angle / 2), *(np.sin(angle / 2) * TURN / angle)]])
+    rotation = reference.quat_to_rotation(quat)[0] @ camera.rotation
+    return replace(camera, rotation=rotation, center=camera.center + TRAVEL)
+
+
+def shutter(kind, *arguments):
+    """Make the shutter of a camera."""
+
+    def make(camera):
+        Array3f = types_of(type(camera.near)).Array3f
+        return kind(Array3f(*map(float, TRAVEL)), Array3f(*map(float, TURN)), *arguments)
+
+    return make
+
+
+def by_motion(case, values, lens=PINHOLE):
+    cameras = reference_camera(case), close_camera(case)
+    gaussians = reference.Gaussians(**values)
+    return planes_of(
+        effects.render_motion_blur(
+            gaussians, *cameras, MOTION_SAMPLES, np.zeros(3), lens, NEAR_THRESHOLD
+        )
+    )
+
+
+# ----------------------------------------------------------------------------------------------
+# Scenes
+# ----------------------------------------------------------------------------------------------
+
+
+def gaussians_at(case, rng, film, z, sizes, logits, degree=None) -> Values:
+    """Gaussians at places (N, 2) px of a pinhole's film and depths z (N,), of sizes (N, 3) px."""
+    slopes = (film - case.K[:2, 2]) / case.focal
+    rotation, center = case.pose
+    n, degree = len(z), case.degree if degree is None else degree
+    return {
+        "means": single(np.column_stack([slopes * z[:, None], z]) @ rotation + center),
+        "quats": single(rng.normal(size=(n, 4)) * rng.uniform(0.2, 5.0, (n, 1))),
+        "log_scales": single(np.log(sizes * np.abs(z)[:, None] / case.focal)),
+        "logit_opacities": single(logits),
+        "sh0": single(rng.normal(size=(n, 1, 3))),
+        "shN": single(rng.normal(0, 0.3, (n, (degree + 1) ** 2 - 1, 3))),
+    }
+
+
+def edges(case, degree=None) -> Values:
+    """Splats on and around the film, and eight that are hard.
+
+    These are behind the camera; nearer than the near plane; too transparent; four beyond each side
+    of the film, where the slope of the Jacobian is clamped; and a fresh Gaussian, with a logit and
+    colours of zero, unrotated and round.
+    """
+    rng, size = np.random.default_rng(case.seed), np.array([case.width, case.height])
+    film = rng.uniform(-0.15, 1.15, (case.count, 2)) * size
+    z, logits = rng.uniform(1.0, 4.0, case.count), rng.normal(0.5, 1.7, case.count)
+    sizes = np.minimum(rng.lognormal(0.4, 0.9, (case.count, 3)), 0.2 * max(size) + 1)
+    z[:2] = [-1.0, 0.1]
+    film[3:7] = size * np.array([[-0.6, 0.5], [1.6, 0.4], [0.3, -0.6], [0.6, 1.6]])
+    film[7], sizes[3:7], sizes[7] = 0.4 * size, 0.3 * max(size), 2.0
+    logits[2:8] = -6, 2, 2, 2, 2, 0
+    values = gaussians_at(case, rng, film, z, sizes, logits, degree)
+    values["quats"][7], values["sh0"][7] = [1, 0, 0, 0], 0
+    return values
+
+
+def stacked(case) -> Values:
+    """Large, mostly opaque splats behind each other: pixels stop, and alphas are clamped."""
+    rng, size = np.random.default_rng(case.seed), np.array([case.width, case.height])
+    film, z = rng.uniform(0.2, 0.8, (case.count, 2)) * size, rng.uniform(1.0, 4.0, case.count)
+    sizes, logits = rng.uniform(0.15, 0.5, (case.count, 3)), rng.uniform(0.0, 4.0, case.count)
+    logits[::4] = 7.0
+    return gaussians_at(case, rng, film, z, sizes * max(size), logits)
+
+
+def mixed(case) -> Values:
+    """Every other one of the stacked splats is a few pixels small."""
+    values = stacked(case)
+    smaller = np.log(4) * (np.arange(case.count) % 2)
+    return {**values, "log_scales": single(values["log_scales"] - smaller[:, None])}
+
+
+def close(case) -> Values:
+    """Large splats that begin near the camera: the affine approximation is bad at them."""
+    values, rng, (rotation, center) = stacked(case), np.random.default_rng(case.seed), case.pose
+    points = (values["means"] - center) @ rotation.T
+    points[:, :2] *= rng.uniform(0.3, 2.0, (case.count, 1))
+    points *= rng.uniform(0.25, 1.0, (case.count, 1))
+    return {
+        **values,
+        "means": single(points @ rotation + center),
+        "log_scales": single(values["log_scales"] - rng.uniform(0.3, 2.0, (case.count, 3))),
+        "logit_opacities": single(rng.normal(0.5, 1.2, case.count)),
+    }
+
+
+def needles(case) -> Values:
+    """Needles that reach past the camera: rays meet their peaks before and behind it."""
+    values, rng, (rotation, center) = close(case), np.random.default_rng(case.seed), case.pose
+    tilt = Rotation.from_rotvec(rng.normal(0, 0.4, (case.count, 3)))
+    quats = (Rotation.from_matrix(rotation.T) * tilt).as_quat(scalar_first=True)
+    depths = (values["means"] - center) @ rotation[2]
+    scales = rng.uniform([0.1, 0.1, 0.5], [0.3, 0.3, 1.5], (case.count, 3)) * depths[:, None]
+    return {**values, "quats": single(quats), "log_scales": single(np.log(scales))}
+
+
+# ----------------------------------------------------------------------------------------------
+# The matrix
+# ----------------------------------------------------------------------------------------------
+
+ALL_LENSES = {"pinhole": PINHOLE, **LENSES}
+
+# px: films of fisheyes reach beyond 90 degrees from the axis; that of parallel rays is 3 units.
+FOCAL = {effects.Fisheye: 10.0, effects.ThinPrismFisheye: 10.0, effects.Orthographic: 12.0}
+
+
+def with_lens(name, effect, reference_of, **options) -> Case:
+    """A case with a lens of the reference and of the kernels."""
+    lens = ALL_LENSES[name]
+    if name != "pinhole":
+        options["lens"] = kernel_lens(lens)
+    options.setdefault("focal", FOCAL.get(type(lens), 26.0))
+    found = reference_of and partial(reference_of, lens=lens)
+    return Case(f"{effect}, {name}", reference=found, **options)
+
+
+EFFECTS = {
+    "no effect": (by_effects, {}),
+    "antialiased": (by_effects, {"approximations": {"antialiased": True}}),
+    "thin lens": (by_effects, {"aperture": (0.0625, 2.0)}),
+    "smoothing": (by_effects, {"smoothing": 0.0625}),
+    "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
+    "rolling shutter": (None, {"shutter": shutter(RollingShutter)}),
+}
+
+NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
+HOLES = {
+    ("thin lens", "orthographic"): "parallel rays meet in no aperture",
+    **{("thin lens", name): NO_SENSOR for name in ("plain fisheye", "fisheye", "thin prism")},
+}
+"""Cells of the matrix without a case, and the reason."""
+
+APPROXIMATIONS = {
+    "exact": {"projection": "exact"},
+    "unscented": {"projection": "unscented"},
+    "pixel order": {"order": "pixel", "order_window": 8},
+    "unscented, pixel order": {"projection": "unscented", "order": "pixel", "order_window": 8},
+    "exact, pixel order": {"projection": "exact", "order": "pixel", "order_window": 8},
+    "pixel colours": {"sh_direction": "pixel"},
+    "all three": {
+        "projection": "exact", "order": "pixel", "order_window": 8, "sh_direction": "pixel"
+    },
+    "all three, other cuts": {
+        "projection": "exact", "order": "pixel", "order_window": 8, "sh_direction": "pixel",
+        "alpha_max": 0.7, "alpha_cut": 0.03, "transmittance_stop": 0.05
+    },
+    "no cuts": {"alpha_cut": 0.0, "transmittance_stop": 0.0},
+    "exact, no cuts": {"projection": "exact", "alpha_cut": 0.0, "transmittance_stop": 0.0},
+    "other cuts": {"alpha_max": 0.7, "alpha_cut": 0.03, "transmittance_stop": 0.05},
+    "3 sigma": {"extent": 3.0},
+    "exact, 2 sigma": {"projection": "exact", "extent": 2.0},
+    "wide low-pass": {"low_pass": 2.0},
+    "no low-pass": {"low_pass": 0.0},
+    "exact, no low-pass": {"projection": "exact", "low_pass": 0.0},
+    "exact, antialiased": {"projection": "exact", "antialiased": True},
+    "unscented, antialiased": {"projection": "unscented", "antialiased": True},
+}  # fmt: skip
+
+SCENES = {
+    "edges": Case("", scene=edges, degree=3, seed=1),
+    "one pixel": Case("", scene=edges, width=1, height=1, count=12),
+    "5 x 3": Case("", scene=edges, width=5, height=3, focal=5.0, count=25, degree=0),
+    "whole tiles": Case("", scene=edges, width=64, height=48, focal=60.0, count=80, degree=2),
+    "many": Case("", scene=edges, width=40, height=40, count=300, degree=0),
+    "one splat": Case("", width=20, height=20, count=1, degree=0),
+    "degree 1 of 3": Case("", scene=partial(edges, degree=3), width=70, height=18, focal=60.0),
+    "stacked": Case("", scene=stacked, degree=2),
+    "close": Case("", scene=close, width=40, height=23, focal=20.0, count=20),
+    "needles": Case("", scene=needles, width=40, height=23, focal=20.0, count=8),
+}
+"""Scenes by name, with the size of film and the numbers of Gaussians that they have."""
+
+OF_SCENES = {
+    "default": (by_effects, {}),
+    "antialiased": (by_effects, {"antialiased": True}),
+    **{
+        name: (by_rays, APPROXIMATIONS[name])
+        for name in ("exact", "pixel order", "all three, other cuts")
+    },
+}
+"""Approximations that render all scenes, and their references."""
+
+WINDOW = "a pixel's window is shorter than the list of splats that are out of order there"
+SCENE_HOLES = {
+    (order, scene): WINDOW
+    for order in ("pixel order", "all three, other cuts")
+    for scene in ("many", "stacked", "close")
+    if (order, scene) != ("all three, other cuts", "close")
+}
+"""Scenes without a case for some approximation, and the reason."""
+
+CASES = [
+    *(
+        with_lens(lens, effect, reference_of, **options)
+        for effect, (reference_of, options) in EFFECTS.items()
+        for lens in ALL_LENSES
+        if (effect, lens) not in HOLES
+    ),
+    *(
+        Case(f"{name}, pinhole", approximations=options, reference=by_rays)
+        for name, options in APPROXIMATIONS.items()
+    ),
+    *(
+        replace(case, name=f"{effect}, {name}", approximations=options, reference=reference_of)
+        for name, case in SCENES.items()
+        for effect, (reference_of, options) in OF_SCENES.items()
+        if (effect, name) not in SCENE_HOLES
+    ),
+]
