@@ -10,50 +10,50 @@ from drgs.core.errors import UserError
 from drgs.datasets.images import read_depth
 
 
-def header(shape, kind="<f8"):
+def header(shape):
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        stream, {"descr": kind, "fortran_order": False, "shape": shape}
-    )
+    description = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(stream, description)
     return stream.getvalue()
 
 
-def write_several_arrays(path):
-    with path.open("wb") as file:
-        np.savez(file, a=np.ones(3))
+def archive():
+    stream = io.BytesIO()
+    np.savez(stream, a=np.ones(3))
+    return stream.getvalue()
 
+
+UNREADABLE, NO_NUMBERS = "cannot read the depth: ", "depth must be (height, width) real numbers"
 
 INVALID_DEPTHS = {
-    "of 8 TB": (lambda p: p.write_bytes(header((10**6, 10**6))), "cannot read the depth"),
-    "of more than there is": (lambda p: p.write_bytes(header((2**40, 2**40))), "cannot read the"),
-    "cut off": (lambda p: p.write_bytes(header((4, 6)) + bytes(80)), "cannot read the depth"),
-    "of another size": (lambda p: np.save(p, np.ones((6, 4))), "must be 6 x 4 px"),
-    "of text": (lambda p: np.save(p, np.full((4, 6), "x")), "depth must be (height, width)"),
-    "complex": (
-        lambda p: np.save(p, np.ones((4, 6), complex)),
-        "depth must be (height, width)",
-    ),
-    "of records": (
-        lambda p: np.save(p, np.ones((4, 6), [("a", "f4")])),
-        "depth must be (height, width)",
-    ),
-    "of objects": (lambda p: np.save(p, np.full((4, 6), None)), "cannot read the depth"),
-    "of several arrays": (
-        write_several_arrays,
-        "depth must be (height, width)",
-    ),
-    "no numbers": (lambda p: p.write_bytes(b"hello"), "cannot read the depth"),
-    "empty": (lambda p: p.write_bytes(b""), "cannot read the depth"),
-    "a pipe": (os.mkfifo, "cannot read the depth: must be a regular file, got a named pipe"),
+    "of 8 TB": (header((10**6, 10**6)), UNREADABLE),
+    "of more than there is": (header((2**40, 2**40)), UNREADABLE),
+    "cut off": (header((4, 6)) + bytes(80), UNREADABLE),
+    "no numbers": (b"hello", UNREADABLE),
+    "empty": (b"", UNREADABLE),
+    "of objects": (np.full((4, 6), None), UNREADABLE),
+    "of several arrays": (archive(), NO_NUMBERS),
+    "of text": (np.full((4, 6), "x"), NO_NUMBERS),
+    "complex": (np.ones((4, 6), complex), NO_NUMBERS),
+    "of records": (np.ones((4, 6), [("a", "f4")]), NO_NUMBERS),
+    "of colours": (np.ones((4, 6, 3)), NO_NUMBERS),
+    "of another size": (np.ones((6, 4)), "must be 6 x 4 px"),
+    "a pipe": (None, f"{UNREADABLE}must be a regular file, got a named pipe"),
 }
 
 
-@pytest.mark.parametrize(("make", "message"), INVALID_DEPTHS.values(), ids=INVALID_DEPTHS)
-def test_invalid_depth_file_is_refused_in_one_line(tmp_path, make, message):
-    make(tmp_path / "a.npy")
+@pytest.mark.parametrize(("content", "message"), INVALID_DEPTHS.values(), ids=INVALID_DEPTHS)
+def test_invalid_depth_file_is_refused_in_one_line(tmp_path, content, message):
+    path = tmp_path / "a.npy"
+    if content is None:
+        os.mkfifo(path)
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content)
     with pytest.raises(UserError) as error:
-        read_depth(tmp_path / "a.npy", 1.0, (6, 4))
-    assert f"{tmp_path}/a.npy: {message}" in str(error.value)
+        read_depth(path, 1.0, (6, 4))
+    assert f"{path}: {message}" in str(error.value)
     assert "\n" not in str(error.value)
 
 

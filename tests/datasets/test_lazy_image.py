@@ -48,9 +48,7 @@ def test_photograph_is_stored_as_bytes(channels, dtype):
         assert np.asarray(alpha).tobytes() == expected.astype(np.float32).tobytes()
 
 
-@pytest.mark.parametrize(
-    ("width", "kept"), [(16, "bytes"), (8, "bytes"), (10, "rounded"), (5, "numbers")]
-)
+@pytest.mark.parametrize(("width", "kept"), [(8, "bytes"), (10, "rounded"), (5, "numbers")])
 def test_downscaled_photograph_is_stored_in_the_smaller_form(width, kept):
     """Numbers of half the width take as much as bytes, those of a third less.
 
@@ -58,17 +56,15 @@ def test_downscaled_photograph_is_stored_in_the_smaller_form(width, kept):
     """
     pixels = RNG.integers(0, 255, (12, 16, 4), np.uint8)
     image, alpha = compact_photograph(pixels, GREY, width)
-    of_all = [(image.nbytes, image), (alpha.nbytes, alpha)]
-    assert sum(count for count, _ in of_all) <= pixels.nbytes
-    assert all(isinstance(p, LazyImage) == (kept != "numbers") for _, p in of_all)
+    assert image.nbytes + alpha.nbytes <= pixels.nbytes
+    assert all(isinstance(each, LazyImage) == (kept != "numbers") for each in (image, alpha))
+    assert image.shape == np.asarray(image).shape and image.shape[1] == width
+    exact = downscale(numbers_of(pixels), width)
     if kept == "rounded":
         assert (image.nbytes, alpha.nbytes) == (2 * 10 * 8 * 3, 2 * 10 * 8)
-        exact = downscale(numbers_of(pixels), width)
         assert 0 < np.abs(np.asarray(image) - exact).max() <= 0.51 / 65535
-    assert image.shape == np.asarray(image).shape and image.shape[1] == width
-    if width == 8:
-        blocks = numbers_of(pixels).reshape(6, 2, 8, 2, 3).mean(axis=(1, 3))
-        np.testing.assert_allclose(image, blocks, atol=2e-7)
+    else:
+        np.testing.assert_allclose(image, exact, atol=2e-7)
 
 
 def test_mask_is_stored_in_one_byte_per_pixel():
@@ -76,6 +72,53 @@ def test_mask_is_stored_in_one_byte_per_pixel():
     kept = compact_mask(mask)
     assert (kept.nbytes, kept.shape) == (35, (5, 7))
     assert np.asarray(kept).tobytes() == mask.tobytes()
+
+
+@pytest.mark.parametrize("shape", [(6, 8), (7, 9), (5, 11), (3, 2)])
+def test_downscaling_averages_over_each_pixels_area(shape):
+    image = np.random.default_rng(1).random((*shape, 3)).astype(np.float32)
+    actual = downscale(image, 4)
+    height, width = actual.shape[:2]
+    assert (height, width) == (round(shape[0] * 4 / shape[1]), 4) if shape[1] > 4 else shape
+    # Each source pixel repeated until old and new pixel edges coincide, then plain means.
+    repeated = image.astype(np.float64).repeat(height, axis=0).repeat(width, axis=1)
+    blocks = repeated.reshape(height, shape[0], width, shape[1], 3)
+    np.testing.assert_allclose(actual, blocks.mean(axis=(1, 3)), rtol=1e-6)
+
+
+def test_scaling_a_composite_equals_compositing_scaled_premultiplied_colours(blender):
+    folder, images_of_views = blender
+    actual = load(folder, image_size=3, background=(0.25, 0.5, 0.75)).train[0].image
+    pixels = images_of_views["train", 0].astype(np.float64) / 255
+    pixels[..., :3] *= pixels[..., 3:]
+    small = pixels.reshape(2, 2, 3, 2, 4).mean(axis=(1, 3))
+    expected = small[..., :3] + np.array([0.25, 0.5, 0.75]) * (1 - small[..., 3:])
+    np.testing.assert_allclose(actual, expected, atol=5e-7)
+
+
+def test_image_size_scales_images_and_intrinsics_together(photographs):
+    full, half = load(photographs), load(photographs, image_size=4)
+    a, b = full.train[0], half.train[0]
+    assert (b.width, b.height, b.image.shape) == (4, 3, (3, 4, 3))
+    np.testing.assert_allclose(b.K[:2], a.K[:2] / 2)
+    assert "4x3" in half.description
+    assert load(photographs, image_size=100).train[0].width == 8  # never enlarged
+
+
+@pytest.mark.parametrize(
+    "pixels",
+    [
+        np.full((6, 8), 51, np.uint8),
+        np.full((6, 8), 13107, np.uint16),
+        np.full((6, 8, 2), (51, 255), np.uint8),
+    ],
+    ids=["grey", "grey16", "grey-alpha"],
+)
+def test_grey_images_become_rgb(photographs, pixels):
+    iio.imwrite(photographs / "images" / "01.png", pixels)
+    image = load(photographs).train[0].image
+    assert image.shape == (6, 8, 3)
+    np.testing.assert_allclose(image, 0.2, rtol=1e-6)
 
 
 def test_dataset_uses_the_memory_of_its_uncompressed_files(photographs):
@@ -97,27 +140,22 @@ def test_smaller_views_take_no_memory():
     np.testing.assert_allclose(smaller.image, blocks, atol=2e-7)
 
 
-def test_a_lazy_image_refuses_conversion_without_a_copy():
-    image, _ = compact_photograph(np.zeros((2, 2, 3), np.uint8), GREY, None)
-    assert np.asarray(image, np.float64).dtype == np.float64
-    with pytest.raises(ValueError, match="only by a copy"):
-        image.__array__(copy=False)
-
-
 def test_lazy_image_supports_array_operations():
     pixels = RNG.integers(0, 255, (4, 6, 3), np.uint8)
     image, _ = compact_photograph(pixels, GREY, None)
     numbers = numbers_of(pixels)
     assert image.dtype == np.float32 and len(image) == 4
-    np.testing.assert_array_equal(image[None], numbers[None])
-    np.testing.assert_array_equal(image[1, ..., 2], numbers[1, ..., 2])
+    assert np.asarray(image, np.float64).dtype == np.float64
     for found, expected in (
+        (image[None], numbers[None]),
+        (image[1, ..., 2], numbers[1, ..., 2]),
         (numbers - image, 0 * numbers),
-        (np.square(image), np.square(numbers)),
         (np.clip(image, 0.2, 0.3), np.clip(numbers, 0.2, 0.3)),
     ):
         assert isinstance(found, np.ndarray) and found.dtype == expected.dtype
         np.testing.assert_array_equal(found, expected)
+    with pytest.raises(ValueError, match="only by a copy"):
+        image.__array__(copy=False)
 
 
 def test_photographs_larger_than_memory_are_refused_before_reading(photographs, monkeypatch):
