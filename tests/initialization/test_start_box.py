@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.datasets import dataset_of, load, load_noting, view_at
+from PIL import Image
+from support.datasets import dataset_of, edit, load, load_noting, put, view_at
 from support.photographs import write_points
 
 from drgs.config.schema import FitConfig, InitConfig
@@ -21,27 +22,27 @@ def config(**sections):
     return FitConfig(data={"path": "unused"}, **sections)
 
 
-def views_from(centers, target=(0, 0, 0), scale=1.0):
+def views_from(target=(0, 0, 0), scale=1.0):
     """Cameras that look at ``target``, all of it scaled."""
     target = np.array(target, float)
-    return [view_at(scale * (target + c), scale * target) for c in np.array(centers, float)]
+    return [view_at(scale * (target + c), scale * target) for c in np.array(REFERENCE_CENTERS)]
 
 
-def refusal(views, **init):
-    with pytest.raises(UserError) as error:
-        initial_gaussians(config(init={"num_points": 20, **init}), dataset_of(views))
-    return str(error.value)
+@pytest.fixture
+def cloud(tmp_path):
+    positions = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    write_points(tmp_path / "cloud.ply", positions, np.full((50, 3), 200, np.uint8))
+    return tmp_path / "cloud.ply"
 
 
-# The layout's own box
 def test_reference_box_is_used_for_cameras_of_the_reference_layout():
-    box = start_box_of(InitConfig(), dataset_of(views_from(REFERENCE_CENTERS), 1.3))
+    box = start_box_of(InitConfig(), dataset_of(views_from(), 1.3))
     assert (box.center == 0).all() and box.half_extent == 1.3
 
 
 @pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
 def test_otherwise_the_box_is_scaled_and_moved_to_the_focus(scale, target):
-    dataset = dataset_of(views_from(REFERENCE_CENTERS, target, scale), 1.3)
+    dataset = dataset_of(views_from(target, scale), 1.3)
     box = start_box_of(InitConfig(), dataset)
     np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
     # Views of 40 px with a focal length of 40 px see half a unit to each side at distance 1.
@@ -50,48 +51,46 @@ def test_otherwise_the_box_is_scaled_and_moved_to_the_focus(scale, target):
     assert np.abs(points - box.center).max() <= box.half_extent * (1 + 1e-6)
 
 
-# A box that is given
-def test_box_outside_most_views_is_refused():
-    views = views_from(REFERENCE_CENTERS, target=(50, 0, 0))
-    message = refusal(views, half_extent=1.3)
-    assert message == (
-        "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at (around "
-        "(50, 0, 0), from 4.03 away), but only 1 of 4 have it in the middle of their images; set "
-        "init.half_extent=null, and it follows from them"
-    )
-
-
-def test_a_box_at_the_edge_of_the_images_is_refused():
-    views = views_from(REFERENCE_CENTERS, target=(0, 0, 1.6))
-    assert "but only 0 of 4 have it in the middle of" in refusal(views, half_extent=0.4)
-
-
-def test_box_that_is_tiny_in_the_images_is_refused():
-    views = views_from(REFERENCE_CENTERS, scale=100)
-    assert "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of an image (the " in (
-        refusal(views, half_extent=1.3)
-    )
-
-
 @pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
-def test_box_in_view_or_around_the_cameras_is_accepted(half_extent):
-    box = start_box_of(
-        InitConfig(half_extent=half_extent), dataset_of(views_from(REFERENCE_CENTERS))
-    )
-    assert box.half_extent == half_extent
+def test_given_box_in_view_or_around_the_cameras_is_used(half_extent):
+    init = {"half_extent": half_extent, "num_points": 99}
+    means = initial_gaussians(config(init=init), dataset_of(views_from())).means
+    assert 0.9 * half_extent < np.abs(means).max() <= half_extent
 
 
-# A cloud of points
-@pytest.fixture
-def cloud(tmp_path):
-    positions = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    write_points(tmp_path / "cloud.ply", positions, np.full((50, 3), 200, np.uint8))
-    return tmp_path / "cloud.ply"
+@pytest.mark.parametrize(
+    ("target", "scale", "half_extent", "message"),
+    [
+        (
+            (50, 0, 0),
+            1,
+            1.3,
+            "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at (around "
+            "(50, 0, 0), from 4.03 away), but only 1 of 4 have it in the middle of their images; "
+            "set init.half_extent=null, and it follows from them",
+        ),
+        ((0, 0, 1.6), 1, 0.4, "but only 0 of 4 have it in the middle of"),
+        (
+            (0, 0, 0),
+            100,
+            1.3,
+            "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of an image (the ",
+        ),
+    ],
+    ids=["outside", "at the edge", "tiny"],
+)
+def test_box_that_views_do_not_show_is_refused(target, scale, half_extent, message):
+    dataset = dataset_of(views_from(target, scale))
+    with pytest.raises(UserError) as error:
+        initial_gaussians(config(init={"half_extent": half_extent}), dataset)
+    assert message in str(error.value)
 
 
 def test_cloud_in_another_coordinate_system_is_refused(cloud):
-    message = refusal(views_from(REFERENCE_CENTERS, target=(30, 30, 30)), point_cloud=cloud)
-    assert message == (
+    dataset = dataset_of(views_from((30, 30, 30)))
+    with pytest.raises(UserError) as error:
+        initial_gaussians(config(init={"point_cloud": cloud}), dataset)
+    assert str(error.value) == (
         f"{cloud}: must hold what the cameras look at (around (30, 30, 30), from 4.03 away), in "
         "their frame of reference, but only 0 of 4 have any of its 50 points in the middle of "
         "their images; give another init.point_cloud, or start from random points "
@@ -100,9 +99,7 @@ def test_cloud_in_another_coordinate_system_is_refused(cloud):
 
 
 def test_point_cloud_of_the_dataset_is_the_start(photographs, cloud):
-    from support.datasets import edit
-
-    edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="cloud.ply"))
+    put(photographs / "transforms.json", "ply_file_path", "cloud.ply")
     dataset = load(photographs)
     assert dataset.point_cloud == cloud
     assert initial_gaussians(config(), dataset).num_gaussians == 50
@@ -115,9 +112,7 @@ def test_point_cloud_of_the_dataset_is_the_start(photographs, cloud):
 
 
 def test_missing_point_cloud_falls_back_to_random_points(photographs):
-    from support.datasets import edit
-
-    edit(photographs / "transforms.json", lambda meta: meta.update(ply_file_path="gone.ply"))
+    put(photographs / "transforms.json", "ply_file_path", "gone.ply")
     dataset, (note,) = load_noting(photographs)
     assert dataset.point_cloud is None
     assert note.endswith("not there: 1 of 1 point cloud (gone.ply); the fit starts without")
@@ -128,64 +123,48 @@ def test_black_points_are_coloured_from_the_images(tmp_path):
     positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
     given = config(init={"point_cloud": tmp_path / "black.ply"})
-    views = [replace(view, image=view.image + 0.75) for view in views_from(REFERENCE_CENTERS)]
+    views = [replace(view, image=view.image + 0.75) for view in views_from()]
     g = initial_gaussians(given, dataset_of(views))
     np.testing.assert_allclose(0.5 + SH_C0 * g.sh0, 0.75, rtol=1e-6)
     assert not initial_gaussians(given, dataset_of([])).sh0.any()  # grey: colour is SH + 0.5
 
 
-# Other defaults derived from the data
 @pytest.mark.parametrize(("mode", "background"), [("RGB", "black"), ("RGBA", "white")])
 def test_the_background_follows_from_the_images(photographs, mode, background):
-    from PIL import Image
-
-    for file in sorted((photographs / "images").iterdir())[3:4]:
-        Image.open(file).convert(mode).save(file)
+    file = photographs / "images" / "03.png"
+    Image.open(file).convert(mode).save(file)
     dataset = load(photographs)
     assert resolve_defaults(config(), dataset).data.background == background
-    given = config().model_copy(
-        update={"data": config().data.model_copy(update={"background": "white"})}
-    )
+    given = FitConfig(data={"path": "unused", "background": "white"})
     assert resolve_defaults(given, dataset).data.background == "white"
 
 
 @pytest.mark.parametrize(
     ("scale", "near"), [(1, 0.2), (1.5, 0.2), (1000, 200), (1e-9, 1e-9), (1e12, 1e9)]
 )
-def test_the_near_plane_follows_from_the_cameras(scale, near):
-    dataset = dataset_of(views_from(REFERENCE_CENTERS, scale=scale))
-    assert resolve_defaults(config(), dataset).model.near == near
+def test_the_near_plane_follows_from_the_cameras_and_is_recorded(scale, near):
+    dataset = dataset_of(views_from(scale=scale))
+    decided = resolve_defaults(config(), dataset)
+    assert decided.model.near == near
+    assert resolve_defaults(decided, dataset) == decided
     given = resolve_defaults(config(model={"near": 1e-9}), dataset)
     assert given.model.near == 1e-9
 
 
 def test_near_plane_beyond_the_focus_is_refused():
-    near = dataset_of(views_from(REFERENCE_CENTERS, scale=0.01))
     with pytest.raises(UserError) as error:
-        resolve_defaults(config(model={"near": 0.2}), near)
+        resolve_defaults(config(model={"near": 0.2}), dataset_of(views_from(scale=0.01)))
     assert str(error.value) == (
         "model.near must be less than half of the distance from the cameras to what they look at, "
         "0.0403, got 0.2; model.near=null lets it follow from the cameras"
     )
 
 
-def test_derived_values_are_recorded():
-    dataset = dataset_of(views_from(REFERENCE_CENTERS), 1.3)
-    decided = resolve_defaults(config(), dataset)
-    assert (decided.model.near, decided.data.background) == (0.2, "white")
-    assert resolve_defaults(decided, dataset) == decided
-
-
 @pytest.mark.slow
 def test_photographs_are_downscaled_to_the_reference_width_by_default(photographs):
-    from PIL import Image
-    from support.datasets import edit
-
     for file in (photographs / "images").iterdir():
         Image.open(file).resize((2000, 4)).save(file)
-    edit(
-        photographs / "transforms.json",
-        lambda meta: meta.update(w=2000, h=4, fl_x=2000, fl_y=2000),
-    )
+    size = {"w": 2000, "h": 4, "fl_x": 2000, "fl_y": 2000}
+    edit(photographs / "transforms.json", lambda meta: meta.update(size))
     assert load(photographs).train[0].width == 1600
     assert load(photographs, image_size=10_000).train[0].width == 2000
