@@ -28,11 +28,6 @@ def directions(count=64) -> np.ndarray:
     return single(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-@pytest.mark.parametrize("degree", DEGREES)
-def test_number_of_sh_coefficients(degree):
-    assert sh.num_coefficients(degree) == len(reference.sh_basis(np.eye(3), degree).T)
-
-
 def test_constants_normalise_the_basis():
     """Degrees 0 to 3 are derived from pi alone, to the last digit of a double."""
     pi = np.pi
