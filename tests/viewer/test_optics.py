@@ -32,41 +32,30 @@ def seen(gaussians, lens="pinhole", **numbers):
     return scene.image(FrameRequest(EYE, WIDTH, HEIGHT, lens, numbers))[0]
 
 
-def viewpoint(focal=FOCAL, lens=None):
-    size = WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT
-    return Viewpoint("", EYE.camera_to_world, focal, focal, *size, lens=lens)
-
-
 @pytest.mark.parametrize(
-    ("lens", "numbers", "view"),
+    ("name", "numbers", "focal", "lens"),
     [
-        ("pinhole", {}, viewpoint()),
-        (
-            "opencv",
-            {"k1": -0.3, "p1": 0.02},
-            viewpoint(lens=RadialTangential.from_coefficients(k1=-0.3, p1=0.02)),
-        ),
+        ("pinhole", {}, FOCAL, None),
+        ("opencv", {"k1": -0.3, "p1": 0.02}, FOCAL, RadialTangential),
         # The angle of the whole height on the film, so many px a radian.
-        (
-            "fisheye",
-            {"k1": 0.1},
-            viewpoint(HEIGHT / math.radians(FOV), Fisheye.from_coefficients(k1=0.1)),
-        ),
+        ("fisheye", {"k1": 0.1}, HEIGHT / math.radians(FOV), Fisheye),
     ],
-    ids=["pinhole", "opencv", "fisheye"],
 )
-def test_image_matches_the_same_camera_in_a_dataset(lens, numbers, view):
+def test_image_matches_the_same_camera_in_a_dataset(name, numbers, focal, lens):
+    lens = lens and lens.from_coefficients(**numbers)
+    size = WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT
+    view = Viewpoint("", EYE.camera_to_world, focal, focal, *size, lens=lens)
     scene = make_scene(blobs(), ModelConfig(**VIEWER_RENDERING), BACKGROUND)
     (expected,) = render_views(scene, [view])
-    rendered = np.clip(seen(blobs(), lens, **numbers), 0, 1)
     assert np.ptp(expected) > 0.3
     # The focal length goes through an angle in degrees, in single precision: 1e-6 of it.
+    rendered = np.clip(seen(blobs(), name, **numbers), 0, 1)
     assert np.abs(rendered - expected).max() < 1e-4
 
 
-def speck(x, y, z):
-    """One opaque Gaussian, much smaller than a pixel, at camera coordinates in scene units."""
-    means = EYE.camera_to_world @ [x, y, z, 1]
+def speck(depth):
+    """One opaque Gaussian, much smaller than a pixel, at (0.8, -0.5, depth), camera axes."""
+    means = EYE.camera_to_world @ [0.8, -0.5, depth, 1]
     return Gaussians(
         means=np.float32([means[:3]]),
         quats=np.float32([[1, 0, 0, 0]]),
@@ -82,34 +71,32 @@ def place(rendered):
     difference."""
     difference = np.abs(rendered[:, :, :3] - BACKGROUND).sum(axis=2)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    return (
-        (difference * x).sum() / difference.sum(),
-        (difference * y).sum() / difference.sum(),
-        difference.max(),
-    )
+    middle = [(difference * axis).sum() / difference.sum() for axis in (x, y)]
+    return np.array(middle), difference.max()
 
 
 @pytest.mark.parametrize("depth", [RADIUS, 1.5 * RADIUS])
 def test_orthographic_view_matches_the_pinhole_at_the_focus_distance(depth):
-    x, y, _ = place(seen(speck(0.8, -0.5, depth), "orthographic"))
+    middle, _ = place(seen(speck(depth), "orthographic"))
+    expected = np.array([WIDTH, HEIGHT]) / 2 + FOCAL / RADIUS * np.array([0.8, -0.5])
     # The middle of a speck that is cut off at a small alpha is within a tenth of a pixel.
-    assert x == pytest.approx(WIDTH / 2 + FOCAL * 0.8 / RADIUS, abs=0.1)
-    assert y == pytest.approx(HEIGHT / 2 - FOCAL * 0.5 / RADIUS, abs=0.1)
+    assert middle == pytest.approx(expected, abs=0.1)
 
 
 def test_a_closed_aperture_is_a_pinhole(capfd):
     """Mitsuba's warning appears at most once an image."""
-    dot = speck(0.8, -0.5, 2 * RADIUS)
+    dot = speck(2 * RADIUS)
     assert np.array_equal(seen(dot, "thin lens", aperture=0.0), seen(dot))
     assert "aperture" not in "".join(capfd.readouterr())
 
 
-def test_thin_lens_is_sharp_at_its_focus_only():
-    for focus, depth in ((1.0, RADIUS), (1.5, 1.5 * RADIUS)):
-        dot = speck(0.8, -0.5, depth)
-        sharp = seen(dot)
-        focused = seen(dot, "thin lens", aperture=0.1, focus=focus)
-        assert np.abs(focused - sharp).max() < 1e-4  # roundings of the field of view
-        blurred = seen(dot, "thin lens", aperture=0.1, focus=focus / 2)
-        assert place(blurred)[2] < 0.5 * place(sharp)[2]
-        assert np.abs(np.subtract(place(blurred)[:2], place(sharp)[:2])).max() < 0.1
+@pytest.mark.parametrize("focus", [1.0, 1.5])
+def test_thin_lens_is_sharp_at_its_focus_only(focus):
+    dot = speck(focus * RADIUS)
+    sharp = seen(dot)
+    focused = seen(dot, "thin lens", aperture=0.1, focus=focus)
+    assert np.abs(focused - sharp).max() < 1e-4  # roundings of the field of view
+    blurred = seen(dot, "thin lens", aperture=0.1, focus=focus / 2)
+    (middle, peak), (expected, sharp_peak) = place(blurred), place(sharp)
+    assert peak < 0.5 * sharp_peak
+    assert np.abs(middle - expected).max() < 0.1
