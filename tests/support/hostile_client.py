@@ -94,10 +94,13 @@ def random_fields(pick, uuids: list[str]) -> dict[str, object]:
     return {"type": name} | values
 
 
-def connect_to(port: int, protocol: str = f"viser-v{viser.__version__}") -> ClientConnection:
+def connect_to(
+    port: int, protocol: str = f"viser-v{viser.__version__}", **options
+) -> ClientConnection:
     """Connect as a page does; what the server sends is kept, and need not be read."""
     settings = {"max_size": None, "max_queue": None, "compression": None, "proxy": None}
-    return connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], **settings)
+    address = f"ws://127.0.0.1:{port}"
+    return connect(address, subprotocols=[protocol], **settings, **options)
 
 
 def send_all(port: int, messages: Iterable[bytes | str]) -> None:
