@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 import msgspec
 import numpy as np
 import viser
-import zstandard
 from viser import _messages
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -114,17 +113,3 @@ def send_all(port: int, messages: Iterable[bytes | str]) -> None:
             connection.send(msgspec.msgpack.encode(CAMERA))
             connection.send(message)
     connection.close()
-
-
-def labels_of_controls(port: int, last: str) -> dict[str, str]:
-    """Return labels by uuid, as a page is told them; last: the label that ends the wait."""
-    labels: dict[str, str] = {}
-    with connect_to(port) as connection:
-        while last not in labels.values():
-            payload = connection.recv(timeout=10)
-            packed = payload[16 : 16 + int.from_bytes(payload[8:16], "little")]
-            window = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed))
-            for message in window["messages"]:
-                if label := message.get("props", {}).get("label"):
-                    labels[message["uuid"]] = label
-    return labels

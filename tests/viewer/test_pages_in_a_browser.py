@@ -23,6 +23,7 @@ from drgs.datasets.viewpoints import FIELD_OF_VIEW
 from drgs.integrator.scene import render_views
 from drgs.results.model import load_model
 
+pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
 browsers = pytest.importorskip("support.browser", reason="needs POSIX", exc_type=ImportError)
 
 pytestmark = [
@@ -59,11 +60,6 @@ def command(*words, log: Path):
     finally:
         process.kill()
         process.wait()
-
-
-@pytest.fixture(autouse=True)
-def needs():
-    pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
 
 
 def shown(rendered: np.ndarray) -> np.ndarray:
