@@ -86,29 +86,34 @@ def test_mask_of_the_file_is_the_default_of_its_frames(photographs):
         np.testing.assert_array_equal(view.mask, masks[int(view.name == "02")])
 
 
-@pytest.mark.parametrize("kind", ["mask", "depth"])
-def test_an_image_of_another_size_than_the_photograph_is_refused(photographs, kind):
-    key = {"mask": "mask_path", "depth": "depth_file_path"}[kind]
+STEPS = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
+DEPTH, SCALE, CLOSE = "depth_file_path", "depth_unit_scale_factor", "transform_matrix_close"
+MISSING = "there is no image {0}/nowhere.png (or with .png added); put them there, or set data."
+
+REFUSED_FRAMES = [
+    ({"mask_path": 3}, "{1}mask_path must be text, got 3"),
+    ({"mask_path": "nowhere.png"}, "{1}mask_path: " + MISSING + "ignore_masks; not there: 1 of 1"),
+    ({DEPTH: "nowhere.png"}, "{1}depth_file_path: " + MISSING + "ignore_depth; not there: 1 of 1"),
+    ({"mask_path": "other.png"}, "{0}/other.png: must be 8 x 6 px, as the photograph is, got 8 x "),
+    ({DEPTH: "other.png"}, "{0}/other.png: must be 8 x 6 px, as the photograph is, got 8 x 4; re"),
+    ({"mask_path": "broken.png"}, "{0}/broken.png: cannot read the image: "),
+    ({DEPTH: "8 bits.png"}, "{0}/8 bits.png: must be a grey image of 16 bits or an .npy file, go"),
+    ({DEPTH: "rgb.png"}, "{0}/rgb.png: must be a grey image of 16 bits or an .npy file, got one o"),
+    ({DEPTH: "16 bits.png", SCALE: 0}, "{1}depth_unit_scale_factor must be > 0, got 0"),
+    ({CLOSE: np.diag([2, 2, 2, 1]).tolist()}, "{1}transform_matrix_close must be rigid (rotation,"),
+    ({CLOSE: np.eye(4).tolist(), "shutter": "curtain"}, "{1}shutter must be one of 'global' or 'r"),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), REFUSED_FRAMES)
+def test_wrong_frame_data_is_refused_with_the_file_or_key(photographs, values, message):
     iio.imwrite(photographs / "other.png", np.ones((4, 8), np.uint16))
-    give(photographs, **{key: "other.png"})
-    assert refusal(photographs) == (
-        f"{photographs / 'other.png'}: must be 8 x 6 px, as the photograph is, got 8 x 4; "
-        "resize it, or leave it out of the frame"
-    )
-
-
-@pytest.mark.parametrize(
-    ("key", "ignore", "kind"),
-    [("mask_path", "masks", "masks"), ("depth_file_path", "depth", "files of depth")],
-)
-def test_missing_mask_or_depth_is_refused(photographs, key, ignore, kind):
-    where = give(photographs, **{key: "nowhere.png"})
-    assert refusal(photographs) == (
-        f"{where}{key}: there is no image {photographs / 'nowhere.png'} (or with .png added); put "
-        f"them there, or set data.ignore_{ignore}; not there: 1 of 1 {kind}"
-    )
-    give(photographs, **{key: 3})
-    assert refusal(photographs) == f"{where}{key} must be text, got 3"
+    iio.imwrite(photographs / "8 bits.png", np.ones((6, 8), np.uint8))
+    iio.imwrite(photographs / "rgb.png", np.ones((6, 8, 3), np.uint8))
+    iio.imwrite(photographs / "16 bits.png", STEPS)
+    (photographs / "broken.png").write_bytes(b"no image")
+    where = give(photographs, **values)
+    assert refusal(photographs).startswith(message.format(photographs, where))
 
 
 def test_missing_masks_drop_their_photographs_and_missing_depths_do_not(photographs):
@@ -164,10 +169,6 @@ def test_empty_mask_is_refused(photographs, name, mask, options):
     )
 
 
-STEPS = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
-SCALE = "depth_unit_scale_factor"
-
-
 @pytest.mark.parametrize(
     ("top", "frame", "unit"),
     [({}, {}, 1e-3), ({SCALE: 0.25}, {}, 0.25), ({}, {SCALE: 2}, 2.0)],
@@ -205,27 +206,6 @@ def test_array_depths_are_in_scene_units_or_in_the_given_unit(photographs, dtype
         assert (expected > 0).sum() >= 43
         np.testing.assert_array_equal(view_named(dataset, name).depth, expected)
     assert dataset.description.endswith("; depth in units of 0.25 and 1")
-
-
-@pytest.mark.parametrize(
-    ("pixels", "mode"),
-    [(np.full((6, 8), 9, np.uint8), "L"), (np.full((6, 8, 3), 9, np.uint8), "RGB")],
-    ids=["8 bits", "colours"],
-)
-def test_depth_image_must_have_16_bits(photographs, pixels, mode):
-    """Numbers of an image of 8 bits would be read as other depths."""
-    iio.imwrite(photographs / "depth.png", pixels)
-    give(photographs, depth_file_path="depth.png")
-    assert refusal(photographs) == (
-        f"{photographs / 'depth.png'}: must be a grey image of 16 bits or an .npy file, got one "
-        f"of Pillow's mode {mode}; convert it"
-    )
-
-
-def test_depth_unit_must_be_positive(photographs):
-    iio.imwrite(photographs / "depth.png", STEPS)
-    where = give(photographs, depth_file_path="depth.png", **{SCALE: 0})
-    assert refusal(photographs) == f"{where}{SCALE} must be > 0, got 0"
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
@@ -273,15 +253,6 @@ def test_closing_pose_is_read(photographs, top, frame, shutter):
     ignored = load(photographs, ignore_motion=True)
     assert view_named(ignored).motion is None
     assert ignored.description.endswith("; motion (transform_matrix_close) ignored")
-
-
-def test_wrong_motion_is_refused_with_the_key(photographs):
-    where = give(photographs, transform_matrix_close=np.diag([2, 2, 2, 1]).tolist())
-    assert refusal(photographs).startswith(f"{where}transform_matrix_close must be rigid (rotation")
-    give(photographs, transform_matrix_close=np.eye(4).tolist(), shutter="curtain")
-    assert refusal(photographs) == (
-        f"{where}shutter must be one of 'global' or 'rolling', got \"curtain\""
-    )
 
 
 def test_synthetic_frames_support_masks_depths_lenses_and_motion(blender):
