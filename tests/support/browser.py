@@ -43,10 +43,12 @@ OPTIONS = (
 SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 NO_WEBGL = ("--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis")
 
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
+
 TIMEOUT_SECONDS = 120.0
 """Timeout of an unresponsive browser, seconds, on one of two busy cores."""
 
-SECOND_TO_END = 5.0
+EXIT_SECONDS = 5.0
 
 
 class Browser:
@@ -69,13 +71,10 @@ class Browser:
         self.events: list[dict] = []
         threading.Thread(target=self._listen, daemon=True).start()
 
-    def __enter__(self) -> Browser:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """The group is the browser's own: nothing else is ended."""
+    def close(self) -> None:
+        """End the browser's own process group: nothing else."""
         os.killpg(self._process, signal.SIGTERM)
-        end = time.monotonic() + SECOND_TO_END
+        end = time.monotonic() + EXIT_SECONDS
         while os.waitpid(self._process, os.WNOHANG) == (0, 0):
             if time.monotonic() > end:
                 os.killpg(self._process, signal.SIGKILL)
@@ -107,10 +106,9 @@ class Browser:
 
 
 class Page:
-    """A window."""
+    """A window of a browser; width, height: px, one of the screen for each of the page."""
 
     def __init__(self, browser: Browser, width: int, height: int) -> None:
-        """width, height: px, one of the screen for each of the page."""
         self._browser = browser
         target = browser.call("Target.createTarget", url="about:blank")["targetId"]
         answer = browser.call("Target.attachToTarget", targetId=target, flatten=True)
@@ -121,7 +119,6 @@ class Page:
         self.call("Emulation.setDeviceMetricsOverride", **size)
 
     def call(self, method: str, **parameters: object) -> dict:
-        """Call a method of the protocol."""
         return self._browser.call(method, self._session, **parameters)
 
     def cut_off(self) -> None:
@@ -130,7 +127,6 @@ class Page:
         self.call("Network.emulateNetworkConditions", offline=True, **nothing)
 
     def open(self, address: str) -> None:
-        """Go there; what it shows comes later."""
         self.call("Page.navigate", url=address)
         self.wait_for("!!document.body")
 
@@ -143,11 +139,7 @@ class Page:
         return answer["result"].get("value")
 
     def wait_for(self, expression: str) -> None:
-        """Until it is true."""
-        end = time.monotonic() + TIMEOUT_SECONDS
-        while not self.evaluate(expression):
-            assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
-            time.sleep(0.05)
+        wait_until(lambda: self.evaluate(expression), expression)
 
     def rendered(self) -> np.ndarray:
         """(height, width, 3) display space, 0 to 1."""
@@ -204,14 +196,16 @@ class Page:
 
 
 @contextmanager
-def browser_page(width: int, height: int) -> Iterator[Page]:
-    """Yield a page of a new browser, whose images are made by software."""
-    with Browser(*SOFTWARE_WEBGL) as browser:
+def browser_page(width: int, height: int, options=SOFTWARE_WEBGL) -> Iterator[Page]:
+    """Yield a page of a new browser."""
+    browser = Browser(*options)
+    try:
         yield Page(browser, width, height)
+    finally:
+        browser.close()
 
 
 def wait_until(happens: Callable[[], object], what: str) -> None:
-    """Ask until it is true; what: it is that."""
     end = time.monotonic() + TIMEOUT_SECONDS
     while not happens():
         assert time.monotonic() < end, f"there never was {what}"

@@ -31,8 +31,6 @@ pytestmark = [
     pytest.mark.skipif(browsers.PROGRAM is None, reason="needs Chromium or Chrome"),
 ]
 
-SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
-
 ENDLESS = 100_000
 """Iterations."""
 
@@ -53,7 +51,7 @@ def command(*words, log: Path):
         )
     try:
         browsers.wait_until(
-            lambda: process.poll() is not None or "http://" in log.read_text(), lambda: "a page"
+            lambda: process.poll() is not None or "http://" in log.read_text(), "a page"
         )
         assert process.poll() is None, log.read_text()
         yield process, "http://" + log.read_text().split("http://")[1].split()[0]
@@ -104,9 +102,9 @@ def expected_view(run: Path, width: int, height: int) -> np.ndarray:
     return 255 * rendered
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", browsers.SIZES)
 def test_page_shows_gaussians_and_orbits_with_the_mouse(fit, size, tmp_path):
-    width, height = SIZES[size]
+    width, height = browsers.SIZES[size]
     with (
         command("drgs.view", fit, log=tmp_path / "log") as (process, address),
         browsers.browser_page(width, height) as page,
@@ -116,12 +114,10 @@ def test_page_shows_gaussians_and_orbits_with_the_mouse(fit, size, tmp_path):
         page.wait_for("/\\d+ ms for \\d+×\\d+/.test(document.body.innerText)")
         expected = shown(expected_view(fit, width, height))
         # JPEG at a quality of 92 is within one or two of 255, half a pixel more at edges.
-        browsers.wait_until(
-            lambda: np.abs(seen(page) - expected).mean() < 3, lambda: "the expected image"
-        )
+        browsers.wait_until(lambda: np.abs(seen(page) - expected).mean() < 3, "the expected image")
         before, middle = seen(page), (0.3 * width, 0.3 * height)
         page.drag(middle, (middle[0] + 60, middle[1] - 20))
-        browsers.wait_until(lambda: np.abs(seen(page) - before).mean() > 6, lambda: "another image")
+        browsers.wait_until(lambda: np.abs(seen(page) - before).mean() > 6, "another image")
         assert_clean(page, address)
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
@@ -133,7 +129,7 @@ def test_page_of_a_fit_shows_pauses_and_ends_it(tmp_path):
     words = ("drgs.fit", config, "--out", out, "--view", "--set", "output.report=false")
     with (
         command(*words, log=log) as (process, address),
-        browsers.browser_page(*SIZES["desktop"]) as page,
+        browsers.browser_page(*browsers.SIZES["desktop"]) as page,
     ):
 
         def iteration() -> int:
@@ -146,7 +142,7 @@ def test_page_of_a_fit_shows_pauses_and_ends_it(tmp_path):
         time.sleep(FADE_SECONDS)
         before = seen(page)
         page.drag((400, 500), (460, 470))
-        browsers.wait_until(lambda: np.abs(seen(page) - before).mean() > 3, lambda: "another image")
+        browsers.wait_until(lambda: np.abs(seen(page) - before).mean() > 3, "another image")
         first = iteration()
         browsers.wait_until(lambda: iteration() > first, "progress")
         page.click("Pause")
@@ -156,9 +152,7 @@ def test_page_of_a_fit_shows_pauses_and_ends_it(tmp_path):
         time.sleep(FADE_SECONDS)
         held, still = iteration(), seen(page)
         page.drag((400, 500), (340, 530))
-        browsers.wait_until(
-            lambda: np.abs(seen(page) - still).mean() > 3, lambda: "an image in the pause"
-        )
+        browsers.wait_until(lambda: np.abs(seen(page) - still).mean() > 3, "an image in the pause")
         assert iteration() == held
         page.click("Continue")
         browsers.wait_until(lambda: iteration() > held, "progress after the pause")
