@@ -135,31 +135,22 @@ def test_half_of_the_points_in_view_are_uniform_in_inverse_distance():
     assert np.mean(behind < 0.5) == pytest.approx((0.5 - 0.1) / (1 - 0.1), abs=0.05)
 
 
+OUTWARD = [view_at(c, 2 * np.array(c)) for c in [(1, 0, 0), (0, 1, 0), (-1, -1, 1)]]
+
+
 @pytest.mark.parametrize(
     ("views", "reason"),
     [
-        (
-            [view_at((5, y, 0), (0, y, 0)) for y in range(3)],
-            "the cameras, whose optical axes are parallel",
-        ),
-        (
-            [view_at(c, 2 * np.array(c)) for c in [(1, 0, 0), (0, 1, 0), (-1, -1, 1)]],
-            "the cameras, which look away from each other",
-        ),
-        (
-            [view_at((4, 0, 0), (0, 0, 0))],
-            "one training camera, which does not tell how far away it looks",
-        ),
+        ([view_at((5, y, 0), (0, y, 0)) for y in range(3)], "whose optical axes are parallel; "),
+        (OUTWARD, "which look away from each other; "),
+        ([view_at((4, 0, 0), (0, 0, 0))], "one training camera, which does not tell how far away"),
     ],
     ids=["parallel", "outward", "one"],
 )
 def test_cameras_that_determine_no_box_are_refused(views, reason):
-    with pytest.raises(UserError) as error:
+    message = f"^init.half_extent: no start box can be derived from .*{reason}"
+    with pytest.raises(UserError, match=message):
         gaussians_of(dataset_of(views))
-    assert str(error.value) == (
-        f"init.half_extent: no start box can be derived from {reason}; set init.half_extent, or "
-        "give a point cloud (init.point_cloud)"
-    )
 
 
 def test_fox_is_read(fox_folder):

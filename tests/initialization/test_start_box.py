@@ -1,5 +1,6 @@
 """Start boxes: which one follows from the data, and which are refused as no camera sees them."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -61,41 +62,26 @@ def test_given_box_in_view_or_around_the_cameras_is_used(half_extent):
 @pytest.mark.parametrize(
     ("target", "scale", "half_extent", "message"),
     [
-        (
-            (50, 0, 0),
-            1,
-            1.3,
-            "init.half_extent: the start box [-1.3, 1.3]^3 must be what the cameras look at (around "
-            "(50, 0, 0), from 4.03 away), but only 1 of 4 have it in the middle of their images; "
-            "set init.half_extent=null, and it follows from them",
-        ),
-        ((0, 0, 1.6), 1, 0.4, "but only 0 of 4 have it in the middle of"),
-        (
-            (0, 0, 0),
-            100,
-            1.3,
-            "(around (0, 0, 0), from 403 away), but it covers only 0.39 % of an image (the ",
-        ),
+        ((50, 0, 0), 1, 1.3, "(around (50, 0, 0), from 4.03 away), but only 1 of 4 have it in the"),
+        ((0, 0, 1.6), 1, 0.4, "but only 0 of 4 have it in the middle of their images; set init.ha"),
+        ((0, 0, 0), 100, 1.3, "from 403 away), but it covers only 0.39 % of an image (the "),
     ],
     ids=["outside", "at the edge", "tiny"],
 )
 def test_box_that_views_do_not_show_is_refused(target, scale, half_extent, message):
     dataset = dataset_of(views_from(target, scale))
-    with pytest.raises(UserError) as error:
+    start = f"init.half_extent: the start box [-{half_extent}, {half_extent}]^3 must be what the ca"
+    with pytest.raises(UserError, match=rf"^{re.escape(start)}.*{re.escape(message)}"):
         initial_gaussians(config(init={"half_extent": half_extent}), dataset)
-    assert message in str(error.value)
 
 
 def test_cloud_in_another_coordinate_system_is_refused(cloud):
     dataset = dataset_of(views_from((30, 30, 30)))
-    with pytest.raises(UserError) as error:
-        initial_gaussians(config(init={"point_cloud": cloud}), dataset)
-    assert str(error.value) == (
-        f"{cloud}: must hold what the cameras look at (around (30, 30, 30), from 4.03 away), in "
-        "their frame of reference, but only 0 of 4 have any of its 50 points in the middle of "
-        "their images; give another init.point_cloud, or start from random points "
-        "(init.point_cloud=null, data.ignore_points=true)"
+    message = (
+        rf"^{cloud}: must hold what the cameras .* only 0 of 4 have any of its 50 points in the"
     )
+    with pytest.raises(UserError, match=message):
+        initial_gaussians(config(init={"point_cloud": cloud}), dataset)
 
 
 def test_point_cloud_of_the_dataset_is_the_start(photographs, cloud):
@@ -152,12 +138,11 @@ def test_the_near_plane_follows_from_the_cameras_and_is_recorded(scale, near):
 
 
 def test_near_plane_beyond_the_focus_is_refused():
-    with pytest.raises(UserError) as error:
-        resolve_defaults(config(model={"near": 0.2}), dataset_of(views_from(scale=0.01)))
-    assert str(error.value) == (
-        "model.near must be less than half of the distance from the cameras to what they look at, "
-        "0.0403, got 0.2; model.near=null lets it follow from the cameras"
+    message = (
+        r"^model.near must be less than half of the distance .*, 0.0403, got 0.2; model.near=nul"
     )
+    with pytest.raises(UserError, match=message):
+        resolve_defaults(config(model={"near": 0.2}), dataset_of(views_from(scale=0.01)))
 
 
 @pytest.mark.slow

@@ -58,20 +58,19 @@ def test_fit_with_alpha_images_starts_on_the_visual_hull(kind):
     np.testing.assert_allclose(g.scales[:, 0], 0.5 * np.sqrt(nearest), rtol=1e-4)
 
 
+EMPTY = with_alpha(np.zeros_like)
+NO_HULL = " (the masks of 12 images have no hull to start from)"
+
+
 @pytest.mark.parametrize(
     ("dataset", "kind", "reason"),
     [
         (OPAQUE, "auto", ""),
         (with_alpha(lambda _: None), "auto", ""),
         (BALL, "random", ""),
-        (with_alpha(np.zeros_like), "auto", " (the masks of 12 images have no hull to start from)"),
-        (
-            with_alpha(np.zeros_like),
-            "masks",
-            " (the masks of 12 images have no hull to start from)",
-        ),
+        (EMPTY, "auto", NO_HULL),
+        (EMPTY, "masks", NO_HULL),
     ],
-    ids=["opaque", "no alpha", "random", "no hull", "no hull of masks"],
 )
 def test_fit_without_masks_starts_at_random(dataset, kind, reason):
     start = start_of(config(start=kind), dataset)
@@ -126,25 +125,13 @@ FEW_MASKS = replace(OPAQUE, train=(*BALL.train[:2], *OPAQUE.train[2:]))
 @pytest.mark.parametrize(
     ("dataset", "kind", "message"),
     [
-        (
-            FEW_MASKS,
-            "masks",
-            "init.start: masks needs nearly all training images to be transparent where there is "
-            "nothing, from cameras that stand still, but only 2 are; cut out what is to be fitted, "
-            "or set init.start=auto",
-        ),
-        (
-            BALL,
-            "points",
-            "init.start: points needs a point cloud, and the dataset names none that may be used "
-            "(ply_file_path, data.ignore_points); give init.point_cloud, or set init.start=auto",
-        ),
+        (FEW_MASKS, "masks", "masks needs nearly all training images .*, but only 2 are; cut out"),
+        (BALL, "points", "points needs a point cloud, and the dataset names none that may be used"),
     ],
 )
 def test_missing_masks_and_clouds_are_refused(dataset, kind, message):
-    with pytest.raises(UserError) as error:
+    with pytest.raises(UserError, match=f"^init.start: {message}"):
         start_of(config(start=kind), dataset)
-    assert str(error.value) == message
 
 
 @pytest.mark.parametrize(

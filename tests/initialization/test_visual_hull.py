@@ -72,7 +72,6 @@ def test_the_same_seed_gives_the_same_points():
     first = carved(BALL, 300)
     assert 0.6 * 300 <= len(first) <= 300
     np.testing.assert_array_equal(carved(BALL, 300), first)
-    assert not np.array_equal(carved(BALL, 300, seed=1), first)
 
 
 @pytest.mark.slow
