@@ -1,6 +1,7 @@
 """Datasets are read as they are, and refused with file and key where they are wrong."""
 
 import math
+import os
 
 import imageio.v3 as iio
 import numpy as np
@@ -10,6 +11,7 @@ from support.datasets import CENTERS, edit, load, load_noting, put, refusal
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
+from drgs.datasets.transforms import unique_names
 
 
 @pytest.mark.parametrize("background", ["white", "black", (0.0, 0.5, 1.0)])
@@ -359,3 +361,27 @@ def test_photographs_that_were_moved_are_found(photographs, file_path, folder):
         np.testing.assert_allclose(view.image, 20 * int(view.name) / 255, rtol=1e-6)
     taken = [": taken under nearly the same name: 10 photographs" in note for note in notes]
     assert taken == ([] if folder == "." else [True])
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (["./train/r_0", "images/b.png"], ["r_0", "b"]),
+        (["a/0.png", "b\\0.png"], ["a_0", "b_0"]),
+        (["a.png", "a.jpg"], ["0000_a", "0001_a"]),
+        (["/data/a/0.png", "/data/b/0.png"], ["data_a_0", "data_b_0"]),
+    ],
+)
+def test_views_are_named_after_their_files_with_folders_if_needed(files, names):
+    assert unique_names(files) == names
+
+
+@pytest.mark.parametrize(
+    "file",
+    ["\u4e2d" * 80 + "{0}.png", "/".join(["x" * 100] * 5) + "/{0}/a.png", "\udcff" * 240 + "{0}"],
+)
+def test_long_view_names_are_shortened(file):
+    """255 bytes are the limit, of which numbers, suffixes and temporary names take some."""
+    names = unique_names([file.format(i) for i in range(2)])
+    assert len(set(names)) == 2
+    assert all(len(os.fsencode(name)) <= 220 and "/" not in name for name in names)
