@@ -6,23 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.small_capture import (
-    FIELD_OF_VIEW,
-    FOCUS,
-    RADIUS,
-    blobs,
-    pose_around,
-    view,
-)
+from support.small_capture import FIELD_OF_VIEW, FOCUS, RADIUS, blobs, pose_around, view
 
 from drgs.core.errors import UserError, UserNote
-from drgs.datasets.orbits import (
-    Orbit,
-    near_plane_of,
-    orbit_of_gaussians,
-    orbit_of_views,
-    up_of,
-)
+from drgs.datasets.orbits import Orbit, near_plane_of, orbit_of_gaussians, orbit_of_views, up_of
 from drgs.datasets.viewpoints import look_at, read_viewpoints
 
 

@@ -58,11 +58,7 @@ def test_compression_leaves_a_flat_background_clean(tmp_path, background):
 
 @pytest.mark.parametrize(
     ("limits", "has_background", "kind"),
-    [
-        ({}, False, b"VP8 "),
-        ({}, True, b"VP8L"),
-        ({"LOSSLESS_WEBP_BYTES": 10_000}, True, b"VP8 "),
-    ],
+    [({}, False, b"VP8 "), ({}, True, b"VP8L"), ({"LOSSLESS_WEBP_BYTES": 10_000}, True, b"VP8 ")],
 )
 def test_images_without_flat_background_are_compressed_lossily(
     tmp_path, monkeypatch, limits, has_background, kind

@@ -201,10 +201,7 @@ def test_files_that_colmap_does_not_read_are_left_out_with_a_note(tmp_path):
 UNREADABLE = {
     "a\udcff.png": (lambda path: save(path), r"COLMAP knows names in UTF-8 only; rename it"),
     "a.png": (lambda path: path.write_bytes(b"no image"), r"a\.png: cannot read the image"),
-    "a.jpg": (
-        lambda path: Image.new("CMYK", (8, 8)).save(path),
-        r"Pillow's mode CMYK; convert it",
-    ),
+    "a.jpg": (lambda path: Image.new("CMYK", (8, 8)).save(path), r"Pillow's mode CMYK; convert it"),
     "a.tif": (
         lambda path: Image.new("1", (8193, 8192)).save(path, compression="group4"),
         r"at most 67,108,864 pixels, got 8193 x 8192",

@@ -12,14 +12,7 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
 
 import msgspec
-from support.hostile_client import (
-    CAMERA,
-    CLICK,
-    VALUES,
-    connect_to,
-    hostile_messages,
-    send_all,
-)
+from support.hostile_client import CAMERA, CLICK, VALUES, connect_to, hostile_messages, send_all
 from support.small_fits import everything_of, make_trainer, true_dataset
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
