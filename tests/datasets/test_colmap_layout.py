@@ -67,14 +67,6 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
     assert dataset.background == (0.0, 0.0, 0.0)
 
 
-def test_folder_names_are_case_insensitive(tmp_path):
-    write_dataset(tmp_path)
-    (tmp_path / "images").rename(tmp_path / "Images")
-    write_images(tmp_path / "IMAGES_2", size=(320, 240))
-    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "Images"
-    assert load(tmp_path, downscale=2).train[0].width == 320
-
-
 @pytest.mark.slow
 def test_intrinsics_follow_the_image_size(tmp_path):
     write_dataset(tmp_path)

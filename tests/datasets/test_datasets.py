@@ -208,16 +208,6 @@ def test_lens_is_read_and_does_not_depend_on_the_image_size(photographs, values,
     assert load(photographs, ignore_distortion=True).train[0].lens is None
 
 
-def test_lens_of_a_frame_is_its_own(photographs):
-    # Frames are in reverse order of their names: the first is the last view.
-    put(photographs / "transforms.json", "frames 0 k1", 0.1)
-    dataset = load(photographs)
-    assert dataset.train[-1].lens == RadialTangential.from_coefficients(k1=0.1)
-    assert dataset.train[0].lens is None
-    dataset = load(photographs, ignore_distortion=True)
-    assert dataset.description.endswith("; lens opencv (k1) ignored")
-
-
 REFUSED_INTRINSICS = [
     ({"fl_x": None}, "fl_x is missing, and there is no camera_angle_x either"),
     ({"fl_y": -1}, "fl_y must be > 0, got -1"),
@@ -318,22 +308,6 @@ def test_point_cloud_is_found_under_a_similar_name(photographs, name):
     dataset, (note,) = load_noting(photographs)
     assert dataset.point_cloud == cloud
     assert note.endswith(f"nearly the same name: 1 point cloud, such as {cloud} for {name}")
-
-
-def test_depths_and_masks_are_found_under_similar_names(photographs):
-    """A depth of another format has another unit: it is not taken."""
-    with (photographs / "D.NPY").open("wb") as file:
-        np.save(file, np.full((6, 8), 2.0))
-    iio.imwrite(photographs / "mask.webp", np.full((6, 8, 3), 255, np.uint8), lossless=True)
-    path = photographs / "transforms.json"
-    put(path, "frames 2 depth_file_path", "d.npy")
-    put(path, "frames 2 mask_path", "Mask.png")
-    dataset, notes = load_noting(photographs)
-    view = next(view for view in dataset.train if view.name == "07")
-    np.testing.assert_array_equal(view.depth, np.full((6, 8), 2, np.float32))
-    assert np.asarray(view.mask).all() and len(notes) == 2
-    put(path, "frames 2 depth_file_path", "d.png")
-    assert "d.png (or with .png added)" in refusal(photographs)
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,8 @@
 
 import pytest
 from conftest import REPOSITORY
-from support.colmap_models import NAMES, write_dataset, write_images
-from support.datasets import load, refusal
+from support.colmap_models import write_dataset, write_images
+from support.datasets import refusal
 
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
@@ -40,19 +40,6 @@ def test_widths_are_divided_by_the_smallest_sufficient_integer(tmp_path, size):
     assert f"scaled from {width} x {height} px to a width of {fitted}" in reasons
     assert fitted * round(height * fitted / width) <= MAX_PIXELS
     assert larger * round(height * larger / width) > MAX_PIXELS
-
-
-def test_largest_image_sets_the_scale(tmp_path):
-    write_dataset(tmp_path)
-    sizes = [(640, 480), (1600, 1200), (1200, 1600), (700, 500)]
-    for name, size in zip(NAMES, sizes, strict=True):
-        write_images(tmp_path / "images", [name], size)
-    config, reasons = config_for(tmp_path)
-    assert config.data.image_size == 600 and MAX_PIXELS >= 600 * 800
-    assert "scaled from 1200 x 1600 px, the largest, to a width of 600" in reasons
-    for name, size in zip(NAMES, [(640, 480), (480, 640), (900, 20), (64, 48)], strict=True):
-        write_images(tmp_path / "images", [name], size)
-    assert config_for(tmp_path)[0].data.image_size == 900
 
 
 def test_images_with_alpha_use_lego_yml():
@@ -150,8 +137,3 @@ def test_missing_folder_is_refused(tmp_path, options, end):
     assert refusal(folder, **options) == (
         f"data.path: there is no folder {folder}; say where it is (--data DIR){end}"
     )
-
-
-def test_dataset_is_read_beside_other_files(photographs):
-    touch(photographs, "sparse/0/cameras.bin", "sparse/0/images.bin", "walk.mp4")
-    assert len(load(photographs).test) == 2

@@ -289,14 +289,6 @@ def test_synthetic_frames_support_masks_depths_lenses_and_motion(blender):
     assert smaller.depth.shape == (2, 3)
 
 
-def test_only_transparent_photographs_have_alpha(photographs):
-    rgba = np.random.default_rng(0).integers(0, 256, (6, 8, 4), np.uint8)
-    iio.imwrite(photographs / "images" / "01.png", rgba)
-    dataset = load(photographs)
-    np.testing.assert_allclose(view_named(dataset).alpha, rgba[..., 3] / 255, rtol=1e-6)
-    assert view_named(dataset, "02").alpha is None
-
-
 def test_smaller_views_average_known_pixels():
     """Blocks of pixels are averaged; a block is known if all its pixels are."""
     rng = np.random.default_rng(4)

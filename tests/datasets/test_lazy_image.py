@@ -1,11 +1,9 @@
 """Photographs are kept as bytes, and become the numbers that they always were."""
 
-from dataclasses import replace
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from support.datasets import edit, load, refusal, view_at
+from support.datasets import edit, load, refusal
 
 from drgs.config.schema import DataConfig
 from drgs.datasets import images, load_dataset, reader
@@ -16,7 +14,6 @@ from drgs.datasets.images import (
     compact_photograph,
     downscale,
     num_threads,
-    smaller_view,
     without_images,
 )
 
@@ -121,25 +118,6 @@ def test_grey_images_become_rgb(photographs, pixels):
     image = load(photographs).train[0].image
     assert image.shape == (6, 8, 3)
     np.testing.assert_allclose(image, 0.2, rtol=1e-6)
-
-
-def test_dataset_uses_the_memory_of_its_uncompressed_files(photographs):
-    iio.imwrite(photographs / "images" / "01.png", RNG.integers(0, 256, (6, 8, 4), np.uint8))
-    dataset = load(photographs)
-    for view in (*dataset.train, *dataset.test):
-        channels = 3 if view.alpha is None else 4
-        assert view.image.nbytes == view.width * view.height * channels
-
-
-def test_smaller_views_take_no_memory():
-    view = view_at((4, 0, 0), (0, 0, 0))
-    pixels = RNG.integers(0, 255, (30, 40, 4), np.uint8)
-    image, alpha = compact_photograph(pixels, GREY, None)
-    smaller = smaller_view(replace(view, image=image, alpha=alpha), 5)
-    assert smaller.image.nbytes == smaller.alpha.nbytes == 0
-    assert (smaller.image.shape, smaller.alpha.shape) == ((6, 8, 3), (6, 8))
-    blocks = numbers_of(pixels).reshape(6, 5, 8, 5, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(smaller.image, blocks, atol=2e-7)
 
 
 def test_lazy_image_supports_array_operations():

@@ -78,11 +78,6 @@ def test_contradictory_lists_are_refused(photographs, lists, test_split, message
     assert refused.startswith(f"{photographs / 'transforms.json'}: ") and message in refused
 
 
-def test_empty_lists_are_ignored(photographs):
-    give(photographs, train=[], val=[], test=[])
-    assert names(load_noting(photographs)[0].test) == [0, 8]
-
-
 def test_list_file_defines_the_split(photographs):
     (photographs / "train.txt").write_text("loss 0.5\nloss 0.4\n")  # a log of some program
     (photographs / "test.txt").write_text("images/03.png\n05\n")

@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from support.helpers import both_precisions, relative_errors, rows, single
 from support.reference_scenes import legendre_sh_basis
 
-from drgs.core.constants import SH_C0
 from drgs.gaussians import sh
 from drgs.gaussians.rotation import rotate_sh, sh_rotation_generators, sh_rotation_matrices
 from drgs.reference import splatting as reference
@@ -28,23 +27,6 @@ def directions(count=64) -> np.ndarray:
     vectors = np.random.default_rng(0).normal(0, 1, (count, 3))
     vectors[:6] = np.concatenate([np.eye(3), -np.eye(3)])
     return single(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
-
-
-def test_constants_normalise_the_basis():
-    """Degrees 0 to 3 are derived from pi alone, to the last digit of a double."""
-    pi = np.pi
-    c2, c3 = np.sqrt(15 / pi) / 2, np.sqrt(105 / pi)
-    expected = {
-        "SH_C0": np.sqrt(1 / pi) / 2,
-        "C1": np.sqrt(3 / pi) / 2,
-        "C2": [c2, -c2, np.sqrt(5 / pi) / 4, -c2, c2 / 2],
-        "C3": [
-            -np.sqrt(35 / (2 * pi)) / 4, c3 / 2, -np.sqrt(21 / (2 * pi)) / 4, np.sqrt(7 / pi) / 4,
-            -np.sqrt(21 / (2 * pi)) / 4, c3 / 4, -np.sqrt(35 / (2 * pi)) / 4,
-        ],
-    }  # fmt: skip
-    for name, values in expected.items():
-        np.testing.assert_allclose(getattr(sh, name), values, rtol=1e-14, err_msg=name)
 
 
 @both_precisions
@@ -106,20 +88,6 @@ def test_colour_and_its_gradients_equal_the_reference(precision, degree):
 
 
 @both_precisions
-def test_clamped_colour_is_zero_and_has_no_gradient(precision):
-    coefficient = precision.Array3f([-2.0, 1.0, -1.7])
-    dr.enable_grad(coefficient)
-    color = sh.sh_color([coefficient], precision.Array3f(0, 0, 1), 0)
-    dr.backward(color)
-    below = 0.5 - 1.7 * SH_C0
-    assert below > 0
-    np.testing.assert_allclose(
-        rows(dr.detach(color))[0], [0, 0.5 + SH_C0, below], rtol=0, atol=tolerance(precision)
-    )
-    np.testing.assert_allclose(rows(dr.grad(coefficient))[0], [0, SH_C0, SH_C0], rtol=1e-6)
-
-
-@both_precisions
 def test_nan_stays_nan(precision):
     coefficient = precision.Array3f([np.nan, 0.0, 0.0])
     color = rows(sh.sh_color([coefficient], precision.Array3f(0, 0, 1), 0))
@@ -148,15 +116,6 @@ def test_rotated_sh_equals_sh_of_inversely_rotated_directions(rotation, degree):
     np.testing.assert_allclose(np.einsum("dk,nkc->ndc", basis, after), expected, atol=16 * ROUNDING)
     if degree > 0:
         assert np.abs(np.einsum("dk,nkc->ndc", basis, before) - expected).max() > 0.1
-
-
-def test_matrices_are_orthogonal_and_compose_like_rotations():
-    a, b = ROTATIONS[:2]
-    matrices = (sh_rotation_matrices(r, 3) for r in (a, b, a @ b))
-    for degree, (of_a, of_b, of_both) in enumerate(zip(*matrices, strict=True), 1):
-        np.testing.assert_allclose(of_a @ of_a.T, np.eye(2 * degree + 1), atol=ROUNDING)
-        np.testing.assert_allclose(of_a @ of_b, of_both, atol=ROUNDING)
-    assert sh_rotation_matrices(a, 0) == []
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -89,18 +89,6 @@ def test_carving_uses_little_memory(is_noise, limit):
     assert peak < limit
 
 
-def test_silhouettes_of_large_images_are_downscaled():
-    large = [replace(v, alpha=np.kron(v.alpha, np.ones((20, 20), np.float32))) for v in BALL[:2]]
-    for silhouette, view in zip(silhouettes_of(large), BALL, strict=False):
-        assert silhouette.scale == 3 and silhouette.solid.shape == (427, 427)
-        wide = np.pad(np.kron(view.alpha, np.ones((20, 20))), ((0, 1), (0, 1)))
-        largest = wide.reshape(427, 3, 427, 3).max(axis=(1, 3))
-        opaque = largest > 4 / 255
-        np.testing.assert_array_equal(silhouette.solid, largest >= 0.5)
-        for rows, columns in ((427, 427), (200, 210), (1, 1), (250, 1)):
-            assert silhouette.table[rows, columns] == opaque[:rows, :columns].sum()
-
-
 def test_masked_pixels_and_moving_cameras_do_not_carve_the_hull():
     hole = np.zeros((64, 64), bool)
     hole[20:40, 20:40] = True

@@ -163,19 +163,6 @@ def test_few_photographs_are_matched_exhaustively_and_many_selectively(tmp_path)
             assert ((i, j) in selected) == expected
 
 
-@pytest.mark.parametrize(
-    ("settings", "count", "options"),
-    [
-        (SfmSettings(), ALL_PAIRS, "--share one or --camera-model SIMPLE_RADIAL or "),
-        (SfmSettings(), ALL_PAIRS + 1, "--compare all or --share one"),
-        (SfmSettings(compare="neighbours"), ALL_PAIRS, "--compare all or --share one"),
-        (SfmSettings("SIMPLE_RADIAL", "all", "one"), 999, "--camera-model OPENCV_FISHEYE (a fish"),
-    ],
-)
-def test_offered_options_differ_from_the_given_ones(settings, count, options):
-    assert settings.alternative_options(count).startswith(options)
-
-
 def test_names_are_sorted_by_number_and_masks_are_not_photographs(tmp_path):
     for name in ("2.png", "10.png", "1.JPG", "b/3.png", "2_mask.png", "10.png.mask.png"):
         save(tmp_path / "images" / name, format="PNG")
@@ -336,16 +323,6 @@ def test_temporary_files_of_a_killed_run_are_removed(write_model, tmp_path):
     write_model("new")
     assert not list(tmp_path.rglob(".drgs-poses-*/"))
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {"sparse", ".poses-notes"}
-
-
-def test_a_second_search_in_the_same_folder_is_refused(write_model, tmp_path):
-    def second(temporary):
-        with pytest.raises(UserError, match="another command is writing to this folder; wait"):
-            search(tmp_path, replace=True)
-        assert temporary.is_dir()
-
-    write_model("first", act=second)
-    assert model_in(tmp_path) == model("first")
 
 
 def test_interrupt_while_moving_files_leaves_a_complete_model(write_model, tmp_path, monkeypatch):

@@ -29,6 +29,8 @@ BACKGROUND = (0.15, 0.35, 0.6)
 TITLE = "</title></script><script>window.intruder = 1</script> & Größe"
 FITTED_WITH = {"low_pass": 0.1, "antialiased": True}
 
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
+
 BUTTONS = """
 [...document.querySelectorAll("button")].map((b) => b.getBoundingClientRect())
   .filter((r) => r.width && r.height).map((r) => [r.left, r.top, r.right, r.bottom])
@@ -165,9 +167,9 @@ def test_dragging_orbits_the_focus_at_the_same_height(page, gaussians, initial_v
     assert_shown_as_fitted(page.rendered(), after, gaussians)
 
 
-@pytest.mark.parametrize("size", browsers.SIZES)
+@pytest.mark.parametrize("size", SIZES)
 def test_page_with_controls_fits_the_window_and_orbits(path, size):
-    width, height = browsers.SIZES[size]
+    width, height = SIZES[size]
     with opened(path, size=(width, height)) as page:
         edges = np.array(page.evaluate(BUTTONS))
         assert len(edges) >= 7  # play, orbit, fly, settings, keys, about, full screen

@@ -18,7 +18,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -42,8 +42,6 @@ OPTIONS = (
 
 SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 NO_WEBGL = ("--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis")
-
-SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 
 TIMEOUT_SECONDS = 120.0
 """Timeout of an unresponsive browser, seconds, on one of two busy cores."""
@@ -139,27 +137,16 @@ class Page:
         return answer["result"].get("value")
 
     def wait_for(self, expression: str) -> None:
-        wait_until(lambda: self.evaluate(expression), expression)
+        end = time.monotonic() + TIMEOUT_SECONDS
+        while not self.evaluate(expression):
+            assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
+            time.sleep(0.05)
 
     def rendered(self) -> np.ndarray:
         """(height, width, 3) display space, 0 to 1."""
         data = self.call("Page.captureScreenshot", format="png")["data"]
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
             return np.asarray(image.convert("RGB")) / 255
-
-    def click(self, words: str) -> None:
-        """The button with these words, at its middle."""
-        button = (
-            f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {words!r})"
-        )
-        self.wait_for(f"!!{button}")
-        x, y = self.evaluate(
-            f"(() => {{ const b = {button}; b.scrollIntoView({{block: 'center'}}); "
-            "const r = b.getBoundingClientRect(); "
-            "return [r.x + r.width / 2, r.y + r.height / 2] })()"
-        )
-        for kind in ("mousePressed", "mouseReleased"):
-            self._mouse(kind, x, y, buttons=1, button="left", clickCount=1)
 
     def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10) -> None:
         """Drag the mouse with its left button; px."""
@@ -175,14 +162,15 @@ class Page:
         """The addresses of all that it has asked for."""
         return [p["request"]["url"] for p in self._events("Network.requestWillBeSent")]
 
-    def console_errors(self, levels: Sequence[str] = ("error", "warning")) -> list[str]:
-        """Exceptions, and what stands in the console at these levels."""
-        logged = [p["entry"] for p in self._events("Log.entryAdded")]
-        said = self._events("Runtime.consoleAPICalled")
+    def console_errors(self) -> list[str]:
+        """Exceptions, errors and warnings."""
+        levels = ("assert", "error", "warning")
+        entries = [p["entry"] for p in self._events("Log.entryAdded")]
+        calls = self._events("Runtime.consoleAPICalled")
         return [
             *(str(p["exceptionDetails"]) for p in self._events("Runtime.exceptionThrown")),
-            *(entry["text"] for entry in logged if entry["level"] in levels),
-            *(str(p["args"]) for p in said if p["type"] in ("assert", *levels)),
+            *(entry["text"] for entry in entries if entry["level"] in levels),
+            *(str(p["args"]) for p in calls if p["type"] in levels),
         ]
 
     def _mouse(self, kind: str, x: float, y: float, **others: object) -> None:
@@ -203,13 +191,6 @@ def browser_page(width: int, height: int, options=SOFTWARE_WEBGL) -> Iterator[Pa
         yield Page(browser, width, height)
     finally:
         browser.close()
-
-
-def wait_until(happens: Callable[[], object], what: str) -> None:
-    end = time.monotonic() + TIMEOUT_SECONDS
-    while not happens():
-        assert time.monotonic() < end, f"there never was {what}"
-        time.sleep(0.05)
 
 
 def _pipe() -> tuple[int, int]:
