@@ -228,16 +228,6 @@ def test_points_with_large_error_or_short_track_are_dropped(tmp_path):
         assert f"{kept.sum()} of {len(kept)} points of" in found.description
 
 
-def test_points_with_unknown_error_are_kept(tmp_path):
-    model = write_dataset(tmp_path)
-    model.points = [
-        (x, c, -1.0 if k < 6 else 5.0, n) for k, (x, c, _, n) in enumerate(model.points)
-    ]
-    write_binary(tmp_path / "sparse" / "0", model)
-    found = start(tmp_path, max_point_error=1.0)
-    np.testing.assert_allclose(found.means, [x for x, *_ in model.points[:6]], rtol=1e-6)
-
-
 CLOUD = {"point_cloud": "cloud.ply"}
 
 
@@ -303,14 +293,6 @@ def test_photograph_is_found_under_a_similar_name(tmp_path, rename, is_noted):
     for view, (_, _, pose) in zip(views, model.images, strict=True):
         np.testing.assert_allclose(view.camera_to_world, pose, atol=1e-14)
     assert [": taken under nearly the same name: " in note for note in notes] == [True] * is_noted
-
-
-def test_file_is_not_matched_to_two_photographs(tmp_path):
-    write_binary(tmp_path / "sparse" / "0", model_of(["a.jpg", "A.tif", "b.jpg", "c.jpg", "d.bmp"]))
-    write_images(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
-    dataset, notes = load_noting(tmp_path)
-    assert [view.name for view in (*dataset.test, *dataset.train)] == ["a", "c", "d"]
-    assert len(notes) == 1 and "2 of 5 photographs (A.tif, b.jpg); left out" in notes[0]
 
 
 @pytest.mark.parametrize("below", ["sparse/0", "."])

@@ -77,17 +77,6 @@ def test_mask_keeps_pixels_brighter_than_half_and_opaque(photographs, mask):
     assert ignored.description.endswith("; masks (mask_path) ignored")
 
 
-def test_mask_of_the_file_is_the_default_of_its_frames(photographs):
-    masks = np.random.default_rng(0).integers(0, 2, (2, 6, 8), np.uint8)
-    for name, mask in zip(("all", "one"), masks, strict=True):
-        iio.imwrite(photographs / f"{name}.png", 255 * mask)
-    put(photographs / "transforms.json", "mask_path", "all.png")
-    give(photographs, "02.png", mask_path="one.png")
-    dataset = load(photographs)
-    for view in (*dataset.train, *dataset.test):
-        np.testing.assert_array_equal(view.mask, masks[int(view.name == "02")])
-
-
 STEPS = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
 DEPTH, SCALE, CLOSE = "depth_file_path", "depth_unit_scale_factor", "transform_matrix_close"
 MISSING = "there is no image {0}/nowhere.png (or with .png added); put them there, or set data."

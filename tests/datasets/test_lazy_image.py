@@ -10,10 +10,8 @@ from drgs.datasets import images, load_dataset, reader
 from drgs.datasets.images import (
     LazyImage,
     check_memory,
-    compact_mask,
     compact_photograph,
     downscale,
-    num_threads,
     without_images,
 )
 
@@ -64,13 +62,6 @@ def test_downscaled_photograph_is_stored_in_the_smaller_form(width, kept):
         assert 0 < np.abs(np.asarray(image) - exact).max() <= 0.51 / 65535
     else:
         np.testing.assert_allclose(image, exact, atol=2e-7)
-
-
-def test_mask_is_stored_in_one_byte_per_pixel():
-    mask = RNG.integers(0, 2, (5, 7)).astype(np.float32)
-    kept = compact_mask(mask)
-    assert (kept.nbytes, kept.shape) == (35, (5, 7))
-    assert np.asarray(kept).tobytes() == mask.tobytes()
 
 
 @pytest.mark.parametrize("shape", [(6, 8), (7, 9), (5, 11), (3, 2)])
@@ -153,12 +144,6 @@ def test_photographs_larger_than_memory_are_refused_before_reading(photographs, 
     )
     assert refusal(photographs) == message
     check_memory(files, 2)
-
-
-def test_large_photographs_are_read_one_at_a_time(tmp_path):
-    for width, expected in ((400, 8), (6000, 1)):
-        iio.imwrite(tmp_path / "a.png", np.zeros((width, width), np.uint8))
-        assert num_threads([tmp_path / "a.png"]) == expected
 
 
 IMAGES = ("image", "alpha", "mask", "depth")

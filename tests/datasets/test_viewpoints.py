@@ -218,14 +218,6 @@ def test_camera_motion_is_read_from_frames(tmp_path, top, frame, shutter):
     assert moving.motion.shutter == shutter
 
 
-def test_wrong_motion_of_a_camera_is_refused_with_the_key(tmp_path):
-    frame = {"transform_matrix_close": np.eye(4).tolist(), "shutter": "curtain"}
-    path = write_cameras(tmp_path / "c.json", ANGLE, {}, frame)
-    message = r"frames\[1\].shutter must be one of 'global' or 'rolling', got \"curtain\""
-    with pytest.raises(UserError, match=message):
-        read_viewpoints(path, (8, 8))
-
-
 def test_unread_keys_of_a_file_of_cameras_are_reported(tmp_path):
     path = write_cameras(tmp_path / "a.json", ANGLE | {"up": [0, 0, 1], "lens": 3}, {"dof": 0.1})
     with pytest.warns(UserNote, match=r"a.json: keys that are not read: lens, frames\[\].dof$"):

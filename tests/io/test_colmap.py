@@ -10,7 +10,7 @@ from support.colmap_models import PARAMETERS, WRITERS, some_model, write_binary,
 from support.formats import damaged
 
 from drgs.core.errors import UserError
-from drgs.io.colmap import MODELS, ColmapCamera, model_files, read_model, read_points3d
+from drgs.io.colmap import MODELS, ColmapCamera, read_model, read_points3d
 
 MUTATIONS = 500  # of each format
 
@@ -55,13 +55,6 @@ def test_written_models_are_read_back(tmp_path, model, write):
 def test_model_without_points_has_no_points(tmp_path, model, write):
     read = read_model(write(tmp_path, model, with_points=False))
     assert read.points_file is None and not read.has_points
-
-
-def test_binary_files_are_preferred_to_text(tmp_path, model):
-    write_text(tmp_path, model)
-    assert model_files(tmp_path)["images"].suffix == ".txt"
-    write_binary(tmp_path, model)
-    assert {path.suffix for path in model_files(tmp_path).values()} == {".bin"}
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])

@@ -73,14 +73,6 @@ def test_other_comments_are_ignored(tmp_path, line):
     assert Gaussians.load(with_lines(tmp_path / "a.ply", line)).rendered_with is None
 
 
-@pytest.mark.parametrize("line_end", [b"\r\n", b"\r"])
-def test_all_line_ends_are_read(tmp_path, line_end):
-    path = with_lines(tmp_path / "a.ply", *LINES)
-    header, end, rows = path.read_bytes().partition(b"end_header\n")
-    path.write_bytes((header + end).replace(b"\n", line_end) + rows)
-    assert Gaussians.load(path).rendered_with == VALUES
-
-
 def test_contradictory_values_are_refused(tmp_path):
     path = with_lines(tmp_path / "a.ply", LINES[1], LINES[1])
     assert Gaussians.load(path).rendered_with == {"low_pass": 0.1}

@@ -94,12 +94,6 @@ def test_antialiasing_is_stored_as_a_flag(tmp_path, values):
     assert unpacked(gaussians)[FLAGS] == (1 if values else 0)
 
 
-def test_values_that_spz_cannot_record_are_noted(tmp_path):
-    gaussians = replace(gaussians_within_ranges(5), rendered_with={"low_pass": 0.1})
-    with pytest.warns(UserNote, match=r"the format spz has no room for low_pass 0.1: left out"):
-        gaussians.save(tmp_path / "a.spz")
-
-
 def test_extensions_are_skipped(tmp_path):
     content = unpacked(gaussians_within_ranges(5))
     expected, _ = Spz().read(written(tmp_path / "a.spz", content))

@@ -10,9 +10,6 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from PIL import Image
-from scipy.spatial.transform import Rotation
-
-from drgs.gaussians.rotation import rotate_sh
 
 SCENES = REPOSITORY / "scenes"
 MODEL = SCENES / "shapes" / "knot.ply"
@@ -71,15 +68,6 @@ def test_a_models_smoothing_filter_reaches_the_integrator(relight):
     filters = [stage.scene.integrator().smoothing for stage in stages]
     assert filters[0] is None
     np.testing.assert_array_equal(np.array(filters[1]), smoothing)
-
-
-def test_sh_rotation_matches_the_host(relight):
-    rotation = Rotation.from_rotvec([0.3, -0.7, 0.4]).as_matrix()
-    coefficients = np.random.default_rng(0).normal(0, 1, (5, 15, 3)).astype(np.float32)
-    matrix = relight.sh_rotation(mi.Matrix3f(rotation), 3)
-    actual = np.array(matrix @ mi.TensorXf(coefficients))
-    # Some tens of float32 products of numbers of size one.
-    np.testing.assert_allclose(actual, rotate_sh(coefficients, rotation), atol=1e-5)
 
 
 @pytest.mark.parametrize(

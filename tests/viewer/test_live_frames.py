@@ -64,13 +64,6 @@ def test_approximations_can_be_changed_and_restored(scene, others):
     assert np.array_equal(pixels(scene), first)
 
 
-def test_smaller_images_are_downscaled_ones(scene):
-    small = scene.frame(REQUEST.smaller(2)).pixels
-    assert small.shape == (16, 24, 3)
-    means = pixels(scene).reshape(16, 2, 24, 2, 3).mean(axis=(1, 3))
-    assert np.abs(small - means).mean() < 6  # of 255: a pixel's centre, or the mean of four
-
-
 def test_depths_are_colored_from_near_to_far(scene):
     frame = scene.frame(replace(REQUEST, content="depth"))
     near, far = (float(word) for word in frame.note.split() if word[0].isdigit())
@@ -106,13 +99,6 @@ def test_the_error_is_the_difference_from_the_most_accurate_image(scene):
     values = replace(scene.approximations, **BEST)
     frame = scene.frame(replace(REQUEST, content="error", approximations=values))
     assert (frame.pixels == 128).all() and "the same as" in frame.note
-
-
-def test_error_of_orthographic_views_comes_from_the_order_only():
-    """``ewa`` is exact there: with the most accurate order there is none."""
-    scene = LiveScene(blobs(), ModelConfig(**MOST_ACCURATE), WHITE)
-    assert (pixels(scene, lens="orthographic", content="error") == 128).all()
-    assert (pixels(scene, content="error") != 128).any()
 
 
 NUMBERS = {"opencv": {"k1": 0.1}, "fisheye": {"k1": 0.1}, "thin lens": {"aperture": 0.03}}

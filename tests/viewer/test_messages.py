@@ -154,8 +154,11 @@ PATHS = [
     ],
 )
 def test_malformed_requests_get_no_page_and_no_file_and_print_nothing(server, request_bytes, capfd):
-    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=5) as connection:
-        connection.sendall(request_bytes)
+    address = "127.0.0.1", server.get_port()
+    with socket.create_connection(address, timeout=5) as connection:
+        connection.sendall(
+            request_bytes.replace(b": 127.0.0.1\r", b": 127.0.0.1:%d\r" % address[1])
+        )
         connection.shutdown(socket.SHUT_WR)
         try:
             answer = connection.recv(100)
