@@ -30,9 +30,9 @@ def example(monkeypatch):
     point = EntryPoint("numpy_poses", "numpy_poses", registry.ENTRY_POINT_GROUP)
     monkeypatch.setattr(registry, "entry_points", lambda group: [point])
     yield importlib.import_module("numpy_poses")
-    for each in registry._registries:
-        each._extensions.pop("numpy_poses", None)
-    registry._loaded.discard("numpy_poses")
+    for each in registry._registries:  # private: a process does not unload packages
+        each._extensions.pop("numpy_poses", None)  # private, as above
+    registry._loaded.discard("numpy_poses")  # private, as above
     sys.modules.pop("numpy_poses", None)
 
 

@@ -200,24 +200,6 @@ def test_wrong_intrinsics_are_refused_with_file_and_key(tmp_path, top, size, mes
     assert str(error.value).startswith(f"{path}: {message}")
 
 
-@pytest.mark.parametrize(
-    ("top", "frame", "shutter"),
-    [
-        ({}, {}, "global"),
-        ({"shutter": "rolling"}, {}, "rolling"),
-        ({}, {"shutter": "rolling"}, "rolling"),
-    ],
-)
-def test_camera_motion_is_read_from_frames(tmp_path, top, frame, shutter):
-    close = pose_around(0.4, 0.25)
-    frame = {"transform_matrix_close": (close * [1, -1, -1, 1]).tolist(), **frame}
-    path = write_cameras(tmp_path / "c.json", ANGLE | top, {}, frame)
-    still, moving = read_viewpoints(path, (64, 48))
-    assert still.motion is None
-    assert moving.motion.close_to_world == pytest.approx(close, abs=1e-12)
-    assert moving.motion.shutter == shutter
-
-
 def test_unread_keys_of_a_file_of_cameras_are_reported(tmp_path):
     path = write_cameras(tmp_path / "a.json", ANGLE | {"up": [0, 0, 1], "lens": 3}, {"dof": 0.1})
     with pytest.warns(UserNote, match=r"a.json: keys that are not read: lens, frames\[\].dof$"):

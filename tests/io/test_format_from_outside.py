@@ -30,8 +30,9 @@ def installed(monkeypatch, tmp_path):
     (about / "entry_points.txt").write_text("[drgs]\nnpz = npz_format\n")
     formats.file_formats()  # imports those that are shipped
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr(registry, "_loaded", set())
-    monkeypatch.setattr(formats.FORMATS, "_extensions", dict(formats.FORMATS._extensions))
+    monkeypatch.setattr(registry, "_loaded", set())  # private: a process unloads no packages
+    extensions = dict(formats.FORMATS._extensions)  # private, as above
+    monkeypatch.setattr(formats.FORMATS, "_extensions", extensions)
     monkeypatch.delitem(sys.modules, "npz_format", raising=False)
     yield folder
     sys.modules.pop("npz_format", None)

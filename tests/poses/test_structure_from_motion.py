@@ -84,9 +84,8 @@ def test_plain_images_have_no_cameras_and_leave_no_files(tmp_path):
     assert names_in(tmp_path) == {"0.png", "1.png", "2.png"}
 
 
-# Steps of a search, which takes minutes as a whole.
 def steps_of(folder, names, **settings):
-    reconstruction = sfm._Reconstruction
+    reconstruction = sfm._Reconstruction  # private: a whole search takes minutes
     folders = folder / "work", folder, folder
     return reconstruction(None, *folders, names, SfmSettings(**settings), lambda *step: None)
 
@@ -223,9 +222,10 @@ def test_errors_of_colmap_are_one_line(tmp_path, monkeypatch, module, message):
         monkeypatch.setitem(sys.modules, "pycolmap", None)
     else:
         pytest.importorskip("pycolmap")
-    # private: a child process would not have what is set here
-    monkeypatch.setattr(sfm._Reconstruction, "largest", fail("[reader.cc:1]\nno such image"))
-    in_child, folders = sfm._reconstruct_in_child, (tmp_path, tmp_path, [], tmp_path)
+    # The function of the child process, which would not have what is set here.
+    steps, in_child = sfm._Reconstruction, sfm._reconstruct_in_child  # private, as above
+    monkeypatch.setattr(steps, "largest", fail("[reader.cc:1]\nno such image"))
+    folders = tmp_path, tmp_path, [], tmp_path
     with pytest.raises(UserError, match=message) as error:
         in_child(SfmSettings(), *folders, lambda *step: None)
     assert "\n" not in str(error.value)

@@ -181,11 +181,6 @@ def test_page_with_controls_fits_the_window_and_orbits(path, size):
         assert decibels(page.rendered()[shown], before[shown]) < MAX_WRONG_PSNR_DB
 
 
-def test_title_is_escaped(page):
-    assert page.evaluate("document.title") == f"{TITLE}: Gaussian splats"
-    assert page.evaluate("typeof window.intruder") == "undefined"
-
-
 def test_page_without_webgl_explains_what_it_needs(path):
     with browsers.browser_page(WIDTH, HEIGHT, browsers.NO_WEBGL) as page:
         page.cut_off()
