@@ -127,10 +127,8 @@ def test_missing_splits_are_refused(blender):
     refused = refusal(blender[0], test_split="test")
     assert refused.endswith("transforms_test.json: cannot read the file: No such file or directory")
     (blender[0] / "transforms_val.json").unlink()
-    assert refusal(blender[0]) == (
-        f"{blender[0]}: there are no test views: neither transforms_test.json nor "
-        "transforms_val.json is there; data.test_split: train measures on the training views"
-    )
+    message = "there are no test views: neither transforms_test.json nor transforms_val.json is"
+    assert refusal(blender[0]).startswith(f"{blender[0]}: {message}")
 
 
 def test_missing_image_is_left_out_and_reported_unless_most_are_missing(blender):
@@ -141,11 +139,9 @@ def test_missing_image_is_left_out_and_reported_unless_most_are_missing(blender)
     assert [view.name for view in dataset.train] == ["r_0", "r_2"]
     assert notes == [f"{path}: not there: 1 of 3 photographs (./train/r_1); left out"]
     (folder / "train" / "r_0.png").unlink()
-    assert refusal(folder) == (
-        f"{path}: frames[0].file_path: there is no image {folder / 'train' / 'r_0'} (or with .png "
-        "added); put them there, or take their frames out of the file; not there: 2 of 3 "
-        "photographs"
-    )
+    refused = refusal(folder)
+    assert refused.startswith(f"{path}: frames[0].file_path: there is no image {folder}/train/r_0")
+    assert refused.endswith("; not there: 2 of 3 photographs")
 
 
 def test_every_eighth_view_by_file_name_is_test(photographs):

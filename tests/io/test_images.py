@@ -55,22 +55,6 @@ def test_compression_leaves_a_flat_background_clean(tmp_path, background):
         assert frame.shape[1] == images.GIF_WIDTH and frame[-1, -1].tolist() == list(background)
 
 
-@pytest.mark.parametrize(
-    ("limits", "has_background", "kind"),
-    [({}, False, b"VP8 "), ({}, True, b"VP8L"), ({"LOSSLESS_WEBP_BYTES": 10_000}, True, b"VP8 ")],
-)
-def test_images_without_flat_background_are_compressed_lossily(
-    tmp_path, monkeypatch, limits, has_background, kind
-):
-    frames = NOISE.copy()
-    if has_background:
-        frames[:, :, 32:] = 1
-    for name, value in limits.items():
-        monkeypatch.setattr(images, name, value)
-    images.write_animation(tmp_path / "a.webp", list(frames))
-    assert kind in (tmp_path / "a.webp").read_bytes()
-
-
 def test_a_large_animation_is_written_at_a_lower_quality(tmp_path, monkeypatch):
     images.write_animation(tmp_path / "fine.webp", list(NOISE))
     size = (tmp_path / "fine.webp").stat().st_size

@@ -102,20 +102,16 @@ def test_run_with_a_broken_configuration_is_kept(finished, config):
 def test_folder_with_foreign_files_is_refused(tmp_path, config):
     for name in "dbca":
         (tmp_path / name).write_text("")
-    assert refusal(claim_output_folder, tmp_path, config) == (
-        f"{tmp_path}: the output folder must be new or empty, got one that holds a, b, c and 1 "
-        "more; choose another with --out"
-    )
+    refused = refusal(claim_output_folder, tmp_path, config)
+    assert "must be new or empty, got one that holds a, b, c and 1 more; choose" in refused
     assert sorted(os.listdir(tmp_path)) == ["a", "b", "c", "d"]
 
 
 def test_file_in_place_of_the_folder_is_refused(tmp_path, config):
     (tmp_path / "out").write_text("mine")
-    assert refusal(claim_output_folder, tmp_path / "out", config) == (
-        f"{tmp_path}/out: cannot be the output folder: File exists; choose another folder: a part "
-        "of this path is a file (--out)"
-    )
-    assert "Not a directory" in refusal(claim_output_folder, tmp_path / "out" / "deeper", config)
+    for folder, reason in (("out", "File exists"), ("out/deeper", "Not a directory")):
+        refused = refusal(claim_output_folder, tmp_path / folder, config)
+        assert f"{reason}; choose another folder: a part of this path is a file" in refused
     assert (tmp_path / "out").read_text() == "mine"
 
 
@@ -125,10 +121,8 @@ def test_folder_without_permission_is_refused(tmp_path, config, monkeypatch, fun
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, function, refuse)
-    assert refusal(claim_output_folder, tmp_path / "out", config) == (
-        f"{tmp_path}/out: cannot be the output folder: Permission denied; choose a folder that you "
-        "may write to (--out)"
-    )
+    refused = refusal(claim_output_folder, tmp_path / "out", config)
+    assert "cannot be the output folder: Permission denied; choose a folder that" in refused
 
 
 def test_removing_a_run_deletes_every_result(tmp_path, config):
@@ -157,10 +151,8 @@ def test_folder_in_place_of_a_result_is_not_removed(finished, is_recorded):
 def test_foreign_files_are_never_removed(finished):
     (finished / "notes.txt").write_text("mine")
     before = contents(finished)
-    assert refusal(remove_run, finished) == (
-        f"{finished}: must hold nothing but a run to be replaced, got notes.txt; move that away, "
-        "or choose another folder with --out"
-    )
+    message = "must hold nothing but a run to be replaced, got notes.txt; move that away"
+    assert message in refusal(remove_run, finished)
     assert contents(finished) == before
     (finished / "config.yml").unlink()
     message = "is not the output folder of a fit: it has no config.yml"
@@ -168,7 +160,5 @@ def test_foreign_files_are_never_removed(finished):
 
 
 def test_a_folder_without_a_run_cannot_be_continued(tmp_path):
-    assert refusal(load_run_config, tmp_path / "none") == (
-        f"{tmp_path}/none: is not the output folder of a fit: it does not exist, and so has no "
-        "config.yml"
-    )
+    message = "is not the output folder of a fit: it does not exist, and so has no config.yml"
+    assert refusal(load_run_config, tmp_path / "none") == f"{tmp_path}/none: {message}"

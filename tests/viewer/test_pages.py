@@ -1,7 +1,6 @@
 """Pages as viser serves them, without a browser: what controls and cameras ask for."""
 
 import warnings
-from dataclasses import replace
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -18,11 +17,11 @@ from websockets.exceptions import InvalidStatus
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.training.loop import History, HistoryRow
-from drgs.viewer.frames import FRAME_CONTENTS, VIEWER_LENSES, ViewerFrame
+from drgs.viewer.frames import FRAME_CONTENTS, VIEWER_LENSES
 from drgs.viewer.page import ADJUSTABLE_APPROXIMATIONS, Page, StartView
 from drgs.viewer.scheduler import RenderRequests
 from drgs.viewer.server import free_port, is_same_origin, run_server, url
-from drgs.viewer.training_viewer import MAX_POINTS, TrainingPage, psnr_curves
+from drgs.viewer.training_viewer import TrainingPage
 
 FITTED = Approximations(low_pass=0.1, antialiased=True, extent=3.5)
 
@@ -134,19 +133,6 @@ def text(page, monkeypatch):
     return page._texts[7]  # private, as above
 
 
-def test_frame_times_are_compared_with_the_fitted_settings(page, text):
-    request, pixels = requested(page), np.zeros((2, 2, 3), np.uint8)
-    other = replace(request, approximations=Approximations(order="pixel"))
-    page.show(7, request, ViewerFrame(pixels, 0.02, ""), True)
-    assert text.content == "**20 ms** for 1280×720"
-    page.show(7, other, ViewerFrame(pixels, 0.05, "x"), True)
-    assert text.content == "**50 ms** for 1280×720; as fitted 20 ms\n\nx"
-    elsewhere = replace(other.camera, camera_to_world=pose_around(0.1, 0.1))
-    for changes in ({"width": 640}, {"content": "depth"}, {"camera": elsewhere}):
-        page.show(7, replace(other, **changes), ViewerFrame(pixels, 0.05, "x"), True)
-        assert "as fitted" not in text.content
-
-
 def test_number_beyond_its_limits_is_reported_and_not_rendered(page, server, text):
     controls_of(server)["alpha_cut"].value = 1.0
     page.update()
@@ -219,16 +205,3 @@ def test_the_page_of_a_fit_follows_its_history(server):
     page.show_end(12)
     controls = controls_of(server)
     assert bar.value == 100 and controls["Pause"].disabled
-
-
-def test_curves_have_few_points_including_ends_and_measurements():
-    rows = [
-        HistoryRow(k, 0.1, 20.0, 25, 1e-3, 0.1, 25.0 if k % 400 == 0 else None)
-        for k in range(1, 1001)
-    ]
-    (x, y), (at, test) = psnr_curves(rows)
-    assert len(x) == MAX_POINTS and x[0] == 1 and x[-1] == 1000
-    assert y == pytest.approx(20)
-    step = [replace(row, psnr=30.0 if row.iteration > 1 else 20.0) for row in rows[:20]]
-    assert psnr_curves(step)[0][1] == pytest.approx(30 - 10 * 0.9 ** np.arange(20))
-    assert list(at) == [400, 800] and list(test) == [25, 25]

@@ -12,7 +12,6 @@ from drgs.viewer.frames import FrameRequest, ViewerCamera, ViewerFrame
 from drgs.viewer.scheduler import (
     MOVING_SECONDS,
     STILL_SECONDS,
-    AdaptiveResolution,
     RenderRequests,
     RenderScheduler,
 )
@@ -96,29 +95,6 @@ def test_images_of_a_moving_camera_meet_their_time_limit(stage):
         stage.ask(1)
         assert stage.serve()
     assert stage.widths()[-2:] == [400, 800]
-
-
-def test_static_camera_gets_progressively_larger_images(stage):
-    stage.seconds_a_pixel = 3e-6
-    for _ in range(6):
-        stage.ask(1)
-        stage.serve()
-    assert stage.shown[-1] == (1, 133, False)  # a sixth
-    stage.clock.now += STILL_SECONDS
-    assert stage.serve() and stage.shown[-1] == (1, 267, False)
-    stage.ask(1)
-    assert stage.serve() and stage.shown[-1] == (1, 133, False)
-    stage.clock.now += STILL_SECONDS
-    assert stage.serve() and stage.serve() and not stage.serve()
-    assert stage.widths()[-2:] == [267, 800]
-
-
-def test_small_windows_keep_a_minimum_resolution():
-    resolution = AdaptiveResolution()
-    for _ in range(9):
-        resolution.update(1, 10.0)
-    for width, height, divisor in ((800, 600, 8), (300, 130, 2), (300, 20, 1)):
-        assert resolution.divisor(replace(REQUEST, width=width, height=height)) == divisor
 
 
 def test_changing_content_is_rendered_again_after_a_while(make_stage):
