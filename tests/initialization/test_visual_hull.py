@@ -89,6 +89,7 @@ def test_carving_uses_little_memory(is_noise, limit):
     assert peak < limit
 
 
+@pytest.mark.slow
 def test_masked_pixels_and_moving_cameras_do_not_carve_the_hull():
     hole = np.zeros((64, 64), bool)
     hole[20:40, 20:40] = True
