@@ -162,6 +162,18 @@ def test_few_photographs_are_matched_exhaustively_and_many_selectively(tmp_path)
             assert ((i, j) in selected) == expected
 
 
+@pytest.mark.parametrize(
+    ("settings", "count", "options"),
+    [
+        (SfmSettings(), ALL_PAIRS, "--share one or --camera-model SIMPLE_RADIAL or "),
+        (SfmSettings(), ALL_PAIRS + 1, "--compare all or --share one"),
+        (SfmSettings("SIMPLE_RADIAL", "all", "one"), 999, "--camera-model OPENCV_FISHEYE (a fish"),
+    ],
+)
+def test_offered_options_differ_from_the_given_ones(settings, count, options):
+    assert settings.alternative_options(count).startswith(options)
+
+
 def test_names_are_sorted_by_number_and_masks_are_not_photographs(tmp_path):
     for name in ("2.png", "10.png", "1.JPG", "b/3.png", "2_mask.png", "10.png.mask.png"):
         save(tmp_path / "images" / name, format="PNG")
