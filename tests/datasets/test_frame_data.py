@@ -156,42 +156,33 @@ def test_empty_mask_is_refused(photographs, name, mask, options):
 
 
 @pytest.mark.parametrize(
-    ("top", "frame", "unit"),
-    [({}, {}, 1e-3), ({SCALE: 0.25}, {}, 0.25), ({}, {SCALE: 2}, 2.0)],
-    ids=["default", "top", "frame"],
+    ("file", "top", "frame", "unit"),
+    [
+        ("depth.png", {}, {}, 1e-3),
+        ("depth.png", {SCALE: 0.25}, {}, 0.25),
+        ("depth.png", {}, {SCALE: 2}, 2.0),
+        ("depth.npy", {}, {}, 1.0),
+        ("depth.npy", {}, {SCALE: 0.25}, 0.25),
+    ],
 )
-def test_integer_depths_are_multiples_of_the_unit(photographs, top, frame, unit):
+def test_depths_are_multiples_of_the_unit(photographs, file, top, frame, unit):
+    """Depths that are not finite or not positive are unknown."""
+    depths = np.random.default_rng(0).uniform(5, 90, (6, 8))
+    depths[0, :5] = [np.nan, np.inf, -1, 0, np.finfo(np.float64).max]
+    np.save(photographs / "depth.npy", depths)
     iio.imwrite(photographs / "depth.png", STEPS)
-    give(photographs, depth_file_path="depth.png", **frame)
+    give(photographs, depth_file_path=file, **frame)
     edit(photographs / "transforms.json", lambda meta: meta.update(top))
     dataset = load(photographs)
     depth = view_named(dataset).depth
-    assert depth.dtype == np.float32
+    with np.errstate(over="ignore"):
+        expected = ((STEPS if file == "depth.png" else depths) * unit).astype(np.float32)
+    expected[~(np.isfinite(expected) & (expected > 0))] = 0
+    assert depth.dtype == np.float32 and (expected > 0).sum() >= 43
     # Divided by the largest number of 16 bits and multiplied by it: two roundings, and the unit's.
-    np.testing.assert_allclose(depth, STEPS * unit, rtol=4 * 6e-8)
-    assert depth[0, 0] == 0  # not known
+    np.testing.assert_allclose(depth, expected, rtol=4 * 6e-8)
     assert view_named(dataset, "02").depth is None
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint16])
-def test_array_depths_are_in_scene_units_or_in_the_given_unit(photographs, dtype):
-    """Depths that are not finite or not positive are unknown."""
-    depths = np.random.default_rng(0).uniform(5, 90, (6, 8)).astype(dtype)
-    if dtype != np.uint16:
-        depths[0, :5] = [np.nan, np.inf, -1, 0, np.finfo(dtype).max]
-    np.save(photographs / "depth.npy", depths)
-    np.save(photographs / "channel.npy", depths[..., None])
-    give(photographs, depth_file_path="depth.npy")
-    give(photographs, "02.png", depth_file_path="channel.npy", **{SCALE: 0.25})
-    dataset = load(photographs)
-    for name, unit in (("01", 1.0), ("02", 0.25)):
-        # A power of two: no rounding but that to single precision.
-        with np.errstate(over="ignore"):
-            expected = (depths * unit).astype(np.float32)
-        expected[~(np.isfinite(expected) & (expected > 0))] = 0
-        assert (expected > 0).sum() >= 43
-        np.testing.assert_array_equal(view_named(dataset, name).depth, expected)
-    assert dataset.description.endswith("; depth in units of 0.25 and 1")
+    assert dataset.description.endswith(f"; depth in units of {unit:g}")
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])

@@ -223,18 +223,6 @@ def test_panels_show_the_history():
     assert tested.y == pytest.approx([8.5, 9])
 
 
-def test_population_panel_shows_added_removed_and_relocated_gaussians():
-    relocated = DensityRow(iteration=80, num_gaussians=2400, relocated=7)
-    shown = history(90, [*CHANGES, relocated])
-    (panel,) = (p for p in curves.panels_of(shown) if p.title == "Gaussians")
-    (x, added), (_, removed), (_, moved) = (
-        panel.others[name] for name in ("added", "removed", "relocated")
-    )
-    assert x.tolist() == [0, 20, 40, 60, 80, 90]  # the last iteration
-    assert (1000 + added - removed).tolist() == [1000, 1500, 1400, 2400, 2400, 2400]
-    assert moved.tolist() == [0, 0, 0, 0, 7, 7]
-
-
 def test_page_has_no_external_references_and_its_images_are_complete(page, out):
     embedded = [reference for reference in page.references if reference.startswith("data:")]
     # The icon, the orbit and its first frame, comparisons, curves for light and dark pages.
