@@ -183,7 +183,7 @@ class TrainingPage(Page):
     def _toggle_pause(self) -> None:
         paused = not self.requests.paused
         self.requests.pause(paused)
-        self._pause.label = "Go on" if paused else "Pause"
+        self._pause.label = "Continue" if paused else "Pause"
         self._pause.icon = self._icons[paused]
 
     async def _confirm_end(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:

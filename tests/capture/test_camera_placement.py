@@ -1,13 +1,12 @@
 """Default camera positions of a capture."""
 
 import math
-from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from drgs.capture import camera_placement
+from drgs.capture.camera_placement import settings_for, views_around, views_of
 from drgs.capture.path_tracing import CaptureCamera, CaptureSettings, lit_part
 from drgs.core.errors import UserError
 
@@ -15,10 +14,6 @@ from drgs.core.errors import UserError
 @pytest.fixture(scope="module", autouse=True)
 def variant():
     mi.set_variant("llvm_ad_rgb")
-
-
-def loaded(**parts):
-    return mi.load_dict({"type": "scene", **parts})
 
 
 TWO_SIDED = {"type": "twosided", "bsdf": {"type": "diffuse"}}
@@ -34,95 +29,26 @@ LAMP = {
 }
 SKY = {"type": "constant"}
 
-
-def sensor(origin, target, up=(0, 1, 0), fov=40.0, width=8, height=8):
-    to_world = mi.ScalarTransform4f().look_at(list(origin), list(target), list(up))
-    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
-    pose = {"to_world": to_world, "film": film, "sampler": {"type": "multijitter"}}
-    return {"type": "perspective", "fov": fov, **pose}
+BALL = {
+    "type": "sphere",
+    "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.05, 0.2, 0.6]}},
+}
 
 
-def derived(scene, **given):
-    return camera_placement.settings_for(scene, CaptureSettings(**given), given.keys())
+def loaded(**parts):
+    return mi.load_dict({"type": "scene", **parts})
 
 
-def centers(scene, settings):
-    return np.array([view.pose[:3, 3] for view in camera_placement.views_of(scene, settings)])
-
-
-# Which kind
-
-
-def test_cornell_box_is_captured_from_inside():
-    scene = mi.load_dict(mi.cornell_box())
-    settings = derived(scene, views=12, test_views=4, size=(16, 16), spp=4)
-    assert (settings.cameras, settings.up) == ("inside", "y")
-    assert math.degrees(settings.fov) == pytest.approx(70)
-    assert np.abs(centers(scene, settings)).max() < 1
-    camera = CaptureCamera(scene, settings)
-    for view in camera_placement.views_of(scene, settings):
-        rendered = camera.image(view)
-        assert lit_part(rendered) > 0.8
-        # Its front is open, and an image may look through it.
-        assert (rendered[:, :, 3] > 0).mean() > 0.15
-
-
-def test_room_of_two_sided_walls_is_captured_from_inside():
-    """No light comes out: from around, all is black."""
-    scene = loaded(room=ROOM, lamp=LAMP)
-    settings = derived(scene)
-    assert (settings.cameras, settings.up) == ("inside", "z")
-    assert (np.abs(centers(scene, settings)) < 1).all()
-
-
-def test_room_lit_from_outside_is_captured_from_inside_if_its_sensor_is_inside():
-    parts = {"room": ROOM, "lamp": LAMP, "sky": SKY}
-    assert derived(loaded(**parts)).cameras == "around"
-    inside = sensor((0.5, 0, 0), (-1, 0, 0))
-    assert derived(loaded(**parts, sensor=inside)).cameras == "inside"
-
-
-@pytest.mark.parametrize("bsdf", [{"type": "diffuse"}, TWO_SIDED], ids=["one side", "two"])
-def test_object_is_captured_from_around(bsdf):
-    """It is closed as a room is, but dark inside."""
-    settings = derived(loaded(ball={"type": "sphere", "bsdf": bsdf}, sky=SKY))
-    assert settings == CaptureSettings()
-
-
-def test_options_of_cameras_around_place_them_around():
-    scene = mi.load_dict(mi.cornell_box())
-    for given in ({"distance": 3.0}, {"azimuth": (-20.0, 20.0)}, {"elevation": (0.0, 20.0)}):
-        assert derived(scene, **given).cameras == "around"
-
-
-# Sensors of the scene
-
-
-def test_one_sensor_decides_up_distance_target_and_field_of_view():
-    # It looks past the middle at (1.5, 2, 3); the film's smaller side spans 30 degrees.
-    seen_from = sensor((1.5, 2, 9), (1.5, 2, 3), fov=30.0, width=16)
-    seen_from["fov_axis"] = "smaller"
-    ball = {"type": "sphere", "center": [1, 2, 3]}
-    scene = loaded(ball=ball, sky=SKY, sensor=seen_from)
-    settings = derived(scene)
-    assert (settings.cameras, settings.up) == ("around", "y")
-    assert settings.target == pytest.approx((1.5, 2, 3), abs=1e-5)
-    assert settings.distance == pytest.approx(6, abs=1e-5)
-    assert math.degrees(settings.fov) == pytest.approx(30, abs=1e-4)
-    wide = derived(scene, size=(20, 10))
-    assert wide.narrower_fov == pytest.approx(settings.fov)
-    given = derived(scene, fov=0.5, up="x")
-    assert (given.fov, given.up, given.target, given.distance) == (0.5, "x", None, None)
-
-
-def test_up_may_point_down_the_axis():
-    scene = loaded(ball={"type": "sphere"}, sky=SKY, s=sensor((5, -1, 0), (0, 0, 0), (0, -1, 0)))
-    settings = derived(scene)
-    assert settings.up == "-y"
-    assert (centers(scene, settings)[:, 1] < 0).all()
-    for view in camera_placement.views_of(scene, settings):
-        assert view.pose[1, 1] < 0, "upside down"
-        assert np.linalg.det(view.pose[:3, :3]) == pytest.approx(1)
+def sensor(origin, target, up=(0, 1, 0), fov=40.0, width=8):
+    film = {"type": "hdrfilm", "width": width, "height": 8, "rfilter": {"type": "box"}}
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "fov_axis": "smaller",
+        "to_world": mi.ScalarTransform4f().look_at(list(origin), list(target), list(up)),
+        "film": film,
+        "sampler": {"type": "multijitter"},
+    }
 
 
 def ring(count):
@@ -134,17 +60,78 @@ def ring(count):
     }
 
 
-BALL = {
-    "type": "sphere",
-    "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.05, 0.2, 0.6]}},
+def derived(scene, **given):
+    return settings_for(scene, CaptureSettings(**given), given.keys())
+
+
+def centers(scene, settings):
+    return np.array([view.pose[:3, 3] for view in views_of(scene, settings)])
+
+
+def test_cornell_box_is_captured_from_inside():
+    scene = mi.load_dict(mi.cornell_box())
+    settings = derived(scene, views=12, test_views=4, size=(16, 16), spp=4)
+    assert (settings.cameras, settings.up) == ("inside", "y")
+    assert math.degrees(settings.fov) == pytest.approx(70)
+    assert np.abs(centers(scene, settings)).max() < 1
+    camera = CaptureCamera(scene, settings)
+    for view in views_of(scene, settings):
+        rendered = camera.image(view)
+        assert lit_part(rendered) > 0.8
+        # Its front is open, and an image may look through it.
+        assert (rendered[:, :, 3] > 0).mean() > 0.15
+
+
+PARTS = {
+    "a room without light outside": {"room": ROOM, "lamp": LAMP},
+    "a room in daylight": {"room": ROOM, "lamp": LAMP, "sky": SKY},
+    "a ball": {"ball": BALL, "sky": SKY},
+    "a ball, dark inside": {"ball": {"type": "sphere", "bsdf": TWO_SIDED}, "sky": SKY},
 }
+
+
+@pytest.mark.parametrize("kind", [*PARTS, "a sensor in a room"])
+def test_rooms_are_captured_from_inside_and_objects_from_around(kind):
+    parts = PARTS.get(kind, PARTS["a room in daylight"])
+    if kind == "a sensor in a room":
+        parts = parts | {"sensor": sensor((0.5, 0, 0), (-1, 0, 0))}
+    scene = loaded(**parts)
+    settings, is_inside = derived(scene), kind.endswith(("outside", "in a room"))
+    assert settings.cameras == ("inside" if is_inside else "around")
+    assert (np.abs(centers(scene, settings)) < 1).all() == is_inside
+    for given in ({"distance": 3.0}, {"azimuth": (-20.0, 20.0)}, {"elevation": (0.0, 20.0)}):
+        assert derived(scene, **given).cameras == "around"
+
+
+def test_one_sensor_decides_up_distance_target_and_field_of_view():
+    # It looks past the middle at (1.5, 2, 3); the film's smaller side spans 30 degrees.
+    seen_from = sensor((1.5, 2, 9), (1.5, 2, 3), fov=30.0, width=16)
+    scene = loaded(ball={"type": "sphere", "center": [1, 2, 3]}, sky=SKY, sensor=seen_from)
+    settings = derived(scene)
+    assert (settings.cameras, settings.up) == ("around", "y")
+    assert settings.target == pytest.approx((1.5, 2, 3), abs=1e-5)
+    assert settings.distance == pytest.approx(6, abs=1e-5)
+    assert math.degrees(settings.fov) == pytest.approx(30, abs=1e-4)
+    assert derived(scene, size=(20, 10)).narrower_fov == pytest.approx(settings.fov)
+    given = derived(scene, fov=0.5, up="x")
+    assert (given.fov, given.up, given.target, given.distance) == (0.5, "x", None, None)
+
+
+def test_up_may_point_down_the_axis():
+    scene = loaded(ball=BALL, sky=SKY, s=sensor((5, -1, 0), (0, 0, 0), (0, -1, 0)))
+    settings = derived(scene)
+    assert settings.up == "-y"
+    assert (centers(scene, settings)[:, 1] < 0).all()
+    for view in views_of(scene, settings):
+        assert view.pose[1, 1] < 0, "upside down"
+        assert np.linalg.det(view.pose[:3, :3]) == pytest.approx(1)
 
 
 def test_many_sensors_are_used_as_cameras():
     scene = loaded(ball=BALL, sky=SKY, **ring(17))
     settings = derived(scene, size=(8, 8), spp=64)
     assert (settings.cameras, settings.views, settings.test_views) == ("sensors", 14, 3)
-    views = camera_placement.views_of(scene, settings)
+    views = views_of(scene, settings)
     assert [view.split for view in views] == ["train"] * 14 + ["test"] * 3
     assert [view.index for view in views] == [*range(14), *range(3)]
     order = [n for n in range(17) if n % 8] + [0, 8, 16]
@@ -159,10 +146,14 @@ def test_many_sensors_are_used_as_cameras():
         np.testing.assert_allclose(camera.linear(view)[:, :, :3], shown[:, :, :3], atol=0.075)
 
 
-@pytest.mark.parametrize("name", ["views", "test_views", "target", "distance", "fov", "azimuth"])
-def test_placement_options_are_refused_with_sensors(name):
-    values = {"views": 3, "test_views": 1, "target": (0.0, 0.0, 0.0), "distance": 2.0, "fov": 0.5}
-    value = values.get(name, (0.0, 1.0))
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("views", 3), ("test_views", 1), ("target", (0.0, 0.0, 0.0))),
+        *(("distance", 2.0), ("fov", 0.5), ("azimuth", (0.0, 1.0))),
+    ],
+)
+def test_placement_options_are_refused_with_sensors(name, value):
     scene = loaded(ball=BALL, sky=SKY, **ring(12))
     assert derived(scene, **{name: value}).cameras == "around"
     with pytest.raises(UserError) as error:
@@ -171,25 +162,31 @@ def test_placement_options_are_refused_with_sensors(name):
     assert str(error.value) == f"{option}: is not used with --cameras sensors; leave it out"
 
 
-def test_contradictory_settings_are_refused():
+INSIDE = {"cameras": "inside"}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"cameras": "sensors"}, "--cameras sensors: the scene has no sensor of type"),
+        (INSIDE | {"distance": 1.0}, "--distance: is not used with --cameras inside"),
+        (INSIDE | {"target": (3.0, 0.0, 0.0)}, "target must lie within the scene's bounding box"),
+        ({"azimuth": (30.0, -30.0)}, "azimuth must be two angles in rising order between -360"),
+        ({"elevation": (-91.0, 0.0)}, "elevation must be two angles in rising order between -90"),
+        ({"elevation": (0.0, math.nan)}, "elevation must be two angles"),
+    ],
+)
+def test_contradictory_settings_are_refused(given, message):
     scene = loaded(ball=BALL, sky=SKY)
-    with pytest.raises(UserError, match="--cameras sensors: the scene has no sensor of type"):
-        derived(scene, cameras="sensors")
-    with pytest.raises(UserError, match="--distance: is not used with --cameras inside"):
-        derived(scene, cameras="inside", distance=1.0)
-    outside = derived(scene, cameras="inside", target=(3.0, 0.0, 0.0))
-    with pytest.raises(UserError, match="target must lie within the scene's bounding box"):
-        camera_placement.views_of(scene, outside)
-
-
-# Exact positions
+    with pytest.raises(UserError, match=message):
+        views_of(scene, derived(scene, **given))
 
 
 def test_cameras_inside_stand_between_target_and_walls():
     scene = loaded(room=ROOM)
     target = (0.4, -0.3, 0.1)
     settings = derived(scene, cameras="inside", target=target, views=40, test_views=0)
-    for view in camera_placement.views_of(scene, settings):
+    for view in views_of(scene, settings):
         offset = view.pose[:3, 3] - target
         np.testing.assert_allclose(view.pose[:3, 2], offset / np.linalg.norm(offset), atol=1e-9)
         # 60 % of the way to the wall behind.
@@ -198,10 +195,9 @@ def test_cameras_inside_stand_between_target_and_walls():
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-z"])
 def test_angles_fill_their_ranges_evenly(up):
-    settings = CaptureSettings(
-        test_views=200, up=up, azimuth=(-30.0, 60.0), elevation=(-10.0, 40.0)
-    )
-    views = camera_placement.views_around(settings, np.array([1.0, 2.0, 3.0]), 2.0)[-200:]
+    ranges = {"azimuth": (-30.0, 60.0), "elevation": (-10.0, 40.0)}
+    settings = CaptureSettings(test_views=200, up=up, **ranges)
+    views = views_around(settings, np.array([1.0, 2.0, 3.0]), 2.0)[-200:]
     offsets = np.array([(view.pose[:3, 3] - [1, 2, 3]) / 2 for view in views])
     sign = -1 if up.startswith("-") else 1
     axis = "xyz".index(up[-1])
@@ -211,32 +207,7 @@ def test_angles_fill_their_ranges_evenly(up):
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), 1)
     low, high = np.sin(np.radians([-10, 40]))
     for values, first, last in ((azimuth, -30, 60), (height, low, high)):
-        assert values.min() >= first - 1e-9
-        assert values.max() <= last + 1e-9
+        assert first - 1e-9 <= values.min() and values.max() <= last + 1e-9
         # Each tenth of the range has a tenth of the cameras: the spiral leaves no gaps.
         counts, _ = np.histogram(values, 10, (first, last))
         assert np.abs(counts - 20).max() <= 2
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"azimuth": (30.0, -30.0)}, "azimuth must be two angles in rising order between -360"),
-        ({"elevation": (-91.0, 0.0)}, "elevation must be two angles in rising order between -90"),
-        ({"elevation": (0.0, math.nan)}, "elevation must be two angles"),
-    ],
-)
-def test_wrong_ranges_are_refused(given, message):
-    with pytest.raises(UserError, match=message):
-        CaptureSettings(**given)
-
-
-def test_default_range_is_the_whole_hemisphere():
-    settings = CaptureSettings(views=7)
-    same = replace(settings, elevation=(0.0, 90.0))
-    for one, other in zip(
-        camera_placement.views_around(settings, np.zeros(3), 4.0),
-        camera_placement.views_around(same, np.zeros(3), 4.0),
-        strict=True,
-    ):
-        assert (one.pose == other.pose).all()

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from conftest import SHARED_DATA
 from drjit.llvm import Array3f64, Float64
 from PIL import Image
 from support.colmap_models import (
@@ -20,20 +19,34 @@ from support.datasets import load, load_noting, refusal
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
-from drgs.config.schema import FitConfig, InitConfig
+from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.files import masks_of
 from drgs.datasets.images import is_scaled
 from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.initialization.defaults import resolve_defaults
-from drgs.initialization.start import _read_cloud, start_of
+from drgs.initialization.start import start_of
 from drgs.io.colmap import MODELS
 
-REAL_MODEL = SHARED_DATA / "colmap_robothead"
+HALF = np.repeat([[255, 0]], 480, axis=0).repeat(320, axis=1).astype(np.uint8)
+"""A mask of which the left half counts."""
+
+
+def model_of(names=NAMES, seed=1):
+    return some_model(np.random.default_rng(seed), names, ["PINHOLE"])
+
+
+def views_by_name(dataset):
+    return {view.name: view for view in (*dataset.train, *dataset.test)}
 
 
 def intrinsics(view):
     return view.fx, view.fy, view.cx, view.cy, view.width, view.height
+
+
+def save(path, mask):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(mask).save(path)
 
 
 @pytest.mark.parametrize("below", ["sparse/0", "sparse", "colmap/sparse/0"])
@@ -44,24 +57,14 @@ def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
     assert [view.name for view in dataset.test] == ["a", "2"]
     assert [view.name for view in dataset.train] == ["b", "1"]
     poses = {name: pose for name, _, pose in model.images}
-    views = dict(
-        zip((NAMES[k] for k in (0, 3, 1, 2)), (*dataset.test, *dataset.train), strict=True)
-    )
-    for name, view in views.items():
+    for view in (*dataset.train, *dataset.test):
+        name = view.files["image"].relative_to(tmp_path / "images").as_posix()
         np.testing.assert_allclose(view.camera_to_world, poses[name], atol=1e-14)
         assert intrinsics(view) == (600, 620, 320.5, 239, 640, 480) and view.lens is None
         level = np.asarray(view.image)[0, 0, 0] * 255
         assert level == pytest.approx(40 * NAMES.index(name), abs=3)
     assert "(COLMAP layout): 2 train views" in dataset.description
     assert dataset.background == (0.0, 0.0, 0.0)
-
-
-def test_folder_names_are_case_insensitive(tmp_path):
-    write_dataset(tmp_path)
-    (tmp_path / "images").rename(tmp_path / "Images")
-    write_images(tmp_path / "IMAGES_2", size=(320, 240))
-    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "Images"
-    assert load(tmp_path, downscale=2).train[0].width == 320
 
 
 @pytest.mark.slow
@@ -82,29 +85,8 @@ def test_intrinsics_follow_the_image_size(tmp_path):
         assert f"images of {folder}" in dataset.description
         assert dataset.train[0].width == width
         assert dataset.train[0].fx == pytest.approx(600 / factor)
-
-
-def test_largest_available_images_are_used(tmp_path):
-    write_dataset(tmp_path)
     (tmp_path / "images").rename(tmp_path / "originals")
-    for factor in (4, 8):
-        write_images(tmp_path / f"images_{factor}", size=(640 // factor, 480 // factor))
-    assert load(tmp_path).train[0].width == 160
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(LENS_OF_MODEL))
-def test_every_supported_lens_is_rendered(tmp_path, name):
-    """Without undistorting; the coefficients are those of the file."""
-    write_dataset(tmp_path, [name])
-    view = load(tmp_path).train[0]
-    coefficients = dict(zip(MODELS[name][1], PARAMETERS[name], strict=True))
-    named = {k: v for k, v in coefficients.items() if k[0] in "kps"}
-    assert ({} if view.lens is None else view.lens.coefficients()) == pytest.approx(named)
-    kind = None if view.lens is None else view.lens.kind
-    fisheye = "thin_prism_fisheye" if "PRISM" in name else "fisheye"
-    assert kind == (fisheye if "FISHEYE" in name else None if "PINHOLE" in name else "opencv")
-    assert load(tmp_path, ignore_distortion=True).train[0].lens is None
+    assert load(tmp_path).train[0].width == 320  # the largest that are there
 
 
 def film_points(view, points):
@@ -125,31 +107,11 @@ def test_points_project_like_in_colmap(tmp_path, name):
     points = np.random.default_rng(3).uniform((-0.7, -0.6, 1), (0.7, 0.6, 1), (50, 3))
     points *= np.linspace(0.5, 9, 50)[:, None]
     expected = theirs.img_from_cam(points)
-    ours = film_points(load(tmp_path).train[0], points)
-    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-11)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
-def test_real_points_project_to_their_observations():
-    """Within the mean error that the model says of itself, through the reader of datasets."""
-    pycolmap = pytest.importorskip("pycolmap")
-    theirs = pycolmap.Reconstruction(str(REAL_MODEL / "sparse" / "0"))
-    dataset = load(REAL_MODEL, downscale=2)
-    errors = {number: [] for number in theirs.points3D}
-    for view in (*dataset.train, *dataset.test):
-        image = theirs.find_image_with_name(view.files["image"].name)
-        observed = [p for p in image.points2D if p.has_point3D()]
-        world = np.array([theirs.points3D[p.point3D_id].xyz for p in observed])
-        inside = (world - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
-        scale = theirs.cameras[image.camera_id].width / view.width
-        places = scale * film_points(view, inside)
-        for point, place in zip(observed, places, strict=True):
-            errors[point.point3D_id].append(np.linalg.norm(place - point.xy))
-    ours = np.array([np.mean(values) for values in errors.values()])
-    stored = np.array([theirs.points3D[number].error for number in errors])
-    np.testing.assert_allclose(ours, stored, rtol=0, atol=0.01)
-    assert np.mean(ours) == pytest.approx(np.mean(stored), rel=1e-3)
+    view = load(tmp_path).train[0]
+    np.testing.assert_allclose(film_points(view, points), expected, rtol=0, atol=1e-11)
+    coefficients = dict(zip(MODELS[name][1], PARAMETERS[name], strict=True))
+    named = {k: v for k, v in coefficients.items() if k[0] in "kps"}
+    assert ({} if view.lens is None else view.lens.coefficients()) == pytest.approx(named)
 
 
 @pytest.mark.parametrize("name", sorted(set(PARAMETERS) - set(LENS_OF_MODEL)))
@@ -162,18 +124,14 @@ def test_other_lenses_are_refused_by_name(tmp_path, name):
 
 def test_masks_are_found_beside_their_images(tmp_path):
     write_dataset(tmp_path)
-    mask = np.zeros((480, 640), np.uint8)
-    mask[:, :320] = 255
-    (tmp_path / "masks" / "cam").mkdir(parents=True)
-    Image.fromarray(mask).save(tmp_path / "masks" / "b.jpg.png")  # as COLMAP has it
-    Image.fromarray(255 - mask).save(tmp_path / "masks" / "cam" / "1.png")
-    views = {view.name: view for view in load(tmp_path).train}
-    assert np.asarray(views["b"].mask).sum(axis=0).tolist() == [480] * 320 + [0] * 320
-    assert np.asarray(views["1"].mask).sum(axis=0).tolist() == [0] * 320 + [480] * 320
-    assert views["2"].mask is None
-    assert all(view.mask is None for view in load(tmp_path, ignore_masks=True).train)
+    save(tmp_path / "masks" / "b.jpg.png", HALF)  # as COLMAP has it
+    save(tmp_path / "masks" / "cam" / "1.png", 255 - HALF)
     (tmp_path / "masks" / "c.png").touch()
     dataset, notes = load_noting(tmp_path)
+    views = views_by_name(dataset)
+    np.testing.assert_array_equal(views["b"].mask, HALF / 255)
+    np.testing.assert_array_equal(views["1"].mask, 1 - HALF / 255)
+    assert views["2"].mask is None
     assert "; masks of 2 of 4 photographs" in dataset.description
     assert notes == [
         f"{tmp_path}: all pixels count of 2 of 4 photographs, which have no mask (a.jpg, "
@@ -183,6 +141,7 @@ def test_masks_are_found_beside_their_images(tmp_path):
     ]
     dataset, notes = load_noting(tmp_path, ignore_masks=True)
     assert dataset.ignored == ("masks",) and notes == []
+    assert all(view.mask is None for view in dataset.train)
 
 
 @pytest.mark.slow
@@ -196,29 +155,23 @@ def test_masks_are_found_beside_their_images(tmp_path):
 )
 def test_common_mask_names_are_found(tmp_path, pattern):
     write_dataset(tmp_path)
-    mask = np.zeros((480, 640), np.uint8)
-    mask[:, :320] = 255
-    for stem in ("a", "cam/1"):
-        folder, _, last = stem.rpartition("/")
-        file = tmp_path / pattern.format(stem, f"{folder}/{last.upper()}".strip("/"))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(mask).save(file)
+    for stem, capital in (("a", "A"), ("cam/1", "cam/1")):
+        save(tmp_path / pattern.format(stem, capital), HALF)
     dataset, notes = load_noting(tmp_path)
-    views = {view.name: view for view in (*dataset.train, *dataset.test)}
+    views = views_by_name(dataset)
     for name in ("a", "1"):
-        assert np.asarray(views[name].mask).sum(axis=0).tolist() == [480] * 320 + [0] * 320
+        np.testing.assert_array_equal(views[name].mask, HALF / 255)
     assert views["b"].mask is None
     assert len(notes) == 1 and "2 of 4 photographs, which have no mask (b.jpg" in notes[0]
 
 
 def test_mask_with_the_full_name_is_preferred(tmp_path):
-    names = ["a.jpg", "b.jpg", "b_mask.jpg"]
+    (tmp_path / "masks").mkdir()
     for file in ("a.png", "a.jpg.png", "b.png", "b_mask.png"):
-        (tmp_path / "masks").mkdir(exist_ok=True)
         (tmp_path / "masks" / file).touch()
     notes = []
     expected = [tmp_path / "masks" / name for name in ("a.jpg.png", "b.png", "b_mask.png")]
-    assert masks_of(tmp_path, names, notes) == expected
+    assert masks_of(tmp_path, ["a.jpg", "b.jpg", "b_mask.jpg"], notes) == expected
     assert len(notes) == 1 and "masks of no photograph that has a camera: masks/a.png" in notes[0]
 
 
@@ -228,41 +181,38 @@ def test_masks_may_be_larger_than_images(tmp_path):
     write_images(tmp_path / "images_2", size=(320, 240))
     mask = np.full((480, 640), 255, np.uint8)
     mask[4:7, 10:12] = 0
-    (tmp_path / "masks").mkdir()
-    Image.fromarray(mask).save(tmp_path / "masks" / "b.png")
-    view = next(view for view in load(tmp_path, downscale=2).train if view.name == "b")
+    save(tmp_path / "masks" / "b.png", mask)
     expected = np.ones((240, 320))
     expected[2:4, 5] = 0
-    np.testing.assert_array_equal(np.asarray(view.mask), expected)
-    Image.fromarray(mask[:, :600]).save(tmp_path / "masks" / "b.png")
+    found = views_by_name(load(tmp_path, downscale=2))["b"].mask
+    np.testing.assert_array_equal(np.asarray(found), expected)
+    save(tmp_path / "masks" / "b.png", mask[:, :600])
     assert "masks/b.png: must be 320 x 240 px, as the photograph is, got 600 x 480" in (
         refusal(tmp_path, downscale=2)
     )
 
 
+def start(folder, **init):
+    dataset = load(folder)
+    config = FitConfig(data={"path": folder}, init=init)
+    return start_of(resolve_defaults(config, dataset), dataset)
+
+
 def test_fit_starts_from_the_points_of_the_model(tmp_path):
     model = write_dataset(tmp_path)
-    dataset = load(tmp_path)
-    assert dataset.point_cloud == tmp_path / "sparse" / "0" / "points3D.bin"
-    config = resolve_defaults(FitConfig(data={"path": tmp_path}, init={"num_points": 9}), dataset)
-    start = start_of(config, dataset)
+    points = tmp_path / "sparse" / "0" / "points3D.bin"
+    assert load(tmp_path).point_cloud == points
+    found = start(tmp_path, num_points=9)
     positions, colors, *_ = (np.array(column) for column in zip(*model.points, strict=True))
-    np.testing.assert_allclose(start.means, positions, rtol=1e-6)
-    np.testing.assert_allclose(start.colors, colors / 255, rtol=1e-6)
-    assert start.description == f"the points of {dataset.point_cloud}"
+    np.testing.assert_allclose(found.means, positions, rtol=1e-6)
+    np.testing.assert_allclose(found.colors, colors / 255, rtol=1e-6)
+    assert found.description == f"the points of {points}"
     assert load(tmp_path, ignore_points=True).point_cloud is None
 
 
 def test_points_with_large_error_or_short_track_are_dropped(tmp_path):
     model = write_dataset(tmp_path)
-    dataset = load(tmp_path)
     positions, _, errors, lengths = (np.array(column) for column in zip(*model.points, strict=True))
-
-    def start(**init):
-        return start_of(
-            resolve_defaults(FitConfig(data={"path": tmp_path}, init=init), dataset), dataset
-        )
-
     error, length = float(np.sort(errors)[-3]), int(np.median(lengths))
     for init, kept in (
         ({"max_point_error": error}, errors <= error),
@@ -273,72 +223,55 @@ def test_points_with_large_error_or_short_track_are_dropped(tmp_path):
         ),
     ):
         assert 4 <= kept.sum() < len(kept)
-        np.testing.assert_allclose(start(**init).means, positions[kept], rtol=1e-6)
-        assert f"{kept.sum()} of {len(kept)} points of" in start(**init).description
-    with pytest.raises(UserError, match=r"leave none of \d+ points \(their errors are"):
-        start(max_point_error=float(errors.min()) / 2)
-    cloud = tmp_path / "cloud.ply"
-    cloud.touch()
-    with pytest.raises(UserError, match=r"init.max_point_error: only COLMAP's points .*cloud.ply"):
-        start(max_point_error=1.0, point_cloud=cloud)
-    with pytest.raises(UserError, match=r"init.min_track_length: .* starts from random points; "):
-        start(min_track_length=2, start="random")
+        found = start(tmp_path, **init)
+        np.testing.assert_allclose(found.means, positions[kept], rtol=1e-6)
+        assert f"{kept.sum()} of {len(kept)} points of" in found.description
 
 
-def test_points_with_unknown_error_are_kept(tmp_path):
-    model = some_model(np.random.default_rng(1))
-    model.points = [
-        (x, c, -1.0 if k < 6 else 5.0, n) for k, (x, c, _, n) in enumerate(model.points)
-    ]
-    points = write_binary(tmp_path, model) / "points3D.bin"
-    means, _, count = _read_cloud(InitConfig(max_point_error=1.0), points)
-    np.testing.assert_allclose(means, [x for x, *_ in model.points[:6]], rtol=1e-6)
-    assert count == 9
-
-
-def test_photographs_may_be_beside_the_model(tmp_path):
-    write_dataset(tmp_path)
-    for path in (tmp_path / "images").iterdir():
-        path.rename(tmp_path / path.name)
-    (tmp_path / "images").rmdir()
-    assert len(load(tmp_path).train) == 3
+CLOUD = {"point_cloud": "cloud.ply"}
 
 
 @pytest.mark.parametrize(
-    ("place", "model", "images"),
+    ("init", "message"),
     [
-        ("flat", ".", "images"),
-        ("flat, beside", ".", "."),
-        ("workspace", "dense/0/sparse", "dense/0/images"),
-        ("undistorted", "dense/sparse", "dense/images"),
+        ({"max_point_error": 1e-9}, r"leave none of \d+ points \(their errors are"),
+        ({"max_point_error": 1.0, **CLOUD}, r"init.max_point_error: only COLMAP's .*cloud.ply"),
+        ({"min_track_length": 2, "start": "random"}, r"init.min_track_length: .* random points; "),
+    ],
+)
+def test_limits_that_leave_no_points_are_refused(tmp_path, monkeypatch, init, message):
+    write_dataset(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cloud.ply").touch()
+    with pytest.raises(UserError, match=message):
+        start(tmp_path, **init)
+
+
+@pytest.mark.parametrize(
+    ("model", "images"),
+    [
+        ("sparse/0", "."),
+        (".", "images"),
+        (".", "."),
+        ("dense/0/sparse", "dense/0/images"),
+        ("dense/sparse", "dense/images"),
     ],
 )
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_models_and_photographs_are_found_in_common_places(tmp_path, place, model, images, write):
-    there = some(NAMES)
+def test_models_and_photographs_are_found_in_common_places(tmp_path, model, images, write):
+    there = model_of()
     write(tmp_path / model, there)
     write_images(tmp_path / images)
-    if place in ("workspace", "undistorted"):  # beside the model of the photographs as taken
-        write(tmp_path / "sparse" / "0", some_model(np.random.default_rng(2), NAMES))
+    if "dense" in model:  # beside the model of the photographs as taken
+        write(tmp_path / "sparse" / "0", model_of(seed=2))
     dataset, notes = load_noting(tmp_path)
     view = dataset.test[0]
     np.testing.assert_allclose(view.camera_to_world, there.images[0][2], atol=1e-14)
     assert view.files["image"] == tmp_path / images / "a.jpg" and notes == []
 
 
-def test_a_model_with_its_photographs_is_preferred_to_an_undistorted_one(tmp_path):
-    write_dataset(tmp_path)
-    write_binary(tmp_path / "dense" / "sparse", some_model(np.random.default_rng(2), NAMES))
-    write_images(tmp_path / "dense" / "images")
-    assert load(tmp_path).train[0].files["image"].parent == tmp_path / "images"
-
-
-def some(names):
-    return some_model(np.random.default_rng(1), names, ["PINHOLE"])
-
-
 @pytest.mark.parametrize(
-    ("call", "is_said"),
+    ("rename", "is_noted"),
     [
         (str, False),
         (str.upper, True),
@@ -349,9 +282,9 @@ def some(names):
     ],
     ids=["right", "case", "suffix", "images", "backslashes", "of another machine"],
 )
-def test_photograph_is_found_under_a_similar_name(tmp_path, call, is_said):
-    model = some(NAMES)
-    model.images = [(call(name), camera, pose) for name, camera, pose in model.images]
+def test_photograph_is_found_under_a_similar_name(tmp_path, rename, is_noted):
+    model = model_of()
+    model.images = [(rename(name), camera, pose) for name, camera, pose in model.images]
     write_binary(tmp_path / "sparse" / "0", model)
     write_images(tmp_path / "images")
     dataset, notes = load_noting(tmp_path, test_every=2)
@@ -359,15 +292,7 @@ def test_photograph_is_found_under_a_similar_name(tmp_path, call, is_said):
     assert [view.files["image"] for view in views] == [tmp_path / "images" / n for n in NAMES]
     for view, (_, _, pose) in zip(views, model.images, strict=True):
         np.testing.assert_allclose(view.camera_to_world, pose, atol=1e-14)
-    assert [": taken under nearly the same name: " in note for note in notes] == [True] * is_said
-
-
-def test_file_is_not_matched_to_two_photographs(tmp_path):
-    write_binary(tmp_path / "sparse" / "0", some(["a.jpg", "A.tif", "b.jpg", "c.jpg", "d.bmp"]))
-    write_images(tmp_path / "images", ["a.jpg", "b.png", "b.webp", "c.jpg", "d.bmp"])
-    dataset, notes = load_noting(tmp_path)
-    assert [view.name for view in (*dataset.test, *dataset.train)] == ["a", "c", "d"]
-    assert len(notes) == 1 and "2 of 5 photographs (A.tif, b.jpg); left out" in notes[0]
+    assert [": taken under nearly the same name: " in note for note in notes] == [True] * is_noted
 
 
 @pytest.mark.parametrize("below", ["sparse/0", "."])
@@ -386,16 +311,11 @@ def test_list_selects_the_test_views(tmp_path, below):
 
 def test_folders_define_the_splits(tmp_path):
     names = ("train/a.jpg", "test/a.jpg", "test/b.jpg", "train/c.jpg")
-    write_binary(tmp_path / "sparse" / "0", some(names))
+    write_binary(tmp_path / "sparse" / "0", model_of(names))
     write_images(tmp_path / "images", names)
     dataset = load(tmp_path)
     assert [view.name for view in dataset.test] == ["test_a", "test_b"]
     assert [view.name for view in dataset.train] == ["train_a", "train_c"]
-
-
-# ----------------------------------------------------------------------------------------------
-# Errors
-# ----------------------------------------------------------------------------------------------
 
 
 def test_missing_images_are_left_out_unless_most_are_missing(tmp_path):
@@ -411,12 +331,6 @@ def test_missing_images_are_left_out_unless_most_are_missing(tmp_path):
     assert message.endswith("; not there: 3 of 4 photographs")
 
 
-def test_image_with_another_aspect_ratio_is_refused(tmp_path):
-    write_dataset(tmp_path)
-    write_images(tmp_path / "images", ["b.jpg"], (480, 640))
-    assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
-
-
 @pytest.mark.parametrize("original", [(4032, 3024), (3000, 4003), (101, 997)])
 def test_scaled_images_are_distinguished_from_cropped_ones(original):
     """However their sides were rounded; a crop by three px of each is none of them."""
@@ -430,7 +344,8 @@ def test_scaled_images_are_distinguished_from_cropped_ones(original):
     assert is_scaled(original, original) and not is_scaled((width, height - 1), original)
 
 
-def test_image_rotated_after_colmap_is_rotated_by_exif(tmp_path):
+@pytest.mark.parametrize("size", [(480, 640), (640, 480)])
+def test_image_rotated_after_colmap_is_rotated_by_exif(tmp_path, size):
     """COLMAP reads images as they are stored: where the stored size is the camera's, it is right.
 
     Where another program has turned what COLMAP saw, EXIF says how it is turned back.
@@ -438,12 +353,8 @@ def test_image_rotated_after_colmap_is_rotated_by_exif(tmp_path):
     write_dataset(tmp_path)
     exif = Image.Exif()
     exif[0x0112] = 6
-    write_images(tmp_path / "images", ["b.jpg"], (480, 640), exif=exif)
-    view = next(view for view in load(tmp_path).train if view.name == "b")
-    assert np.asarray(view.image).shape == (480, 640, 3)
-    write_images(tmp_path / "images", ["b.jpg"], (640, 480), exif=exif)
-    view = next(view for view in load(tmp_path).train if view.name == "b")
-    assert np.asarray(view.image).shape == (480, 640, 3)
+    write_images(tmp_path / "images", ["b.jpg"], size, exif=exif)
+    assert np.asarray(views_by_name(load(tmp_path))["b"].image).shape == (480, 640, 3)
 
 
 def test_exif_rotation_by_180_degrees_is_ignored_like_in_colmap(tmp_path):
@@ -454,25 +365,29 @@ def test_exif_rotation_by_180_degrees_is_ignored_like_in_colmap(tmp_path):
     pixels = np.random.default_rng(5).integers(0, 256, (480, 640, 3), np.uint8)
     path = tmp_path / "images" / "cam" / "1.png"
     Image.fromarray(pixels).save(path, exif=exif)
-    view = next(view for view in load(tmp_path).train if view.name == "1")
+    image = views_by_name(load(tmp_path))["1"].image
     read = pycolmap.Bitmap.read(str(path), True).to_array()
-    np.testing.assert_array_equal(np.round(np.asarray(view.image) * 255), read)
+    np.testing.assert_array_equal(np.round(np.asarray(image) * 255), read)
 
 
-def test_folders_without_images_and_models_without_folders_are_explained(tmp_path):
+@pytest.mark.parametrize(
+    ("missing", "options", "message"),
+    [
+        ("images", {}, "there is no folder images (or images_2, images_4, images_8)"),
+        ("sparse", {"type": "colmap"}, "there is no model of COLMAP in sparse/0"),
+        (None, {"test_split": "val"}, "this layout has no split val"),
+    ],
+)
+def test_incomplete_dataset_is_refused(tmp_path, missing, options, message):
     write_dataset(tmp_path)
-    (tmp_path / "images").rename(tmp_path / "originals")
-    assert "there is no folder images (or images_2, images_4, images_8)" in refusal(tmp_path)
-    assert "nor a model of COLMAP in sparse/0 with its photographs in" in (
-        refusal(tmp_path / "sparse")
-    )
-    assert "there is no model of COLMAP in sparse/0" in refusal(
-        tmp_path / "originals", type="colmap"
-    )
+    if missing is not None:
+        (tmp_path / missing).rename(tmp_path / "elsewhere")
+    assert message in refusal(tmp_path, **options)
 
 
-def test_fewer_than_two_views_is_an_error(tmp_path):
+def test_image_of_another_shape_and_a_single_view_are_refused(tmp_path):
     write_dataset(tmp_path)
-    assert "this layout has no split val" in refusal(tmp_path, test_split="val")
-    write_binary(tmp_path / "sparse" / "0", some_model(np.random.default_rng(1), ["a.jpg"]))
+    write_images(tmp_path / "images", ["b.jpg"], (480, 640))
+    assert "was 640 x 480 px for COLMAP" in refusal(tmp_path)
+    write_binary(tmp_path / "sparse" / "0", model_of(["a.jpg"]))
     assert "at least 2 views are needed" in refusal(tmp_path)

@@ -1,60 +1,45 @@
-"""Folders that are fitted without a configuration."""
-
-import json
+"""Folders that are fitted without a configuration, and what others are recognised as."""
 
 import pytest
 from conftest import REPOSITORY
-from support.colmap_models import NAMES, write_dataset, write_images
+from support.colmap_models import write_dataset, write_images
+from support.datasets import refusal
 
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
-from drgs.datasets.folders import MAX_PIXELS, config_for
+from drgs.datasets.folders import GUIDE, MAX_PIXELS, config_for
+from drgs.poses.structure_from_motion import photographs_in
 
 SCENES = REPOSITORY / "scenes"
 
 
-def test_photographs_are_scaled_by_an_integer_and_use_photos_yml(tmp_path):
+def test_photographs_use_the_settings_of_photos_yml(tmp_path):
     write_dataset(tmp_path)
-    for size, expected in (((640, 480), 640), ((1600, 1200), 800), ((2400, 1800), 800)):
-        write_images(tmp_path / "images", size=size)
-        config, reasons = config_for(tmp_path)
-        assert config.data.image_size == expected
-        assert expected**2 * 3 / 4 <= MAX_PIXELS
-        scaled = f"scaled from {size[0]} x {size[1]} px to a width of {expected}"
-        assert (scaled if expected < size[0] else "as they are") in reasons
+    config, reasons = config_for(tmp_path)
     example = load_config(SCENES / "photos.yml")
     assert config.data.path == tmp_path and config.data.type == "colmap"
+    assert config.data.image_size == 640 and "as they are" in reasons
     assert config.iterations == example.iterations
     assert "COLMAP's model" in reasons and "4,000 iterations" in reasons
     for section in ("init", "model", "optimizer", "loss", "densify", "coarse"):
         assert getattr(config, section) == getattr(example, section)
+    given, _ = config_for(tmp_path, ["data.image_size=100", "iterations=30", "seed=3"])
+    assert (given.data.image_size, given.iterations, given.seed) == (100, 30, 3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [(4032, 3024), (3023, 4031), (901, 667), (41, 60001)])
+@pytest.mark.parametrize("size", [(1600, 1200), (4032, 3024), (3023, 4031), (41, 60001)])
 def test_widths_are_divided_by_the_smallest_sufficient_integer(tmp_path, size):
     write_dataset(tmp_path)
     write_images(tmp_path / "images", size=size)
-    config, _ = config_for(tmp_path)
+    config, reasons = config_for(tmp_path)
     width, height = size
     factor = width // config.data.image_size
     fitted, larger = width // factor, width // (factor - 1)
     assert config.data.image_size == fitted
+    assert f"scaled from {width} x {height} px to a width of {fitted}" in reasons
     assert fitted * round(height * fitted / width) <= MAX_PIXELS
     assert larger * round(height * larger / width) > MAX_PIXELS
-
-
-def test_largest_image_sets_the_scale(tmp_path):
-    write_dataset(tmp_path)
-    sizes = [(640, 480), (1600, 1200), (1200, 1600), (700, 500)]
-    for name, size in zip(NAMES, sizes, strict=True):
-        write_images(tmp_path / "images", [name], size)
-    config, reasons = config_for(tmp_path)
-    assert config.data.image_size == 600 and MAX_PIXELS >= 600 * 800
-    assert "scaled from 1200 x 1600 px, the largest, to a width of 600" in reasons
-    for name, size in zip(NAMES, [(640, 480), (480, 640), (900, 20), (64, 48)], strict=True):
-        write_images(tmp_path / "images", [name], size)
-    assert config_for(tmp_path)[0].data.image_size == 900
 
 
 def test_images_with_alpha_use_lego_yml():
@@ -71,16 +56,84 @@ def test_transforms_json_is_recognised(photographs):
     assert "cameras of transforms.json" in reasons
 
 
-def test_given_values_are_not_chosen(tmp_path):
-    write_dataset(tmp_path)
-    config, _ = config_for(tmp_path, ["data.image_size=100", "iterations=30", "seed=3"])
-    assert (config.data.image_size, config.iterations, config.seed) == (100, 30, 3)
-
-
 def test_folders_that_are_no_datasets_are_explained(tmp_path):
+    write_images(tmp_path / "images")
     with pytest.raises(UserError, match=r"drgs poses"):
-        write_images(tmp_path / "images")
         config_for(tmp_path)
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": []}))
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
     with pytest.raises(UserError, match=r"transforms\.json: frames"):
         config_for(tmp_path)
+
+
+def touch(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"")
+
+
+NOTHING = (
+    "neither transforms_train.json nor transforms.json is there, nor a model of COLMAP in sparse/0 "
+    f"with its photographs in images; see {GUIDE}"
+)
+PHOTOGRAPHS = f"but no cameras: find out where each was taken: drgs poses {{0}}; see {GUIDE}"
+SEVERAL = "one scene into {0}/images, "
+
+FOLDERS = {
+    "empty": ([], NOTHING),
+    "model": (["0/cameras.bin", "0/images.bin"], NOTHING),
+    "flat model": (["cameras.txt", "images.txt"], NOTHING),
+    "video": (["walk.MOV"], NOTHING),
+    "no training views": (["transforms_test.json", "transforms_val.json"], NOTHING),
+    "output of a fit": (["config.yml", "point_cloud.ply"], NOTHING),
+    "photographs": (["IMG_0.JPG", "notes.txt"], f"holds photographs (scans), {PHOTOGRAPHS}"),
+    "in images": (["images/a.JPG"], f"holds photographs (scans/images), {PHOTOGRAPHS}"),
+    "in input": (["input/a.JPG"], "drgs poses {0}/input;"),
+    "in one folder": (["cam 1/a.jpg", "notes/b.txt"], "/cam 1), but no cameras"),
+    "quoted": (["cam 1/a.jpg", ".thumbs/a.jpg", "._a.jpg"], "drgs poses '{0}/cam 1'"),
+    "in folders": (["b/a.jpg", "a/a.jpg"], SEVERAL),
+    "in a folder of images": (["images/b/a.jpg"], "/images/b), but no cameras"),
+    "a dataset below": (
+        ["a/notes.txt", "scene/transforms.json", "b.jpg"],
+        "holds a dataset in its folder scene; give {0}/scene",
+    ),
+    "a model below": (
+        ["my scene/sparse/0/cameras.bin", "my scene/sparse/0/images.bin", "my scene/images/a.jpg"],
+        "holds a dataset in its folder my scene; give '{0}/my scene'",
+    ),
+}
+
+
+@pytest.mark.parametrize(("files", "message"), FOLDERS.values(), ids=FOLDERS)
+def test_folder_that_is_no_dataset_is_explained(tmp_path, files, message):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    touch(folder, *files)
+    refused = refusal(folder)
+    assert refused.startswith(f"{folder}: ") and message.format(folder) in refused
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [(["cam 1/a.jpg"], r"drgs poses '.*/cam 1'"), (["b/a.jpg", "a/a.jpg"], "one scene into")],
+)
+def test_folder_of_folders_of_photographs_is_refused_by_poses(tmp_path, files, message):
+    touch(tmp_path, *files)
+    with pytest.raises(UserError, match=f"got one that holds photographs .*{message}"):
+        photographs_in(tmp_path)
+
+
+def test_file_in_place_of_the_folder_is_refused(tmp_path):
+    touch(tmp_path, "transforms.json")
+    assert refusal(tmp_path / "transforms.json") == (
+        f"data.path: cannot open the folder {tmp_path}/transforms.json: Not a directory"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "end"), [({}, ""), ({"source": "our server"}, ", or get it from our server")]
+)
+def test_missing_folder_is_refused(tmp_path, options, end):
+    folder = tmp_path / "none"
+    assert refusal(folder, **options) == (
+        f"data.path: there is no folder {folder}; say where it is (--data DIR){end}"
+    )

@@ -1,21 +1,18 @@
 """Photographs are kept as bytes, and become the numbers that they always were."""
 
-from dataclasses import replace
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from support.datasets import load, refusal, view_at
+from support.datasets import edit, load, refusal
 
-from drgs.datasets import images, reader
+from drgs.config.schema import DataConfig
+from drgs.datasets import images, load_dataset, reader
 from drgs.datasets.images import (
     LazyImage,
     check_memory,
-    compact_mask,
     compact_photograph,
     downscale,
-    num_threads,
-    smaller_view,
+    without_images,
 )
 
 RNG = np.random.default_rng(8)
@@ -48,9 +45,7 @@ def test_photograph_is_stored_as_bytes(channels, dtype):
         assert np.asarray(alpha).tobytes() == expected.astype(np.float32).tobytes()
 
 
-@pytest.mark.parametrize(
-    ("width", "kept"), [(16, "bytes"), (8, "bytes"), (10, "rounded"), (5, "numbers")]
-)
+@pytest.mark.parametrize(("width", "kept"), [(8, "bytes"), (10, "rounded"), (5, "numbers")])
 def test_downscaled_photograph_is_stored_in_the_smaller_form(width, kept):
     """Numbers of half the width take as much as bytes, those of a third less.
 
@@ -58,50 +53,62 @@ def test_downscaled_photograph_is_stored_in_the_smaller_form(width, kept):
     """
     pixels = RNG.integers(0, 255, (12, 16, 4), np.uint8)
     image, alpha = compact_photograph(pixels, GREY, width)
-    of_all = [(image.nbytes, image), (alpha.nbytes, alpha)]
-    assert sum(count for count, _ in of_all) <= pixels.nbytes
-    assert all(isinstance(p, LazyImage) == (kept != "numbers") for _, p in of_all)
+    assert image.nbytes + alpha.nbytes <= pixels.nbytes
+    assert all(isinstance(each, LazyImage) == (kept != "numbers") for each in (image, alpha))
+    assert image.shape == np.asarray(image).shape and image.shape[1] == width
+    exact = downscale(numbers_of(pixels), width)
     if kept == "rounded":
         assert (image.nbytes, alpha.nbytes) == (2 * 10 * 8 * 3, 2 * 10 * 8)
-        exact = downscale(numbers_of(pixels), width)
         assert 0 < np.abs(np.asarray(image) - exact).max() <= 0.51 / 65535
-    assert image.shape == np.asarray(image).shape and image.shape[1] == width
-    if width == 8:
-        blocks = numbers_of(pixels).reshape(6, 2, 8, 2, 3).mean(axis=(1, 3))
-        np.testing.assert_allclose(image, blocks, atol=2e-7)
+    else:
+        np.testing.assert_allclose(image, exact, atol=2e-7)
 
 
-def test_mask_is_stored_in_one_byte_per_pixel():
-    mask = RNG.integers(0, 2, (5, 7)).astype(np.float32)
-    kept = compact_mask(mask)
-    assert (kept.nbytes, kept.shape) == (35, (5, 7))
-    assert np.asarray(kept).tobytes() == mask.tobytes()
+@pytest.mark.parametrize("shape", [(6, 8), (7, 9), (5, 11), (3, 2)])
+def test_downscaling_averages_over_each_pixels_area(shape):
+    image = np.random.default_rng(1).random((*shape, 3)).astype(np.float32)
+    actual = downscale(image, 4)
+    height, width = actual.shape[:2]
+    assert (height, width) == (round(shape[0] * 4 / shape[1]), 4) if shape[1] > 4 else shape
+    # Each source pixel repeated until old and new pixel edges coincide, then plain means.
+    repeated = image.astype(np.float64).repeat(height, axis=0).repeat(width, axis=1)
+    blocks = repeated.reshape(height, shape[0], width, shape[1], 3)
+    np.testing.assert_allclose(actual, blocks.mean(axis=(1, 3)), rtol=1e-6)
 
 
-def test_dataset_uses_the_memory_of_its_uncompressed_files(photographs):
-    iio.imwrite(photographs / "images" / "01.png", RNG.integers(0, 256, (6, 8, 4), np.uint8))
-    dataset = load(photographs)
-    for view in (*dataset.train, *dataset.test):
-        channels = 3 if view.alpha is None else 4
-        assert view.image.nbytes == view.width * view.height * channels
+def test_scaling_a_composite_equals_compositing_scaled_premultiplied_colours(blender):
+    folder, images_of_views = blender
+    actual = load(folder, image_size=3, background=(0.25, 0.5, 0.75)).train[0].image
+    pixels = images_of_views["train", 0].astype(np.float64) / 255
+    pixels[..., :3] *= pixels[..., 3:]
+    small = pixels.reshape(2, 2, 3, 2, 4).mean(axis=(1, 3))
+    expected = small[..., :3] + np.array([0.25, 0.5, 0.75]) * (1 - small[..., 3:])
+    np.testing.assert_allclose(actual, expected, atol=5e-7)
 
 
-def test_smaller_views_take_no_memory():
-    view = view_at((4, 0, 0), (0, 0, 0))
-    pixels = RNG.integers(0, 255, (30, 40, 4), np.uint8)
-    image, alpha = compact_photograph(pixels, GREY, None)
-    smaller = smaller_view(replace(view, image=image, alpha=alpha), 5)
-    assert smaller.image.nbytes == smaller.alpha.nbytes == 0
-    assert (smaller.image.shape, smaller.alpha.shape) == ((6, 8, 3), (6, 8))
-    blocks = numbers_of(pixels).reshape(6, 5, 8, 5, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(smaller.image, blocks, atol=2e-7)
+def test_image_size_scales_images_and_intrinsics_together(photographs):
+    full, half = load(photographs), load(photographs, image_size=4)
+    a, b = full.train[0], half.train[0]
+    assert (b.width, b.height, b.image.shape) == (4, 3, (3, 4, 3))
+    np.testing.assert_allclose(b.K[:2], a.K[:2] / 2)
+    assert "4x3" in half.description
+    assert load(photographs, image_size=100).train[0].width == 8  # never enlarged
 
 
-def test_a_lazy_image_refuses_conversion_without_a_copy():
-    image, _ = compact_photograph(np.zeros((2, 2, 3), np.uint8), GREY, None)
-    assert np.asarray(image, np.float64).dtype == np.float64
-    with pytest.raises(ValueError, match="only by a copy"):
-        image.__array__(copy=False)
+@pytest.mark.parametrize(
+    "pixels",
+    [
+        np.full((6, 8), 51, np.uint8),
+        np.full((6, 8), 13107, np.uint16),
+        np.full((6, 8, 2), (51, 255), np.uint8),
+    ],
+    ids=["grey", "grey16", "grey-alpha"],
+)
+def test_grey_images_become_rgb(photographs, pixels):
+    iio.imwrite(photographs / "images" / "01.png", pixels)
+    image = load(photographs).train[0].image
+    assert image.shape == (6, 8, 3)
+    np.testing.assert_allclose(image, 0.2, rtol=1e-6)
 
 
 def test_lazy_image_supports_array_operations():
@@ -109,15 +116,17 @@ def test_lazy_image_supports_array_operations():
     image, _ = compact_photograph(pixels, GREY, None)
     numbers = numbers_of(pixels)
     assert image.dtype == np.float32 and len(image) == 4
-    np.testing.assert_array_equal(image[None], numbers[None])
-    np.testing.assert_array_equal(image[1, ..., 2], numbers[1, ..., 2])
+    assert np.asarray(image, np.float64).dtype == np.float64
     for found, expected in (
+        (image[None], numbers[None]),
+        (image[1, ..., 2], numbers[1, ..., 2]),
         (numbers - image, 0 * numbers),
-        (np.square(image), np.square(numbers)),
         (np.clip(image, 0.2, 0.3), np.clip(numbers, 0.2, 0.3)),
     ):
         assert isinstance(found, np.ndarray) and found.dtype == expected.dtype
         np.testing.assert_array_equal(found, expected)
+    with pytest.raises(ValueError, match="only by a copy"):
+        image.__array__(copy=False)
 
 
 def test_photographs_larger_than_memory_are_refused_before_reading(photographs, monkeypatch):
@@ -137,7 +146,57 @@ def test_photographs_larger_than_memory_are_refused_before_reading(photographs, 
     check_memory(files, 2)
 
 
-def test_large_photographs_are_read_one_at_a_time(tmp_path):
-    for width, expected in ((400, 8), (6000, 1)):
-        iio.imwrite(tmp_path / "a.png", np.zeros((width, width), np.uint8))
-        assert num_threads([tmp_path / "a.png"]) == expected
+IMAGES = ("image", "alpha", "mask", "depth")
+
+
+@pytest.fixture
+def folder(photographs):
+    """Photographs with alpha, masks and depths."""
+    for index in range(10):
+        pixels = RNG.integers(0, 256, (6, 8, 4), np.uint8)
+        iio.imwrite(photographs / "images" / f"{index:02d}.png", pixels)
+        iio.imwrite(photographs / f"mask{index}.png", np.full((6, 8), 255, np.uint8))
+        np.save(photographs / f"depth{index}.npy", RNG.random((6, 8)))
+
+    def add_data(meta):
+        for index, frame in enumerate(meta["frames"]):
+            frame.update(mask_path=f"mask{9 - index}.png", depth_file_path=f"depth{9 - index}.npy")
+
+    edit(photographs / "transforms.json", add_data)
+    return photographs
+
+
+def assert_is_placeholder(image):
+    assert image.nbytes == 0
+    with pytest.raises(RuntimeError, match="another process has its image"):
+        np.asarray(image)
+
+
+def test_images_of_other_processes_are_not_read(folder):
+    """Pixels are damaged behind the headers, so all but the images is known."""
+    config = DataConfig(path=folder, image_size=4)
+    every = load_dataset(config)
+    for index in (2, 5):
+        image = folder / "images" / f"{index:02d}.png"
+        image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
+        (folder / f"mask{index}.png").write_bytes(b"")
+        (folder / f"depth{index}.npy").write_bytes(b"")
+    some = load_dataset(config, keeps=lambda name: name not in ("02", "05"))
+    for view, expected in zip(some.train, every.train, strict=True):
+        for name in ("name", "fx", "fy", "cx", "cy", "width", "height", "files"):
+            assert getattr(view, name) == getattr(expected, name)
+        for name in IMAGES:
+            image, of_all = getattr(view, name), getattr(expected, name)
+            assert image.shape == of_all.shape
+            if view.name in ("02", "05"):
+                assert_is_placeholder(image)
+            else:
+                np.testing.assert_array_equal(np.asarray(image), np.asarray(of_all))
+
+
+def test_images_that_were_read_can_be_dropped(folder):
+    view = load_dataset(DataConfig(path=folder, ignore_depth=True)).train[0]
+    without = without_images(view)
+    assert without.depth is None and without.mask.shape == view.mask.shape
+    assert without.image.shape == view.image.shape
+    assert_is_placeholder(without.image)

@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
-from support.datasets import load, look_at
+from support.datasets import load, look_at, refusal
 
-from drgs.core.errors import UserError
 from drgs.io.images import image_size, read_header, read_pixels, upright
 
 STORED = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
@@ -19,7 +18,7 @@ def save(path, orientation, pixels=STORED, **options):
     Image.fromarray(pixels).save(path, exif=exif, **options)
 
 
-def dataset(folder, orientation, pixels=STORED, **size):
+def write_dataset(folder, orientation, pixels=STORED, **size):
     """Two views of one image, whose camera has this size in px."""
     frames = []
     for i in range(2):
@@ -43,35 +42,24 @@ def test_images_are_rotated_like_pillow(tmp_path, orientation, suffix):
 
 
 @pytest.mark.parametrize("compression", [None, "tiff_lzw"])
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_tiff_orientation_is_ignored_like_in_colmap(tmp_path, orientation, compression):
+def test_tiff_orientation_is_ignored_like_in_colmap(tmp_path, compression):
     pycolmap = pytest.importorskip("pycolmap")
     path = tmp_path / "a.tif"
-    save(path, orientation, compression=compression)
-    np.testing.assert_array_equal(read_pixels(path), STORED)
-    np.testing.assert_array_equal(pycolmap.Bitmap.read(str(path), True).to_array(), STORED)
-    assert image_size(path) == read_header(path).size == (8, 6)
-
-
-@pytest.mark.parametrize("orientation", [0, 9, 65535])
-def test_invalid_orientations_are_ignored(tmp_path, orientation):
-    save(tmp_path / "a.jpg", orientation)
-    assert read_header(tmp_path / "a.jpg").orientation == 1
+    for orientation in range(1, 9):
+        save(path, orientation, compression=compression)
+        np.testing.assert_array_equal(read_pixels(path), STORED)
+        np.testing.assert_array_equal(pycolmap.Bitmap.read(str(path), True).to_array(), STORED)
+        assert image_size(path) == read_header(path).size == (8, 6)
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
 def test_camera_size_decides_whether_its_image_is_rotated(tmp_path, orientation):
-    dataset(tmp_path, orientation, w=6, h=8)  # stored is 8 wide
-    view = load(tmp_path).train[0]
-    assert (view.width, view.height) == (6, 8)
-    expected = upright(STORED, orientation) / np.float32(255)
-    np.testing.assert_array_equal(np.asarray(view.image), expected.astype(np.float32))
-    dataset(tmp_path, orientation, w=8)
-    view = load(tmp_path).train[0]
-    assert (view.width, view.height) == (8, 6)
-    np.testing.assert_array_equal(
-        np.asarray(view.image), STORED.astype(np.float32) / np.float32(255)
-    )
+    upright_size, stored_size = {"w": 6, "h": 8}, {"w": 8}
+    for size, pixels in ((upright_size, upright(STORED, orientation)), (stored_size, STORED)):
+        write_dataset(tmp_path, orientation, **size)
+        view = load(tmp_path).train[0]
+        assert (view.height, view.width) == pixels.shape[:2]
+        np.testing.assert_array_equal(view.image, pixels.astype(np.float32) / np.float32(255))
 
 
 SQUARE = np.zeros((6, 6, 3), np.uint8)
@@ -88,14 +76,6 @@ SQUARE = np.zeros((6, 6, 3), np.uint8)
     ids=["half a turn", "no size", "a square", "mirrored"],
 )
 def test_ambiguous_orientation_is_refused(tmp_path, orientation, pixels, size):
-    dataset(tmp_path, orientation, pixels, **size)
-    message = rf"\.png: has the EXIF orientation {orientation}, and w and h do not tell"
-    with pytest.raises(UserError, match=message):
-        load(tmp_path)
-
-
-def test_wrong_size_of_a_rotated_image_reports_both_sizes(tmp_path):
-    dataset(tmp_path, 6, w=7, h=8)
-    message = r"w and h do not tell .* \(.*json: w\) are for .* stored, 8 x 6 px, or as"
-    with pytest.raises(UserError, match=message):
-        load(tmp_path)
+    write_dataset(tmp_path, orientation, pixels, **size)
+    message = f".png: has the EXIF orientation {orientation}, and w and h do not tell"
+    assert message in refusal(tmp_path)

@@ -30,9 +30,9 @@ def example(monkeypatch):
     point = EntryPoint("numpy_poses", "numpy_poses", registry.ENTRY_POINT_GROUP)
     monkeypatch.setattr(registry, "entry_points", lambda group: [point])
     yield importlib.import_module("numpy_poses")
-    for each in registry._registries:
-        each._extensions.pop("numpy_poses", None)
-    registry._loaded.discard("numpy_poses")
+    for each in registry._registries:  # private: a process does not unload packages
+        each._extensions.pop("numpy_poses", None)  # private, as above
+    registry._loaded.discard("numpy_poses")  # private, as above
     sys.modules.pop("numpy_poses", None)
 
 
@@ -80,11 +80,6 @@ def test_configuration_sets_the_reader_section(folder):
         np.testing.assert_allclose(center, expected[name], rtol=1e-6)
 
 
-def test_unknown_reader_lists_the_registered_ones(folder):
-    with pytest.raises(UserError, match=r"data\.type must be one of 'auto', .*'numpy_poses'; did"):
-        load_dataset(folder[0], type="numpy_pose")
-
-
 def test_errors_of_the_reader_are_reported(folder):
     path, _ = folder
     (path / "images" / "9.png").write_bytes(b"")
@@ -102,3 +97,8 @@ def test_shipped_readers_come_first(folder, tmp_path):
     path, _ = folder
     (path / "transforms.json").write_text("{}")
     assert find_reader(config_from({"data": {"path": str(path)}}, "x").data)[0] == "nerfstudio"
+
+
+def test_unknown_reader_lists_the_registered_ones(folder):
+    with pytest.raises(UserError, match=r"data\.type must be one of 'auto', .*'numpy_poses'; did"):
+        load_dataset(folder[0], type="numpy_pose")

@@ -4,15 +4,13 @@ import pytest
 from support.datasets import edit, load_noting, refusal
 
 IMAGES = [f"images/{i:02d}.png" for i in range(10)]
-LISTS = {
-    "train_filenames": IMAGES[:6],
-    "val_filenames": IMAGES[6:8],
-    "test_filenames": IMAGES[8:],
-}
+LISTS = {"train": IMAGES[:6], "val": IMAGES[6:8], "test": IMAGES[8:]}
 
 
 def give(folder, **lists):
-    edit(folder / "transforms.json", lambda m: m.update(lists))
+    """Add lists by split."""
+    lists = {f"{split}_filenames": names for split, names in lists.items()}
+    edit(folder / "transforms.json", lambda meta: meta.update(lists))
 
 
 def names(views):
@@ -20,7 +18,7 @@ def names(views):
 
 
 @pytest.mark.parametrize(
-    ("keys", "test_split", "train", "test"),
+    ("splits", "test_split", "train", "test"),
     [
         (("train", "val", "test"), None, range(6), [8, 9]),
         (("train", "val", "test"), "val", range(6), [6, 7]),
@@ -31,36 +29,28 @@ def names(views):
         (("train",), None, range(6), range(6, 10)),
     ],
 )
-def test_lists_define_the_splits(photographs, keys, test_split, train, test):
-    give(photographs, **{f"{key}_filenames": LISTS[f"{key}_filenames"] for key in keys})
+def test_lists_define_the_splits(photographs, splits, test_split, train, test):
+    give(photographs, **{split: LISTS[split] for split in splits})
     dataset, notes = load_noting(photographs, test_split=test_split)
     assert names(dataset.train) == list(train) and names(dataset.test) == list(test)
-    assert dataset.test_split == (test_split or ("val" if keys == ("train", "val") else "test"))
-    unlisted = keys == ("train", "val")
+    assert dataset.test_split == (test_split or ("val" if splits == ("train", "val") else "test"))
+    unlisted = splits == ("train", "val")
     assert [": left out, as " in note for note in notes] == [True] * unlisted
     if unlisted:
         assert "2 of 10 photographs (images/08.png, images/09.png)" in notes[0]
 
 
 def test_names_are_compared_as_paths_without_case_and_suffix(photographs):
-    give(photographs, train_filenames=["./images/00.png", "images\\01.png", "02", "IMAGES/03.PNG"])
+    give(photographs, train=["./images/00.png", "images\\01.png", "02", "IMAGES/03.PNG"])
     assert names(load_noting(photographs)[0].train) == [0, 1, 2, 3]
 
 
-def test_unknown_names_are_reported_or_if_most_are_refused(photographs):
-    give(photographs, test_filenames=["images/02.png", "images/xx.png"])
-    dataset, notes = load_noting(photographs)
+def test_unknown_and_missing_names_are_reported(photographs):
     path = photographs / "transforms.json"
+    give(photographs, test=["images/02.png", "images/xx.png"])
+    dataset, notes = load_noting(photographs)
     assert names(dataset.test) == [2]
     assert notes == [f"{path}: test_filenames has names that no frame has: images/xx.png"]
-    give(photographs, test_filenames=["images/2.jpg", "images/xx.png"])
-    assert refusal(photographs).startswith(
-        f"{path}: test_filenames must list the photographs of frames, but 2 of its 2 names are not "
-        "theirs: images/2.jpg, images/xx.png; did you mean images/"
-    )
-
-
-def test_missing_photograph_is_not_reported_as_unknown_name(photographs):
     give(photographs, **LISTS)
     (photographs / IMAGES[8]).unlink()
     dataset, notes = load_noting(photographs)
@@ -68,31 +58,24 @@ def test_missing_photograph_is_not_reported_as_unknown_name(photographs):
     assert len(notes) == 1 and "not there: 1 of 10 photographs (images/08.png)" in notes[0]
 
 
-def test_photograph_in_both_splits_is_refused(photographs):
-    give(photographs, train_filenames=IMAGES, test_filenames=IMAGES[3:5])
-    assert refusal(photographs) == (
-        f"{photographs / 'transforms.json'}: a photograph must be either to train or to measure "
-        "on, but train_filenames and test_filenames have 2 in both train and test: "
-        "images/03.png, images/04.png; take them out of one"
-    )
-
-
-def test_missing_and_empty_splits_are_refused(photographs):
-    give(photographs, test_filenames=IMAGES[:2])
-    assert "there is no split val, only test; set data.test_split" in (
-        refusal(photographs, test_split="val")
-    )
-    give(photographs, test_filenames=IMAGES)
-    assert "at least 1 view of the splits train and test is needed, and test_filenames" in (
-        refusal(photographs)
-    )
-    give(photographs, test_filenames=["a", 3])
-    assert refusal(photographs).endswith("test_filenames[1] must be text, got 3")
-
-
-def test_empty_lists_are_ignored(photographs):
-    give(photographs, train_filenames=[], val_filenames=[], test_filenames=[])
-    assert names(load_noting(photographs)[0].test) == [0, 8]
+@pytest.mark.parametrize(
+    ("lists", "test_split", "message"),
+    [
+        ({"test": ["images/2.jpg", "x"]}, None, "but 2 of its 2 names are not theirs: images/2.jp"),
+        ({"train": IMAGES, "test": IMAGES[3:5]}, None, "have 2 in both train and test: images/03."),
+        ({"test": IMAGES[:2]}, "val", "there is no split val, only test; set data.test_split"),
+        (
+            {"test": IMAGES},
+            None,
+            "at least 1 view of the splits train and test is needed, and test",
+        ),
+        ({"test": ["a", 3]}, None, "test_filenames[1] must be text, got 3"),
+    ],
+)
+def test_contradictory_lists_are_refused(photographs, lists, test_split, message):
+    give(photographs, **lists)
+    refused = refusal(photographs, test_split=test_split)
+    assert refused.startswith(f"{photographs / 'transforms.json'}: ") and message in refused
 
 
 def test_list_file_defines_the_split(photographs):

@@ -1,31 +1,89 @@
-"""The scene representation: copies, not views."""
+"""Gaussians from arrays, on the device, and some of them."""
 
 import numpy as np
 import pytest
+from support.formats import gaussians_within_ranges
 from support.helpers import both_precisions
 
-from drgs.bench.scenes import bench_gaussians
+import drgs
+from drgs.export import find_kept, take
 from drgs.gaussians.parameters import PARAMETER_NAMES
+
+COUNT = 7
 
 
 @both_precisions
 @pytest.mark.parametrize("count", [1, 5, 2000])
 def test_uploaded_arrays_are_copies(precision, count):
     """Dr.Jit wraps numpy's memory, in float32 without a conversion between."""
-    source = bench_gaussians(count)
-    values = {name: getattr(source, name).copy() for name in PARAMETER_NAMES}
+    source, expected = gaussians_within_ranges(count), gaussians_within_ranges(count)
     uploaded = source.to(precision.TensorXf)
     for name in PARAMETER_NAMES:
         getattr(source, name)[:] = 7
-    for name, value in values.items():
-        np.testing.assert_array_equal(np.array(getattr(uploaded, name)), value, name)
-        assert np.array(getattr(uploaded, name)).dtype == precision.dtype
+    for name in (*PARAMETER_NAMES, "sh", "scales", "opacities"):
+        found = np.array(getattr(uploaded, name))
+        # Activated values are float32 in numpy: a few roundings of 6e-8.
+        tolerance = 1e-6 if name in ("scales", "opacities") else 0
+        np.testing.assert_allclose(found, getattr(expected, name), rtol=tolerance, err_msg=name)
+        assert found.dtype == precision.dtype
 
 
-@both_precisions
-def test_activated_values_follow_from_raw_ones(precision):
-    source = bench_gaussians(50)
-    uploaded = source.to(precision.TensorXf)
-    # numpy's side is float32 in both cases: a few roundings of 6e-8.
-    np.testing.assert_allclose(np.array(uploaded.scales), source.scales, rtol=1e-6)
-    np.testing.assert_allclose(np.array(uploaded.opacities), source.opacities, rtol=1e-6)
+def arrays(degree=2):
+    rng = np.random.default_rng(2)
+    return {
+        "means": rng.normal(0, 1, (COUNT, 3)),
+        "quats": rng.normal(0, 1, (COUNT, 4)),
+        "scales": rng.uniform(0.01, 3, (COUNT, 3)),
+        "opacities": rng.uniform(0.01, 0.99, COUNT),
+        "sh": rng.normal(0, 1, (COUNT, (degree + 1) ** 2, 3)),
+    }
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_activated_values_survive_from_numpy(degree):
+    given = arrays(degree)
+    gaussians = drgs.Gaussians.from_numpy(**given)
+    assert (gaussians.num_gaussians, gaussians.sh_degree) == (COUNT, degree)
+    for name, values in given.items():
+        # float32; a logarithm of 5 is rounded by 2.4e-7, the relative error of its exponential
+        np.testing.assert_allclose(getattr(gaussians, name), values, rtol=1e-6)
+    assert {getattr(gaussians, name).dtype for name in PARAMETER_NAMES} == {np.dtype(np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"means": np.zeros((COUNT, 2))}, r"means must be of shape \(7, 3\), got \(7, 2\)"),
+        ({"means": np.zeros((3, COUNT))}, r"means must be of shape \(3, 3\), got \(3, 7\)"),
+        ({"opacities": np.zeros((COUNT, 1))}, r"opacities must be of shape \(7,\)"),
+        ({"sh": np.zeros((COUNT, 5, 3))}, r"sh must be of shape \(7, 1, 3\) or .*, got \(7, 5"),
+        ({"scales": np.zeros((COUNT, 3))}, "scales must be above 0 and below inf, got 0.0"),
+        ({"opacities": np.full(COUNT, 1.5)}, "opacities must be above 0 and below 1, got 1.5"),
+    ],
+)
+def test_invalid_gaussians_are_refused(changes, message):
+    with pytest.raises(ValueError, match=rf"Gaussians.from_numpy\(\): {message}"):
+        drgs.Gaussians.from_numpy(**{**arrays(), **changes})
+
+
+def test_selection_keeps_gaussians_within_its_limits():
+    g = gaussians_within_ranges(400)
+    x, y, z = g.means.T
+    expected = {
+        "box": (abs(x) <= 1) & (abs(y) <= 1) & (z >= 0) & (z <= 2),
+        "opacity": 1 / (1 + np.exp(-g.logit_opacities)) >= 0.3,
+        "size": np.exp(g.log_scales.max(axis=1)) <= 0.1,
+    }
+    found = find_kept(g, box=(1, -1, 2, -1, 1, 0), min_opacity=0.3, max_scale=0.1)
+    assert found.keys() == expected.keys() and find_kept(g) == {}
+    for name, kept in found.items():
+        np.testing.assert_array_equal(kept, expected[name])
+        assert 0 < kept.sum() < 400
+
+
+def test_rows_are_taken_from_every_parameter():
+    g, rows = gaussians_within_ranges(9), np.array([7, 0])
+    found = take(g, rows)
+    for name in PARAMETER_NAMES:
+        np.testing.assert_array_equal(getattr(found, name), getattr(g, name)[rows])
+    assert found.features is None and found.smoothing is None

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.formats import distance_of_ellipsoids, gaussians_within_ranges
 from support.views import Scene
 
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.gaussians.similarity import Similarity
+from drgs.gaussians.similarity import Similarity, rotation_towards, shortest_rotation
 from drgs.reference import splatting as reference
 
 SCALE, TRANSLATION = 1.75, np.array([0.5, -2.0, 1.25])
@@ -23,16 +24,6 @@ def matrix_of(linear, translation=(0, 0, 0)) -> np.ndarray:
 
 
 MATRIX = matrix_of(SCALE * ROTATION, TRANSLATION)
-
-
-def model(degree=3, **others) -> Gaussians:
-    gaussians = Scene(degree=degree).gaussians
-    fields = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    return Gaussians(**fields, **others)
-
-
-def as_reference(gaussians) -> reference.Gaussians:
-    return reference.Gaussians(**{n: np.float64(getattr(gaussians, n)) for n in PARAMETER_NAMES})
 
 
 def test_matrix_is_decomposed():
@@ -59,22 +50,27 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_anything_but_a_similarity_is_refused(case):
+@pytest.mark.parametrize("matrix", REFUSED.values(), ids=REFUSED)
+def test_anything_but_a_similarity_is_refused(matrix):
     message = (
         r"^splats: to_world must be made of rotations, translations and scales that are the same "
         r"along all axes and positive, got the matrix \["
     )
     with pytest.raises(ValueError, match=message):
-        Similarity.from_matrix(REFUSED[case], "splats: to_world")
+        Similarity.from_matrix(matrix, "splats: to_world")
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_model_and_camera_moved_together_give_the_same_image(degree):
     """Depths are multiplied. float32 parameters of a moved model are rounded anew: 1e-7 each."""
     scene, camera = Scene(degree=degree), Scene().camera
-    moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(model(degree))
-    assert {getattr(moved, n).dtype for n in PARAMETER_NAMES} == {np.dtype(np.float32)}
+    fields = {name: getattr(scene.gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
+    filters = np.linspace(0.01, 0.2, len(fields["means"]), dtype=np.float32)
+    similarity = Similarity.from_matrix(MATRIX, "x")
+    moved = similarity.of_gaussians(Gaussians(**fields, smoothing=filters))
+    np.testing.assert_allclose(moved.smoothing, SCALE * filters, rtol=1e-6)
+    names = (*PARAMETER_NAMES, "smoothing")
+    assert {getattr(moved, name).dtype for name in names} == {np.dtype(np.float32)}
     follower = replace(
         camera,
         rotation=camera.rotation @ ROTATION.T,
@@ -82,33 +78,45 @@ def test_model_and_camera_moved_together_give_the_same_image(degree):
         near=SCALE * camera.near,
     )
     expected = reference.render(scene.gaussians, camera, np.zeros(3), degree)
-    actual = reference.render(as_reference(moved), follower, np.zeros(3), degree)
+    fields = {name: np.float64(getattr(moved, name)) for name in PARAMETER_NAMES}
+    actual = reference.render(reference.Gaussians(**fields), follower, np.zeros(3), degree)
     np.testing.assert_allclose(actual.image, expected.image, atol=1e-5 * expected.image.max())
     np.testing.assert_allclose(
         actual.depth, SCALE * expected.depth, atol=1e-5 * SCALE * expected.depth.max()
     )
 
 
-def test_a_smoothing_filter_grows_with_the_model():
-    filters = np.linspace(0.01, 0.2, 40, dtype=np.float32)
-    moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(model(smoothing=filters))
-    np.testing.assert_allclose(moved.smoothing, SCALE * filters, rtol=1e-6)
-    assert moved.smoothing.dtype == np.float32
-
-
 def test_positions_that_overflow_float32_are_refused():
-    turn = Similarity.from_matrix(
-        matrix_of(Rotation.from_euler("z", 45, degrees=True).as_matrix()), "it"
-    )
-    far = model()
+    turn = Rotation.from_euler("z", 45, degrees=True).as_matrix()
+    similarity = Similarity.from_matrix(matrix_of(turn), "it")
+    far = gaussians_within_ranges(9)
     far.quats[:] = 3e38
-    assert np.isfinite(turn.of_gaussians(far).quats).all()
+    assert np.isfinite(similarity.of_gaussians(far).quats).all()
     far.means[2] = 3e38, 3e38, 0
     with pytest.raises(UserError, match=r"means of Gaussian 2 is 4.24264e\+38 once it is moved"):
-        turn.of_gaussians(far)
+        similarity.of_gaussians(far)
 
 
-def test_translation_keeps_opacities_and_colours():
-    before = model()
-    moved = Similarity.from_matrix(MATRIX, "x").of_gaussians(before)
-    assert moved.logit_opacities is before.logit_opacities and moved.sh0 is before.sh0
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+@pytest.mark.parametrize("direction", [*AXES, np.array([0.6, 0, 0.8])], ids=str)
+def test_shortest_rotation_axis_is_perpendicular_to_both_directions(direction):
+    for towards in AXES:
+        rotation = shortest_rotation(direction, towards)
+        np.testing.assert_allclose(rotation @ direction, towards, atol=1e-15)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
+        assert np.linalg.det(rotation) > 0
+        angle = Rotation.from_matrix(rotation).magnitude()
+        assert angle == pytest.approx(np.arccos(direction @ towards), abs=1e-7)
+
+
+def test_rotation_turns_means_and_quats():
+    g = gaussians_within_ranges(50)
+    found = rotation_towards(g, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    x, y, z = g.means.T
+    np.testing.assert_allclose(found.means, np.column_stack([x, z, -y]), atol=1e-6)
+    about_x = Rotation.from_euler("x", -90, degrees=True)
+    quats = about_x * Rotation.from_quat(np.roll(g.quats, -1, axis=1))
+    expected = np.roll(quats.as_quat(), 1, axis=1)
+    assert distance_of_ellipsoids(expected, found.quats).max() < 1e-6

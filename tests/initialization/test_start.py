@@ -1,145 +1,66 @@
-"""Sizes of images, extents of scenes, and the Gaussians that a fit starts from."""
+"""Extents of scenes, start boxes, and the Gaussians that a fit starts from."""
 
 import math
+import re
 from dataclasses import replace
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from support.datasets import dataset_of, edit, load, refusal, view_at
+from PIL import Image
+from support.datasets import dataset_of, edit, load, load_noting, put, view_at
+from support.photographs import write_points
 
-from drgs.config.schema import FitConfig
+from drgs.config.schema import FitConfig, InitConfig
+from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
-from drgs.datasets.folders import GUIDE
-from drgs.datasets.images import downscale
 from drgs.datasets.viewpoints import focus_of
+from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import (
+    description_of_start,
     initial_gaussians,
     mean_squared_neighbour_distance,
     start_of,
 )
-from drgs.initialization.start_box import points_in_view
+from drgs.initialization.start_box import points_in_view, start_box_of
+
+TETRAHEDRON = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
 
 
-# Either layout
-def test_missing_folder_is_an_error_with_the_download_command(tmp_path):
-    folder = tmp_path / "none"
-    assert refusal(folder, source="our server") == (
-        f"data.path: there is no folder {folder}; say where it is (--data DIR), or get it from our "
-        "server"
-    )
-    assert refusal(folder) == (
-        f"data.path: there is no folder {folder}; say where it is (--data DIR)"
-    )
+def gaussians_of(dataset, **sections):
+    return initial_gaussians(FitConfig(data={"path": "unused"}, **sections), dataset)
 
 
-def test_folder_of_unknown_layout_is_refused(tmp_path):
-    assert refusal(tmp_path) == (
-        f"{tmp_path}: neither transforms_train.json nor transforms.json is there, nor a model of "
-        f"COLMAP in sparse/0 with its photographs in images; see {GUIDE}"
-    )
+def points_file(path, positions, color=(255, 0, 51)):
+    write_points(path, positions, np.tile(np.uint8(color), (len(positions), 1)))
+    return path
 
 
 @pytest.mark.parametrize(
-    ("pixels", "expected"),
+    ("centers", "extent"),
     [
-        (np.full((2, 2), 51, np.uint8), 0.2),
-        (np.full((2, 2), 13107, np.uint16), 0.2),
-        (np.full((2, 2, 2), (51, 255), np.uint8), 0.2),
+        # Centroid (1, 1.0333, 2); the farthest is the third.
+        ([(3, 0, 0), (0, 3, 0), (0, 0.1, 6)], 1.1 * math.dist((1, 3.1 / 3, 2), (0, 0.1, 6))),
+        ([(1, 2, 3), (1, 2, 3)], 1),
     ],
-    ids=["grey", "grey16", "grey-alpha"],
 )
-def test_grey_images_become_rgb(photographs, pixels, expected):
-    def change(meta):
-        del meta["w"], meta["h"]
-
-    edit(photographs / "transforms.json", change)
-    iio.imwrite(photographs / "images" / "01.png", pixels)
-    image = load(photographs).train[0].image
-    assert image.shape == (2, 2, 3)
-    np.testing.assert_allclose(image, expected, rtol=1e-6)
-
-
-def test_image_size_scales_images_and_intrinsics_together(photographs):
-    full, half = load(photographs), load(photographs, image_size=4)
-    a, b = full.train[0], half.train[0]
-    assert (b.width, b.height, b.image.shape) == (4, 3, (3, 4, 3))
-    np.testing.assert_allclose(b.K[:2], a.K[:2] / 2)
-    assert "4x3" in half.description
-
-
-def test_images_are_never_enlarged(photographs):
-    assert load(photographs, image_size=100).train[0].width == 8
-
-
-@pytest.mark.parametrize("shape", [(6, 8), (7, 9), (5, 11)])
-def test_downscaling_averages_over_each_pixels_area(shape):
-    image = np.random.default_rng(1).random((*shape, 3)).astype(np.float32)
-    actual = downscale(image, 4)
-    height, width = actual.shape[:2]
-    assert (height, width) == (round(shape[0] * 4 / shape[1]), 4)
-    # Each source pixel repeated until old and new pixel edges coincide, then plain means.
-    repeated = image.astype(np.float64).repeat(height, axis=0).repeat(width, axis=1)
-    blocks = repeated.reshape(height, shape[0], width, shape[1], 3)
-    np.testing.assert_allclose(actual, blocks.mean(axis=(1, 3)), rtol=1e-6)
-
-
-@given(st.integers(1, 12), st.integers(1, 12), st.integers(1, 12))
-def test_downscaling_keeps_a_constant_image(height, width, new_width):
-    actual = downscale(np.full((height, width, 3), 0.7, np.float32), new_width)
-    assert actual.shape[1] == min(width, new_width)
-    np.testing.assert_allclose(actual, 0.7, rtol=1e-6)
-
-
-def test_scaling_a_composite_equals_compositing_scaled_premultiplied_colours(blender):
-    folder, images = blender
-    actual = load(folder, image_size=3, background=(0.25, 0.5, 0.75)).train[0].image
-    pixels = images["train", 0].astype(np.float64) / 255
-    pixels[..., :3] *= pixels[..., 3:]
-    small = pixels.reshape(2, 2, 3, 2, 4).mean(axis=(1, 3))
-    expected = small[..., :3] + np.array([0.25, 0.5, 0.75]) * (1 - small[..., 3:])
-    np.testing.assert_allclose(actual, expected, atol=5e-7)
-
-
-def test_extent_is_1_1_times_the_largest_distance_from_the_centroid():
-    views = [view_at(c, (0, 0, 0)) for c in [(3, 0, 0), (0, 3, 0), (0, 0.1, 6)]]
-    # Centroid (1, 1.0333, 2); the farthest is the third.
-    expected = 1.1 * math.dist((1, 3.1 / 3, 2), (0, 0.1, 6))
-    assert dataset_of(views).extent == pytest.approx(expected)
-
-
-def test_extent_is_1_if_all_cameras_share_a_centre():
-    views = [view_at((1, 2, 3), (0, 0, 0)), view_at((1, 2, 3), (5, 0, 0))]
-    assert dataset_of(views).extent == 1
-
-
-# Starting points
-def config(**sections):
-    return FitConfig(data={"path": "unused"}, **sections)
+def test_extent_is_1_1_times_the_largest_distance_from_the_centroid(centers, extent):
+    views = [view_at(center, (0, 0, 0)) for center in centers]
+    assert dataset_of(views).extent == pytest.approx(extent)
 
 
 def test_random_points_fill_the_reference_box_and_depend_on_the_seed_only(blender):
     dataset = load(blender[0])
-    a = initial_gaussians(config(init={"num_points": 2000}), dataset)
-    b = initial_gaussians(config(init={"num_points": 2000}), dataset)
-    c = initial_gaussians(config(init={"num_points": 2000}, seed=1), dataset)
-    np.testing.assert_array_equal(a.means, b.means)
-    assert not np.array_equal(a.means, c.means)
-    assert np.abs(a.means).max() <= 1.3
+    g = gaussians_of(dataset, init={"num_points": 2000, "opacity": 0.2})
+    again = gaussians_of(dataset, init={"num_points": 2000})
+    other = gaussians_of(dataset, init={"num_points": 2000}, seed=1)
+    np.testing.assert_array_equal(g.means, again.means)
+    assert not np.array_equal(g.means, other.means)
     # The largest of 6000 uniform numbers falls short of 1.3 by 1.3 / 6000 on average.
-    assert np.abs(a.means).max() > 1.3 * (1 - 20 / 6000)
-
-
-def test_starting_gaussians_have_the_reference_values(blender):
-    g = initial_gaussians(config(init={"num_points": 50, "opacity": 0.2}), load(blender[0]))
-    assert g.num_gaussians == 50
-    assert g.sh_degree == 3
+    assert 1.3 * (1 - 20 / 6000) < np.abs(g.means).max() <= 1.3
+    assert (g.num_gaussians, g.sh_degree) == (2000, 3)
     np.testing.assert_allclose(g.opacities, 0.2, rtol=1e-6)
-    np.testing.assert_array_equal(g.quats, np.tile([1, 0, 0, 0], (50, 1)))
-    assert not g.sh0.any()  # grey: colour is SH + 0.5
-    assert not g.shN.any()
+    np.testing.assert_array_equal(g.quats, np.tile([1, 0, 0, 0], (2000, 1)))
+    assert not g.sh0.any() and not g.shN.any()  # grey: colour is SH + 0.5
     np.testing.assert_array_equal(g.log_scales, g.log_scales[:, :1].repeat(3, axis=1))
 
 
@@ -150,58 +71,39 @@ def test_scales_are_the_rms_distance_to_the_three_nearest_points():
     np.testing.assert_allclose(mean_squared_neighbour_distance(points), expected, rtol=1e-12)
 
 
-def points_file(path, rgb=None, positions=None):
-    """A PLY of 4 points at the corners of a unit tetrahedron's bounding cube."""
-    from plyfile import PlyData, PlyElement
-
-    if positions is None:
-        positions = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    names = "xyz" if rgb is None else ["x", "y", "z", "red", "green", "blue"]
-    rows = [tuple(p) + (tuple(rgb) if rgb else ()) for p in positions]
-    kinds = [(name, "u1" if len(name) > 1 else "f4") for name in names]
-    vertex = PlyElement.describe(np.array(rows, kinds), "vertex")
-    PlyData([vertex]).write(str(path))
-    return path
-
-
 def test_a_point_cloud_gives_positions_colours_and_scales(tmp_path):
-    path = points_file(tmp_path / "p.ply", rgb=(255, 0, 51))
-    g = initial_gaussians(
-        config(init={"point_cloud": path}, model={"sh_degree": 1}), dataset_of([])
-    )
+    path = points_file(tmp_path / "p.ply", TETRAHEDRON)
+    g = gaussians_of(dataset_of([]), init={"point_cloud": path}, model={"sh_degree": 1})
     assert (g.num_gaussians, g.sh_degree) == (4, 1)
-    # Colour 0.5 + C0 sh0, C0 = sqrt(1 / (4 pi)).
-    colors = 0.5 + math.sqrt(1 / (4 * math.pi)) * g.sh0[:, 0]
-    np.testing.assert_allclose(colors, np.tile([1, 0, 0.2], (4, 1)), atol=2e-7)
+    np.testing.assert_array_equal(g.means, TETRAHEDRON)
+    np.testing.assert_allclose(0.5 + SH_C0 * g.sh0[:, 0], [[1, 0, 0.2]] * 4, atol=2e-7)
     # Neighbours of the corner at distance 1, 1, 1; of the others at 1, sqrt(2), sqrt(2).
     np.testing.assert_allclose(g.scales[0], 1, rtol=1e-6)
     np.testing.assert_allclose(g.scales[1:], math.sqrt(5 / 3), rtol=1e-6)
 
 
-def test_coinciding_points_keep_a_positive_scale(tmp_path):
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_coinciding_points_keep_a_positive_scale(tmp_path, unit):
     positions = np.concatenate([[(1, 2, 3)] * 4, np.random.default_rng(0).normal(size=(95, 3))])
     size = np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1))
-    for unit in (1e-6, 1.0, 1e6):
-        path = points_file(tmp_path / "p.ply", positions=unit * positions)
-        g = initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
-        np.testing.assert_allclose(g.scales[:4], 2.5e-4 * size * unit, rtol=1e-5)
+    path = points_file(tmp_path / "p.ply", unit * positions)
+    g = gaussians_of(dataset_of([]), init={"point_cloud": path})
+    np.testing.assert_allclose(g.scales[:4], 2.5e-4 * size * unit, rtol=1e-5)
 
 
-def test_a_point_cloud_of_the_wrong_size_is_refused(tmp_path):
-    path = points_file(tmp_path / "p.ply", positions=[(0, 0, 0)] * 3)
-    with pytest.raises(UserError, match=r"p.ply: at least 4 points, got 3"):
-        initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
-    path = points_file(tmp_path / "p.ply", positions=[(0, 0, 0)] * 4)
-    with pytest.raises(UserError, match=r"p.ply: its 4 points must not all be the same"):
-        initial_gaussians(config(init={"point_cloud": path}), dataset_of([]))
-    path = points_file(tmp_path / "p.ply", positions=[(0, 0, i) for i in range(9)])
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        (TETRAHEDRON[:3], "at least 4 points, got 3"),
+        (TETRAHEDRON[[0] * 4], "its 4 points must not all be the same"),
+        (np.eye(9)[:, :3], "must hold at most densify.max_gaussians (8) points, got 9"),
+    ],
+)
+def test_a_point_cloud_of_the_wrong_size_is_refused(tmp_path, positions, message):
+    path = points_file(tmp_path / "p.ply", positions)
     with pytest.raises(UserError) as error:
-        initial_gaussians(
-            config(init={"point_cloud": path}, densify={"max_gaussians": 8}), dataset_of([])
-        )
-    assert str(error.value) == (
-        f"{path}: must hold at most densify.max_gaussians (8) points, got 9"
-    )
+        gaussians_of(dataset_of([]), init={"point_cloud": path}, densify={"max_gaussians": 8})
+    assert str(error.value).startswith(f"{path}: {message}")
 
 
 def test_focus_is_the_point_that_cameras_look_at():
@@ -241,72 +143,22 @@ def test_half_of_the_points_in_view_are_uniform_in_inverse_distance():
     assert np.mean(behind < 0.5) == pytest.approx((0.5 - 0.1) / (1 - 0.1), abs=0.05)
 
 
-def test_description_of_random_points_states_their_extent():
-    dataset = dataset_of([view_at(c, (1, 0, 0)) for c in [(5, 0, 0), (1, 4, 0), (1, -4, 0)]])
-    start = start_of(config(init={"num_points": 99}), dataset)
-    assert start.description == (
-        "99 random points that the cameras see, part of them about within 4 of (1, 0, 0), the "
-        "others up to 10 times as far"
-    )
-
-
-def test_half_extent_overrides_the_default_box(blender):
-    g = initial_gaussians(config(init={"half_extent": 0.25, "num_points": 99}), load(blender[0]))
-    assert np.abs(g.means).max() <= 0.25
-    views = [view_at((5, 0, 0), (0, 0, 0)), view_at((0, 5, 0), (0, 0, 0))]
-    g = initial_gaussians(config(init={"half_extent": 9.0, "num_points": 99}), dataset_of(views))
-    assert 8 < np.abs(g.means).max() <= 9
+OUTWARD = [view_at(c, 2 * np.array(c)) for c in [(1, 0, 0), (0, 1, 0), (-1, -1, 1)]]
 
 
 @pytest.mark.parametrize(
     ("views", "reason"),
     [
-        ([view_at((5, y, 0), (0, y, 0)) for y in range(3)], "whose optical axes are parallel"),
-        (
-            [view_at(c, 2 * np.array(c)) for c in [(1, 0, 0), (0, 1, 0), (-1, -1, 1)]],
-            "which look away from each other",
-        ),
+        ([view_at((5, y, 0), (0, y, 0)) for y in range(3)], "whose optical axes are parallel; "),
+        (OUTWARD, "which look away from each other; "),
+        ([view_at((4, 0, 0), (0, 0, 0))], "one training camera, which does not tell how far away"),
     ],
-    ids=["parallel", "outward"],
+    ids=["parallel", "outward", "one"],
 )
 def test_cameras_that_determine_no_box_are_refused(views, reason):
-    with pytest.raises(UserError) as error:
-        initial_gaussians(config(), dataset_of(views))
-    assert str(error.value) == (
-        f"init.half_extent: no start box can be derived from the cameras, {reason}; set "
-        "init.half_extent, or give a point cloud (init.point_cloud)"
-    )
-
-
-def test_single_camera_does_not_determine_a_box():
-    with pytest.raises(UserError) as error:
-        initial_gaussians(config(), dataset_of([view_at((4, 0, 0), (0, 0, 0))]))
-    assert str(error.value) == (
-        "init.half_extent: no start box can be derived from one training camera, which does not "
-        "tell how far away it looks; set init.half_extent, or give a point "
-        "cloud (init.point_cloud)"
-    )
-
-
-def test_starting_gaussians_can_be_written(blender, tmp_path):
-    g = initial_gaussians(config(init={"num_points": 5}), load(blender[0]))
-    g.save(tmp_path / "start.ply")
-    assert (tmp_path / "start.ply").is_file()
-
-
-# The real data
-@pytest.mark.slow
-def test_lego_is_read(lego_folder):
-    dataset = load(lego_folder, image_size=200)
-    assert (len(dataset.train), len(dataset.test), dataset.test_split) == (100, 100, "val")
-    view = dataset.train[0]
-    assert (view.width, view.height) == (200, 200)
-    assert view.fx == pytest.approx(555.5555 / 2, rel=1e-6)
-    np.testing.assert_array_equal(np.asarray(view.image)[0, 0], 1)  # background
-    # All cameras of this scene look at the origin from one distance.
-    focus, distance = focus_of(dataset.train)
-    np.testing.assert_allclose(focus, 0, atol=1e-5)
-    assert distance == pytest.approx(4.0311, abs=1e-3)
+    message = f"^init.half_extent: no start box can be derived from .*{reason}"
+    with pytest.raises(UserError, match=message):
+        gaussians_of(dataset_of(views))
 
 
 def test_fox_is_read(fox_folder):
@@ -314,6 +166,143 @@ def test_fox_is_read(fox_folder):
     assert (len(dataset.train), len(dataset.test)) == (43, 7)
     assert (dataset.train[0].width, dataset.train[0].height) == (270, 480)
     named = dataset.train[0].lens.coefficients()
-    assert named == {
-        "k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575
-    }  # fmt: skip
+    assert named == {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575}
+
+
+REFERENCE_CENTERS = [(4.03, 0, 0), (0, 4.03, 0), (-4.03, 0, 0), (0, -4.03, 0.1)]
+
+
+def config(**sections):
+    return FitConfig(data={"path": "unused"}, **sections)
+
+
+def views_from(target=(0, 0, 0), scale=1.0):
+    """Cameras that look at ``target``, all of it scaled."""
+    target = np.array(target, float)
+    return [view_at(scale * (target + c), scale * target) for c in np.array(REFERENCE_CENTERS)]
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    positions = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    write_points(tmp_path / "cloud.ply", positions, np.full((50, 3), 200, np.uint8))
+    return tmp_path / "cloud.ply"
+
+
+def test_reference_box_is_used_for_cameras_of_the_reference_layout():
+    box = start_box_of(InitConfig(), dataset_of(views_from(), 1.3))
+    assert (box.center == 0).all() and box.half_extent == 1.3
+
+
+@pytest.mark.parametrize(("scale", "target"), [(100, (0, 0, 0)), (0.01, (0, 0, 0)), (1, (9, 5, 7))])
+def test_otherwise_the_box_is_scaled_and_moved_to_the_focus(scale, target):
+    dataset = dataset_of(views_from(target, scale), 1.3)
+    box = start_box_of(InitConfig(), dataset)
+    np.testing.assert_allclose(box.center, scale * np.array(target), atol=0.05 * scale)
+    # Views of 40 px with a focal length of 40 px see half a unit to each side at distance 1.
+    assert box.half_extent == pytest.approx(0.9 * 0.5 * 4.03 * scale, rel=0.02)
+    points = initial_gaussians(config(init={"num_points": 500}), dataset).means
+    assert np.abs(points - box.center).max() <= box.half_extent * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("half_extent", [0.3, 1.3, 10.0])
+def test_given_box_in_view_or_around_the_cameras_is_used(half_extent):
+    init = {"half_extent": half_extent, "num_points": 99}
+    means = initial_gaussians(config(init=init), dataset_of(views_from())).means
+    assert 0.9 * half_extent < np.abs(means).max() <= half_extent
+
+
+@pytest.mark.parametrize(
+    ("target", "scale", "half_extent", "message"),
+    [
+        ((50, 0, 0), 1, 1.3, "(around (50, 0, 0), from 4.03 away), but only 1 of 4 have it in the"),
+        ((0, 0, 1.6), 1, 0.4, "but only 0 of 4 have it in the middle of their images; set init.ha"),
+        ((0, 0, 0), 100, 1.3, "from 403 away), but it covers only 0.39 % of an image (the "),
+    ],
+    ids=["outside", "at the edge", "tiny"],
+)
+def test_box_that_views_do_not_show_is_refused(target, scale, half_extent, message):
+    dataset = dataset_of(views_from(target, scale))
+    start = f"init.half_extent: the start box [-{half_extent}, {half_extent}]^3 must be what the ca"
+    with pytest.raises(UserError, match=rf"^{re.escape(start)}.*{re.escape(message)}"):
+        initial_gaussians(config(init={"half_extent": half_extent}), dataset)
+
+
+def test_cloud_in_another_coordinate_system_is_refused(cloud):
+    dataset = dataset_of(views_from((30, 30, 30)))
+    message = (
+        rf"^{cloud}: must hold what the cameras .* only 0 of 4 have any of its 50 points in the"
+    )
+    with pytest.raises(UserError, match=message):
+        initial_gaussians(config(init={"point_cloud": cloud}), dataset)
+
+
+def test_point_cloud_of_the_dataset_is_the_start(photographs, cloud):
+    put(photographs / "transforms.json", "ply_file_path", "cloud.ply")
+    dataset = load(photographs)
+    assert dataset.point_cloud == cloud
+    assert initial_gaussians(config(), dataset).num_gaussians == 50
+    shown = description_of_start(resolve_defaults(config(), dataset), start_of(config(), dataset))
+    assert shown.startswith(f"starts from the points of {cloud}; near plane at")
+    few = {"num_points": 30}
+    assert initial_gaussians(config(init={"half_extent": 2.0, **few}), dataset).num_gaussians == 30
+    ignoring = load(photographs, ignore_points=True)
+    assert initial_gaussians(config(init=few), ignoring).num_gaussians == 30
+
+
+def test_missing_point_cloud_falls_back_to_random_points(photographs):
+    put(photographs / "transforms.json", "ply_file_path", "gone.ply")
+    dataset, (note,) = load_noting(photographs)
+    assert dataset.point_cloud is None
+    assert note.endswith("not there: 1 of 1 point cloud (gone.ply); the fit starts without")
+
+
+def test_black_points_are_coloured_from_the_images(tmp_path):
+    """Some pipelines write points without colours."""
+    positions = np.random.default_rng(0).uniform(-1, 1, (9, 3))
+    write_points(tmp_path / "black.ply", positions, np.zeros((9, 3), np.uint8))
+    given = config(init={"point_cloud": tmp_path / "black.ply"})
+    views = [replace(view, image=view.image + 0.75) for view in views_from()]
+    g = initial_gaussians(given, dataset_of(views))
+    np.testing.assert_allclose(0.5 + SH_C0 * g.sh0, 0.75, rtol=1e-6)
+    assert not initial_gaussians(given, dataset_of([])).sh0.any()  # grey: colour is SH + 0.5
+
+
+@pytest.mark.parametrize(("mode", "background"), [("RGB", "black"), ("RGBA", "white")])
+def test_the_background_follows_from_the_images(photographs, mode, background):
+    file = photographs / "images" / "03.png"
+    Image.open(file).convert(mode).save(file)
+    dataset = load(photographs)
+    assert resolve_defaults(config(), dataset).data.background == background
+    given = FitConfig(data={"path": "unused", "background": "white"})
+    assert resolve_defaults(given, dataset).data.background == "white"
+
+
+@pytest.mark.parametrize(
+    ("scale", "near"), [(1, 0.2), (1.5, 0.2), (1000, 200), (1e-9, 1e-9), (1e12, 1e9)]
+)
+def test_the_near_plane_follows_from_the_cameras_and_is_recorded(scale, near):
+    dataset = dataset_of(views_from(scale=scale))
+    decided = resolve_defaults(config(), dataset)
+    assert decided.model.near == near
+    assert resolve_defaults(decided, dataset) == decided
+    given = resolve_defaults(config(model={"near": 1e-9}), dataset)
+    assert given.model.near == 1e-9
+
+
+def test_near_plane_beyond_the_focus_is_refused():
+    message = (
+        r"^model.near must be less than half of the distance .*, 0.0403, got 0.2; model.near=nul"
+    )
+    with pytest.raises(UserError, match=message):
+        resolve_defaults(config(model={"near": 0.2}), dataset_of(views_from(scale=0.01)))
+
+
+@pytest.mark.slow
+def test_photographs_are_downscaled_to_the_reference_width_by_default(photographs):
+    for file in (photographs / "images").iterdir():
+        Image.open(file).resize((2000, 4)).save(file)
+    size = {"w": 2000, "h": 4, "fl_x": 2000, "fl_y": 2000}
+    edit(photographs / "transforms.json", lambda meta: meta.update(size))
+    assert load(photographs).train[0].width == 1600
+    assert load(photographs, image_size=10_000).train[0].width == 2000

@@ -12,13 +12,7 @@ from drgs.io.formats import read_gaussians, readable_formats
 Z_TO_Y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Our z axis is the file's y axis: right, up, back."""
 
-ROUNDING = {
-    "ply": 0,
-    "compressed-ply": 1 / 64,
-    "spz": 9 / 256,
-    "glb": 0,
-    "splat": 1 / 255,
-}
+ROUNDING = {"ply": 0, "compressed-ply": 1 / 64, "spz": 9 / 256, "glb": 0, "splat": 1 / 255}
 """Largest error of an SH coefficient by format, which exceeds any other error of a colour; for
 ``splat``, which has none, of a base colour."""
 

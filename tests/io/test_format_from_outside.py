@@ -6,7 +6,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import blobs
@@ -31,8 +30,9 @@ def installed(monkeypatch, tmp_path):
     (about / "entry_points.txt").write_text("[drgs]\nnpz = npz_format\n")
     formats.file_formats()  # imports those that are shipped
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr(registry, "_loaded", set())
-    monkeypatch.setattr(formats.FORMATS, "_extensions", dict(formats.FORMATS._extensions))
+    monkeypatch.setattr(registry, "_loaded", set())  # private: a process unloads no packages
+    extensions = dict(formats.FORMATS._extensions)  # private, as above
+    monkeypatch.setattr(formats.FORMATS, "_extensions", extensions)
     monkeypatch.delitem(sys.modules, "npz_format", raising=False)
     yield folder
     sys.modules.pop("npz_format", None)
@@ -55,28 +55,11 @@ def test_gaussians_are_saved_and_loaded(installed, tmp_path):
         np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
 
 
-def test_plugin_renders_the_file(installed, tmp_path):
-    mi.set_variant("llvm_ad_rgb")
-    images = []
-    for name in ("a.npz", "a.ply"):
-        blobs().save(tmp_path / name)
-        scene = {
-            "type": "scene",
-            "integrator": {"type": "splats", "filename": str(tmp_path / name)},
-            "sensor": {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f().look_at([3, 3, 2], [0, 0, 0], [0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": 24, "height": 16},
-            },
-        }
-        images.append(np.array(mi.render(mi.load_dict(scene))))
-    assert images[0].max() > 0.1
-    np.testing.assert_array_equal(*images)
-
-
 @pytest.mark.slow
 def test_commands_export_and_render_it(installed, tmp_path):
     blobs().save(tmp_path / "a.ply")
+    _, text = drgs(installed, "export", "--help")
+    assert "npz: NumPy's archive of arrays" in " ".join(text.split())
     status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
     assert (status, f"written: {tmp_path / 'a.npz'} (" in text) == (0, True), text
     assert np.array_equal(np.load(tmp_path / "a.npz")["means"], blobs().means)
@@ -86,13 +69,7 @@ def test_commands_export_and_render_it(installed, tmp_path):
     assert list((tmp_path / "out").glob("**/*.png"))
 
 
-@pytest.mark.slow
-def test_help_and_messages_list_the_format(installed, tmp_path):
-    _, text = drgs(installed, "export", "--help")
-    assert "npz: NumPy's archive of arrays" in " ".join(text.split())
-    (tmp_path / "a.obj").touch()
-    _, text = drgs(installed, "render", tmp_path / "a.obj", "--out", tmp_path)
-    assert ".npz" in text and 'entry point of the group "drgs"' in text
+def test_messages_list_the_format(installed, tmp_path):
     with pytest.raises(UserError, match=r"in one of .*\.npz; .*entry point of the group"):
         blobs().save(tmp_path / "a.obj")
     with pytest.raises(UserError, match=r'"npzz"; did you mean npz\?; there are .*entry point'):
@@ -119,15 +96,12 @@ def test_errors_of_the_format_are_reported_with_its_name(installed, tmp_path, co
         Gaussians.load(tmp_path / "a.npz")
 
 
-@pytest.mark.slow
-def test_error_while_writing_ends_a_command_with_one_line(installed, tmp_path):
+def test_error_while_writing_is_reported_with_the_name(installed):
     module = installed / "npz_format.py"
     module.write_text(module.read_text().replace("return content.getvalue()", "return 1 / 0"))
-    blobs().save(tmp_path / "a.ply")
-    status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
-    assert status == 2
-    assert 'error: file format "npz" (npz_format): ZeroDivisionError: division by zero' in text
-    assert "Traceback" not in text and not (tmp_path / "a.npz").exists()
+    message = r'file format "npz" \(npz_format\): ZeroDivisionError: division by zero'
+    with pytest.raises(UserError, match=message):
+        blobs().to_bytes("npz")
 
 
 def test_a_format_without_a_suffix_is_refused_with_its_package(installed):
@@ -144,21 +118,6 @@ def test_broken_package_does_not_affect_shipped_formats(installed, tmp_path):
     assert Gaussians.load(tmp_path / "a.ply").num_gaussians == 30
     with pytest.raises(UserError, match='cannot load the extension "npz"'):
         blobs().save(tmp_path / "a.npz")
-
-
-def test_shipped_suffix_cannot_be_replaced(installed):
-    module = installed / "npz_format.py"
-    module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = ".ply"'))
-    assert formats.format_for("a.ply").name == "ply"
-    assert {each.name for each in formats.file_formats()} >= {"npz", "ply"}
-
-
-def test_nonfinite_numbers_are_refused(installed, tmp_path):
-    means = ARRAYS["means"].copy()
-    means[3, 1] = np.nan
-    np.savez(tmp_path / "a.npz", **{**ARRAYS, "means": means, "rendered_with": "{}"})
-    with pytest.raises(UserError, match=r"a\.npz: .*means of Gaussian 3 is nan"):
-        Gaussians.load(tmp_path / "a.npz")
 
 
 def test_the_documented_example_is_the_file():

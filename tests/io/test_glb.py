@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.datasets import set_value
 from support.formats import gaussians_within_ranges
 
 from drgs.core.errors import UserError
@@ -13,6 +14,8 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.glb import Glb
 
 NAME = "KHR_gaussian_splatting"
+WHERE = "meshes[0].primitives[0]"
+PRIMITIVE = "meshes 0 primitives 0"
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
@@ -30,18 +33,16 @@ def joined(document, binary):
     return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
-def primitive_of(document):
-    return document["meshes"][0]["primitives"][0]
-
-
 def numbers(document, binary, name):
-    """Return an attribute's numbers as the specification's section 3.6 defines them."""
-    accessor = document["accessors"][primitive_of(document)["attributes"][name]]
+    """Return an attribute's first byte, and its numbers as section 3.6 defines them."""
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    accessor = document["accessors"][attributes[name]]
     view = document["bufferViews"][accessor["bufferView"]]
-    part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    start = view["byteOffset"]
+    part = binary[start : start + view["byteLength"]]
     kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
-    assert view["byteOffset"] % 4 == 0
-    return np.frombuffer(part, kind).reshape(accessor["count"], TYPES[accessor["type"]])
+    assert start % 4 == 0
+    return start, np.frombuffer(part, kind).reshape(accessor["count"], TYPES[accessor["type"]])
 
 
 @pytest.fixture
@@ -58,34 +59,34 @@ def refusal(path, document, binary):
     path.write_bytes(joined(document, binary))
     with pytest.raises(UserError) as error:
         Glb().read(path)
+    assert "\n" not in str(error.value)
     return str(error.value).removeprefix(f"{path}: ")
 
 
 def test_a_file_follows_the_extensions_specification(gaussians, parts):
     document, binary = parts
     assert document["extensionsUsed"] == [NAME] and document["asset"]["version"] == "2.0"
-    primitive = primitive_of(document)
+    assert document["nodes"] == [{"mesh": 0}]
+    primitive = document["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0
     assert primitive["extensions"] == {
         NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     }
-    position = numbers(document, binary, "POSITION")
+    _, position = numbers(document, binary, "POSITION")
     x, y, z = gaussians.means.T
     np.testing.assert_array_equal(position, np.column_stack([x, z, -y]))  # z up -> y up
     accessor = document["accessors"][primitive["attributes"]["POSITION"]]
     assert np.float32(accessor["min"]).tolist() == position.min(axis=0).tolist()
     assert np.float32(accessor["max"]).tolist() == position.max(axis=0).tolist()
-    np.testing.assert_allclose(
-        numbers(document, binary, f"{NAME}:SCALE"), gaussians.scales, rtol=1e-6
-    )
-    np.testing.assert_allclose(
-        numbers(document, binary, f"{NAME}:OPACITY")[:, 0], gaussians.opacities, rtol=1e-6
-    )
-    rotations = numbers(document, binary, f"{NAME}:ROTATION")
+    _, scales = numbers(document, binary, f"{NAME}:SCALE")
+    np.testing.assert_allclose(scales, gaussians.scales, rtol=1e-6)
+    _, opacities = numbers(document, binary, f"{NAME}:OPACITY")
+    np.testing.assert_allclose(opacities[:, 0], gaussians.opacities, rtol=1e-6)
+    _, rotations = numbers(document, binary, f"{NAME}:ROTATION")
     np.testing.assert_allclose(np.linalg.norm(rotations, axis=1), 1, rtol=1e-6)
-    base = numbers(document, binary, f"{NAME}:SH_DEGREE_0_COEF_0")
+    _, base = numbers(document, binary, f"{NAME}:SH_DEGREE_0_COEF_0")
     np.testing.assert_array_equal(base, gaussians.sh0[:, 0])
-    fallback = numbers(document, binary, "COLOR_0") / 255
+    fallback = numbers(document, binary, "COLOR_0")[1] / 255
     np.testing.assert_allclose(fallback[:, :3], 0.5 + 0.28209479 * base, atol=0.5 / 255 + 1e-6)
     harmonics = [n for n in primitive["attributes"] if ":SH_DEGREE_" in n]
     assert harmonics[1:] == [
@@ -93,22 +94,22 @@ def test_a_file_follows_the_extensions_specification(gaussians, parts):
     ]
 
 
-def test_extras_record_rendered_with(tmp_path, gaussians):
-    said = {"antialiased": True, "low_pass": 0.1, "projection": "exact"}
-    replace(gaussians, rendered_with=said).save(tmp_path / "a.glb")
-    assert Gaussians.load(tmp_path / "a.glb").rendered_with == said
+def test_origin_is_the_translation_of_the_node(gaussians):
+    """Its y axis is our z axis."""
+    document, _ = split(replace(gaussians, origin=(4.2e6, 1.5, -4.7e6)).to_bytes("glb"))
+    assert document["nodes"][0]["translation"] == [4.2e6, -4.7e6, -1.5]
 
 
 @pytest.mark.parametrize("extras", [7, None, [{"drgs": 1}], {"theirs": {"low_pass": []}}])
 def test_foreign_extras_are_ignored(tmp_path, parts, extras):
     document, binary = parts
-    primitive_of(document)["extras"] = extras
+    document["meshes"][0]["primitives"][0]["extras"] = extras
     (tmp_path / "a.glb").write_bytes(joined(document, binary))
     assert Glb().read(tmp_path / "a.glb")[1] == {}
 
 
 @pytest.mark.parametrize(
-    "said",
+    "extras",
     [
         [1, 2],
         None,
@@ -119,34 +120,29 @@ def test_foreign_extras_are_ignored(tmp_path, parts, extras):
         {"Two words": 1},
     ],
 )
-def test_damaged_drgs_extras_are_refused(tmp_path, parts, said):
+def test_damaged_drgs_extras_are_refused(tmp_path, parts, extras):
     document, binary = parts
-    primitive_of(document)["extras"] = {"drgs": said}
+    document["meshes"][0]["primitives"][0]["extras"] = {"drgs": extras}
     refused = refusal(tmp_path / "a.glb", document, binary)
     expected = "must be an object of names and values of one word, got "
-    assert refused.startswith(f"meshes[0].primitives[0].extras.drgs: {expected}")
-    assert "\n" not in refused and len(refused) < 300
+    assert refused.startswith(f"{WHERE}.extras.drgs: {expected}")
+    assert len(refused) < 300
 
 
 def test_interleaved_and_quantised_numbers_are_read(tmp_path, gaussians, parts):
     """Rotations in 16 bits and opacities in 8, all in rows of one part of the buffer."""
     document, binary = parts
-    rotation = numbers(document, binary, f"{NAME}:ROTATION")
-    opacity = numbers(document, binary, f"{NAME}:OPACITY")
     rows = np.zeros(7, [("rotation", "<i2", 4), ("opacity", "u1"), ("gap", "u1", 3)])
-    rows["rotation"] = np.round(rotation * 32767)
-    rows["opacity"] = np.round(opacity[:, 0] * 255)
+    rows["rotation"] = np.round(numbers(document, binary, f"{NAME}:ROTATION")[1] * 32767)
+    rows["opacity"] = np.round(numbers(document, binary, f"{NAME}:OPACITY")[1][:, 0] * 255)
     view = {"buffer": 0, "byteOffset": len(binary), "byteLength": rows.nbytes, "byteStride": 12}
     document["bufferViews"].append(view)
     where = {"bufferView": len(document["bufferViews"]) - 1, "count": 7, "normalized": True}
-    attributes = primitive_of(document)["attributes"]
-    for name, offset, kind, shape in (
-        ("ROTATION", 0, 5122, "VEC4"),
-        ("OPACITY", 8, 5121, "SCALAR"),
-    ):
-        attributes[f"{NAME}:{name}"] = len(document["accessors"])
-        numbers_here = {**where, "byteOffset": offset, "componentType": kind, "type": shape}
-        document["accessors"].append(numbers_here)
+    kinds = {"ROTATION": (0, 5122, "VEC4"), "OPACITY": (8, 5121, "SCALAR")}
+    for name, (offset, kind, shape) in kinds.items():
+        set_value(document, f"{PRIMITIVE} attributes {NAME}:{name}", len(document["accessors"]))
+        accessor = {"byteOffset": offset, "componentType": kind, "type": shape}
+        document["accessors"].append(where | accessor)
     (tmp_path / "a.glb").write_bytes(joined(document, binary + rows.tobytes()))
     found = Gaussians.load(tmp_path / "a.glb")
     np.testing.assert_allclose(found.opacities, gaussians.opacities, atol=0.5 / 255 + 1e-6)
@@ -155,72 +151,41 @@ def test_interleaved_and_quantised_numbers_are_read(tmp_path, gaussians, parts):
     np.testing.assert_allclose(found.quats, quats, atol=0.5 / 32767 * 2 + 1e-6)
 
 
-def edited(document, path, value):
-    """The document with one value changed; path: keys, such as ``nodes 0 scale``."""
-    *keys, last = (int(key) if key.isdigit() else key for key in path.split())
-    part = document
-    for key in keys:
-        part = part[key]
-    if value is None:
-        del part[last]
-    else:
-        part[last] = value
-
-
-PRIMITIVE = "meshes 0 primitives 0"
+EXTENSION = f"{PRIMITIVE} extensions {NAME}"
+SCALED = {"children": [0], "scale": [2, 2, 2]}
 
 
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        (f"{PRIMITIVE} mode", 4, "meshes[0].primitives[0].mode: Input should be 0, got 4"),
-        (f"{PRIMITIVE} extensions {NAME} kernel", "cube", "meshes[0].primitives[0].extensions."),
-        (
-            f"{PRIMITIVE} extensions {NAME} colorSpace",
-            "lin_rec709_display",
-            "meshes[0].primitives[0].extensions.KHR_gaussian_splatting.colorSpace: Input should be",
-        ),
-        (
-            f"{PRIMITIVE} extensions {NAME} extensions",
-            {f"{NAME}_compression": {}},
-            "meshes[0].primitives[0].extensions.KHR_gaussian_splatting.extensions: ",
-        ),
-        (f"{PRIMITIVE} extensions", {}, "must have one primitive with KHR_gaussian_splatting"),
-        (
-            "extensionsRequired",
-            ["KHR_draco"],
-            "extensionsRequired.0: Input should be 'KHR_gaussian_splatting', got 'KHR_draco'",
-        ),
-        (
-            f"{PRIMITIVE} attributes {NAME}:SCALE",
-            None,
-            "meshes[0].primitives[0]: attributes KHR_gaussian_splatting:SCALE are missing",
-        ),
+        (f"{PRIMITIVE} mode", 4, f"{WHERE}.mode: Input should be 0, got 4"),
+        (f"{EXTENSION} kernel", "cube", f"{WHERE}.extensions.{NAME}.kernel: Input should be"),
+        (f"{EXTENSION} colorSpace", "lin_rec709_display", f"{WHERE}.extensions.{NAME}.colorSpace"),
+        (f"{EXTENSION} extensions", {"a": {}}, f"{WHERE}.extensions.{NAME}.extensions: "),
+        (f"{PRIMITIVE} extensions", {}, f"must have one primitive with {NAME}"),
+        ("extensionsRequired", ["KHR_draco"], f"extensionsRequired.0: Input should be '{NAME}', g"),
+        (f"{PRIMITIVE} attributes {NAME}:SCALE", None, f"{WHERE}: attributes {NAME}:SCALE are mis"),
         (
             f"{PRIMITIVE} attributes {NAME}:SH_DEGREE_2_COEF_3",
             None,
-            "meshes[0].primitives[0]: harmonics must be complete: all those below",
+            f"{WHERE}: harmonics must be complete: all those below",
         ),
         (f"{PRIMITIVE} attributes POSITION", 99, "accessors[99] must be there, got "),
-        ("accessors 0 count", 8, "meshes[0].primitives[0]: POSITION: 8 times VEC3 in 96 bytes"),
-        ("accessors 2 type", "VEC3", "meshes[0].primitives[0]: KHR_gaussian_splatting:ROTATION: 7"),
+        ("accessors 0 count", 8, f"{WHERE}: POSITION: 8 times VEC3 in 96 bytes"),
+        ("accessors 2 type", "VEC3", f"{WHERE}: {NAME}:ROTATION: 7"),
         ("accessors 0 sparse", {}, "accessors[0].sparse: Input should be None"),
-        (
-            "bufferViews 0 byteLength",
-            2**31,
-            "meshes[0].primitives[0]: POSITION: 7 times VEC3 in 84 bytes",
-        ),
+        ("bufferViews 0 byteLength", 2**31, f"{WHERE}: POSITION: 7 times VEC3 in 84 bytes"),
         ("bufferViews 0 buffer", 1, "bufferViews[0].buffer: Input should be 0, got 1"),
         ("nodes 0 scale", [2, 2, 2], "nodes[0].scale: splats that a node rotates or scales are"),
         ("nodes 0 translation", [1, 0, 1e13], "nodes.0.translation.2: Input should be less than"),
         ("nodes", [{"mesh": 0}, {"mesh": 0}], "the splats must be shown once, got 2 nodes"),
-        ("nodes", [{"mesh": 0}, {"children": [0], "scale": [2, 2, 2]}], "nodes[1].scale: splats"),
+        ("nodes", [{"mesh": 0}, SCALED], "nodes[1].scale: splats"),
         ("meshes", {}, "meshes: Input should be a valid list, got {}"),
     ],
 )
 def test_invalid_document_is_refused(tmp_path, parts, path, value, message):
     document, binary = parts
-    edited(document, path, value)
+    set_value(document, path, value)
     assert refusal(tmp_path / "a.glb", document, binary).startswith(message)
 
 
@@ -234,14 +199,11 @@ def test_invalid_document_is_refused(tmp_path, parts, path, value, message):
 )
 def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute, value, message):
     document, binary = parts
-    name = f"{NAME}:{attribute}"
-    numbers_there = numbers(document, binary, name)
-    accessor = document["accessors"][primitive_of(document)["attributes"][name]]
-    start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
-    at = start + 5 * 4 * numbers_there.shape[1]
+    start, there = numbers(document, binary, f"{NAME}:{attribute}")
+    at = start + 5 * 4 * there.shape[1]
     changed = binary[:at] + struct.pack("<f", value) + binary[at + 4 :]
     text = refusal(tmp_path / "a.glb", document, changed)
-    assert text.startswith("byte ") and f", row 5: {name} {message}" in text
+    assert text.startswith("byte ") and f", row 5: {NAME}:{attribute} {message}" in text
 
 
 def test_zero_scales_and_opacities_are_clamped_before_the_logarithm(tmp_path):

@@ -8,11 +8,17 @@ import pytest
 from drjit.llvm.ad import TensorXf
 from support.small_capture import blobs
 
-from drgs.config.approximations import Approximations, from_ply_header
+from drgs.config.approximations import from_ply_header
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
 
-HEADER_VALUES = {"antialiased": True, "low_pass": 0.1, "order_window": 8, "projection": "exact"}
+VALUES = {"antialiased": True, "low_pass": 0.1, "order_window": 8, "projection": "exact"}
+LINES = [
+    b"comment drgs antialiased true",
+    b"comment drgs low_pass 0.1",
+    b"comment drgs order_window 8",
+    b"comment drgs projection exact",
+]
 
 
 def with_lines(path, *lines):
@@ -26,7 +32,7 @@ def with_lines(path, *lines):
 
 
 def test_values_are_read_back_with_their_types(tmp_path):
-    expected = HEADER_VALUES | {"alpha_cut": Approximations().alpha_cut, "extent": np.inf}
+    expected = VALUES | {"alpha_cut": 1 / 255, "extent": np.inf}
     replace(blobs(10), rendered_with=expected).save(tmp_path / "a.ply")
     found = Gaussians.load(tmp_path / "a.ply")
     assert found.rendered_with == expected
@@ -36,21 +42,14 @@ def test_values_are_read_back_with_their_types(tmp_path):
 
 
 def test_each_value_is_a_comment_after_the_format(tmp_path):
-    replace(blobs(10), rendered_with=HEADER_VALUES).save(tmp_path / "a.ply")
-    lines = (tmp_path / "a.ply").read_bytes().split(b"\n")[1:7]
-    assert lines[1:5] == [
-        b"comment drgs antialiased true",
-        b"comment drgs low_pass 0.1",
-        b"comment drgs order_window 8",
-        b"comment drgs projection exact",
-    ]
-    plain = with_lines(tmp_path / "b.ply", *lines[1:5])
-    assert plain.read_bytes() == (tmp_path / "a.ply").read_bytes()
+    replace(blobs(10), rendered_with=VALUES).save(tmp_path / "a.ply")
+    expected = with_lines(tmp_path / "b.ply", *LINES).read_bytes()
+    assert (tmp_path / "a.ply").read_bytes() == expected
 
 
 def test_a_file_without_statements_has_no_settings(tmp_path):
-    for said in (None, {}):
-        replace(blobs(10), rendered_with=said).save(tmp_path / "a.ply")
+    for values in (None, {}):
+        replace(blobs(10), rendered_with=values).save(tmp_path / "a.ply")
         assert b"comment" not in (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0]
         assert Gaussians.load(tmp_path / "a.ply").rendered_with is None
 
@@ -74,25 +73,14 @@ def test_other_comments_are_ignored(tmp_path, line):
     assert Gaussians.load(with_lines(tmp_path / "a.ply", line)).rendered_with is None
 
 
-@pytest.mark.parametrize("line_end", [b"\r\n", b"\r"])
-def test_all_line_ends_are_read(tmp_path, line_end):
-    path = with_lines(tmp_path / "a.ply", b"comment drgs low_pass 0.1")
-    header, end, rows = path.read_bytes().partition(b"end_header\n")
-    path.write_bytes((header + end).replace(b"\n", line_end) + rows)
-    assert Gaussians.load(path).rendered_with == {"low_pass": 0.1}
-
-
 def test_contradictory_values_are_refused(tmp_path):
-    line = b"comment drgs low_pass 0.1"
-    path = with_lines(tmp_path / "a.ply", line, line)
+    path = with_lines(tmp_path / "a.ply", LINES[1], LINES[1])
     assert Gaussians.load(path).rendered_with == {"low_pass": 0.1}
-    with_lines(path, line, b"comment drgs low_pass 0.2")
+    with_lines(path, LINES[1], b"comment drgs low_pass 0.2")
     with pytest.raises(UserError) as error:
         Gaussians.load(path)
-    assert str(error.value) == (
-        f"{path}: the header's comments must give low_pass once, got 0.1 and 0.2; remove one of "
-        "the lines"
-    )
+    message = "the header's comments must give low_pass once, got 0.1 and 0.2; remove one of the"
+    assert str(error.value).startswith(f"{path}: {message}")
 
 
 @pytest.mark.parametrize(
@@ -100,57 +88,35 @@ def test_contradictory_values_are_refused(tmp_path):
     [
         ("low_pass", "-1", "finite and not negative, got -1.0"),
         ("low_pass", "nan", "finite and not negative, got nan"),
-        ("low_pass", "inf", "finite and not negative, got inf"),
         ("low_pass", "1e999", "finite and not negative, got inf"),
         ("low_pass", "true", "finite and not negative, got True"),
         ("order_window", "9" * 40, f"from 1 to 64, got {'9' * 40}"),
         ("order_window", "4.0", "from 1 to 64, got 4.0"),
-        ("antialiased", "yes", "true or false, got yes"),
         ("antialiased", "1", "true or false, got 1"),
-        (
-            "projection",
-            "fish",
-            "one of ewa, unscented, exact (others come with installed packages that have an entry "
-            'point of the group "drgs"), got fish',
-        ),
+        ("projection", "fish", "one of ewa, unscented, exact (others come with installed packages"),
         ("alpha_max", "0.99999999999", "above 0 and below 1 in float32, got 0.99999999999"),
     ],
 )
 def test_values_outside_their_limits_are_refused_on_use(tmp_path, name, text, expected):
     path = with_lines(tmp_path / "a.ply", f"comment drgs {name} {text}".encode())
-    said = Gaussians.load(path).rendered_with  # reading the Gaussians does not depend on it
+    values = Gaussians.load(path).rendered_with  # reading the Gaussians does not depend on it
     with pytest.raises(UserError) as error:
-        from_ply_header(str(path), said)
-    assert str(error.value) == (
-        f"{path}: the header's {name} must be {expected}; correct the line, or remove it"
-    )
+        from_ply_header(str(path), values)
+    assert str(error.value).startswith(f"{path}: the header's {name} must be {expected}")
+    assert str(error.value).endswith("; correct the line, or remove it")
 
 
-def said_noted(values):
-    with pytest.warns(UserNote) as notes:
-        found = from_ply_header("a.ply", values)
-    (note,) = notes
-    assert "\n" not in str(note.message) and str(note.message).isprintable()
-    return found
-
-
-def test_unknown_names_are_noted(tmp_path):
-    lines = [f"comment drgs new{letter} 1".encode() for letter in "abcde"]
-    path = with_lines(tmp_path / "a.ply", b"comment drgs low_pas 0.2", *lines)
+def test_unknown_names_are_noted_in_a_line_however_many_they_are(tmp_path):
+    names = ["".join(letters) for letters in product("abcdefghijklmnopqrst", repeat=3)]
+    lines = [f"comment drgs {name} 1".encode() for name in ("low_pas", *names)]
+    path = with_lines(tmp_path / "a.ply", *lines)
     with pytest.warns(UserNote) as notes:
         assert from_ply_header(str(path), Gaussians.load(path).rendered_with) == {}
-    assert str(notes[0].message) == (
-        f"{path}: specifies low_pas, newa, newb and 3 more, which is not known here and "
+    (note,) = notes
+    assert str(note.message) == (
+        f"{path}: specifies low_pas, aaa, aab and 7,998 more, which is not known here and "
         "ignored; did you mean low_pass?"
     )
-
-
-def test_large_header_is_read_quickly(tmp_path):
-    names = ["".join(letters) for letters in product("abcdefghijklmnopqrst", repeat=3)]
-    path = with_lines(tmp_path / "a.ply", *(f"comment drgs {n} 1".encode() for n in names))
-    said = Gaussians.load(path).rendered_with
-    assert len(said) == len(names)
-    assert said_noted(said) == {}
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,11 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from importlib import resources
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from support.formats import gaussians_within_ranges
 from support.small_capture import FOCUS, RADIUS, blobs, make_dataset, pose_around
 
 from drgs.config.approximations import Approximations
@@ -33,7 +31,7 @@ TITLE = '<i>"ü" & </script>'
 
 
 class Page(HTMLParser):
-    """Contents and links of a page's elements."""
+    """Contents and links of a page's elements, and its Gaussians."""
 
     def __init__(self, page: bytes):
         super().__init__()
@@ -49,9 +47,18 @@ class Page(HTMLParser):
     def handle_data(self, data):
         self.texts[self._inside] = self.texts.get(self._inside, "") + data
 
+    def gaussians(self, path) -> Gaussians:
+        path.write_bytes(gzip.decompress(base64.b64decode(self.texts["splats"])))
+        return Gaussians.load(path)
 
-def page_of(gaussians, initial_view, title="title", background=(0.1, 0.2, 0.3)):
-    return viewer_page(title, DisplaySettings(gaussians, FITTED), initial_view, background)
+
+def page_of(gaussians, initial_view):
+    settings = DisplaySettings(gaussians, FITTED)
+    return viewer_page(TITLE, settings, initial_view, (0.1, 0.2, 0.3))
+
+
+def write(folder, dataset):
+    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
 
 
 @pytest.fixture(scope="module")
@@ -61,45 +68,23 @@ def initial_view():
 
 @pytest.fixture(scope="module")
 def page(initial_view):
-    return page_of(blobs(), initial_view, TITLE)
+    return page_of(blobs(), initial_view)
 
 
-# ----------------------------------------------------------------------------------------------
-# Shipped files
-# ----------------------------------------------------------------------------------------------
-
-
-def test_shipped_files_match_the_manifest():
+def test_shipped_files_have_the_pinned_versions_with_all_changes_and_licences(page):
     files = {entry.name: entry.read_bytes() for entry in SHIPPED.iterdir()}
     assert files.keys() - {"MANIFEST.json"} == MANIFEST["sha256"].keys()
     for name, digest in MANIFEST["sha256"].items():
         assert hashlib.sha256(files[name]).hexdigest() == digest, name
-
-
-def test_viewer_has_the_pinned_versions_with_all_changes():
-    code = gzip.decompress(SHIPPED.joinpath("viewer.js.gz").read_bytes()).decode()
+    code, text = gzip.decompress(files["viewer.js.gz"]).decode(), files["LICENSE"].decode()
     for package in MANIFEST["packages"]:
         assert f'"{package["version"]}"' in code
-    for change in MANIFEST["changes"]:
-        lines = [line.strip() for line in change["new"].splitlines()]
-        assert all(line in code for line in lines) and change["old"] not in code
-
-
-def test_licences_are_in_the_files_and_on_each_page(page):
-    text = SHIPPED.joinpath("LICENSE").read_text()
-    for package in MANIFEST["packages"]:
         assert f"{package['name']} {package['version']}\n" in text
     assert text.count("Permission is hereby granted, free of charge") == len(MANIFEST["packages"])
     assert text in page.decode()
-
-
-# ----------------------------------------------------------------------------------------------
-# The page
-# ----------------------------------------------------------------------------------------------
-
-
-def test_equal_gaussians_give_equal_bytes(page, initial_view):
-    assert page_of(blobs(), initial_view, TITLE) == page
+    for change in MANIFEST["changes"]:
+        lines = [line.strip() for line in change["new"].splitlines()]
+        assert all(line in code for line in lines) and change["old"] not in code
 
 
 def test_page_has_no_external_references_and_connects_nowhere(page):
@@ -119,30 +104,19 @@ def test_external_text_is_escaped(page):
     assert parsed.tags.count("script") == 4
 
 
-def test_content_cannot_close_a_script_element():
-    text = viewer._in_script({"a": "</script><!--"})
-    assert "<" not in text and json.loads(text) == {"a": "</script><!--"}
-
-
-def test_page_records_the_approximations(page):
+def test_page_contains_gaussians_in_axes_of_the_first_camera(page, initial_view, tmp_path):
+    """Their means in the camera's axes: y is up on the page, which turns files by 180 degrees."""
+    assert page_of(blobs(), initial_view) == page  # the same bytes
     scene = json.loads(Page(page).texts["scene"])
     assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.1), True)
     assert scene["settings"]["background"]["color"] == [0.1, 0.2, 0.3]
-
-
-def test_page_contains_gaussians_in_axes_of_the_first_camera(page, initial_view, tmp_path):
-    """Their means in the camera's axes: y is up on the page, which turns files by 180 degrees."""
-    parsed = Page(page)
-    scene = json.loads(parsed.texts["scene"])
-    (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(parsed.texts["splats"])))
-    found = Gaussians.load(tmp_path / "a.ply")
+    found = Page(page).gaussians(tmp_path / "a.ply")
     (first,) = scene["settings"]["cameras"]
     back = np.array(first["initial"]["position"])
     assert first["initial"]["target"] == [0, 0, 0] and np.linalg.norm(back) == pytest.approx(3)
     right = np.cross([0, 1, 0], back)
     axes = [v / np.linalg.norm(v) for v in (right, np.cross(right, back), -back)]  # OpenCV's
     seen = (found.means * [-1, -1, 1] - back) @ np.transpose(axes)
-
     camera = initial_view.camera
     expected = (blobs().means - camera.center) @ camera.camera_to_world[:3, :3]
     scale = 3 / RADIUS
@@ -161,11 +135,6 @@ def test_nonfinite_numbers_are_refused(initial_view):
         page_of(wrong, initial_view)
 
 
-# ----------------------------------------------------------------------------------------------
-# Start views
-# ----------------------------------------------------------------------------------------------
-
-
 def cameras(poses):
     return [pinhole(f"{i}", pose, 32, 24, 40.0) for i, pose in enumerate(poses)]
 
@@ -174,34 +143,20 @@ def test_first_camera_is_nearest_to_the_orbit_start():
     """At their mean height, in the direction that most of them have."""
     azimuths = [(0.9, 0.2), (1.0, 0.6), (1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.4, 0.1)]
     views = cameras([pose_around(*angles) for angles in azimuths])
-    initial_view = InitialView.from_views(views, blobs())
-    start = initial_view.orbit.viewpoints(1, 32, 24, 40.0)[0].center
+    found = InitialView.from_views(views, blobs())
+    start = found.orbit.viewpoints(1, 32, 24, 40.0)[0].center
     distances = [np.linalg.norm(view.center - start) for view in views]
-    assert initial_view.camera is views[int(np.argmin(distances))]
-    np.testing.assert_allclose(initial_view.target, FOCUS, atol=1e-6)
-
-
-def test_target_is_in_front_of_a_camera_that_looks_away(initial_view):
-    away = pose_around(0.3, 0.2)
-    away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1, -1])
-    initial_view = replace(initial_view, camera=cameras([away])[0])
-    expected = away[:3, 3] + initial_view.orbit.radius * away[:3, 2]
-    np.testing.assert_allclose(initial_view.target, expected, rtol=1e-12)
+    assert found.camera is views[int(np.argmin(distances))]
+    np.testing.assert_allclose(found.target, FOCUS, atol=1e-6)
 
 
 def test_view_without_cameras_shows_all_gaussians():
     up = Rotation.from_euler("xyz", [30, 50, 0], degrees=True).apply([0, 0, 1])
-    initial_view = InitialView.from_gaussians(blobs(), up)
-    camera = initial_view.camera
+    camera = InitialView.from_gaussians(blobs(), up).camera
     seen = (blobs().means - camera.center) @ camera.camera_to_world[:3, :3]
     tangents = np.abs(seen[:, :2] / seen[:, 2:])
     assert (tangents < np.tan(np.radians(40) / 2)).mean() > 0.95
     assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-9)
-
-
-# ----------------------------------------------------------------------------------------------
-# Pages of fits
-# ----------------------------------------------------------------------------------------------
 
 
 def test_supported_approximations_are_recognised():
@@ -210,66 +165,36 @@ def test_supported_approximations_are_recognised():
 
 
 def test_a_page_that_is_too_large_is_not_written(tmp_path, monkeypatch):
-    folder, dataset = tmp_path / "blobs", make_dataset()
-    folder.mkdir()
-    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
-    size = (folder / "viewer.html").stat().st_size
-    (folder / "viewer.html").unlink()
+    path = tmp_path / "viewer.html"
+    write(tmp_path, make_dataset())
+    size = path.stat().st_size
+    path.unlink()
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size - 1)
-    with pytest.warns(
-        UserNote, match=r"blobs/viewer\.html: not written, .*export .* --format html"
-    ):
-        viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
-    assert list(folder.iterdir()) == []
-    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", size)
-    viewer.write_viewer(folder, dataset, DisplaySettings(blobs(), FITTED))
-    assert (folder / "viewer.html").stat().st_size == size
-
-
-def test_page_too_large_by_gaussian_count_is_not_built(tmp_path, monkeypatch):
+    with pytest.warns(UserNote, match=r"viewer\.html: not written, .*export .* --format html"):
+        write(tmp_path, make_dataset())
+    # So large that it is not even built.
+    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.min_page_bytes(30, 1) - 1)
     monkeypatch.setattr(viewer, "viewer_page", None)
-    monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.min_page_bytes(30, blobs().sh_degree) - 1)
     with pytest.warns(UserNote, match=r"not written, as it would have at least 0 MB"):
-        viewer.write_viewer(tmp_path, make_dataset(), DisplaySettings(blobs(), FITTED))
-    assert list(tmp_path.iterdir()) == []
+        write(tmp_path, make_dataset())
+    assert not path.exists()
     assert viewer.seconds_of_page(30, 1) == 0 < viewer.seconds_of_page(29, 0)
-
-
-@pytest.mark.parametrize("sh_degree", [0, 3])
-def test_page_size_is_within_the_estimated_bounds(initial_view, sh_degree):
-    """All: in base64, of them and of 72 bytes for each group of 256, and 1 % that gzip adds."""
-    counts = 256, 256 * 12
-    one, twelve = (
-        len(page_of(gaussians_within_ranges(n, sh_degree), initial_view)) for n in counts
-    )
-    least = viewer.min_page_bytes(counts[1] - counts[0], sh_degree)
-    assert least <= twelve - one <= 1.01 * (least / viewer.MIN_GZIP_RATIO + 11 * 72 * 4 / 3)
-
-
-def test_a_page_in_the_current_folder_is_named_after_it(tmp_path, monkeypatch):
-    (tmp_path / "blobs").mkdir()
-    monkeypatch.chdir(tmp_path / "blobs")
-    viewer.write_viewer(Path(), make_dataset(), DisplaySettings(blobs(), FITTED))
-    assert Page(Path("viewer.html").read_bytes()).texts["title"].strip() == "blobs: Gaussian splats"
 
 
 def test_first_view_uses_refined_cameras(tmp_path):
     """All of them twice as far away: what is walked around is half as large on the page."""
     dataset, sizes = make_dataset(), []
-    far = [replace(view, camera_to_world=far_pose(view.camera_to_world)) for view in dataset.train]
-    for folder in ("given", "refined"):
-        (tmp_path / folder).mkdir()
-        config = {"data": {"path": "data"}, "cameras": {"optimise": folder == "refined"}}
-        (tmp_path / folder / "config.yml").write_text(yaml.safe_dump(config))
-        write_views(tmp_path / folder / "cameras.json", replace(dataset, train=far))
-        viewer.write_viewer(tmp_path / folder, dataset, DisplaySettings(blobs(), FITTED))
-        splats = Page((tmp_path / folder / "viewer.html").read_bytes()).texts["splats"]
-        (tmp_path / "a.ply").write_bytes(gzip.decompress(base64.b64decode(splats)))
-        sizes.append(np.ptp(Gaussians.load(tmp_path / "a.ply").means, axis=0))
+    far = [
+        replace(view, camera_to_world=np.block([[view.camera_to_world[:, :3], end[:, None]]]))
+        for view in dataset.train
+        for end in [np.append(2 * view.center - FOCUS, 1)]
+    ]
+    for folder in (tmp_path / "given", tmp_path / "refined"):
+        folder.mkdir()
+        config = {"data": {"path": "data"}, "cameras": {"optimise": folder.name == "refined"}}
+        (folder / "config.yml").write_text(yaml.safe_dump(config))
+        write_views(folder / "cameras.json", replace(dataset, train=far))
+        write(folder, dataset)
+        found = Page((folder / "viewer.html").read_bytes()).gaussians(tmp_path / "a.ply")
+        sizes.append(np.ptp(found.means, axis=0))
     np.testing.assert_allclose(sizes[0], 2 * sizes[1], rtol=0.01)  # 10 bits of a box
-
-
-def far_pose(pose):
-    pose = pose.copy()
-    pose[:3, 3] = FOCUS + 2 * (pose[:3, 3] - FOCUS)
-    return pose

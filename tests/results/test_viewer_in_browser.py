@@ -1,5 +1,6 @@
 """``viewer.html`` in a real browser: from disk, with the network off."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import mitsuba as mi
@@ -86,13 +87,23 @@ def path(tmp_path_factory, gaussians, initial_view):
 
 @pytest.fixture(scope="module")
 def page(path):
-    with browsers.Browser(*browsers.SOFTWARE_WEBGL) as browser:
-        page = browsers.Page(browser, WIDTH, HEIGHT)
+    with opened(path, "?noui") as page:
+        yield page
+
+
+@contextmanager
+def opened(path, query="", size=(WIDTH, HEIGHT)):
+    """The page with the network off."""
+    with browsers.browser_page(*size) as page:
         page.cut_off()
-        page.open(path.as_uri() + "?noui")
+        page.open(path.as_uri() + query)
         page.wait_for("window.viewer?.state.loaded")
         settle(page)
         yield page
+        assert page.console_errors() == []
+        own, *others = page.requests()
+        assert own == path.as_uri() + query
+        assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
 
 
 def settle(page) -> None:
@@ -131,13 +142,6 @@ def assert_shown_as_fitted(rendered, camera, gaussians) -> None:
         assert decibels(rendered, image) <= MAX_WRONG_PSNR_DB, name
 
 
-def test_page_opens_from_disk_without_requests_or_errors(page, path):
-    assert page.console_errors() == []
-    own, *others = page.requests()
-    assert own == path.as_uri() + "?noui"
-    assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
-
-
 def test_first_view_is_the_training_camera(page, gaussians, initial_view):
     camera = shown_camera(page, initial_view)
     np.testing.assert_allclose(
@@ -166,11 +170,7 @@ def test_dragging_orbits_the_focus_at_the_same_height(page, gaussians, initial_v
 @pytest.mark.parametrize("size", SIZES)
 def test_page_with_controls_fits_the_window_and_orbits(path, size):
     width, height = SIZES[size]
-    with browsers.browser_page(width, height) as page:
-        page.cut_off()
-        page.open(path.as_uri())
-        page.wait_for("window.viewer?.state.loaded")
-        settle(page)
+    with opened(path, size=(width, height)) as page:
         edges = np.array(page.evaluate(BUTTONS))
         assert len(edges) >= 7  # play, orbit, fly, settings, keys, about, full screen
         assert edges.min() >= 0 and (edges[:, 2:] <= [width, height]).all()
@@ -179,19 +179,10 @@ def test_page_with_controls_fits_the_window_and_orbits(path, size):
         settle(page)
         shown = np.s_[height // 3 : height // 2, width // 4 : 3 * width // 4]
         assert decibels(page.rendered()[shown], before[shown]) < MAX_WRONG_PSNR_DB
-        assert page.console_errors() == []
-        own, *others = page.requests()
-        assert own == path.as_uri() and all(a.startswith(("blob:", "data:")) for a in others)
-
-
-def test_title_is_escaped(page):
-    assert page.evaluate("document.title") == f"{TITLE}: Gaussian splats"
-    assert page.evaluate("typeof window.intruder") == "undefined"
 
 
 def test_page_without_webgl_explains_what_it_needs(path):
-    with browsers.Browser(*browsers.NO_WEBGL) as browser:
-        page = browsers.Page(browser, WIDTH, HEIGHT)
+    with browsers.browser_page(WIDTH, HEIGHT, browsers.NO_WEBGL) as page:
         page.cut_off()
         page.open(path.as_uri())
         page.wait_for("document.querySelector('p.trouble') !== null")

@@ -1,4 +1,4 @@
-"""No command and no script writes into the checkout unless it is told to."""
+"""Scripts and commands run, and write into the checkout only if they are told to."""
 
 import importlib
 import sys
@@ -12,101 +12,105 @@ from drgs.bench.__main__ import COMMANDS as MEASUREMENTS
 from drgs.cli.commands import CommandParser
 
 SCENES = REPOSITORY / "scenes"
-FOLDERS = ("docs", "drgs", "plugins", "scenes", "tests")
-SCRIPTS = ("among_surfaces", "compare_shapes", "draw_tiles", "flat_mirror", "knot", "relight")
+STUDIES = SCENES / "studies"
 MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name in MEASUREMENTS]
+
+SCRIPTS = {
+    "compare_shapes": ((), {"out/shapes.png"}),
+    "knot": ((), {"out/knot.ply"}),
+    "draw_tiles": ((), {"out/tiles.png"}),
+    "flat_mirror": (("--size", 8, "--splats", 20), set()),
+    "among_surfaces": ((), set()),
+    "relight": ((SCENES / "shapes" / "knot.ply",), {"out/relight/target.png"}),
+}
+"""Arguments, and the files that are written to the current folder."""
+
+
+def main_scripts(folder):
+    return sorted(path.stem for path in folder.glob("*.py") if "__main__" in path.read_text())
 
 
 def files_of_the_checkout():
     """Return path, size and time of the last change of each file."""
-    paths = [path for folder in FOLDERS for path in (REPOSITORY / folder).rglob("*")]
+    folders = (REPOSITORY / name for name in ("docs", "drgs", "plugins", "scenes", "tests"))
+    paths = [path for folder in folders for path in folder.rglob("*")]
     kept = [path for path in paths if path.is_file() and "__pycache__" not in path.parts]
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in kept}
 
 
-def photographs_in(folder):
-    """In the place of what a script computes."""
-    folder.mkdir(parents=True)
-    (folder / "target.png").write_text("an image")
-
-
 @pytest.fixture
-def script(monkeypatch, tmp_path):
-    """Runs one in another folder, without what takes long: script(name, *arguments)."""
+def load_script(monkeypatch, tmp_path):
+    """Load a script in an empty folder, as with these arguments: load(name, *arguments)."""
 
-    def run(name, *arguments):
-        for folder in (SCENES, REPOSITORY / "docs"):
+    def load(name, *arguments):
+        for folder in (SCENES, STUDIES, REPOSITORY / "docs"):
             monkeypatch.syspath_prepend(folder)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
-        module = importlib.import_module(name)
-        if name == "compare_shapes":
-            result = module.Result(np.zeros((4, 4, 3)), 1.0)
-            monkeypatch.setattr(module, "measure", lambda *arguments: result)
-        if name == "relight":
-            monkeypatch.setattr(module, "relight", lambda *arguments: photographs_in(arguments[-1]))
-        if name == "among_surfaces":
-            for rows in ("furnace_rows", "shadow_rows"):
-                monkeypatch.setattr(module, rows, lambda *arguments: [])
-        before = files_of_the_checkout()
-        module.main()
-        assert files_of_the_checkout() == before
-        return {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.p*")}
+        return importlib.import_module(name)
 
-    return run
+    return load
 
 
-def test_every_script_is_tested():
-    files = [path for folder in ("docs", "scenes") for path in (REPOSITORY / folder).glob("*.py")]
-    found = {path.stem for path in files if "__main__" in path.read_text()}
-    assert found == set(SCRIPTS)
+def write_image(*arguments):
+    """In the place of what a script computes."""
+    arguments[-1].mkdir(parents=True)
+    (arguments[-1] / "target.png").write_text("an image")
 
 
-def test_shape_images_are_written_to_the_current_folder(script):
-    assert script("compare_shapes") == {"out/shapes.png"}
+def test_every_script_is_tested_and_every_study_has_its_result():
+    assert {*main_scripts(SCENES), *main_scripts(REPOSITORY / "docs")} == SCRIPTS.keys()
+    listed = (STUDIES / "README.md").read_text()
+    for name in main_scripts(STUDIES):
+        assert (STUDIES / f"{name}.md").is_file() and f"({name}.py)" in listed
 
 
 @pytest.mark.slow
-def test_knot_is_written_to_the_current_folder(script):
-    assert script("knot") == {"out/knot.ply"}
-
-
-@pytest.mark.slow
-def test_tile_image_is_written_to_the_current_folder(script):
-    assert script("draw_tiles") == {"out/tiles.png"}
-
-
-@pytest.mark.slow
-def test_flat_mirror_table_is_only_printed(script, capsys):
-    assert script("flat_mirror", "--size", 8, "--splats", 20) == set()
-    assert capsys.readouterr().out.count("\n") == 6
-
-
-def test_among_surfaces_tables_are_only_printed(script, capsys):
-    assert script("among_surfaces") == set()
-    assert capsys.readouterr().out.count("\n") == 4
-
-
-def test_relit_images_are_written_to_the_current_folder(script):
-    model = SCENES / "shapes" / "knot.ply"
-    assert script("relight", model) == {"out/relight/target.png"}
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_script_writes_to_the_current_folder(load_script, monkeypatch, tmp_path, capsys, name):
+    arguments, written = SCRIPTS[name]
+    module = load_script(name, *arguments)
+    if name == "compare_shapes":
+        result = module.Result(np.zeros((4, 4, 3)), 1.0)
+        monkeypatch.setattr(module, "measure", lambda *arguments: result)
+    if name == "relight":
+        monkeypatch.setattr(module, "relight", write_image)
+    if name == "among_surfaces":
+        for rows in ("furnace_rows", "shadow_rows"):
+            monkeypatch.setattr(module, rows, lambda *arguments: [])
+    before = files_of_the_checkout()
+    module.main()
+    assert files_of_the_checkout() == before
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.p*")} == written
+    assert written or capsys.readouterr().out.count("\n") >= 4
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_commands_write_to_the_current_folder_by_default(module):
     parser = CommandParser(prog="command")
     importlib.import_module(module).add_arguments(parser)
-    for action in parser._actions:
+    for action in parser._actions:  # argparse has no public list
         if action.dest == "out":
             assert action.required or action.default is None or not action.default.is_absolute()
 
 
-def test_modified_file_is_found(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules[__name__], "REPOSITORY", tmp_path)
-    path = tmp_path / "docs" / "a.png"
-    path.parent.mkdir()
-    path.write_text("a")
-    before = files_of_the_checkout()
-    assert set(before) == {path}
-    path.write_text("bb")
-    assert files_of_the_checkout() != before
+@pytest.mark.parametrize("name", main_scripts(STUDIES))
+def test_every_study_has_help(load_script, name, capsys):
+    with pytest.raises(SystemExit) as end:
+        load_script(name, "--help").main()
+    assert end.value.code == 0
+    assert f"usage: {name}.py" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "arguments", "printed"),
+    [
+        ("hybrid", "--gaussians 100 --size 16 --rounds 1", "| 100 |"),
+        ("kernels", "--gaussians 200 --size 32 --rounds 1", "| a training iteration |"),
+        ("prediction", "--quick", "| 64 | 25 Gbit/s |"),
+    ],
+)
+def test_study_runs(load_script, name, arguments, printed, capsys):
+    load_script(name, *arguments.split()).main()
+    assert printed in capsys.readouterr().out

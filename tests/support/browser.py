@@ -18,7 +18,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -46,7 +46,7 @@ NO_WEBGL = ("--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis
 TIMEOUT_SECONDS = 120.0
 """Timeout of an unresponsive browser, seconds, on one of two busy cores."""
 
-SECOND_TO_END = 5.0
+EXIT_SECONDS = 5.0
 
 
 class Browser:
@@ -69,13 +69,10 @@ class Browser:
         self.events: list[dict] = []
         threading.Thread(target=self._listen, daemon=True).start()
 
-    def __enter__(self) -> Browser:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """The group is the browser's own: nothing else is ended."""
+    def close(self) -> None:
+        """End the browser's own process group: nothing else."""
         os.killpg(self._process, signal.SIGTERM)
-        end = time.monotonic() + SECOND_TO_END
+        end = time.monotonic() + EXIT_SECONDS
         while os.waitpid(self._process, os.WNOHANG) == (0, 0):
             if time.monotonic() > end:
                 os.killpg(self._process, signal.SIGKILL)
@@ -107,10 +104,9 @@ class Browser:
 
 
 class Page:
-    """A window."""
+    """A window of a browser; width, height: px, one of the screen for each of the page."""
 
     def __init__(self, browser: Browser, width: int, height: int) -> None:
-        """width, height: px, one of the screen for each of the page."""
         self._browser = browser
         target = browser.call("Target.createTarget", url="about:blank")["targetId"]
         answer = browser.call("Target.attachToTarget", targetId=target, flatten=True)
@@ -121,7 +117,6 @@ class Page:
         self.call("Emulation.setDeviceMetricsOverride", **size)
 
     def call(self, method: str, **parameters: object) -> dict:
-        """Call a method of the protocol."""
         return self._browser.call(method, self._session, **parameters)
 
     def cut_off(self) -> None:
@@ -130,7 +125,6 @@ class Page:
         self.call("Network.emulateNetworkConditions", offline=True, **nothing)
 
     def open(self, address: str) -> None:
-        """Go there; what it shows comes later."""
         self.call("Page.navigate", url=address)
         self.wait_for("!!document.body")
 
@@ -143,7 +137,6 @@ class Page:
         return answer["result"].get("value")
 
     def wait_for(self, expression: str) -> None:
-        """Until it is true."""
         end = time.monotonic() + TIMEOUT_SECONDS
         while not self.evaluate(expression):
             assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
@@ -154,20 +147,6 @@ class Page:
         data = self.call("Page.captureScreenshot", format="png")["data"]
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
             return np.asarray(image.convert("RGB")) / 255
-
-    def click(self, words: str) -> None:
-        """The button with these words, at its middle."""
-        button = (
-            f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {words!r})"
-        )
-        self.wait_for(f"!!{button}")
-        x, y = self.evaluate(
-            f"(() => {{ const b = {button}; b.scrollIntoView({{block: 'center'}}); "
-            "const r = b.getBoundingClientRect(); "
-            "return [r.x + r.width / 2, r.y + r.height / 2] })()"
-        )
-        for kind in ("mousePressed", "mouseReleased"):
-            self._mouse(kind, x, y, buttons=1, button="left", clickCount=1)
 
     def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10) -> None:
         """Drag the mouse with its left button; px."""
@@ -183,14 +162,15 @@ class Page:
         """The addresses of all that it has asked for."""
         return [p["request"]["url"] for p in self._events("Network.requestWillBeSent")]
 
-    def console_errors(self, levels: Sequence[str] = ("error", "warning")) -> list[str]:
-        """Exceptions, and what stands in the console at these levels."""
-        logged = [p["entry"] for p in self._events("Log.entryAdded")]
-        said = self._events("Runtime.consoleAPICalled")
+    def console_errors(self) -> list[str]:
+        """Exceptions, errors and warnings."""
+        levels = ("assert", "error", "warning")
+        entries = [p["entry"] for p in self._events("Log.entryAdded")]
+        calls = self._events("Runtime.consoleAPICalled")
         return [
             *(str(p["exceptionDetails"]) for p in self._events("Runtime.exceptionThrown")),
-            *(entry["text"] for entry in logged if entry["level"] in levels),
-            *(str(p["args"]) for p in said if p["type"] in ("assert", *levels)),
+            *(entry["text"] for entry in entries if entry["level"] in levels),
+            *(str(p["args"]) for p in calls if p["type"] in levels),
         ]
 
     def _mouse(self, kind: str, x: float, y: float, **others: object) -> None:
@@ -204,18 +184,13 @@ class Page:
 
 
 @contextmanager
-def browser_page(width: int, height: int) -> Iterator[Page]:
-    """Yield a page of a new browser, whose images are made by software."""
-    with Browser(*SOFTWARE_WEBGL) as browser:
+def browser_page(width: int, height: int, options=SOFTWARE_WEBGL) -> Iterator[Page]:
+    """Yield a page of a new browser."""
+    browser = Browser(*options)
+    try:
         yield Page(browser, width, height)
-
-
-def wait_until(happens: Callable[[], object], what: str) -> None:
-    """Ask until it is true; what: it is that."""
-    end = time.monotonic() + TIMEOUT_SECONDS
-    while not happens():
-        assert time.monotonic() < end, f"there never was {what}"
-        time.sleep(0.05)
+    finally:
+        browser.close()
 
 
 def _pipe() -> tuple[int, int]:

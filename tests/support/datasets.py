@@ -44,6 +44,22 @@ def edit(path, change):
     path.write_text(json.dumps(meta))
 
 
+def set_value(document, keys, value):
+    """Set a value, or remove it if None; keys: such as ``frames 1 file_path``."""
+    *parents, last = (int(key) if key.isdigit() else key for key in keys.split())
+    for key in parents:
+        document = document[key]
+    if value is None:
+        del document[last]
+    else:
+        document[last] = value
+
+
+def put(path, keys, value):
+    """Set a value in a JSON file, or remove it if None."""
+    edit(path, lambda meta: set_value(meta, keys, value))
+
+
 def load(folder, **options):
     return load_dataset(DataConfig(path=folder, **options))
 

@@ -148,6 +148,8 @@ def damaged(content: bytes, count: int, seed=0) -> Iterator[bytes]:
     for _ in range(count):
         data = bytearray(content)
         for _ in range(int(rng.integers(1, 4))):
+            if not data:
+                break
             # Half of the changes are among the first bytes, where headers are.
             at = int(rng.integers(min(len(data), 64) if rng.random() < 0.5 else len(data)))
             kind = int(rng.integers(4))

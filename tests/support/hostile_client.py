@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 import msgspec
 import numpy as np
 import viser
-import zstandard
 from viser import _messages
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -94,10 +93,13 @@ def random_fields(pick, uuids: list[str]) -> dict[str, object]:
     return {"type": name} | values
 
 
-def connect_to(port: int, protocol: str = f"viser-v{viser.__version__}") -> ClientConnection:
+def connect_to(
+    port: int, protocol: str = f"viser-v{viser.__version__}", **options
+) -> ClientConnection:
     """Connect as a page does; what the server sends is kept, and need not be read."""
     settings = {"max_size": None, "max_queue": None, "compression": None, "proxy": None}
-    return connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], **settings)
+    address = f"ws://127.0.0.1:{port}"
+    return connect(address, subprotocols=[protocol], **settings, **options)
 
 
 def send_all(port: int, messages: Iterable[bytes | str]) -> None:
@@ -111,17 +113,3 @@ def send_all(port: int, messages: Iterable[bytes | str]) -> None:
             connection.send(msgspec.msgpack.encode(CAMERA))
             connection.send(message)
     connection.close()
-
-
-def labels_of_controls(port: int, last: str) -> dict[str, str]:
-    """Return labels by uuid, as a page is told them; last: the label that ends the wait."""
-    labels: dict[str, str] = {}
-    with connect_to(port) as connection:
-        while last not in labels.values():
-            payload = connection.recv(timeout=10)
-            packed = payload[16 : 16 + int.from_bytes(payload[8:16], "little")]
-            window = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed))
-            for message in window["messages"]:
-                if label := message.get("props", {}).get("label"):
-                    labels[message["uuid"]] = label
-    return labels

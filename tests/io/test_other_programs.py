@@ -1,0 +1,147 @@
+"""gsply and PlayCanvas's splat-transform find the same numbers in files, and the other way round.
+
+Tests of the latter run where ``splat-transform`` is found: ``npm install -g
+@playcanvas/splat-transform``, or the environment variable DRGS_SPLAT_TRANSFORM with the path of its
+``cli.mjs``.
+"""
+
+import os
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.formats import (
+    FLOAT32,
+    PRECISION,
+    assert_within,
+    gaussians_within_ranges,
+    matched,
+    turned,
+)
+
+from drgs.gaussians.parameters import Gaussians
+from drgs.io.compressed_ply import CompressedPly
+from drgs.io.spz import Spz
+
+CLI = os.environ.get("DRGS_SPLAT_TRANSFORM") or shutil.which("splat-transform")
+
+splat_transform = pytest.mark.skipif(
+    not CLI or not shutil.which("node"),
+    reason="splat-transform is not here (npm, or DRGS_SPLAT_TRANSFORM=cli.mjs)",
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
+
+SAME = np.eye(3)
+Z_TO_Y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+SPZ_WORLD = np.diag([1, -1, -1]) @ Z_TO_Y
+"""From our world to right, up, back, as SPZ has it, and on to right, down, forward, as
+splat-transform takes PLY files to be."""
+
+HALF_TURN = np.diag([-1, -1, 1])
+"""Rotation by splat-transform when it converts PLY files."""
+
+ALIKE = replace(
+    PRECISION["glb"], means=4 * FLOAT32, quats=1e-6, colors=4 * FLOAT32, harmonics=16 * FLOAT32
+)
+"""The same numbers, through two programs' arithmetic in float32."""
+
+READ = {
+    ".compressed.ply": (SAME, ALIKE),
+    ".splat": (SAME, replace(ALIKE, quats=PRECISION["splat"].quats)),  # divides by 255, not 256
+    ".spz": (SPZ_WORLD, ALIKE),
+}
+"""Rotation from our world to that of the converted PLY file, and precision, by suffix."""
+
+COARSE = replace(
+    PRECISION["spz"],
+    means=2.0**-12 / 2 + 4 * FLOAT32,  # always 12 bits behind the point
+    harmonics=np.sqrt(7) * (1 / 256 + 16 / 256) + 4 * FLOAT32,  # 4 of 8 bits
+)
+
+WRITTEN = [
+    (".compressed.ply", [], SAME, PRECISION["compressed-ply"]),
+    (".spz", ["--spz-version", "3"], SPZ_WORLD.T, COARSE),
+    (".spz", ["--spz-version", "4"], SPZ_WORLD.T, COARSE),
+    (".glb", [], Z_TO_Y.T @ HALF_TURN, ALIKE),
+]
+"""Options, rotation from the world of a PLY file to ours after conversion, and precision."""
+
+
+def convert(*arguments) -> None:
+    command = ["node", CLI, "--overwrite", "--quiet", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@splat_transform
+@pytest.mark.parametrize("suffix", READ)
+def test_our_files_are_read_by_splat_transform(tmp_path, suffix):
+    rotation, precision = READ[suffix]
+    path = tmp_path / f"ours{suffix}"
+    gaussians_within_ranges().save(path)
+    convert(path, tmp_path / "theirs.ply")
+    expected = turned(Gaussians.load(path), rotation)
+    assert_within(precision, expected, matched(expected, Gaussians.load(tmp_path / "theirs.ply")))
+
+
+@splat_transform
+@pytest.mark.parametrize(("suffix", "options", "rotation", "precision"), WRITTEN)
+def test_files_of_splat_transform_are_read(tmp_path, suffix, options, rotation, precision):
+    if "4" in options:
+        pytest.importorskip("zstandard")
+    path = tmp_path / f"theirs{suffix}"
+    gaussians_within_ranges().save(tmp_path / "ours.ply")
+    convert(tmp_path / "ours.ply", path, *options)
+    expected = turned(Gaussians.load(tmp_path / "ours.ply"), rotation)
+    assert_within(precision, expected, matched(expected, Gaussians.load(path)))
+
+
+@pytest.fixture
+def gsply():
+    return pytest.importorskip("gsply")
+
+
+def assert_found_alike(theirs, ours):
+    """Check that both readers agree, in the axes of the file; logits of opacities 0 and 1 are a
+    choice."""
+
+    def opacities(logits):
+        return 1 / (1 + np.exp(-np.asarray(logits, np.float64).ravel()))
+
+    pairs = {
+        "means": (theirs.means, ours["means"]),
+        "quats": (theirs.quats, ours["quats"]),
+        "scales": (theirs.scales, ours["log_scales"]),
+        "opacities": (opacities(theirs.opacities), opacities(ours["logit_opacities"])),
+        "sh0": (theirs.sh0, ours["sh0"][:, 0]),
+    }
+    if ours["shN"].size:
+        pairs["shN"] = (theirs.shN, ours["shN"])
+    for name, (expected, found) in pairs.items():
+        # A few operations in float32 on numbers up to 10; gsply keeps opacities from 1e-6 on.
+        np.testing.assert_allclose(found, expected, atol=40 * FLOAT32, err_msg=name)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_our_files_are_read_by_gsply(gsply, tmp_path, degree):
+    for suffix, theirs, ours in (
+        (".compressed.ply", gsply.plyread, CompressedPly()),
+        (".spz", gsply.read_spz, Spz()),
+    ):
+        path = tmp_path / f"ours{suffix}"
+        gaussians_within_ranges(degree=degree).save(path)
+        assert_found_alike(theirs(path), ours.read(path)[0])
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_spz_files_of_gsply_are_read(gsply, tmp_path, version):
+    if version == 4:
+        pytest.importorskip("zstandard")
+    gaussians_within_ranges().save(tmp_path / "ours.spz")
+    path = tmp_path / "theirs.spz"
+    gsply.write_spz(path, gsply.read_spz(tmp_path / "ours.spz"), version=version)
+    assert_found_alike(gsply.read_spz(path), Spz().read(path)[0])
