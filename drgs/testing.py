@@ -289,6 +289,12 @@ def camera_gradients_equal_differences(case: Case) -> None:
         terms = direction * gradient
         error = abs(terms.sum() - expected) / np.abs(terms).sum()
         assert error <= case.gradient_tolerance, f"{case.name}: camera is off by {error:.1e}"
+        tangents = [llvm.Float64(number) for number in direction]
+        still = case._gaussians({n: 0 * v for n, v in case.values.items()}, llvm.Float64)
+        planes = rendering.frames_tangent(gaussians, [frame], still, tangents)[0]
+        forward = np.sum(weights * _arrays(planes))
+        error = abs(terms.sum() - forward) / np.abs(terms).sum()
+        assert error <= TRANSPOSE_TOLERANCE, f"{case.name}: modes differ in the camera: {error:.1e}"
 
 
 def adjoint_is_transpose(case: Case) -> None:

@@ -23,6 +23,7 @@ from support.cases import (
     OF_SCENES,
     SCENE_HOLES,
     SCENES,
+    SPECIAL_CASES,
     by_rays,
 )
 from support.views import tensors
@@ -83,6 +84,13 @@ PAIRS = [
 @pytest.mark.parametrize(("case", "law"), PAIRS)
 def test_law_holds(case, law):
     law(case)
+
+
+@pytest.mark.parametrize("make", SPECIAL_CASES, ids=lambda make: make.__name__)
+def test_laws_hold_for_special_cases(make):
+    case = make()
+    for law in SPECIAL_CASES[make]:
+        law(case)
 
 
 def test_matrix_has_a_case_or_a_reason_in_each_cell():

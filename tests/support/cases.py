@@ -15,7 +15,13 @@ from drgs.cameras.motion import MotionBlur, RollingShutter
 from drgs.core.arrays import types_of
 from drgs.reference import effects, rays
 from drgs.reference import splatting as reference
-from drgs.testing import Case, Values, single
+from drgs.testing import (
+    Case,
+    Values,
+    adjoint_is_transpose,
+    bytes_are_reproducible,
+    single,
+)
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES, kernel_lens
 
@@ -157,6 +163,30 @@ def mixed(case) -> Values:
     return {**values, "log_scales": single(values["log_scales"] - smaller[:, None])}
 
 
+def no_opacity(case) -> Values:
+    """The opacity of two of the stacked splats underflows to zero."""
+    values = stacked(case)
+    return {**values, "logit_opacities": np.append([-np.inf, -900], values["logit_opacities"][2:])}
+
+
+def in_the_middle(case) -> Values:
+    """Equal splats behind each other in the middle of the film."""
+    rng, n = np.random.default_rng(case.seed), case.count
+    film, sizes = np.full((n, 2), case.width / 2), np.full((n, 3), 2.0)
+    return gaussians_at(case, rng, film, np.linspace(2.0, 2.5, n), sizes, np.full(n, 2.0))
+
+
+def thresholds() -> Case:
+    """Alpha is the cut at one pixel, its maximum at another, and transmittance ends at the stop."""
+    cases = [
+        Case("thresholds", scene=in_the_middle, width=9, height=9, focal=8.0, count=n, degree=0)
+        for n in (1, 2, 4)
+    ]
+    one, two = (case.planes(case.values)[0].reshape(9, 9) for case in cases[:2])
+    cuts = {"alpha_cut": 1 - one[4, 5], "alpha_max": 1 - one[4, 4], "transmittance_stop": two[4, 5]}
+    return replace(cases[2], approximations=cuts)
+
+
 def close(case) -> Values:
     """Large splats that begin near the camera: the affine approximation is bad at them."""
     values, rng, (rotation, center) = stacked(case), np.random.default_rng(case.seed), case.pose
@@ -253,6 +283,8 @@ SCENES = {
     "degree 1 of 3": Case("", scene=partial(edges, degree=3), width=70, height=18, focal=60.0),
     "stacked": Case("", scene=stacked, degree=2),
     "close": Case("", scene=close, width=40, height=23, focal=20.0, count=20),
+    "mixed": Case("", scene=mixed, width=18, height=9, focal=12.0, count=10),
+    "no opacity": Case("", scene=no_opacity, width=18, height=9, focal=12.0, count=10),
     "needles": Case("", scene=needles, width=40, height=23, focal=20.0, count=8),
 }
 """Scenes by name, with the size of film and the numbers of Gaussians that they have."""
@@ -294,3 +326,8 @@ CASES = [
         if (effect, name) not in SCENE_HOLES
     ),
 ]
+
+
+SPECIAL_CASES = {thresholds: (adjoint_is_transpose, bytes_are_reproducible)}
+"""Functions that make cases to which few laws apply, and these laws: where decisions are taken at
+equality, no step is small enough for differences."""

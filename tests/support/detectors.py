@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from support.mutants import SCALED, Mutant, Switchboard
+from support.mutants import Mutant, Switchboard
 
 MutantKey = tuple[str, str, str, str]
 """Function, source, part, change."""
@@ -30,11 +30,6 @@ class Detector:
         except (AssertionError, pytest.fail.Exception):
             return True
         return False
-
-
-def detectors(checks: dict[str, Callable[[], None]]) -> list[Detector]:
-    """Return detectors by name."""
-    return [Detector(*item) for item in checks.items()]
 
 
 @dataclass(frozen=True)
@@ -100,39 +95,3 @@ def find_noticed(board: Switchboard, general: list[Detector], special: list[Dete
         noticed_by[mutant] = ask(general) or ask(special)
     board.apply(None)
     return Outcome(board, list(reached), false_alarms, noticed_by)
-
-
-class MutationChecks:
-    """Checks of an outcome: the tests of a module that has a fixture ``outcome``."""
-
-    equivalent: dict[MutantKey, str] = {}  # mutants that change no result, and why  # noqa: RUF012
-    derivatives = ""  # functions that have mutants, at least these
-    elsewhere: dict[str, str] = {}  # sites that only other tests reach, and which  # noqa: RUF012
-
-    def test_no_detector_fails_without_a_mutant(self, outcome):
-        """Nor does instrumentation change a result."""
-        assert outcome.false_alarms == []
-
-    def test_every_mutant_is_detected(self, outcome):
-        print(f"\n{outcome.table}")
-        survivors = outcome.survivors(self.equivalent)
-        assert not survivors, "noticed by nobody:\n" + "\n".join(survivors)
-
-    def test_equivalent_mutants_exist_and_are_undetected(self, outcome):
-        """Otherwise the reason for leaving them out no longer holds."""
-        assert outcome.noticing(self.equivalent) == {key: [] for key in self.equivalent}
-
-    def test_every_detector_detects_a_mutant(self, outcome):
-        assert outcome.busy_detectors == set(outcome.detectors)
-
-    def test_derivatives_have_mutants(self, outcome):
-        """The functions of a derivative are found by their callers."""
-        scaled = {m.site.function for m in outcome.noticed_by if m.change == SCALED}
-        assert set(self.derivatives.split()) <= scaled
-
-    def test_every_site_is_evaluated(self, outcome):
-        """A partial that no scene reaches would have no mutant."""
-        idle = {
-            site.partition(":")[0] + site.partition("  ")[2]: site for site in outcome.idle_sites
-        }
-        assert set(idle) == set(self.elsewhere), "\n".join(outcome.idle_sites)

@@ -322,9 +322,11 @@ def _scale_fields(site: Site, part: str, value: Any) -> Any:
 
 
 def _scale_array(site: Site, part: str, value: Any, kind: _Kind) -> Any:
+    if dr.width(value) == 0:
+        return value
     reason = site.reason or (UNNAMED if part == "_" else "")
     if kind is _Kind.FLAT and value.state == dr.VarState.Literal:
-        reason = LITERAL_ZERO if dr.width(value) > 0 and value[0] == 0 else reason
+        reason = LITERAL_ZERO if value[0] == 0 else reason
     if reason:
         site.left_out[part] = reason
         return value
