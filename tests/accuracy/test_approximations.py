@@ -9,28 +9,16 @@ import numpy as np
 import pytest
 from conftest import TESTS
 from support.approximation_checks import (
-    APPROXIMATIONS,
     GRADIENTS,
-    MARKED,
-    PLANES,
     SCENES,
     Problem,
     _inputs,
     _planes,
-    check_a_colour_at_its_minimum_keeps_its_derivative,
-    check_a_peak_in_the_plane_of_the_camera_shows_nothing,
-    check_a_splat_without_opacity_has_no_derivatives,
-    check_adjoint_is_the_transpose_of_the_tangent,
-    check_behind_hundreds_of_layers_gradients_keep_their_accuracy,
-    check_gradients_equal_central_differences_of_the_reference,
-    check_sums_of_products_are_exact_to_twice_the_precision,
-    check_twins_are_composited_in_one_order_by_image_and_derivative,
 )
+from support.cases import APPROXIMATIONS
 from support.helpers import (
     FLOAT32,
     FLOAT64,
-    assert_arrays_agree,
-    both_precisions,
     device_camera,
     device_gaussians,
     frame_adjoint,
@@ -55,19 +43,6 @@ all_scenes = pytest.mark.parametrize("scene", ("random", "close"))
 # ----------------------------------------------------------------------------------------------
 # Images
 # ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@both_precisions
-@all_scenes
-@all_approximations
-def test_image_equals_the_reference(precision, scene, name):
-    problem = Problem(name, scene)
-    rendered = problem.rendered(MARKED[precision])
-    kept = ~rendered.near_threshold
-    assert kept.mean() > 0.9
-    actual = {"planes": problem.kernel_planes(precision)[kept]}
-    assert_arrays_agree(actual, {"planes": _planes(rendered)[kept]}, PLANES[precision])
 
 
 @all_approximations
@@ -98,51 +73,6 @@ def test_order_converges_with_the_window():
 # ----------------------------------------------------------------------------------------------
 # Derivatives
 # ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@all_scenes
-@all_approximations
-def test_gradients_equal_central_differences_of_the_reference(scene, name):
-    check_gradients_equal_central_differences_of_the_reference(scene, name)
-
-
-@pytest.mark.slow
-@all_scenes
-@pytest.mark.parametrize(
-    ("name", "precision"),
-    [*((name, FLOAT64) for name in APPROXIMATIONS), ("all three, other cuts", FLOAT32)],
-    ids=lambda value: value if isinstance(value, str) else f"float{32 * (1 + (value is FLOAT64))}",
-)
-def test_adjoint_is_the_transpose_of_the_tangent(precision, scene, name):
-    """Adjoints of both precisions are compared below."""
-    check_adjoint_is_the_transpose_of_the_tangent(precision, scene, name)
-
-
-@pytest.mark.slow
-@all_scenes
-@all_approximations
-def test_single_precision_gradients_equal_double_precision(scene, name):
-    problem = Problem(name, scene)
-    weights = problem.weights(seed=5)
-    expected = problem.kernel_gradients(FLOAT64, weights)
-    assert_arrays_agree(problem.kernel_gradients(FLOAT32, weights), expected, GRADIENTS[FLOAT32])
-
-
-@pytest.mark.slow
-@all_approximations
-def test_same_bytes_in_every_run(name):
-    problem = Problem(name, "random")
-    weights = problem.weights(seed=6)
-    first, second = (
-        [problem.kernel_planes(FLOAT32), *problem.kernel_gradients(FLOAT32, weights).values()]
-        for _ in range(2)
-    )
-    assert [a.tobytes() for a in first] == [a.tobytes() for a in second]
-
-
-def test_gradients_stay_accurate_behind_hundreds_of_layers():
-    check_behind_hundreds_of_layers_gradients_keep_their_accuracy()
 
 
 def test_unordered_faint_splats_change_the_image_within_bounds():
@@ -201,26 +131,6 @@ def test_without_transmittance_stop_gradients_exist_behind_opaque_layers():
     for single_precision, correct in zip(results[1], results[0], strict=True):
         tolerance = GRADIENTS[FLOAT32] * np.abs(correct).max()
         np.testing.assert_allclose(single_precision, correct, rtol=0, atol=tolerance)
-
-
-def test_sums_of_products_are_exact_to_twice_the_precision():
-    check_sums_of_products_are_exact_to_twice_the_precision()
-
-
-def test_equal_splats_have_one_order_in_image_and_derivative():
-    check_twins_are_composited_in_one_order_by_image_and_derivative()
-
-
-def test_splat_whose_peak_is_in_the_camera_plane_is_invisible():
-    check_a_peak_in_the_plane_of_the_camera_shows_nothing()
-
-
-def test_a_splat_without_opacity_has_no_derivatives():
-    check_a_splat_without_opacity_has_no_derivatives()
-
-
-def test_a_colour_at_its_minimum_keeps_its_derivative():
-    check_a_colour_at_its_minimum_keeps_its_derivative()
 
 
 # ----------------------------------------------------------------------------------------------
@@ -310,18 +220,6 @@ def test_missing_module_fails_only_when_its_approximation_is_chosen(
 ):
     result = kernels_in_a_new_process(run_python, (module,), **approximations)
     assert result.returncode != 0 and f"drgs.accuracy.{module}" in result.stderr
-
-
-def test_approximations_change_only_kernels_of_their_stage():
-    """Kernels in front of an approximation's stage are those of the default."""
-    from support import kernels
-
-    plain = kernels.kernels_of_a_frame(pipeline_of(Approximations(), 1))["forward"]
-    cut = kernels.kernels_of_a_frame(pipeline_of(Approximations(transmittance_stop=0.0), 1))[
-        "forward"
-    ]
-    assert plain != cut and len(plain) == len(cut)
-    assert sum(a != b for a, b in zip(plain, cut, strict=True)) == 1
 
 
 def test_no_kernel_of_an_approximation_reduces_floats_in_memory():

@@ -300,11 +300,15 @@ OF_SCENES = {
 """Approximations that render all scenes, and their references."""
 
 WINDOW = "a pixel's window is shorter than the list of splats that are out of order there"
+KINK = "the colour of a pixel crosses zero within a step"
 SCENE_HOLES = {
-    (order, scene): WINDOW
-    for order in ("pixel order", "all three, other cuts")
-    for scene in ("many", "stacked", "close")
-    if (order, scene) != ("all three, other cuts", "close")
+    **{
+        (order, scene): WINDOW
+        for order in ("pixel order", "all three, other cuts")
+        for scene in ("many", "stacked", "close")
+        if (order, scene) != ("all three, other cuts", "close")
+    },
+    **{(name, "needles"): KINK for name in ("pixel colours", "all three")},
 }
 """Scenes without a case for some approximation, and the reason."""
 
@@ -324,6 +328,12 @@ CASES = [
         for name, case in SCENES.items()
         for effect, (reference_of, options) in OF_SCENES.items()
         if (effect, name) not in SCENE_HOLES
+    ),
+    *(
+        replace(SCENES[scene], name=f"{name}, {scene}", approximations=options, reference=by_rays)
+        for name, options in APPROXIMATIONS.items()
+        for scene in ("close", "needles")
+        if name not in OF_SCENES and (name, scene) not in SCENE_HOLES
     ),
 ]
 

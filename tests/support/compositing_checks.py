@@ -1,6 +1,5 @@
 """Scenes of splats that lie on the film already, and what compositing them is checked against."""
 
-import math
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -17,7 +16,6 @@ from drgs.splatting.rasterize import (
     SplatGradients,
     composite,
     composite_adjoint,
-    composite_tangent,
 )
 from support.helpers import (
     FLOAT32,
@@ -215,44 +213,6 @@ def check_gradients_equal_the_reference(precision, scene):
         with pytest.raises(AssertionError, match=rf"{name}\["):
             scaled = {**actual, name: 1.01 * actual[name]}
             assert_arrays_agree(scaled, expected, GRADIENTS[precision])
-
-
-def random_tangents(scene, seed=5) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    names = ("means2d", "conic_factor", "opacities", "features")
-    # A direction that moves a splat of any size by a like part of itself.
-    size = {"conic_factor": scene.conic_factor[:, :1], "opacities": scene.opacities}
-    return {
-        name: single(rng.normal(0, 1, getattr(scene, name).shape) * size.get(name, 1.0))
-        for name in names
-    }
-
-
-def kernel_tangents(scene, precision, tangents) -> dict[str, np.ndarray]:
-    direction = SplatGradients(
-        [
-            *precision.vectors(tangents["means2d"]),
-            *precision.vectors(tangents["conic_factor"]),
-            precision.array(tangents["opacities"]),
-        ],
-        [precision.array(column) for column in tangents["features"].T],
-    )
-    return scene.as_images(composite_tangent(*scene.composite(precision), direction).planes())
-
-
-def check_adjoint_is_the_transpose_of_the_tangent(precision, scene):
-    tangents = random_tangents(scene)
-    d_features, d_transmittance = scene.random_cotangents(3)
-    images = kernel_tangents(scene, precision, tangents)
-    gradients = scene.kernel_gradients(precision, d_features, d_transmittance)
-    pixels = [d_features * images["features"], d_transmittance * images["transmittance"]]
-    splats = [gradients[name] * tangents[name] for name in tangents]
-    left, right = (sum(term.sum() for term in terms) for terms in (pixels, splats))
-    size = math.sqrt(sum((term**2).sum() for term in [*pixels, *splats]))
-    # Relative to the root of the sum of squares: the sum itself may cancel.
-    tolerance = GRADIENTS[precision]
-    assert abs(left - right) <= tolerance * size
-    assert not abs(left - 1.01 * right) <= tolerance * size
 
 
 def stack(opacities, width=1, height=1, sigma=10.0, offset=(0.0, 0.0)) -> FlatScene:
