@@ -9,7 +9,6 @@ import pytest
 from support.sensors import PIXELS, camera_of, numbers, points_on_rays, project
 from support.views import VIEWS, View, pose
 
-from drgs.cameras.camera import Camera
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 
 all_views = pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
@@ -31,18 +30,6 @@ def test_points_on_sensor_rays_project_to_their_pixels(view):
         columns.stop - columns.start,
         rows.stop - rows.start,
     )
-
-
-@all_views
-def test_camera_parameters_follow_mitsubas_definitions(view):
-    """To float32 rounding; with the rays above, this checks the cameras of the other tests."""
-    expected, (rows, columns) = view.camera, view.window
-    actual = numbers(camera_of(mi.load_dict(view.sensor())))
-    assert actual["rotation"] == pytest.approx(expected.rotation, abs=3e-7)
-    assert np.array_equal(actual["center"], expected.center)
-    assert actual["focal"] == pytest.approx(expected.fx, rel=3e-7)
-    principal = [expected.cx - columns.start, expected.cy - rows.start]
-    assert actual["principal"] == pytest.approx(principal, abs=1e-5)
 
 
 def test_a_camera_far_from_the_origin_keeps_its_centre():
@@ -88,20 +75,6 @@ def test_unsupported_sensors_are_refused_by_name():
     )
     with pytest.raises(TypeError, match=message):
         read_sensor(sensor, 0.01)
-
-
-def test_create_uploads_a_camera():
-    rotation, center = np.array(VIEWS[1].camera.rotation), np.array([1e6, 2.0, 3.0])
-    K = np.array([[20.0, 0, 9.5], [0, 21.0, 7.25], [0, 0, 1]])
-    camera = Camera.create(mi.Float, rotation, center, K, 19, 15, 0.25)
-    assert {n: v.tolist() for n, v in numbers(camera).items()} == {
-        "rotation": rotation.astype(np.float32).tolist(),
-        "center": center.tolist(),
-        "focal": [20.0, 21.0],
-        "principal": [9.5, 7.25],
-        "near": 0.25,
-    }
-    assert (camera.width, camera.height) == (19, 15)
 
 
 def test_films_of_all_sizes_share_kernels():

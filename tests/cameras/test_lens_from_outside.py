@@ -20,6 +20,7 @@ from drgs.core.registry import ExtensionError, reporting_extensions
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.initialization.film import to_film
 from drgs.results.refined_cameras import cameras_json
+from drgs.testing import Case, laws_of
 
 XI = 0.75
 K = np.array([[30.0, 0, 17], [0, 32, 13], [0, 0, 1]])
@@ -53,19 +54,13 @@ def test_ray_through_a_projected_point_meets_the_point():
     assert 32 < dr.count(seen)[0] < 64
 
 
-def test_jacobian_is_the_derivative_of_the_projection():
-    camera = camera_with(UnifiedCamera(XI))
-    _, position, _ = camera.lens.visibility(camera, llvm.Array3f64(points()))
-    rows = camera.lens.projection_jacobian(camera, position)
-    step = 1e-6
-    for axis in range(3):
-        # A step along a camera axis, in world coordinates.
-        moved = camera.rotation @ llvm.Array3f64([step if k == axis else 0 for k in range(3)])
-        after, before = (
-            camera.lens.project_point(camera, position + sign * moved) for sign in (1, -1)
-        )
-        for row, difference in zip(rows, (after - before) / (2 * step), strict=True):
-            np.testing.assert_allclose(row[axis], difference, rtol=1e-6, atol=1e-6)
+CASE = Case("unified", lens=UnifiedCamera(XI), count=10, width=13, height=9, focal=10.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", laws_of(CASE))
+def test_laws_hold(law):
+    law(CASE)
 
 
 def test_newton_ray_has_the_derivatives_of_the_closed_form():

@@ -63,16 +63,6 @@ def test_rotation_vector_inverts_rotation_matrix(precision):
     assert (errors <= tolerance + (angles < 2 * shutter.MIN_TURN_RAD) * 2e-13).all()
 
 
-@both_precisions
-def test_rotation_vectors_survive_a_round_trip(precision):
-    """Both ways, without another computation between them."""
-    angles = np.linalg.norm(turns(), axis=1)
-    kept = turns()[angles < 2.5]
-    again = rows(rotation_vector(rotation_matrix(precision.vectors(kept))))
-    tolerance = {FLOAT64: 3e-13, FLOAT32: 2e-6}[precision]
-    np.testing.assert_allclose(again, kept, rtol=0, atol=tolerance)
-
-
 def test_derivatives_at_zero_rotation_match_small_rotations():
     """(a_x)' = e_x: nothing is divided by an angle of zero."""
     turn = FLOAT64.vectors(np.zeros((1, 3)))

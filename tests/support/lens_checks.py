@@ -16,11 +16,7 @@ from support.helpers import (
 from support.lens_scenes import (
     LENSES,
     LensCase,
-    camera_behind,
-    gaussians_at_points,
     lens_camera,
-    points_at,
-    points_near_lens_limit,
 )
 
 every_lens = pytest.mark.parametrize("name", LENSES)
@@ -49,27 +45,6 @@ def kernel_gradients(case, precision, cotangents, pipeline=None) -> dict[str, np
     d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
     gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
     return {n: np.array(getattr(gradients.parameters, n)) for n in PARAMETER_NAMES}
-
-
-def keep_bounds(case, monkeypatch) -> None:
-    """The camera stays: what its film sees is looked for once, not for each difference."""
-    bounds = case.lens.slope_bounds(case.camera)
-    monkeypatch.setattr(type(case.lens), "slope_bounds", lambda *_: bounds)
-
-
-def tiny_scene(case, rng):
-    camera = camera_behind(case, rng)
-    size = np.array([case.width, case.height])
-    film = rng.uniform(0.2, 0.8, (case.count, 2)) * size
-    film[0], film[1] = (camera.cx, camera.cy), size * [1.5, 0.4]
-    distances = rng.uniform(1, 3, case.count)
-    points = points_at(case.lens, camera, film, distances)
-    near_the_end = points_near_lens_limit(case.lens, camera, film, distances)
-    points = np.where(np.isnan(points), near_the_end, points)
-    sizes = rng.uniform(0.7, 3.0, (case.count, 3))
-    sizes[1] = 0.5 * max(size)
-    logits = rng.normal(0, 1, case.count)
-    return gaussians_at_points(case, rng, camera, points, sizes, logits), camera
 
 
 def splats_of(gaussians, camera, lens, precision, shape=ewa, low_pass=0.3, degree=0):

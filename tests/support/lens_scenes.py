@@ -207,9 +207,7 @@ def scene_behind(case, rng) -> tuple[reference.Gaussians, reference.Camera]:
         sizes[3:7], logits[3:7] = 0.3 * max(size), 2.0
         film[7], sizes[7], logits[7] = 0.4 * size, 2.0, 0.0
         film[8] = camera.cx, camera.cy
-    points = points_at(case.lens, camera, film, distances)
-    near_the_end = points_near_lens_limit(case.lens, camera, film, distances)
-    points = np.where(np.isnan(points), near_the_end, points)
+    points = seen_points(case.lens, camera, film, distances)
     if special:
         points[0] = [0, 0, -1]
         beyond = point_beyond_lens_limit(case.lens)
@@ -234,6 +232,13 @@ def gaussians_at_points(case, rng, camera, points, sizes, logits) -> reference.G
         sh0=single(rng.normal(0, 1.0, (n, 1, 3))),
         shN=single(rng.normal(0, 0.3, (n, (case.degree + 1) ** 2 - 1, 3))),
     )
+
+
+def seen_points(lens, camera, film, distances) -> np.ndarray:
+    """Points (N, 3) seen at ``film``, or close to where the lens model ends before it."""
+    points = points_at(lens, camera, film, distances)
+    near_the_end = points_near_lens_limit(lens, camera, film, distances)
+    return np.where(np.isnan(points), near_the_end, points)
 
 
 def points_near_lens_limit(lens, camera, film, distances) -> np.ndarray:
