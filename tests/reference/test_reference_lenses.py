@@ -68,47 +68,6 @@ def test_point_on_the_axis_is_at_the_principal_point(lens):
     np.testing.assert_allclose(lens.film_points(camera, points), [[140, 95]] * 3, atol=1e-9)
 
 
-def test_pinhole_points_match_the_reference():
-    gaussians, camera = small_scene()
-    splats = reference.project(gaussians, camera)
-    points = (gaussians.means - camera.center) @ camera.rotation.T
-    seen = Pinhole().is_seen(camera, points)
-    np.testing.assert_array_equal(seen, splats.depths >= camera.near)
-    np.testing.assert_allclose(
-        Pinhole().film_points(camera, points[seen]), splats.means2d[seen], rtol=1e-14
-    )
-    # Two sums of three products, in another order.
-    np.testing.assert_allclose(Pinhole().depths(camera, points), splats.depths, atol=1e-15)
-
-
-def test_opencv_without_coefficients_is_a_pinhole():
-    camera = camera_at_origin()
-    points = points_within(Pinhole(), camera)
-    np.testing.assert_allclose(
-        OpenCV().film_points(camera, points), Pinhole().film_points(camera, points), rtol=1e-13
-    )
-    assert OpenCV().valid_radius == math.inf
-    bounds = OpenCV().slope_bounds(camera), Pinhole().slope_bounds(camera)
-    np.testing.assert_allclose(*bounds, atol=1e-15)
-
-
-@pytest.mark.parametrize("lens", [BARREL, RATIONAL, PINCUSHION], ids=str)
-def test_opencv_matches_its_vector_equation(lens):
-    """s q + r^2 p + 2 (p . s) s with the vector p = (p2, p1); radii by Horner, not powers."""
-    camera = camera_at_origin()
-    points = points_within(lens, camera)
-    film = lens.film_points(camera, points)
-    for point, actual in zip(points, film, strict=True):
-        slope, p = point[:2] / point[2], np.array([lens.p2, lens.p1])
-        r2 = slope @ slope
-        q = (1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))) / (
-            1 + r2 * (lens.k4 + r2 * (lens.k5 + r2 * lens.k6))
-        )
-        expected = slope * q + r2 * p + 2 * (p @ slope) * slope
-        expected = np.array([230.0, 190.0]) * expected + [140.0, 95.0]
-        np.testing.assert_allclose(actual, expected, atol=1e-12)
-
-
 # cv2.projectPoints and cv2.fisheye.projectPoints of opencv-python 5.0.0 and Camera.img_from_cam of
 # pycolmap 4.2.1, of the points (0, 0, 1), (0.5, -0.25, 2), (-1.5, 1, 2), (0.75, 1.5, 1.25), with
 # RATIONAL, FISHEYE and THIN_PRISM.
@@ -171,21 +130,6 @@ def test_tangential_terms_alone_fold_on_one_side(p1, p2):
         np.testing.assert_allclose(*images, rtol=1e-9)
 
 
-@pytest.mark.parametrize("k1", [-0.3, 0.3])
-def test_tangential_lens_is_invertible_within_its_radius(k1):
-    """In all directions. What a barrel shows is folded just beyond, in that of the terms."""
-    lens = OpenCV(k1=k1, p1=0.18, p2=-0.24)
-    assert lens.valid_radius < OpenCV(k1=k1).valid_radius
-    angles, parts = np.meshgrid(np.linspace(0, 6.2, 40), [0.5, 0.9, 0.999])
-    slopes = (parts * lens.valid_radius)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
-    slopes = slopes.reshape(-1, 2)
-    # Next to the fold the inverse is steeper than the distortion by a factor of 1000.
-    np.testing.assert_allclose(lens.undistort(lens.distort(slopes)), slopes, atol=1e-8)
-    toward = lens.valid_radius * np.array([0.8, -0.6])
-    steps = [lens.distort(f * toward) - lens.distort((f - 1e-3) * toward) for f in (1, 1.002)]
-    assert steps[0] @ toward > 0 and (steps[1] @ toward < 0) == (k1 < 0)
-
-
 @pytest.mark.slow
 def test_tangential_lenses_have_no_fold_within_their_radius():
     """The determinants of difference quotients, in a disc of each of 40 lenses, are positive."""
@@ -229,72 +173,12 @@ def test_valid_radius_is_where_the_distorted_radius_first_turns(seed):
         assert lens.valid_radius > 5
 
 
-def test_random_lenses_include_bounded_and_unbounded_ones():
-    """The test above meets both."""
-    radii = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        radii.append(OpenCV(*rng.normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03])).valid_radius)
-    assert min(radii) < 5 and max(radii) > 5
-
-
-def test_points_that_fold_back_into_the_image_are_invisible():
-    camera, lens = camera_at_origin(), OpenCV(k1=-0.3)
-    limit = math.sqrt(1 / 0.9)
-    folded = np.array([[1.8, 0, 1.0], [2 * limit, 0, 2.0]])
-    film = lens.film_points(camera, folded)[0]
-    assert ((film > 0) & (film < [camera.width, camera.height])).all()
-    assert not lens.is_seen(camera, folded).any()
-    assert lens.is_seen(camera, np.array([[2 * limit - 1e-9, 0, 2.0]])).all()
-    splats = effects.project(gaussians_at(folded), camera, lens)
-    assert not splats.visible.any()
-    assert effects.project(gaussians_at(folded), camera).visible.all()
-
-
 @pytest.mark.parametrize("lens", [BARREL, RATIONAL, PINCUSHION], ids=str)
 def test_distortion_is_inverted(lens):
     slopes = np.random.default_rng(0).uniform(-0.55, 0.55, (300, 2))
     assert np.linalg.norm(slopes, axis=1).max() < lens.valid_radius
     # Newton stops at rounding; near no fold the inverse is as accurate as the residual.
     np.testing.assert_allclose(lens.undistort(lens.distort(slopes)), slopes, atol=1e-11)
-
-
-def test_undistorted_radius_is_the_root_of_the_radial_equation():
-    lens = OpenCV(k1=-0.3)
-    highest = radial(lens, lens.valid_radius)
-    for radius in (0.1, 0.5, 0.999 * highest):
-        expected = brentq(lambda r, t=radius: radial(lens, r) - t, 0, lens.valid_radius)
-        actual = lens.undistort(np.array([[0.6, -0.8]]) * radius)
-        # brentq's own tolerance, 2e-12; the fold amplifies the residual by a few hundred.
-        np.testing.assert_allclose(actual, [[0.6 * expected, -0.8 * expected]], atol=1e-9)
-    beyond = np.array([[0.6, -0.8]]) * [[1.001 * highest], [3.0]]
-    assert np.isnan(lens.undistort(beyond)).all()
-
-
-@pytest.mark.parametrize("degrees", [1e-6, 30, 90, 120, 170])
-def test_plain_fisheye_is_proportional_to_the_angle(degrees):
-    camera, theta = camera_at_origin(fy=230.0), math.radians(degrees)
-    point = 3.0 * np.array([[math.sin(theta) * 0.6, math.sin(theta) * -0.8, math.cos(theta)]])
-    assert Fisheye().is_seen(camera, point).all()
-    expected = 230 * theta * np.array([[0.6, -0.8]]) + [140, 95]
-    np.testing.assert_allclose(Fisheye().film_points(camera, point), expected, rtol=1e-13)
-
-
-def test_fisheye_agrees_with_a_pinhole_that_bends_the_angle():
-    """In front, theta_d is the polynomial and the point (tan(theta_d) u, 1) a pinhole's."""
-    camera = camera_at_origin()
-    points = points_within(Pinhole(), camera)
-    u = points[:, :2] / np.linalg.norm(points[:, :2], axis=1, keepdims=True)
-    theta = np.arccos(points[:, 2] / np.linalg.norm(points, axis=1))
-    bent = theta + sum(
-        k * theta**n
-        for k, n in zip([-0.03125, 0.015625, -0.0078125, 0.001953125], [3, 5, 7, 9], strict=True)
-    )
-    expected = np.column_stack([bent[:, None] * u, np.ones(len(u))])
-    # arccos loses half the digits near the axis: 1e-16 / sin(theta).
-    np.testing.assert_allclose(
-        FISHEYE.film_points(camera, points), Pinhole().film_points(camera, expected), rtol=1e-11
-    )
 
 
 def test_fisheye_is_valid_up_to_its_first_turn_or_almost_all_around():
@@ -313,33 +197,6 @@ def test_fisheye_is_valid_up_to_its_first_turn_or_almost_all_around():
         angles = np.array([limit - 1e-9, limit + 1e-9, math.pi])
         points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
         np.testing.assert_array_equal(lens.is_seen(camera, points), [True, False, False])
-
-
-def test_thin_prism_fisheye_matches_its_vector_equation():
-    """w q + r^2 (p + s) + 2 (p . w) w with p = (p2, p1), s = (sx1, sy1), of a fisheye's w and q."""
-    camera, lens = camera_at_origin(), THIN_PRISM
-    points = points_within(lens, camera)
-    focal, principal = np.array([230.0, 190.0]), np.array([140.0, 95.0])
-    films = (fisheye.film_points(camera, points) for fisheye in (FISHEYE, Fisheye()))
-    plain, w = ((film - principal) / focal for film in films)
-    p, s = np.array([lens.p2, lens.p1]), np.array([lens.sx1, lens.sy1])
-    r2 = np.arccos(points[:, 2:] / np.linalg.norm(points, axis=1, keepdims=True)) ** 2
-    expected = focal * (plain + r2 * (p + s) + 2 * (w @ p)[:, None] * w) + principal
-    # arccos, as above.
-    np.testing.assert_allclose(lens.film_points(camera, points), expected, rtol=1e-11)
-    without = replace(lens, p1=0.0, p2=0.0, sx1=0.0, sy1=0.0)
-    np.testing.assert_allclose(without.film_points(camera, points), focal * plain + principal)
-    assert without.valid_angle == FISHEYE.valid_angle
-
-
-def test_prism_or_tangential_term_alone_folds_on_one_side():
-    """Along -s, w becomes (r - |s| r^2) w / r. Tangential terms turn as those of slopes do."""
-    assert ThinPrismFisheye(p1=0.18, p2=-0.24).valid_angle == pytest.approx(1 / 1.8, rel=1e-12)
-    lens = ThinPrismFisheye(sx1=0.3, sy1=-0.4)
-    assert lens.valid_angle == pytest.approx(1.0, rel=1e-12)
-    places = np.array([[0.5], [0.99], [1.5], [1.01]]) * [-0.6, 0.8]
-    shown = lens.distort(places)
-    np.testing.assert_allclose(shown[:2], shown[2:], rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -392,13 +249,6 @@ def test_depth_is_distance_for_a_fisheye_and_z_otherwise():
     for lens in (Pinhole(), OpenCV(), Orthographic()):
         assert list(lens.is_seen(camera, points)) == [False, False, True, False, False]
         np.testing.assert_array_equal(lens.depths(camera, points), points[:, 2])
-
-
-def test_orthographic_film_does_not_depend_on_z():
-    camera = camera_at_origin()
-    points = np.array([[0.25, -0.5, 0.5], [0.25, -0.5, 50.0]])
-    film = Orthographic().film_points(camera, points)
-    np.testing.assert_array_equal(film, [[197.5, 0.0]] * 2)
 
 
 @every_lens
@@ -460,55 +310,6 @@ def test_covariances_match_projected_samples(lens):
         np.testing.assert_allclose(splats.conics[n] @ splats.cov2d[n], np.eye(2), atol=1e-8)
 
 
-@pytest.mark.parametrize("lens", [Fisheye(), FISHEYE, PINCUSHION], ids=str)
-def test_a_sphere_is_stretched_along_and_across_the_radius(lens):
-    """Along: f d theta_d / d theta s / distance; across: f theta_d / sin(theta) s / distance."""
-    camera = camera_at_origin(fy=230.0)
-    points = points_within(lens, camera, count=20)
-    scale = 0.1
-    splats = effects.project(gaussians_at(points, scale), camera, lens)
-
-    def film_radius(theta):
-        """theta_d, a function of the angle from the axis alone."""
-        if isinstance(lens, Fisheye):
-            powers = theta ** np.arange(1, 10, 2)
-            return powers @ [1, lens.k1, lens.k2, lens.k3, lens.k4]
-        return radial(lens, math.tan(theta))
-
-    lower, upper = (camera.width * 0.65 * np.array([[-1], [1]]) + [130, 105]) / 230
-    for point, cov2d in zip(points, splats.cov2d, strict=True):
-        distance, rho = np.linalg.norm(point), math.hypot(*point[:2])
-        theta = math.atan2(rho, point[2])
-        if isinstance(lens, OpenCV) and not np.all((lower < point[:2]) & (point[:2] < upper)):
-            continue
-        along = (film_radius(theta + 1e-5) - film_radius(theta - 1e-5)) / 2e-5
-        across = film_radius(theta) / math.sin(theta)
-        u = point[:2] / rho
-        v = np.array([-u[1], u[0]])
-        size = (230 * scale / distance) ** 2
-        expected = size * (along**2 * np.outer(u, u) + across**2 * np.outer(v, v))
-        # Central differences with a step of 1e-5: 1e-10 of the third derivative.
-        np.testing.assert_allclose(cov2d, expected + 0.3 * np.eye(2), rtol=1e-8, atol=1e-6)
-
-
-@pytest.mark.parametrize("lens", [Fisheye(), FISHEYE, RATIONAL], ids=str)
-def test_central_lenses_match_a_pinhole_on_the_axis(lens):
-    gaussians = gaussians_at([0, 0, 2.0], [[0.1, 0.2, 0.05]], quats=[0.3, 0.8, -0.5, 0.1])
-    actual = effects.project(gaussians, camera_at_origin(), lens)
-    expected = reference.project(gaussians, camera_at_origin())
-    np.testing.assert_allclose(actual.cov2d, expected.cov2d, rtol=1e-11)
-    np.testing.assert_array_equal(actual.means2d, expected.means2d)
-
-
-def test_low_pass_variance_is_added():
-    gaussians, camera = small_scene()
-    plain, none = (effects.project(gaussians, camera, low_pass=t) for t in (0.3, 0.0))
-    difference = plain.cov2d[:10] - none.cov2d[:10]
-    np.testing.assert_allclose(difference, np.tile(0.3 * np.eye(2), (10, 1, 1)), atol=1e-10)
-    compensated = effects.project(gaussians, camera, antialiased=True, low_pass=0.0)
-    np.testing.assert_allclose(compensated.opacities, none.opacities, rtol=1e-12)
-
-
 def test_a_singular_splat_is_not_visible():
     gaussians = gaussians_at([0, 0, 1], [1e-200, 1e-200, 0.1])
     splats = effects.project(gaussians, camera_at_origin(), Orthographic(), low_pass=0.0)
@@ -561,21 +362,6 @@ def test_slopes_are_bounded_if_the_lens_covers_the_whole_border(part):
     half = part * radial(lens, lens.valid_radius)
     camera = camera_at_origin(fx=100 / half, fy=100 / half, cx=100, cy=100, width=200, height=200)
     assert (lens.slope_bounds(camera) is None) == (part > math.sqrt(0.5))
-
-
-def test_lens_without_slope_bounds_uses_the_jacobian_at_the_mean():
-    """The corners of the film are beyond the fold: a mean beside it, below the fold, is not."""
-    lens, camera = OpenCV(k1=-0.3), camera_at_origin(fx=230.0, fy=230.0, width=400, height=400)
-    assert lens.slope_bounds(camera) is None
-    point = np.array([[-1.0, 0.2, 1.0]])
-    splats = effects.project(gaussians_at(point, 0.1), camera, lens)
-    J = 0.1 * effects.jacobians(lens, camera, point)[0]
-    np.testing.assert_allclose(splats.cov2d[0], J @ J.T + 0.3 * np.eye(2), rtol=1e-12, atol=1e-12)
-
-
-def test_lenses_without_slopes_have_no_bounds():
-    assert Fisheye().slope_bounds(camera_at_origin()) is None
-    assert Orthographic().slope_bounds(camera_at_origin()) is None
 
 
 @pytest.mark.parametrize("lens", [Pinhole(), PINCUSHION], ids=str)

@@ -18,6 +18,9 @@ from support.reference_scenes import (
 UNCUT = ImageModel(alpha_max=1.0, alpha_cut=0.0, transmittance_stop=0.0)
 """No decisions: every splat touches every pixel."""
 
+MARKED_DISTANCES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
+"""(relative distance from a threshold, whether a width of 1e-6 marks the pixel)"""
+
 
 def camera_gaussian(gaussians, camera, n) -> tuple[np.ndarray, np.ndarray]:
     """(mean (3,), factor V (3, 3)) in camera axes, the covariance being V V^T."""
