@@ -117,19 +117,6 @@ def test_defocus_needs_a_lens_with_a_centre():
             ThinLens(*wrong)
 
 
-@pytest.mark.parametrize("count", [1, 7, 1000])
-def test_lens_points_are_evenly_spread(count):
-    points = effects._disc_points(count)
-    radii = np.linalg.norm(points, axis=1)
-    # Rings of equal area hold equal numbers, and the variance of a disc along an axis is 1 / 4.
-    np.testing.assert_allclose(radii**2 * count, np.arange(count) + 0.5)
-    if count == 1000:
-        np.testing.assert_allclose(np.cov(points.T, bias=True), np.eye(2) / 4, atol=1e-3)
-        np.testing.assert_allclose(points.mean(axis=0), 0, atol=1e-3)
-        angles = np.sort(np.arctan2(points[:, 1], points[:, 0]))
-        assert np.diff(angles).max() < 3 * 2 * np.pi / 1000
-
-
 # ----------------------------------------------------------------------------------------------
 # Cameras that move
 # ----------------------------------------------------------------------------------------------

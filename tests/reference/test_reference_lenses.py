@@ -52,11 +52,6 @@ def points_within(lens, camera, count=200, seed=3) -> np.ndarray:
     return points
 
 
-# ----------------------------------------------------------------------------------------------
-# Lenses: where points lie
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "lens", [Pinhole(), OpenCV(), BARREL, Fisheye(), FISHEYE, THIN_PRISM, Orthographic()], ids=str
 )
@@ -130,26 +125,6 @@ def test_tangential_terms_alone_fold_on_one_side(p1, p2):
         np.testing.assert_allclose(*images, rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_tangential_lenses_have_no_fold_within_their_radius():
-    """The determinants of difference quotients, in a disc of each of 40 lenses, are positive."""
-    ended = 0
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        lens = OpenCV(*rng.normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03, 0.1, 0.1]))
-        ended += lens.valid_radius < 0.99 * replace(lens, p1=0.0, p2=0.0).valid_radius
-        radius = min(lens.valid_radius, 10.0)
-        angles, radii = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.linspace(0.01, 0.999, 100))
-        slopes = (radius * radii)[..., None] * np.stack([np.cos(angles), np.sin(angles)], -1)
-        h = 1e-6 * radius
-        (a, c), (b, d) = (
-            np.moveaxis((lens.distort(slopes + step) - lens.distort(slopes - step)) / h, -1, 0)
-            for step in h * np.eye(2) / 2
-        )
-        assert (a * d - b * c).min() > 0 and (a + d).min() > 0, lens
-    assert ended > 20
-
-
 def test_valid_radius_of_a_touching_derivative_is_where_it_touches():
     # 1 + 3 k1 u + 5 k2 u^2 = (1 - u / c)^2: a double root, found to the square root of rounding,
     # and with an imaginary part of 1e-8 for some of these.
@@ -173,12 +148,74 @@ def test_valid_radius_is_where_the_distorted_radius_first_turns(seed):
         assert lens.valid_radius > 5
 
 
-@pytest.mark.parametrize("lens", [BARREL, RATIONAL, PINCUSHION], ids=str)
-def test_distortion_is_inverted(lens):
-    slopes = np.random.default_rng(0).uniform(-0.55, 0.55, (300, 2))
-    assert np.linalg.norm(slopes, axis=1).max() < lens.valid_radius
-    # Newton stops at rounding; near no fold the inverse is as accurate as the residual.
-    np.testing.assert_allclose(lens.undistort(lens.distort(slopes)), slopes, atol=1e-11)
+TILTED = ThinPrismFisheye(-0.1, p1=0.06, p2=-0.08, sx1=0.1, sy1=0.05)
+
+
+def limit_of(lens) -> float:
+    """The largest slope, or angle, that a lens is made for, at most 10."""
+    return min(lens.valid_radius if isinstance(lens, OpenCV) else lens.valid_angle, 10.0)
+
+
+def places_within(lens, parts, count) -> np.ndarray:
+    """(parts, count, 2) slopes or angles in all directions, at parts of the limit."""
+    azimuths, radii = np.meshgrid(np.linspace(0, 2 * np.pi, count), limit_of(lens) * parts)
+    return radii[..., None] * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
+
+
+TANGENTIAL = OpenCV(k1=-0.3, p1=0.18, p2=-0.24)
+
+
+@pytest.mark.parametrize("lens", [BARREL, RATIONAL, TANGENTIAL, TILTED, THIN_PRISM], ids=str)
+def test_distortion_is_inverted_within_the_limit(lens):
+    places = places_within(lens, np.array([0.1, 0.5, 0.9, 0.999]), 40).reshape(-1, 2)
+    # Next to a fold the inverse is steeper than the distortion by a factor of 1000.
+    np.testing.assert_allclose(lens.undistort(lens.distort(places)), places, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "sizes"),
+    [
+        (OpenCV, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03, 0.1, 0.1]),
+        (ThinPrismFisheye, [0.1, 0.05, 0.02, 0.01, 0.1, 0.1, 0.1, 0.1]),
+    ],
+)
+def test_lenses_have_no_fold_within_their_limit(kind, sizes):
+    """The symmetric parts of difference quotients, in a disc of each of 40 lenses, are positive.
+
+    No direction has a smaller eigenvalue than ``least_eigenvalue`` has; where there are no radial
+    terms, one has it.
+    """
+    ended, parts = 0, np.linspace(0.01, 0.999, 20)
+    tilt = ("p1", "p2", "sx1", "sy1")
+    for seed in range(40):
+        lens = kind(*np.random.default_rng(seed).normal(0, sizes))
+        plain = replace(lens, **{name: 0.0 for name in tilt if hasattr(lens, name)})
+        ended += limit_of(lens) < 0.99 * limit_of(plain)
+        if seed % 2 == 0:
+            lens = kind(**{name: getattr(lens, name) for name in tilt if hasattr(lens, name)})
+        places, h = places_within(lens, parts, 720), 1e-6 * limit_of(lens)
+        columns = [
+            (lens.distort(places + step) - lens.distort(places - step)) / h
+            for step in h * np.eye(2) / 2
+        ]
+        quotients = np.stack(columns, axis=-1)
+        symmetric = (quotients + np.swapaxes(quotients, -1, -2)) / 2
+        found = np.linalg.eigvalsh(symmetric)[..., 0].min(axis=1)
+        least = lens.least_eigenvalue(limit_of(lens) * parts)
+        # Rounding of quotients, over h; half a degree between directions.
+        assert (found > least - 1e-9).all() and (least > 0).all(), lens
+        assert seed % 2 or np.abs(found - least).max() < 1e-4, lens
+    assert ended > 20
+
+
+@pytest.mark.parametrize("degrees", [1e-6, 30, 90, 120, 170])
+def test_plain_fisheye_is_proportional_to_the_angle(degrees):
+    camera, theta = camera_at_origin(fy=230.0), math.radians(degrees)
+    point = 3.0 * np.array([[math.sin(theta) * 0.6, math.sin(theta) * -0.8, math.cos(theta)]])
+    assert Fisheye().is_seen(camera, point).all()
+    expected = 230 * theta * np.array([[0.6, -0.8]]) + [140, 95]
+    np.testing.assert_allclose(Fisheye().film_points(camera, point), expected, rtol=1e-13)
 
 
 def test_fisheye_is_valid_up_to_its_first_turn_or_almost_all_around():
@@ -197,48 +234,6 @@ def test_fisheye_is_valid_up_to_its_first_turn_or_almost_all_around():
         angles = np.array([limit - 1e-9, limit + 1e-9, math.pi])
         points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
         np.testing.assert_array_equal(lens.is_seen(camera, points), [True, False, False])
-
-
-@pytest.mark.slow
-def test_thin_prism_fisheyes_have_no_fold_within_their_angle():
-    """The symmetric parts of difference quotients, in a disc of each of 40 lenses, are positive.
-
-    No direction has a smaller eigenvalue than ``least_eigenvalue`` says; where there are no radial
-    terms, one has it.
-    """
-    ended = 0
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        sizes = np.array([0.1, 0.05, 0.02, 0.01, 0.1, 0.1, 0.1, 0.1])
-        lens = ThinPrismFisheye(*rng.normal(0, sizes * (1 if seed % 2 else [0] * 4 + [1] * 4)))
-        limit = lens.valid_angle
-        ended += limit < 0.99 * replace(lens, p1=0.0, p2=0.0, sx1=0.0, sy1=0.0).valid_angle
-        azimuths, parts = np.meshgrid(np.linspace(0, 2 * np.pi, 720), np.linspace(0.01, 0.999, 20))
-        unit = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
-        places, h = (limit * parts)[..., None] * unit, 1e-6 * limit
-        columns = [
-            (lens.distort(places + step) - lens.distort(places - step)) / h
-            for step in h * np.eye(2) / 2
-        ]
-        quotients = np.stack(columns, axis=-1)
-        symmetric = (quotients + np.swapaxes(quotients, -1, -2)) / 2
-        found = np.linalg.eigvalsh(symmetric)[..., 0].min(axis=1)
-        least = lens.least_eigenvalue(limit * parts[:, 0])
-        # Rounding of quotients, over h; half a degree between directions.
-        assert (found > least - 1e-9).all() and (least > 0).all(), lens
-        assert seed % 2 or np.abs(found - least).max() < 1e-4, lens
-    assert ended > 20
-
-
-def test_thin_prism_fisheye_is_invertible_within_its_angle():
-    """In all directions, of one that ends by its tilted elements, and of one that is wide."""
-    for lens in (ThinPrismFisheye(-0.1, p1=0.06, p2=-0.08, sx1=0.1, sy1=0.05), THIN_PRISM):
-        azimuths, parts = np.meshgrid(np.linspace(0, 6.2, 40), [0.1, 0.5, 0.9, 0.999])
-        angles = parts * lens.valid_angle
-        places = angles[..., None] * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
-        places = places.reshape(-1, 2)
-        # Next to a fold the inverse is steeper than the distortion by a factor of 1000.
-        np.testing.assert_allclose(lens.undistort(lens.distort(places)), places, atol=1e-8)
 
 
 def test_depth_is_distance_for_a_fisheye_and_z_otherwise():
@@ -262,13 +257,7 @@ def test_view_directions_end_at_the_means_unless_rays_are_parallel(lens):
         np.testing.assert_allclose(direction, expected / np.linalg.norm(expected), atol=1e-14)
 
 
-# ----------------------------------------------------------------------------------------------
-# Lenses: how large splats are
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("lens", [Pinhole(), OpenCV()], ids=str)
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(("lens", "antialiased"), [(Pinhole(), True), (OpenCV(), False)])
 def test_pinhole_splats_match_the_reference(lens, antialiased):
     """Row 9's slopes are clamped in J, row 10 is behind the camera, row 11 is too faint."""
     gaussians, camera = small_scene()
@@ -327,11 +316,6 @@ def test_invisible_splats_have_finite_values(lens):
     assert splats.visible[4] and not splats.visible[0]
 
 
-# ----------------------------------------------------------------------------------------------
-# Lenses: the clamp of J
-# ----------------------------------------------------------------------------------------------
-
-
 def test_slope_bounds_of_a_barrel_are_at_its_corners():
     """A barrel's film corners are its border's extremes: they are pulled in most."""
     camera, lens = camera_at_origin(), OpenCV(k1=-0.1)
@@ -353,15 +337,6 @@ def test_slope_bounds_of_a_pincushion_are_on_the_axes_of_the_film():
     for axis, half in enumerate([130 / 230, 105 / 190]):
         expected = brentq(lambda r, t=half: radial(PINCUSHION, r) - t, 0, 2)
         np.testing.assert_allclose([lower[axis], upper[axis]], [-expected, expected], rtol=1e-10)
-
-
-@pytest.mark.parametrize("part", [0.7, 0.71, 0.81, 1.2])
-def test_slopes_are_bounded_if_the_lens_covers_the_whole_border(part):
-    """Half a side is a part of the largest distorted radius; the corners are sqrt(2) as far."""
-    lens = OpenCV(k1=-0.3)
-    half = part * radial(lens, lens.valid_radius)
-    camera = camera_at_origin(fx=100 / half, fy=100 / half, cx=100, cy=100, width=200, height=200)
-    assert (lens.slope_bounds(camera) is None) == (part > math.sqrt(0.5))
 
 
 @pytest.mark.parametrize("lens", [Pinhole(), PINCUSHION], ids=str)

@@ -132,38 +132,6 @@ def test_exact_falloff_is_the_largest_density_along_the_ray(low_pass):
     assert visible >= 10
 
 
-def test_boxes_contain_every_pixel_a_splat_reaches(monkeypatch):
-    """Splats of all shapes, close to the camera and across it; jittered positions."""
-    rng = np.random.default_rng(1)
-    camera = straight_camera(size=24, focal=15.0)
-    gaussians = scene_of(
-        rng.uniform([-1, -1, 0.02], [1, 1, 2.0], (300, 3)),
-        rng.normal(np.log(0.05), 1.0, (300, 3)),
-        quats=rng.normal(0, 1, (300, 4)),
-        opacity=rng.uniform(0.005, 0.6, 300),
-        colors=rng.uniform(0, 1, (300, 3)),
-    )
-    x, y = np.meshgrid(np.arange(24) + 0.5, np.arange(24) + 0.5)
-    positions = np.stack([x, y], axis=-1) + rng.uniform(-0.5, 0.5, (24, 24, 2))
-    for projection in ("ewa", "unscented", "exact"):
-        for extent in (math.inf, 2.0):
-            model = ImageModel(projection, extent=extent, transmittance_stop=0.0)
-            args = (gaussians, camera, BACKGROUND, model, None, positions)
-            boxed = rays.render(*args)
-            with monkeypatch.context() as everywhere:
-                everywhere.setattr(
-                    rays,
-                    "_film_bounds",
-                    lambda splats, *_: (
-                        np.full(splats.means2d.shape, -np.inf),
-                        np.full(splats.means2d.shape, np.inf),
-                    ),
-                )
-                unboxed = rays.render(*args)
-            for name in ("image", "transmittance", "near_threshold"):
-                np.testing.assert_array_equal(getattr(boxed, name), getattr(unboxed, name))
-
-
 PROJECTIONS = [
     ImageModel(),
     ImageModel("unscented", "pixel", extent=3.0),
