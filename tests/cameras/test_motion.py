@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -20,7 +19,6 @@ from support.helpers import (
     image_planes,
     plane_cotangents,
     rows,
-    single,
 )
 from support.lens_checks import planes_of
 from support.lens_scenes import LENSES, lens_camera
@@ -143,30 +141,6 @@ def test_times_are_found_for_fast_rotations():
         found.append(np.linalg.norm(Rotation.from_matrix(turned).as_rotvec()) / turn)
     expected = [time_of(case, mean) for mean in case.gaussians.means[in_front]]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
-
-
-def test_motion_gradients_equal_central_differences():
-    """A calibration of the motion needs those of a rolling shutter's travel and turn."""
-    case = clear(case_of("pinhole", samples=0, threshold_width=1e-3))
-    weights = single(np.random.default_rng(1).normal(size=(5, case.height * case.width)))
-    gaussians, (frame,) = case.frames(FLOAT64)
-    gradients = rendering.frames_adjoint(
-        gaussians, [frame], [list(map(FLOAT64.array, weights))], of_camera=True
-    )
-    step = 1e-7
-    motion = frame.camera.shutter
-    # The motion's are the last of the camera's numbers.
-    for n, name in enumerate(["travel"] * 3 + ["turn"] * 3):
-        change = np.eye(3)[n % 3] * step
-        found = []
-        for sign in (1, -1):
-            value = getattr(motion, name) + FLOAT64.Array3f((sign * change).tolist())
-            camera = replace(frame.camera, shutter=replace(motion, **{name: value}))
-            dr.make_opaque(camera)
-            found.append(weights * planes_of(rendering.render(gaussians, camera, case.pipeline)))
-        terms = (found[0] - found[1]) / (2 * step)
-        actual = float(gradients.camera[n - 6][0])
-        assert abs(actual - terms.sum()) <= 1e-6 * np.abs(terms).sum(), (name, n % 3)
 
 
 @pytest.mark.parametrize("samples", [2, 0], ids=["motion blur", "rolling"])
