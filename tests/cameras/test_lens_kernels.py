@@ -16,6 +16,7 @@ from support.helpers import (
     frame_adjoint,
     frame_tangent,
     plane_cotangents,
+    render_composed,
     rows,
 )
 from support.kernels import drain_kernels
@@ -167,23 +168,25 @@ def test_coefficients_add_operations_to_the_projection_only(lenses):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "shape", "precision"),
+    ("name", "shape", "precision", "defocus"),
     [
-        *((name, ewa, FLOAT32) for name in FORMS),
-        ("rational", ewa, FLOAT64),
-        ("rational", unscented_shape, FLOAT32),
-        ("fisheye", unscented_shape, FLOAT32),
+        *((name, ewa, FLOAT32, None) for name in FORMS),
+        ("rational", ewa, FLOAT64, None),
+        ("rational", unscented_shape, FLOAT32, None),
+        ("fisheye", unscented_shape, FLOAT32, None),
+        ("rational", ewa, FLOAT32, effects.ThinLens(0.21875, 2.0)),
+        ("rational", ewa, FLOAT64, effects.ThinLens(0.21875, 2.0)),
     ],
     ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
 )
-def test_nonfinite_positions_affect_no_other_gaussian(precision, name, shape):
+def test_invisible_positions_affect_no_other_gaussian(precision, name, shape, defocus):
     """The image and all other gradients are those of the same Gaussians far away."""
-    case = clear(case_of(name, count=30))
+    case = clear(case_of(name, count=30, defocus=defocus))
     means = case.gaussians.means.copy()
     bad = np.array([
         [np.nan, 0, 0], [0, np.nan, 0], [0, 0, np.nan], [np.inf, 0, 0], [0, -np.inf, 0],
         [0, 0, np.inf], [0, 0, -np.inf], [np.inf, np.inf, np.inf], [-np.inf, np.nan, np.inf],
-        case.camera.center,
+        case.camera.center, case.camera.center - 20 * case.camera.rotation[2],
     ])  # fmt: skip
     where = np.arange(10, 10 + len(bad))
     means[where] = bad
@@ -195,7 +198,7 @@ def test_nonfinite_positions_affect_no_other_gaussian(precision, name, shape):
 
     def rendered(gaussians):
         device = device_gaussians(gaussians, precision)
-        frame = rendering.render(device, case.device_camera(precision), pipeline)
+        frame = render_composed(device, case.device_camera(precision), pipeline)
         gradients = frame_adjoint(device, frame, d_features, d_transmittance).parameters
         planes = {n: rows(plane) for n, plane in enumerate(frame.planes())}
         return planes, {n: np.array(getattr(gradients, n)) for n in PARAMETER_NAMES}

@@ -11,12 +11,9 @@ import pytest
 from support.helpers import (
     FLOAT32,
     FLOAT64,
-    Cotangents,
     both_precisions,
     clear,
     device_gaussians,
-    frame_adjoint,
-    plane_cotangents,
     render_composed,
     rows,
     single,
@@ -33,7 +30,6 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Aperture
 from drgs.config.approximations import Approximations
 from drgs.effects.defocus import Defocused
-from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.reference.effects import ThinLens
@@ -109,46 +105,6 @@ def test_defocus_preserves_the_integral_of_a_splat(precision, rule, scale, low_p
     assert sizes[0] > sizes[1] + 100
 
 
-def separate_scene() -> tuple[reference.Gaussians, reference.Camera]:
-    """12 splats side by side on a 64 x 48 film, at depths of 1 to 6: no two overlap."""
-    rng = np.random.default_rng(0)
-    camera = camera_at_origin(fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)
-    x, y = (v.ravel() for v in np.meshgrid(8 + 16 * np.arange(4), 8 + 16 * np.arange(3)))
-    z = np.geomspace(1, 6, 12)[rng.permutation(12)]
-    slopes = (np.column_stack([x, y]) + rng.uniform(-1, 1, (12, 2)) - [32, 24]) / 60
-    points = np.column_stack([slopes * z[:, None], z])
-    gaussians = gaussians_at(points, (rng.uniform(1, 1.6, (12, 3)) * z[:, None] / 60), 0.7)
-    gaussians = replace(gaussians, quats=rng.normal(0, 1, (12, 4)))
-    return replace(gaussians, sh0=rng.uniform(-1, 1.7, (12, 1, 3))), camera
-
-
-# PSNR (dB) of the blurred and the focused image, by aperture. Measured: 73.8 and 52.6,
-# 45.5 and 27.7.
-SAMPLED = {0.03125: (73, 53), 0.25: (45, 28)}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("aperture_radius", SAMPLED)
-def test_defocused_image_approximates_many_aperture_samples(aperture_radius):
-    """A disc and a Gaussian of its variance differ in shape, by the square of its area over the
-    splat's. The splats have standard deviations of 1 to 1.6 px, the discs radii of up to 0.9 and
-    7.5 px.
-    """
-    gaussians, camera = separate_scene()
-    defocus = ThinLens(aperture_radius, 2.0)
-    expected, _ = effects.render_lens_samples(gaussians, camera, defocus, 400)
-    found = []
-    for used in (defocus, None):
-        device = device_gaussians(gaussians, FLOAT64)
-        frame = render_composed(
-            device, aperture_camera(camera, FLOAT64, used), rendering.Pipeline(0)
-        )
-        image = np.moveaxis(planes_of(frame)[1:].reshape(3, camera.height, camera.width), 0, -1)
-        found.append(-10 * np.log10(np.mean((image - expected) ** 2)))
-    psnr, in_focus = SAMPLED[aperture_radius]
-    assert found[0] > psnr and found[1] < in_focus
-
-
 # ----------------------------------------------------------------------------------------------
 # Surfaces far out of focus
 # ----------------------------------------------------------------------------------------------
@@ -198,17 +154,6 @@ def test_defocused_wall_keeps_alpha_and_colour():
     np.testing.assert_allclose(found[0] ** thicker, mean[0], rtol=0, atol=0.004)
     np.testing.assert_allclose(found[1:] / (1 - found[0]), mean[1:] / (1 - mean[0]), atol=0.004)
     assert mean[0].min() > 0.1 and mean[0].max() < 0.3
-
-
-@pytest.mark.slow
-def test_defocused_wall_matches_the_reference():
-    """Which evaluates each splat at each pixel, up to the alpha at which it ends."""
-    gaussians, camera = wall()
-    expected = effects.render(gaussians, camera, defocus=FAR)
-    found = planes_of_wall()
-    # Some hundreds of 5000 splats at each pixel end within a rounding of its centre.
-    np.testing.assert_allclose(found[0], expected.transmittance.ravel(), rtol=0, atol=1e-5)
-    np.testing.assert_allclose(found[1:].T, expected.image.reshape(-1, 3), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("order", ["center", "pixel"])
@@ -284,34 +229,6 @@ def test_small_exact_splats_are_blurred_like_affine_ones():
             planes[projection, defocus is None] = planes_of(frame)
     np.testing.assert_allclose(planes["exact", False], planes["ewa", False], rtol=0, atol=1e-6)
     assert np.abs(planes["exact", True] - planes["exact", False]).max() > 0.05
-
-
-@both_precisions
-def test_invisible_splats_affect_no_other_gaussian(precision):
-    """Behind the camera, at its centre, no numbers: as if they were not there."""
-    case = clear(LensCase("defocus", 37, 29, 1, count=30, defocus=DEFOCUS))
-    means = case.gaussians.means.copy()
-    bad = [[np.nan, 0, 0], [0, np.inf, 0], [-np.inf, np.nan, np.inf], case.camera.center,
-           case.camera.center - case.camera.rotation[2]]  # fmt: skip
-    where = np.arange(10, 10 + len(bad))
-    means[where] = bad
-    hidden = case.gaussians.logit_opacities.copy()
-    hidden[where] = -50.0
-    d_features, d_transmittance = plane_cotangents(case, Cotangents.random(case), precision)
-    found = []
-    for gaussians in (
-        replace(case.gaussians, means=means),
-        replace(case.gaussians, logit_opacities=hidden),
-    ):
-        device = device_gaussians(gaussians, precision)
-        frame = render_composed(device, case.device_camera(precision), case.pipeline)
-        gradients = frame_adjoint(device, frame, d_features, d_transmittance).parameters
-        found.append(
-            [planes_of(frame), *(np.array(getattr(gradients, n)) for n in PARAMETER_NAMES)]
-        )
-    for a, b in zip(*found, strict=True):
-        np.testing.assert_array_equal(a, b)
-        assert np.isfinite(a).all() and a.any()
 
 
 @both_precisions

@@ -122,13 +122,6 @@ def test_baked_gaussians_give_the_same_image(precision):
         np.testing.assert_allclose(image, expected.image, rtol=0, atol=2e-5 * expected.image.max())
 
 
-def test_baking_without_a_filter_changes_nothing():
-    host = as_numpy(Case("", 20, 20, 1).gaussians)
-    plain = bake_smoothing(host)
-    for name in PARAMETER_NAMES:
-        assert np.array_equal(getattr(plain, name), getattr(host, name)), name
-
-
 @pytest.mark.parametrize(("logit", "smoothing"), [(40.0, 1e-6), (-80.0, 10.0)])
 def test_baked_opacities_stay_finite_where_they_round_to_0_or_1(logit, smoothing):
     host = as_numpy(Case("", 20, 20, 0, count=2).gaussians)

@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from support.reference_lenses import camera_at_origin, gaussians_at
+from support.reference_loops import assert_images_agree
 from support.reference_scenes import (
     BACKGROUND,
     rotation_about,
@@ -20,20 +21,8 @@ from drgs.reference import splatting as reference
 from drgs.reference.effects import Orthographic, ThinLens
 from drgs.reference.splatting import Camera
 
-# ----------------------------------------------------------------------------------------------
-# Images
-# ----------------------------------------------------------------------------------------------
 
-
-def assert_images_agree(actual, expected, tolerance) -> None:
-    for name in ("image", "alpha", "depth", "transmittance"):
-        np.testing.assert_allclose(
-            getattr(actual, name), getattr(expected, name), rtol=0, atol=tolerance, err_msg=name
-        )
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("degree", [None, 1])
+@pytest.mark.parametrize(("antialiased", "degree"), [(False, None), (True, 1)])
 def test_pinhole_image_matches_the_reference(antialiased, degree):
     gaussians, camera = small_scene()
     expected = reference.render(gaussians, camera, BACKGROUND, degree, antialiased)
@@ -68,26 +57,6 @@ def test_orthographic_image_is_the_limit_of_distant_pinholes():
     np.testing.assert_allclose(actual.depth, expected.depth - depth_of_alpha, atol=1e-3)
 
 
-# ----------------------------------------------------------------------------------------------
-# Defocus
-# ----------------------------------------------------------------------------------------------
-
-
-def test_blur_radius_is_half_the_spread_of_the_aperture():
-    """The point's images from the two ends of the aperture are two radii apart."""
-    camera, defocus = camera_at_origin(), ThinLens(0.2, 3.0)
-    for depth in (0.5, 2.0, 3.0, 40.0):
-        point = np.array([0.4, -0.3, depth])
-        film = []
-        for shift in ([-0.2, 0, 0], [0.2, 0, 0], [0, -0.2, 0], [0, 0.2, 0]):
-            # A shifted pinhole, whose image is moved so that the plane z = 3 stays.
-            moved = (point - shift)[:2] / depth + np.array(shift[:2]) / 3.0
-            film.append(np.array([230, 190]) * moved)
-        expected = [abs(film[1] - film[0])[0] / 2, abs(film[3] - film[2])[1] / 2]
-        actual = defocus.blur_radii(camera, np.array([depth]))
-        np.testing.assert_allclose(actual, [expected], atol=1e-12)
-
-
 @pytest.mark.parametrize("depth", [1.0, 2.0, 5.0])
 def test_defocused_moments_match_many_pinholes(depth):
     """Law of total variance: mean of the covariances plus the covariance of the means."""
@@ -117,30 +86,19 @@ def test_defocus_needs_a_lens_with_a_centre():
             ThinLens(*wrong)
 
 
-# ----------------------------------------------------------------------------------------------
-# Cameras that move
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.4, -2.0, 3.1, math.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.4, -2.0, 3.1, math.pi, 1.5 * math.pi])
 @pytest.mark.parametrize("t", [0.0, 0.25, 1.0])
 def test_pose_rotates_by_a_fraction_of_the_angle(angle, t):
+    """On the shortest arc; half a turn may go either way."""
     axis, start = [0.3, -1.0, 0.5], rotation_about([1.0, 0.2, 0.1], 1.3)
     open = start, np.array([1.0, -2.0, 1e6])
     close = rotation_about(axis, angle) @ start, np.array([3.0, -2.0, -1e6])
     rotation, center = effects.interpolate_pose(open, close, t)
-    expected = [rotation_about(axis, sign * t * angle) @ start for sign in (1, -1)]
-    # Half a turn may go either way.
-    ways = expected if angle == math.pi else expected[:1]
+    arcs = [angle - 2 * math.pi] if angle > math.pi else [angle]
+    arcs += [-angle] * (angle == math.pi)
+    ways = [rotation_about(axis, t * arc) @ start for arc in arcs]
     assert min(np.abs(rotation - way).max() for way in ways) < 1e-14
     np.testing.assert_allclose(center, [1 + 2 * t, -2, 1e6 - 2e6 * t], rtol=1e-15)
-
-
-def test_pose_takes_the_shortest_arc():
-    start = np.eye(3), np.zeros(3)
-    end = rotation_about([0, 0, 1], 1.5 * math.pi), np.zeros(3)
-    halfway, _ = effects.interpolate_pose(start, end, 0.5)
-    np.testing.assert_allclose(halfway, rotation_about([0, 0, 1], -0.25 * math.pi), atol=1e-15)
 
 
 def test_cameras_must_differ_in_their_poses_only():
@@ -193,11 +151,6 @@ def test_rows_of_a_rolling_shutter_match_images_at_their_times():
             np.testing.assert_allclose(
                 getattr(rolled, field.name)[row], getattr(rendered, field.name)[row], atol=1e-10
             )
-
-
-# ----------------------------------------------------------------------------------------------
-# Smoothing
-# ----------------------------------------------------------------------------------------------
 
 
 def test_smoothing_is_a_convolution():

@@ -8,17 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 from support.reference_loops import (
     UNCUT,
     assert_images_agree,
-    camera_gaussian,
     naive_image,
     only,
-    pixel_rays,
-    rotated_splats,
-    scene_of,
-    straight_camera,
 )
 from support.reference_scenes import (
     BACKGROUND,
@@ -91,45 +85,6 @@ def test_each_choice_changes_the_image():
     gaussians, camera = small_scene()
     images = {rays.render(gaussians, camera, model=model).image.tobytes() for model in MODELS}
     assert len(images) == len(MODELS)
-
-
-@pytest.mark.parametrize("low_pass", [0.0, 0.3])
-def test_exact_falloff_is_the_largest_density_along_the_ray(low_pass):
-    """Dense search of the 3D density on the ray's positive half, then refinement."""
-    gaussians, camera = rotated_splats(), straight_camera()
-    model = replace(UNCUT, projection="exact", order="pixel", low_pass=low_pass)
-    directions = pixel_rays(camera)
-    visible = 0
-    for n in range(len(gaussians.means)):
-        rendered = rays.render(only(gaussians, [n]), camera, model=model)
-        mean, factor = camera_gaussian(gaussians, camera, n)
-        widening = low_pass * mean[2] ** 2 / camera.fx**2 * np.diag([1, 1, 0])
-        precision = np.linalg.inv(factor @ factor.T + widening)
-        for row, column in [(0, 0), (2, 7), (4, 4), (7, 3)]:
-            ray = directions[row, column]
-
-            def rho_sq(t, ray=ray, mean=mean, precision=precision):
-                return (t * ray - mean) @ precision @ (t * ray - mean)
-
-            grid = mean[2] * np.geomspace(1e-3, 1e3, 400)
-            best = int(np.argmin([rho_sq(t) for t in grid]))
-            if best in (0, len(grid) - 1):
-                continue
-            # Any tolerance: a minimum is found to the square root of rounding.
-            found = minimize_scalar(
-                rho_sq, bounds=(grid[best - 1], grid[best + 1]), options={"xatol": 1e-12}
-            )
-            response = rendered.alpha[row, column] / 0.5
-            # rho^2, of at most 1e4 here where the response is not zero, to 1e-16 times its
-            # condition of 1e3; alpha is 1 - T, rounded at the size of 1.
-            np.testing.assert_allclose(response, math.exp(-found.fun / 2), rtol=0, atol=1e-11)
-            if response > 1e-3:
-                visible += 1
-                peak = rendered.depth[row, column] / rendered.alpha[row, column]
-                # The minimiser is known to sqrt(1e-16) deviations along the ray, which are at
-                # most a few times the depth; the depth carries 1e-16 / 1e-3 beside it.
-                np.testing.assert_allclose(peak, found.x, rtol=1e-6)
-    assert visible >= 10
 
 
 PROJECTIONS = [
@@ -212,16 +167,6 @@ def test_culled_and_degenerate_gaussians_raise_no_warning_and_change_nothing(pro
     alone = rays.render(gaussians, camera, BACKGROUND, model)
     # Batched matrix products may round differently in batches of another size.
     assert_images_agree(rendered, alone, atol=1e-13)
-
-
-def test_point_gaussian_renders_as_the_low_pass():
-    """In every projection: a round splat of 0.3 px^2."""
-    gaussians, camera = scene_of([[0, 0, 1.0]], -np.inf), straight_camera()
-    squares = (np.arange(9) - 4.0) ** 2
-    expected = 0.5 * np.exp(-(squares[:, None] + squares) / 0.6)
-    for projection in ("ewa", "unscented", "exact"):
-        rendered = rays.render(gaussians, camera, model=replace(UNCUT, projection=projection))
-        np.testing.assert_allclose(rendered.alpha, expected, rtol=0, atol=1e-15)
 
 
 def test_image_without_gaussians_is_background():

@@ -207,18 +207,6 @@ def scene_of(means, log_scales, quats=None, opacity=0.5, colors=None) -> Gaussia
     )
 
 
-def rotated_splats() -> Gaussians:
-    """Eight, with axes up to 30 to 1, off the axis of ``straight_camera`` and near it."""
-    rng = np.random.default_rng(3)
-    slopes = rng.uniform(-0.25, 0.25, (8, 2))
-    z = np.geomspace(0.3, 4.0, 8)
-    return scene_of(
-        means=np.column_stack([slopes * z[:, None], z]),
-        log_scales=rng.uniform(np.log(0.01), np.log(0.3), (8, 3)),
-        quats=rng.normal(0, 1, (8, 4)),
-    )
-
-
 def only(gaussians, kept) -> Gaussians:
     return Gaussians(**{name: getattr(gaussians, name)[kept] for name in PARAMETERS})
 
