@@ -11,25 +11,21 @@ from support.views import VIEWS, View, pose
 
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 
-all_views = pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
-
 
 @pytest.fixture(scope="module", autouse=True)
 def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-@all_views
+@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
 def test_points_on_sensor_rays_project_to_their_pixels(view):
     sensor = mi.load_dict(view.sensor())
     points, expected = points_on_rays(sensor)
     camera = camera_of(sensor)
     assert np.abs(project(camera, points) - expected).max() < PIXELS
     rows, columns = view.window
-    assert (camera.width, camera.height) == (
-        columns.stop - columns.start,
-        rows.stop - rows.start,
-    )
+    size = columns.stop - columns.start, rows.stop - rows.start
+    assert (camera.width, camera.height) == size
 
 
 def test_a_camera_far_from_the_origin_keeps_its_centre():

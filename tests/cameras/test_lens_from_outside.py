@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import drjit as dr
 import drjit.llvm.ad as llvm
-import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
 from examples.unified_camera import UnifiedCamera
-from support.datasets import load, view_at
+from support.datasets import view_at
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import LENSES, Lens, Pinhole
@@ -169,19 +168,6 @@ def test_errors_of_a_lens_contain_its_name():
     with pytest.raises(ExtensionError, match=message), reporting_extensions():
         Broken().project_point(None, None)
     del LENSES._extensions["broken"]
-
-
-def test_photographs_of_a_custom_lens_are_loaded(tmp_path):
-    frames = []
-    for k in range(3):
-        iio.imwrite(tmp_path / f"{k}.png", np.full((30, 40, 3), 50 * k, np.uint8))
-        pose = np.eye(4)
-        pose[2, 3] = 4 + k
-        frames.append({"file_path": f"{k}.png", "transform_matrix": pose.tolist()})
-    meta = {"camera_model": "unified", "xi": XI, "fl_x": 30.0, "w": 40, "h": 30, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    views = load(tmp_path).train
-    assert [view.lens for view in views] == [UnifiedCamera(XI)] * len(views)
 
 
 def test_documented_example_is_the_file():

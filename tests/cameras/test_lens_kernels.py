@@ -20,8 +20,7 @@ from support.helpers import (
     rows,
 )
 from support.kernels import drain_kernels
-from support.lens_checks import FORMS, case_of
-from support.lens_scenes import LENSES, LensCase, kernel_lens
+from support.lens_scenes import FORMS, LENSES, LensCase, case_of, kernel_lens
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.unscented import unscented_shape

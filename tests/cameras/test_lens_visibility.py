@@ -11,13 +11,16 @@ from support.helpers import (
     rows,
     single,
 )
-from support.lens_checks import case_of, covariances, every_lens, splats_of
 from support.lens_scenes import (
     LENSES,
     camera_behind,
+    case_of,
+    covariances,
+    every_lens,
     kernel_lens,
     lens_camera,
     points_at,
+    splats_of,
 )
 from support.reference_lenses import camera_at_origin, gaussians_at
 

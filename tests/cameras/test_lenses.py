@@ -11,12 +11,15 @@ from support.helpers import (
     clear,
     image_planes,
 )
-from support.lens_checks import IMAGE, case_of, every_lens, kernel_gradients
 from support.lens_scenes import (
+    IMAGE,
     LENSES,
     LensCase,
     camera_behind,
+    case_of,
+    every_lens,
     gaussians_at_points,
+    kernel_gradients,
     scene_behind,
     seen_points,
 )

@@ -18,12 +18,7 @@ from support.helpers import (
     rows,
     single,
 )
-from support.lens_checks import covariances, planes_of
-from support.lens_scenes import (
-    PINHOLE,
-    LensCase,
-    lens_camera,
-)
+from support.lens_scenes import PINHOLE, LensCase, covariances, lens_camera, planes_of
 from support.reference_lenses import camera_at_origin, gaussians_at
 
 from drgs.accuracy.pipeline import pipeline_of
