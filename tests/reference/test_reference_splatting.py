@@ -69,7 +69,7 @@ def test_gradients_equal_central_differences(antialiased, sh_degree):
     assert not actual["shN"][:, (sh_degree + 1) ** 2 - 1 :].any()
 
 
-def one_splat(opacities, offset=(0.0, 0.0), depths=None) -> reference.RenderedImage:
+def one_splat(opacities, offset=(0.0, 0.0)) -> reference.RenderedImage:
     """White splats of 1 px^2, stacked on the centre of the middle pixel of a 9 x 9 film."""
     n = len(opacities)
     return reference.composite(
@@ -77,7 +77,7 @@ def one_splat(opacities, offset=(0.0, 0.0), depths=None) -> reference.RenderedIm
         conics=np.tile(np.eye(2), (n, 1, 1)),
         opacities=np.array(opacities),
         colors=np.ones((n, 3)),
-        depths=np.arange(1.0, n + 1) if depths is None else np.array(depths),
+        depths=np.arange(1.0, n + 1),
         visible=np.ones(n, dtype=bool),
         background=np.zeros(3),
         width=9,
