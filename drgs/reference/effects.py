@@ -754,13 +754,15 @@ def render_motion_blur(
     num_samples: int,
     background: ArrayLike = (0.0, 0.0, 0.0),
     lens: Lens = Pinhole(),
+    threshold_width: float = reference.THRESHOLD_WIDTH,
 ) -> RenderedImage:
     """Return the mean of n = num_samples images, at the times (k + 0.5) / n of the exposure."""
     times = (np.arange(num_samples) + 0.5) / num_samples
+    cameras = [camera_at(camera_open, camera_close, t) for t in times]
     return _mean_image(
         [
-            render(gaussians, camera_at(camera_open, camera_close, t), lens, background)
-            for t in times
+            render(gaussians, camera, lens, background, threshold_width=threshold_width)
+            for camera in cameras
         ]
     )
 
