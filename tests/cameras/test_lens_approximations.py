@@ -5,32 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.helpers import (
-    FLOAT32,
     FLOAT64,
     clear,
     device_gaussians,
-    frame_adjoint,
     rows,
-    single,
-)
-from support.lens_checks import (
-    FORMS,
-    IMAGE,
-    case_of,
-    covariances,
-    every_lens,
-    planes_of,
-    splats_of,
 )
 from support.lens_scenes import (
+    FORMS,
+    IMAGE,
     LENSES,
     LensCase,
     camera_behind,
-    directions,
+    case_of,
+    covariances,
+    every_lens,
     gaussians_at_points,
+    kernel_lens,
     lens_camera,
-    moved,
+    planes_of,
     points_at,
+    splats_of,
 )
 from support.reference_lenses import gaussians_at, whitened_samples
 
@@ -41,7 +35,7 @@ from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.reference.effects import Orthographic
 from drgs.splatting import rendering
-from drgs.splatting.projection import ewa
+from drgs.testing import Case, gradients_equal_differences
 
 
 def unscented_scene(name, size) -> tuple[reference.Gaussians, reference.Camera]:
@@ -59,61 +53,31 @@ def unscented_scene(name, size) -> tuple[reference.Gaussians, reference.Camera]:
 
 @every_lens
 def test_unscented_splats_have_the_mean_and_covariance_of_projected_samples(name):
-    """The affine approximation's mean is off by some percent of the splat; this one's is not."""
     gaussians, camera = unscented_scene(name, size=0.03)
     lens = LENSES[name]
-    by_samples, by_unscented, by_ewa = [], [], []
     turns = reference.quat_to_rotation(gaussians.quats)
     samples = whitened_samples(4000)
     samples = np.concatenate([samples, -samples])
+    means, covs = [], []
     for mean, turn, log_scale in zip(gaussians.means, turns, gaussians.log_scales, strict=True):
         world = mean + samples * np.exp(log_scale) @ turn.T
         film = lens.film_points(camera, (world - camera.center) @ camera.rotation.T)
-        by_samples.append((film.mean(axis=0), np.cov(film.T, bias=True)))
-    for shape, found in ((unscented_shape, by_unscented), (ewa, by_ewa)):
-        splats = splats_of(gaussians, camera, lens, FLOAT64, shape, low_pass=0.0)
-        assert np.array(splats.visible).all()
-        found += zip(rows(splats.means2d), covariances(splats), strict=True)
-
-    def errors(found) -> tuple[float, float]:
-        """Return errors of means and covariances, relative to the splats' sizes."""
-        pairs = list(zip(found, by_samples, strict=True))
-        sizes = [np.sqrt(np.trace(cov)) for _, (_, cov) in pairs]
-        means = [np.abs(a[0] - b[0]).max() for a, b in pairs]
-        covs = [np.abs(a[1] - b[1]).max() for a, b in pairs]
-        return np.max(np.array(means) / sizes), np.max(np.array(covs) / np.square(sizes))
-
-    mean_error, covariance_error = errors(by_unscented)
-    # Third powers of the size times fourth derivatives of the lens, of some 10. Measured: 3.4e-5.
-    assert mean_error < 6e-5
+        means.append(film.mean(axis=0))
+        covs.append(np.cov(film.T, bias=True))
+    splats = splats_of(gaussians, camera, lens, FLOAT64, unscented_shape, low_pass=0.0)
+    assert np.array(splats.visible).all()
+    variances = np.trace(covs, axis1=1, axis2=2)
+    mean_errors = np.abs(rows(splats.means2d) - means).max(axis=1) / np.sqrt(variances)
+    # Third powers of the size times fourth derivatives of the lens, of some 10. Measured: 3.4e-5;
+    # the affine approximation's are 0.01 to 0.02.
+    assert mean_errors.max() < 6e-5
     # Squares of the size times these. Measured: 0.0019; the affine approximation's are 0.0029.
-    assert covariance_error < 0.004
-    if name != "orthographic":
-        # Measured: 0.01 to 0.02.
-        assert errors(by_ewa)[0] > 100 * mean_error
-
-
-@every_lens
-def test_tiny_unscented_splats_match_affine_ones(name):
-    gaussians, camera = unscented_scene(name, size=1e-4)
-    affine, points = (
-        splats_of(gaussians, camera, LENSES[name], FLOAT64, shape, low_pass=0.0)
-        for shape in (ewa, unscented_shape)
-    )
-    # The square of the size, times second derivatives of up to 1000 px.
-    np.testing.assert_allclose(rows(points.means2d), rows(affine.means2d), rtol=0, atol=1e-4)
-    sizes = np.abs(covariances(affine)).max(axis=(1, 2), keepdims=True)
-    errors = np.abs(covariances(points) - covariances(affine)) / sizes
-    assert errors.max() < 1e-5
-
-
-UNSCENTED = {"projection": "unscented"}
-
-
-PIXEL_ORDER = {"order": "pixel", "order_window": 2}
+    errors = np.abs(covariances(splats) - covs).max(axis=(1, 2)) / variances
+    assert errors.max() < 0.004
 
 
 PIXEL_COLORS = {"sh_direction": "pixel"}
+UNSCENTED = {"projection": "unscented", "sh_direction": "pixel"}
 
 
 def direction_of_pixels(case) -> np.ndarray:
@@ -127,22 +91,18 @@ def direction_of_pixels(case) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "precision"),
-    [*((name, FLOAT64) for name in FORMS), ("rational", FLOAT32)],
-    ids=[*FORMS, "rational, float32"],
-)
-def test_colours_use_the_directions_of_pixel_rays(precision, name):
+@pytest.mark.parametrize("name", FORMS)
+def test_colours_use_the_directions_of_pixel_rays(name):
     """One reference image for each pixel, of that pixel."""
     case = clear(LensCase("small", 12, 9, 1, 20, lens=LENSES[name]))
-    pipeline = pipeline_of(Approximations(sh_direction="pixel"), 1)
-    _, frame = case.render(precision, pipeline)
+    _, frame = case.render(FLOAT64, pipeline_of(Approximations(**PIXEL_COLORS), 1))
     color = planes_of(frame)[1:].T
     splats = effects.project(*case.scene, case.lens)
     expected = np.zeros((case.height * case.width, 3))
     directions_of = direction_of_pixels(case)
+    coefficients = np.concatenate([case.gaussians.sh0, case.gaussians.shN], axis=1)
     for pixel, direction in enumerate(directions_of):
-        colors = reference._unclamped_colors(case.gaussians, np.tile(direction, (20, 1)), 1)
+        colors = 0.5 + reference.sh_basis(direction[None], 1)[0] @ coefficients
         offset = np.array([pixel % case.width, pixel // case.width])
         expected[pixel] = reference.composite(
             splats.means2d - offset, splats.conics, splats.opacities, np.maximum(colors, 0),
@@ -150,7 +110,7 @@ def test_colours_use_the_directions_of_pixel_rays(precision, name):
         ).image[0, 0]  # fmt: skip
     shown = ~np.isnan(directions_of).any(axis=1)
     assert shown.mean() > 0.7 and np.isfinite(color).all()
-    tolerance = IMAGE[precision] * np.abs(expected[shown]).max()
+    tolerance = IMAGE[FLOAT64] * np.abs(expected[shown]).max()
     np.testing.assert_allclose(color[shown], expected[shown], rtol=0, atol=tolerance)
 
 
@@ -159,21 +119,21 @@ def test_colours_use_the_directions_of_pixel_rays(precision, name):
 )
 def test_pixel_order_equals_center_order_for_separate_layers(name):
     """Flat splats in layers far apart, so that no pixel's order is another one."""
-    camera = camera_behind(case_of(name), np.random.default_rng(0))
+    case = case_of(name)
+    camera = camera_behind(case, np.random.default_rng(0))
     rng = np.random.default_rng(1)
     film = rng.uniform(0.2, 0.8, (12, 2)) * [camera.width, camera.height]
-    points = points_at(LENSES[name], camera, film, np.linspace(1, 8, 12))
+    points = points_at(case.lens, camera, film, np.linspace(1, 8, 12))
     points = points[~np.isnan(points).any(axis=1)]
-    case = LensCase("layers", 37, 29, 1, lens=LENSES[name])
     gaussians = gaussians_at_points(
         case, rng, camera, points, np.full((len(points), 3), 1.5), np.full(len(points), 0.5)
     )
     gaussians = replace(gaussians, log_scales=gaussians.log_scales - 0.5)
     device = device_gaussians(gaussians, FLOAT64)
-    device_camera = lens_camera(camera, LENSES[name], FLOAT64)
+    device_camera = lens_camera(camera, case.lens, FLOAT64)
     plain, ordered = (
         planes_of(rendering.render(device, device_camera, pipeline_of(approximations, 1)))
-        for approximations in (Approximations(), Approximations(**PIXEL_ORDER))
+        for approximations in (Approximations(), Approximations(order="pixel", order_window=2))
     )
     assert plain[0].min() < 0.5 and len(points) > 8
     np.testing.assert_allclose(ordered, plain, rtol=0, atol=1e-13)
@@ -242,38 +202,17 @@ def needles(case, rng):
 @pytest.mark.parametrize(
     ("name", "approximations"),
     [
-        ("rational", UNSCENTED | PIXEL_ORDER | PIXEL_COLORS),
+        ("rational", UNSCENTED | {"order": "pixel", "order_window": 2}),
         ("barrel", PIXEL_COLORS),
-        ("fisheye", UNSCENTED | PIXEL_COLORS),
-        ("fisheye", PIXEL_ORDER),
-        ("orthographic", UNSCENTED | PIXEL_COLORS),
-        ("orthographic", PIXEL_ORDER),
+        ("fisheye", UNSCENTED),
+        ("fisheye", {"order": "pixel", "order_window": 2}),
+        ("orthographic", UNSCENTED),
+        ("orthographic", {"order": "pixel", "order_window": 2}),
     ],
     ids=lambda value: value if isinstance(value, str) else ", ".join(value),
 )
-def test_gradients_equal_central_differences(name, approximations):
-    """The kernels' adjoint against the kernels' image. So small a step meets no jump, neither of
-    a cut nor of the order of splats at a pixel.
-    """
-    case = LensCase("choices", 19, 14, 1, 20, lens=LENSES[name])
-    pipeline = pipeline_of(Approximations(**approximations), 1)
-    weights = single(np.random.default_rng(1).normal(size=(4, case.height * case.width)))
-    gaussians, frame = case.render(FLOAT64, pipeline)
-    d_transmittance, *d_features = map(FLOAT64.array, weights)
-    gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance).parameters
-    step = 1e-7
-    for parameter, direction in directions(case.gaussians, seed=2).items():
-        forward, backward = (
-            planes_of(
-                rendering.render(
-                    device_gaussians(moved(case.gaussians, direction, sign * step), FLOAT64),
-                    frame.camera,
-                    pipeline,
-                )
-            )
-            for sign in (1, -1)
-        )
-        expected = np.sum(weights * (forward - backward)) / (2 * step)
-        terms = getattr(direction, parameter) * np.array(getattr(gradients, parameter))
-        # Rounding, 1e-15 / step, of each plane. Measured: 2e-8.
-        assert abs(terms.sum() - expected) <= 1e-6 * np.abs(terms).sum(), parameter
+def test_gradients_equal_differences(name, approximations):
+    lens = kernel_lens(LENSES[name])
+    focal = 26.0 if name in ("rational", "barrel") else 10.0
+    case = Case(name, lens=lens, approximations=approximations, count=20, focal=focal)
+    gradients_equal_differences(case)

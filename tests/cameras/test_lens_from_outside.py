@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import drjit as dr
 import drjit.llvm.ad as llvm
-import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
 from examples.unified_camera import UnifiedCamera
-from support.datasets import load, view_at
+from support.datasets import view_at
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import LENSES, Lens, Pinhole
@@ -20,11 +19,13 @@ from drgs.core.registry import ExtensionError, reporting_extensions
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.initialization.film import to_film
 from drgs.results.refined_cameras import cameras_json
+from drgs.testing import Case, laws_of
 
 XI = 0.75
 K = np.array([[30.0, 0, 17], [0, 32, 13], [0, 0, 1]])
 
-UNIFIED = LENSES._extensions.pop("unified")  # not there in other tests
+# Not there in other tests. Registries have no public way to remove an entry.
+UNIFIED = LENSES._extensions.pop("unified")
 
 
 @pytest.fixture(autouse=True)
@@ -53,19 +54,13 @@ def test_ray_through_a_projected_point_meets_the_point():
     assert 32 < dr.count(seen)[0] < 64
 
 
-def test_jacobian_is_the_derivative_of_the_projection():
-    camera = camera_with(UnifiedCamera(XI))
-    _, position, _ = camera.lens.visibility(camera, llvm.Array3f64(points()))
-    rows = camera.lens.projection_jacobian(camera, position)
-    step = 1e-6
-    for axis in range(3):
-        # A step along a camera axis, in world coordinates.
-        moved = camera.rotation @ llvm.Array3f64([step if k == axis else 0 for k in range(3)])
-        after, before = (
-            camera.lens.project_point(camera, position + sign * moved) for sign in (1, -1)
-        )
-        for row, difference in zip(rows, (after - before) / (2 * step), strict=True):
-            np.testing.assert_allclose(row[axis], difference, rtol=1e-6, atol=1e-6)
+CASE = Case("unified", lens=UnifiedCamera(XI), count=10, width=13, height=9, focal=10.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", laws_of(CASE))
+def test_laws_hold(law):
+    law(CASE)
 
 
 def test_newton_ray_has_the_derivatives_of_the_closed_form():
@@ -174,19 +169,6 @@ def test_errors_of_a_lens_contain_its_name():
     with pytest.raises(ExtensionError, match=message), reporting_extensions():
         Broken().project_point(None, None)
     del LENSES._extensions["broken"]
-
-
-def test_photographs_of_a_custom_lens_are_loaded(tmp_path):
-    frames = []
-    for k in range(3):
-        iio.imwrite(tmp_path / f"{k}.png", np.full((30, 40, 3), 50 * k, np.uint8))
-        pose = np.eye(4)
-        pose[2, 3] = 4 + k
-        frames.append({"file_path": f"{k}.png", "transform_matrix": pose.tolist()})
-    meta = {"camera_model": "unified", "xi": XI, "fl_x": 30.0, "w": 40, "h": 30, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    views = load(tmp_path).train
-    assert [view.lens for view in views] == [UnifiedCamera(XI)] * len(views)
 
 
 def test_documented_example_is_the_file():

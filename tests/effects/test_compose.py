@@ -1,11 +1,9 @@
 """One place puts effects into a pipeline; whoever renders does not ask for them."""
 
-import ast
 from dataclasses import replace
 
 import drjit.llvm.ad as llvm
 import pytest
-from conftest import REPOSITORY
 from support.helpers import FLOAT32, Case, device_camera, device_gaussians
 
 from drgs.accuracy.exact import RayFalloff, exact_shape
@@ -53,29 +51,3 @@ def test_ignored_effect_is_not_composed(scene):
     blurred = replace(camera, aperture=APERTURE)
     assert with_effects(pipeline, gaussians, without_effects(blurred, ["motion"])) != pipeline
     assert with_effects(pipeline, gaussians, without_effects(blurred, ["defocus"])) is pipeline
-
-
-def test_adjoint_and_tangent_replay_the_composed_pipeline(scene):
-    gaussians, camera = scene
-    camera = replace(camera, aperture=APERTURE)
-    pipeline = with_effects(rendering.Pipeline(0), gaussians, camera)
-    assert rendering.render(gaussians, camera, pipeline).pipeline is pipeline
-
-
-def reads_camera_effects(source):
-    """Whether ``source`` reads an attribute ``aperture`` or ``shutter``."""
-    nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute))
-    return any(node.attr in ("aperture", "shutter") for node in nodes)
-
-
-@pytest.mark.parametrize("package", ["splatting", "accuracy"])
-def test_packages_do_not_query_effects_of_a_camera(package):
-    paths = sorted((REPOSITORY / "drgs" / package).glob("*.py"))
-    assert len(paths) > 5
-    assert [path.name for path in paths if reads_camera_effects(path.read_text())] == []
-
-
-def test_query_of_a_camera_effect_is_found():
-    assert reads_camera_effects("x = camera.aperture is None") and not reads_camera_effects(
-        "aperture = 1"
-    )

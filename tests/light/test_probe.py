@@ -70,17 +70,6 @@ def directions(count, seed=0):
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-@both_precisions
-def test_cube_map_lookup_is_a_bijection(precision):
-    """The vector to the place that a vector points to is parallel to it, on all faces."""
-    towards = directions(5000)
-    face, x, y = probe._place_on_cube(precision.vectors(towards))
-    back = rows(probe._vector_to(face, 2 * x - 1, 2 * y - 1)).astype(np.float64)
-    back /= np.linalg.norm(back, axis=1, keepdims=True)
-    assert set(rows(face)) == set(range(6))
-    np.testing.assert_allclose(back, towards, atol=2e-6)
-
-
 @pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize("number", [0, 1])

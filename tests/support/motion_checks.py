@@ -62,14 +62,9 @@ class MovingCase(LensCase):
     def reference_image(self, gaussians=None, threshold_width=0.0) -> reference.RenderedImage:
         gaussians = gaussians or self.gaussians
         if self.samples:
-            return effects._mean_image(
-                [
-                    effects.render(
-                        gaussians, self.camera_at((k + 0.5) / self.samples), self.lens,
-                        self.background, threshold_width=threshold_width,
-                    )
-                    for k in range(self.samples)
-                ]
+            return effects.render_motion_blur(
+                gaussians, self.camera, self.close_camera, self.samples, self.background,
+                self.lens, threshold_width,
             )  # fmt: skip
         return rolling_image(self, gaussians, threshold_width)
 

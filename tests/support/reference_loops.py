@@ -18,6 +18,9 @@ from support.reference_scenes import (
 UNCUT = ImageModel(alpha_max=1.0, alpha_cut=0.0, transmittance_stop=0.0)
 """No decisions: every splat touches every pixel."""
 
+MARKED_DISTANCES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
+"""(relative distance from a threshold, whether a width of 1e-6 marks the pixel)"""
+
 
 def camera_gaussian(gaussians, camera, n) -> tuple[np.ndarray, np.ndarray]:
     """(mean (3,), factor V (3, 3)) in camera axes, the covariance being V V^T."""
@@ -201,18 +204,6 @@ def scene_of(means, log_scales, quats=None, opacity=0.5, colors=None) -> Gaussia
         logit_opacities=np.log(opacities / (1 - opacities)),
         sh0=((colors - 0.5) * math.sqrt(4 * math.pi))[:, None],
         shN=np.zeros((n, 0, 3)),
-    )
-
-
-def rotated_splats() -> Gaussians:
-    """Eight, with axes up to 30 to 1, off the axis of ``straight_camera`` and near it."""
-    rng = np.random.default_rng(3)
-    slopes = rng.uniform(-0.25, 0.25, (8, 2))
-    z = np.geomspace(0.3, 4.0, 8)
-    return scene_of(
-        means=np.column_stack([slopes * z[:, None], z]),
-        log_scales=rng.uniform(np.log(0.01), np.log(0.3), (8, 3)),
-        quats=rng.normal(0, 1, (8, 4)),
     )
 
 
