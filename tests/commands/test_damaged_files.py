@@ -45,7 +45,7 @@ def folder(photographs):
     meta |= {"camera_model": "OPENCV", "camera_angle_x": 0.7, "k1": 0.0}
     meta |= {"train_filenames": ["images/00.png", "./images/03.png", "images/08.png"]}
     meta |= {"test_filenames": ["images/02"]}
-    meta["frames"][1]["mask_path"] = "mask.png"  # of 08.png
+    meta["frames"][6]["mask_path"] = "mask.png"  # of 03.png
     path.write_text(json.dumps(meta))
     return photographs
 
@@ -133,7 +133,7 @@ def test_damaged_masks_are_read_or_refused(folder, layout):
         images = [(f["file_path"][7:], 1, np.array(f["transform_matrix"]) @ axes) for f in poses]
         write_binary(folder / "sparse", Model(cameras, images, []))
         (folder / "masks").mkdir()
-        files = [folder / "masks" / name for name in ("08.png.mask.png", "08.PNG", "08_mask.png")]
+        files = [folder / "masks" / name for name in ("03.png.mask.png", "03.PNG", "03_mask.png")]
 
     def read(path):
         views = load_dataset(DataConfig(path=folder)).train
@@ -156,7 +156,7 @@ def test_strange_names_are_found_or_reported(folder):
     def mutate(rng, seed):
         meta = json.loads(content)
         places = [(frame, "file_path") for frame in meta["frames"][:4]]
-        places += [(meta["frames"][1], "mask_path"), (meta, "ply_file_path")]
+        places += [(meta["frames"][6], "mask_path"), (meta, "ply_file_path")]
         places += [(meta["test_filenames"], 0), (meta["train_filenames"], 1)]
         container, key = places[rng.integers(len(places))]
         chosen = [parts[k] for k in rng.integers(len(parts), size=rng.integers(1, 4))]
