@@ -22,6 +22,10 @@ def fitted(tmp_path):
     return tmp_path / "run"
 
 
+def refused(fitted, *words, message):
+    assert_refused(render.main, fitted, *words, folder=fitted.parent, message=message)
+
+
 VIEWS = {
     "split": [],
     "orbit": ["--orbit", 2, "--size", 8, 6],
@@ -31,28 +35,27 @@ VIEWS = {
 
 @pytest.mark.parametrize("way", VIEWS)
 def test_images_are_not_written_into_a_photograph_folder(fitted, way):
-    data = fitted.parent / "data"
-    message = f"--out {data / 'test'}: holds images of the dataset (r_0.png, r_1.png); choose"
-    arguments = [fitted, *VIEWS[way], "--out", data / "test"]
-    assert_refused(render.main, *arguments, folder=fitted.parent, message=message)
+    test = fitted.parent / "data" / "test"
+    message = f"--out {test}: holds images of the dataset (r_0.png, r_1.png); choose"
+    refused(fitted, *VIEWS[way], "--out", test, message=message)
 
 
 @pytest.mark.parametrize(
-    ("way", "name"),
+    ("way", "name", "content"),
     [
-        ("split", "r_1.png"),
-        ("split", "metrics.json"),
-        ("orbit", "orbit_001.png"),
-        ("orbit", "orbit.gif"),
-        ("origin", "camera.png"),
+        ("split", "r_1.png", ""),
+        *(("split", "metrics.json", text) for text in ("[", "[]", '{"split": "test"}', "7")),
+        ("orbit", "orbit_001.png", ""),
+        ("orbit", "orbit.gif", ""),
+        ("origin", "camera.png", ""),
     ],
 )
-def test_user_file_is_not_replaced_by_an_image(fitted, tmp_path, way, name):
+def test_user_file_is_not_replaced(fitted, tmp_path, way, name, content):
     out = tmp_path / "out"
     out.mkdir()
-    (out / name).write_text("[]")
+    (out / name).write_text(content)
     message = f"{out}: holds {name}, which this command would replace and has not written"
-    assert_refused(render.main, fitted, *VIEWS[way], "--out", out, folder=tmp_path, message=message)
+    refused(fitted, *VIEWS[way], "--out", out, message=message)
 
 
 def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
@@ -69,13 +72,12 @@ def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
 @pytest.mark.slow
 def test_own_images_are_replaced_unless_modified(fitted, tmp_path):
     out = tmp_path / "out"
-    for way in VIEWS:
-        assert_ends_well(render.main, fitted, *VIEWS[way], "--out", out)
-    for way in VIEWS:
-        assert_ends_well(render.main, fitted, *VIEWS[way], "--background", "black", "--out", out)
+    for options in ((), ("--background", "black")):
+        for words in VIEWS.values():
+            assert_ends_well(render.main, fitted, *words, *options, "--out", out)
     (out / "r_0.png").write_bytes((fitted.parent / "data" / "test" / "r_0.png").read_bytes())
     message = "holds r_0.png, which this command would replace and has not written, or which chang"
-    assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
+    refused(fitted, "--out", out, message=message)
 
 
 def test_folder_in_use_by_another_command_is_refused(fitted, tmp_path, monkeypatch):
@@ -87,7 +89,7 @@ def test_folder_in_use_by_another_command_is_refused(fitted, tmp_path, monkeypat
         write_png(path, image)
         if not refused:
             refused.append(path)
-            assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
+            refused(fitted, "--out", out, message=message)
 
     monkeypatch.setattr(render, "write_png", write_while_another_begins)
     assert_ends_well(render.main, fitted, "--out", out)
@@ -113,18 +115,10 @@ def test_images_of_an_interrupted_command_are_replaced(fitted, tmp_path, monkeyp
     rendered = (out / "r_0.png").read_bytes()
     (out / "r_0.png").write_text("mine")
     message = "holds r_0.png, which this command would replace"
-    assert_refused(render.main, fitted, "--out", out, folder=tmp_path, message=message)
+    refused(fitted, "--out", out, message=message)
     (out / "r_0.png").write_bytes(rendered)
     assert_ends_well(render.main, fitted, "--out", out)
     assert contents(out) == contents(expected)
-
-
-@pytest.mark.parametrize("metrics", ["[", "[]", '{"split": "test"}', "7"])
-def test_foreign_metrics_are_not_replaced(fitted, tmp_path, metrics):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "metrics.json").write_text(metrics)
-    message = "holds metrics.json, which"
-    assert_refused(render.main, fitted, "--out", tmp_path / "out", folder=tmp_path, message=message)
 
 
 def test_the_record_of_a_finished_command_names_every_file(fitted, tmp_path):

@@ -1,6 +1,7 @@
 """``python -m drgs.render``, against the float64 reference and PSNR computed plainly."""
 
 import json
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -32,19 +33,14 @@ from support.small_capture import (
 )
 from support.small_capture import view as small_view
 
-from drgs import render
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
+from drgs.results.refined_cameras import write_views
 
 
 def photo(fit, name, background, split="test"):
     """A photograph of the dataset over a background."""
     rgba = iio.imread(fit.parent / "data" / split / f"{name}.png") / 255
     return rgba[:, :, :3] * rgba[:, :, 3:] + np.array(background) * (1 - rgba[:, :, 3:])
-
-
-# ----------------------------------------------------------------------------------------------
-# Views with photographs
-# ----------------------------------------------------------------------------------------------
 
 
 def test_a_fit_is_rendered_from_its_test_views_and_measured(fit, tmp_path, capsys):
@@ -79,36 +75,30 @@ def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
 @pytest.mark.parametrize("optimised", [True, False])
 def test_refined_cameras_are_used_or_mentioned(tmp_path, capsys, optimised):
     """Whether the fit's folder or its PLY file is named, as its configuration says."""
-    dataset = make_dataset(2, 1)
+    dataset, found = make_dataset(2, 1), tmp_path / "run"
     write_dataset(tmp_path / "data", dataset)
-    found = tmp_path / "run"
     blobs().save(found / "point_cloud.ply")
     config = {"data": {"path": str(tmp_path / "data")}, "cameras": {"optimise": optimised}}
     (found / "config.yml").write_text(yaml.safe_dump(config))
     refined = [
         small_view(v.name, pose_around(0.4 + i, 0.6), None) for i, v in enumerate(dataset.train)
     ]
-    frames = [
-        {"file_path": v.name, "transform_matrix": (v.camera_to_world * [1, -1, -1, 1]).tolist()}
-        for v in refined
-    ]
-    (found / "cameras.json").write_text(json.dumps({"lens_change": {}, "frames": frames}))
+    path = found / "cameras.json"
+    write_views(path, replace(dataset, train=refined))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"lens_change": {}}))
+    said = f"cameras: as refined, from {path}"
+    if not optimised:
+        said = f"cameras: as the dataset has them; those of {path} are used with --set cameras.opti"
     for name, what in (
         ("folder", [found]),
         ("file", [found / "point_cloud.ply", "--scene", found / "config.yml"]),
     ):
         run(*what, "--split", "train", "--out", tmp_path / name)
         printed = capsys.readouterr().out.splitlines()
-        said = [line for line in printed if "cameras.json" in line]
-        assert said == [
-            f"cameras: as refined, from {found / 'cameras.json'}"
-            if optimised
-            else f"cameras: as the dataset has them; those of {found / 'cameras.json'} are used "
-            "with --set cameras.optimise=true"
-        ]
-        for view, moved in zip(dataset.train, refined, strict=True):
-            seen_from = moved if optimised else view
-            assert_shows(tmp_path / name / f"{view.name}.png", seen_from, WHITE)
+        (line,) = (line for line in printed if "cameras.json" in line)
+        assert line.startswith(said)
+        for view in refined if optimised else dataset.train:
+            assert_shows(tmp_path / name / f"{view.name}.png", view, WHITE)
 
 
 def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
@@ -123,8 +113,7 @@ def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
 def test_depths_are_not_opened(tmp_path):
     """There are none: nothing that is rendered looks at them."""
     write_dataset(tmp_path / "data", make_dataset(1, 1))
-    for split in ("train", "test"):
-        path = tmp_path / "data" / f"transforms_{split}.json"
+    for path in (tmp_path / "data").glob("transforms_*.json"):
         values = json.loads(path.read_text())
         values["frames"][0]["depth_file_path"] = "nowhere.png"
         path.write_text(json.dumps(values))
@@ -137,16 +126,6 @@ def test_depths_are_not_opened(tmp_path):
 def test_values_of_the_configuration_can_be_set(fit, tmp_path):
     run(fit, "--set", "data.image_size=16", "--out", tmp_path)
     assert rendered(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)
-
-
-def test_infinite_psnr_is_null_in_json():
-    quality = {"psnr": float("inf"), "views": {"a": {"psnr": 3.5}}}
-    assert render._replace_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
-
-
-# ----------------------------------------------------------------------------------------------
-# Views without
-# ----------------------------------------------------------------------------------------------
 
 
 def test_orbit_is_around_the_focus_of_the_photographs(fit, tmp_path):
@@ -177,9 +156,9 @@ def test_cameras_of_a_transforms_file_render_the_images_of_the_split(fit, tmp_pa
         assert (tmp_path / "cameras" / f"camera_{index}.png").read_bytes() == expected
 
 
-def write_camera(path, begin, end=None, **says):
+def write_camera(path, begin, end=None, **values):
     """Write a small camera in the layout of transforms.json; end: its second pose."""
-    frame = {"transform_matrix": (begin * [1, -1, -1, 1]).tolist(), **says}
+    frame = {"transform_matrix": (begin * [1, -1, -1, 1]).tolist(), **values}
     if end is not None:
         frame["transform_matrix_close"] = (end * [1, -1, -1, 1]).tolist()
     values = {"camera_angle_x": FIELD_OF_VIEW, "w": WIDTH, "h": HEIGHT, "frames": [frame]}
@@ -222,18 +201,16 @@ def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path, samples):
 @pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
 def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys, ignored):
     """Cameras come from a file, and from a Mitsuba scene whose first camera is plain."""
-    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3))
+    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3), pose_around(0.8, 0.3), k1=0.1)
     values = json.loads(path.read_text())
-    close = {"transform_matrix_close": values["frames"][0]["transform_matrix"]}
-    values["frames"].append({**values["frames"][0], **close, "k1": 0.1})
-    path.write_text(json.dumps(values))
+    plain = {"transform_matrix": values["frames"][0]["transform_matrix"]}
+    path.write_text(json.dumps(values | {"frames": [plain, *values["frames"]]}))
     ignore = ["--ignore", *ignored] if ignored else []
     run(fit, "--camera", path, *ignore, "--out", tmp_path / "file")
     of_file = capsys.readouterr().out
-    bent = sensor(pose_around(2.0, 0.3)).replace("perspective", "calibrated")
     lens = '<string name="lens" value="opencv"/><float name="k1" value="0.1"/>'
-    bent = bent.replace("<film", f"{lens}<film")
-    bent = bent.replace(f'<float name="fov" value="{np.degrees(FIELD_OF_VIEW)}"/>', "")
+    bent = sensor(pose_around(2.0, 0.3)).replace("perspective", "calibrated")
+    bent = bent.replace(f'<float name="fov" value="{np.degrees(FIELD_OF_VIEW)}"/>', lens)
     settings = f'<string name="ignore" value="{", ".join(ignored)}"/>'
     scene = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), bent, settings=settings)
     run(scene, "--out", tmp_path / "scene")
@@ -257,9 +234,10 @@ def pose_between(begin, end, time):
 
 
 def test_camera_set_by_options_is_used(fit, tmp_path):
+    """A file's background is black; a folder's is that of its configuration."""
     pose = pose_around(0.8, 0.3)
-    fov = np.degrees(FIELD_OF_VIEW)
-    arguments = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", fov]
-    size = ("--size", WIDTH, HEIGHT)
-    run(fit / "point_cloud.ply", *arguments, *size, "--out", tmp_path)
-    assert_shows(tmp_path / "camera.png", small_view("", pose, None), BLACK)
+    words = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", np.degrees(FIELD_OF_VIEW)]
+    words += ["--size", WIDTH, HEIGHT, "--out", tmp_path]
+    for what, background in ((fit / "point_cloud.ply", BLACK), (fit, WHITE)):
+        run(what, *words)
+        assert_shows(tmp_path / "camera.png", small_view("", pose, None), background)
