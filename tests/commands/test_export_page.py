@@ -46,21 +46,18 @@ def exported(what, out, *options):
     return outcome.stdout, page, json.loads(scene), Gaussians.load(model)
 
 
-def test_page_of_a_fit_shows_its_own_gaussians(fit, tmp_path):
+@pytest.mark.parametrize("order", ["center", "pixel"])
+def test_page_of_a_fit_shows_its_own_gaussians_if_the_page_supports_them(fit, tmp_path, order):
+    configure(fit, {**FITTED_WITH, "order": order})
     said, page, scene, gaussians = exported(fit, tmp_path / "a.html")
-    assert said.splitlines()[0] == f"{fit}/point_cloud.ply: 30 Gaussians"
-    assert "note" not in said and gaussians.num_gaussians == 30
-    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.1), True)
+    is_own = order == "center"
+    name, count = ("point_cloud.ply", 30) if is_own else ("point_cloud_viewers.ply", 20)
+    assert said.splitlines()[0] == f"{fit}/{name}: {count} Gaussians"
+    assert "note" not in said and gaussians.num_gaussians == count
+    expected = (0.1, True) if is_own else (0.3, False)
+    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(expected[0]), expected[1])
     assert scene["settings"]["background"]["color"] == [0.25, 0.5, 0.75]
     assert "<title>run: Gaussian splats</title>" in page
-
-
-def test_page_of_an_unsupported_fit_shows_gaussians_for_viewers(fit, tmp_path):
-    configure(fit, {**FITTED_WITH, "order": "pixel"})
-    said, _, scene, gaussians = exported(fit, tmp_path / "a.html")
-    assert said.splitlines()[0] == f"{fit}/point_cloud_viewers.ply: 20 Gaussians"
-    assert gaussians.num_gaussians == 20
-    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(0.3), False)
 
 
 def test_first_view_of_a_fit_is_a_training_camera(fit, tmp_path):

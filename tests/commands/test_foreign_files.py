@@ -83,17 +83,17 @@ def test_own_images_are_replaced_unless_modified(fitted, tmp_path):
 def test_folder_in_use_by_another_command_is_refused(fitted, tmp_path, monkeypatch):
     """The one that was refused leaves what the other notes of its images alone."""
     out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
-    write_png, refused = render.write_png, []
+    write_png, others = render.write_png, []
 
     def write_while_another_begins(path, image):
         write_png(path, image)
-        if not refused:
-            refused.append(path)
+        if not others:
+            others.append(path)
             refused(fitted, "--out", out, message=message)
 
     monkeypatch.setattr(render, "write_png", write_while_another_begins)
     assert_ends_well(render.main, fitted, "--out", out)
-    assert refused and visible(out) == {"r_0.png", "r_1.png", "metrics.json"}
+    assert others and visible(out) == {"r_0.png", "r_1.png", "metrics.json"}
 
 
 @pytest.mark.slow

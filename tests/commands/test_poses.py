@@ -51,14 +51,10 @@ def test_photographs_without_a_camera_are_named(run):
     assert "so may --share one or --camera-model SIMPLE_RADIAL" in text
 
 
-def test_options_set_the_search(run):
+def test_options_set_the_search(run, capsys):
     options = ["--camera-model", "RADIAL", "--share", "one", "--compare", "neighbours"]
     asked, _ = run(PLACED, *options, "--overwrite")
     assert asked[1:] == (SfmSettings("RADIAL", "neighbours", "one"), True)
-
-
-def test_a_wrong_option_is_refused(run, capsys):
-    with pytest.raises(SystemExit) as end:
+    with pytest.raises(SystemExit):
         run(PLACED, "--camera-model", "FOV")
-    assert end.value.code == 2
     assert "invalid choice: 'FOV'" in capsys.readouterr().err

@@ -96,14 +96,14 @@ def make_dataset(train=8, test=4, seed=0) -> Dataset:
     )
 
 
-def write_dataset(folder: Path, dataset: Dataset) -> None:
-    """The same views in the NeRF-synthetic layout, with half transparent photographs."""
+def write_dataset(folder: Path, dataset: Dataset, alpha: float = 0.5) -> None:
+    """The same views in the NeRF-synthetic layout; alpha: of every pixel."""
     for split, views in (("train", dataset.train), ("test", dataset.test)):
         (folder / split).mkdir(parents=True)
         frames = []
         for v in views:
-            alpha = np.full((HEIGHT, WIDTH, 1), 0.5)
-            rgba = np.round(np.concatenate([v.image, alpha], axis=2) * 255).astype(np.uint8)
+            rgba = np.dstack([v.image, np.full((HEIGHT, WIDTH), alpha)])
+            rgba = np.round(rgba * 255).astype(np.uint8)
             iio.imwrite(folder / split / f"{v.name}.png", rgba)
             opengl = v.camera_to_world * [1, -1, -1, 1]
             frames.append({"file_path": f"./{split}/{v.name}", "transform_matrix": opengl.tolist()})
