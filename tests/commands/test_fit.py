@@ -98,8 +98,8 @@ def test_report_records_command_machine_and_date(fitted, configuration):
 def test_test_views_are_shown_well_and_measured(fitted, configuration):
     _, out = fitted
     metrics = json.loads((out / "metrics.json").read_text())
-    # 300 random points reach 25 dB and more; a fit that does not learn stays below 15 dB.
-    assert metrics["test"]["psnr"] > 23
+    # 300 random points reach 31 dB; a fit that does not learn stays below 15 dB.
+    assert metrics["test"]["psnr"] > 29
     assert (metrics["test"]["num_views"], metrics["test"]["split"]) == (3, "test")
     assert (metrics["iterations"], metrics["seed"]) == (300, 0)
     assert metrics["config"]["densify"]["max_gaussians"] == 500

@@ -5,19 +5,19 @@ import socket
 import sys
 from contextlib import contextmanager
 from types import ModuleType
+from unittest.mock import Mock
 
 import pytest
 import yaml
-from support.commands import run_in_process
 from support.fit_command import (
     assert_fit_refused,
     assert_fits,
+    run_fit,
     without_images,
     write_project,
 )
 from support.small_capture import HEIGHT, WIDTH, pose_around
 
-from drgs import fit
 from drgs.training import fit_folder
 from drgs.viewer import training_viewer
 from drgs.viewer.frames import FrameRequest, ViewerCamera
@@ -119,10 +119,8 @@ def test_fit_ended_early_and_killed_writes_its_results_on_resume(
     config, out = write_project(tmp_path), tmp_path / "out"
     viewer_page(end_at=4)
     with monkeypatch.context() as patch:
-        patch.setattr(
-            fit_folder, "write_images", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
-        )
-        assert run_in_process(fit.main, config, "--out", out, "--view").returncode == 130
+        patch.setattr(fit_folder, "write_images", Mock(side_effect=KeyboardInterrupt))
+        assert run_fit(config, "--out", out, "--view").returncode == 130
     assert_fits("--resume", out)
     assert json.loads((out / "metrics.json").read_text())["iterations"] == 5
 
@@ -134,33 +132,25 @@ def test_fit_ended_early_and_killed_writes_its_results_on_resume(
         (("--view-address", "::1"), "--view-address: needs --view"),
         (("--view", "--view-port", "0"), "--view-port: must be a whole number >= 1, got 0"),
         (("--view", "--view-port", "65536"), "--view-port: must be at most 65,535"),
+        (("--view", "--view-address", "192.0.2.1"), "192.0.2.1: cannot listen at 192.0.2.1"),
+        (("--view", "--view-address", "no address"), "no address: cannot listen at no address"),
     ],
 )
-def test_contradictory_options_are_refused(tmp_path, arguments, message):
+def test_wrong_options_are_refused(tmp_path, arguments, message):
+    pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
     assert_fit_refused(write_project(tmp_path), *arguments, folder=tmp_path, message=message)
 
 
-def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):
-    config = write_project(tmp_path)
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert_fit_refused(
-        config,
-        "--view",
-        folder=tmp_path,
-        message="--view: needs viser, which is not installed; pip install 'drgs[viewer]'",
-    )
-
-
-def test_occupied_port_and_remote_address_are_refused(tmp_path):
+def test_occupied_port_is_refused(tmp_path):
     pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
-    config = write_project(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
+        words = (write_project(tmp_path), "--view", "--view-port", port)
         message = f"--view-port {port}: cannot listen at 127.0.0.1: Address already in use"
-        assert_fit_refused(config, "--view", "--view-port", port, folder=tmp_path, message=message)
-    for address, message in (
-        ("192.0.2.1", "--view-address 192.0.2.1: cannot listen at 192.0.2.1"),
-        ("no address", "--view-address no address: cannot listen at no address"),
-    ):
-        arguments = (config, "--view", "--view-address", address)
-        assert_fit_refused(*arguments, folder=tmp_path, message=message)
+        assert_fit_refused(*words, folder=tmp_path, message=message)
+
+
+def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    message = "--view: needs viser, which is not installed; pip install 'drgs[viewer]'"
+    assert_fit_refused(write_project(tmp_path), "--view", folder=tmp_path, message=message)

@@ -8,11 +8,14 @@ import warnings
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from support.commands import run_in_process
-from support.fit_command import write_scene
+from support.fit_command import (
+    assert_fit_refused,
+    assert_fits,
+    run_fit,
+    without_images,
+    write_scene,
+)
 
-from drgs import fit
-from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
 
 
@@ -22,34 +25,28 @@ def scene(tmp_path):
     return write_scene(tmp_path, model={"sh_degree": 1}, iterations=3, output=often).parent
 
 
-@pytest.fixture
-def interrupts(monkeypatch):
-    """How often Ctrl-C is pressed during the second iteration."""
-    before = signal.getsignal(signal.SIGINT)
-    counts, step = [1], Trainer.step
+@pytest.mark.parametrize(("count", "kept"), [(1, 2), (2, 1)])
+def test_the_first_interrupt_saves_and_the_second_ends_without_a_traceback(
+    scene, monkeypatch, count, kept
+):
+    """Ctrl-C is pressed so often in the second iteration; kept: the checkpoint's iteration."""
+    step = Trainer.step
 
     def step_and_interrupt(trainer):
         report = step(trainer)
-        for _ in range(counts[0] if trainer.iteration == 2 else 0):
+        for _ in range(count if trainer.iteration == 2 else 0):
             signal.raise_signal(signal.SIGINT)
         return report
 
     monkeypatch.setattr(Trainer, "step", step_and_interrupt)
-    yield counts
+    before = signal.getsignal(signal.SIGINT)
+    outcome = run_fit(scene / "a.yml", "--out", scene / "out")
     signal.signal(signal.SIGINT, before)
-
-
-def test_the_first_interrupt_saves_and_the_second_ends_without_a_traceback(scene, interrupts):
-    once = run_in_process(fit.main, scene / "a.yml", "--out", scene / "once")
-    assert (once.returncode, once.stderr) == (130, "")
-    assert once.stdout.splitlines()[-1].startswith("stopped; continue with: ")
-    interrupts[0] = 2
-    twice = run_in_process(fit.main, scene / "a.yml", "--out", scene / "twice")
-    assert (twice.returncode, twice.stderr) == (130, "interrupted\n")
-    for name, iteration in (("once", 2), ("twice", 1)):
-        assert not list((scene / name).glob(".*.tmp*"))
-        with np.load(scene / name / "checkpoint.npz") as checkpoint:
-            assert checkpoint["trainer.iteration"] == iteration
+    assert (outcome.returncode, outcome.stderr) == (130, "" if count == 1 else "interrupted\n")
+    assert ("stopped; continue with: " in outcome.stdout) == (count == 1)
+    assert not list((scene / "out").glob(".*.tmp*"))
+    with np.load(scene / "out" / "checkpoint.npz") as checkpoint:
+        assert checkpoint["trainer.iteration"] == kept
 
 
 def rename_view(folder, split, name):
@@ -63,11 +60,10 @@ def rename_view(folder, split, name):
 
 
 def test_images_with_long_names_are_written_under_shorter_ones(scene, monkeypatch):
-    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
+    without_images(monkeypatch)
     for split in ("train", "test"):
         rename_view(scene, split, "\u4e2d" * 83)  # 249 bytes
-    outcome = run_in_process(fit.main, scene / "a.yml", "--out", scene / "out")
-    assert outcome.returncode == 0, outcome.stderr
+    assert_fits(scene / "a.yml", "--out", scene / "out")
     (rendered,) = os.listdir(scene / "out" / "renders" / "test")
     assert rendered.startswith("0000_\u4e2d") and len(os.fsencode(rendered)) < 220
 
@@ -78,30 +74,24 @@ def test_a_configuration_whose_name_is_not_utf_8_is_fitted(scene, monkeypatch):
     monkeypatch.chdir(scene)
     name = os.fsdecode(b"b\xff")
     (scene / "a.yml").rename(scene / f"{name}.yml")
-    outcome = run_in_process(fit.main, f"{name}.yml")
-    assert outcome.returncode == 0, outcome.stderr
+    assert_fits(f"{name}.yml")
     assert "b\\udcff" in (scene / "out" / name / "report.html").read_text()
 
 
 @pytest.mark.parametrize("option", ["--out", "--data"])
 def test_folders_whose_names_are_not_utf_8_are_refused_before_the_fit(scene, option):
-    name = os.fsdecode(b"\xff")
-    outcome = run_in_process(
-        fit.main, scene / "a.yml", "--out", scene / "out", option, scene / name
-    )
-    assert outcome.returncode == 2
-    assert "must be a path in UTF-8, got " in outcome.stderr and outcome.stderr.count("\n") == 1
-    assert sorted(os.listdir(scene)) == ["a.yml", "data"]
+    words = (scene / "a.yml", "--out", scene / "out", option, scene / os.fsdecode(b"\xff"))
+    assert_fit_refused(*words, folder=scene, message="must be a path in UTF-8, got ")
 
 
 def test_cloud_of_coinciding_and_distant_points_is_fitted(scene, monkeypatch):
     """Without a line of NumPy's about scales that are beyond float32."""
-    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
+    without_images(monkeypatch)
     points = np.zeros(18, [(axis, "f4") for axis in "xyz"])
     points[17] = (3e38, -1e30, 1)
     PlyData([PlyElement.describe(points, "vertex")]).write(str(scene / "points.ply"))
     cloud = f"init.point_cloud={scene / 'points.ply'}"
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        outcome = run_in_process(fit.main, scene / "a.yml", "--out", scene / "out", "--set", cloud)
-    assert (outcome.returncode, outcome.stderr) == (0, "")
+        outcome = assert_fits(scene / "a.yml", "--out", scene / "out", "--set", cloud)
+    assert outcome.stderr == ""
