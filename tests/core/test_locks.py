@@ -21,6 +21,8 @@ def test_folder_has_one_writer(tmp_path):
         with sole_writer(tmp_path / "other"):
             pass
         assert os.listdir(folder) == []
+    with pytest.raises(KeyError), sole_writer(folder):
+        raise KeyError
     with sole_writer(folder):
         pass
 
@@ -29,17 +31,9 @@ def test_lock_creates_a_new_folder_on_demand(tmp_path):
     folder = tmp_path / "new" / "out"
     with sole_writer(folder) as keep, sole_writer(folder) as keep_as_well:
         assert not folder.exists()
-        assert keep()
-        assert folder.is_dir()
+        assert keep() and folder.is_dir()
         with pytest.raises(UserError, match="another command is writing to this folder"):
             keep_as_well()
-
-
-def test_error_releases_the_lock(tmp_path):
-    with pytest.raises(KeyError), sole_writer(tmp_path):
-        raise KeyError
-    with sole_writer(tmp_path):
-        pass
 
 
 def _keep(folder, pipe):
