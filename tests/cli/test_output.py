@@ -16,7 +16,7 @@ from PIL import Image
 from support.commands import run_in_process
 
 from drgs.cli.commands import bounded_int, file_or_folder, run_command
-from drgs.cli.ending import escape_unencodable, exit_on_interrupt
+from drgs.cli.ending import escape_unencodable
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
 from drgs.io.images import image_size, write_png
@@ -32,14 +32,13 @@ def command(act):
     return lambda words: run_command(add_arguments, "some command", words)
 
 
-def ascii_streams():
-    """A standard output and an error output as ``PYTHONIOENCODING=ascii`` makes them."""
-    return [io.TextIOWrapper(io.BytesIO(), "ascii") for _ in range(2)]
+def raising(error):
+    """``main`` of a command that raises."""
 
+    def act():
+        raise error
 
-def printed(stream):
-    stream.flush()
-    return stream.buffer.getvalue()
+    return command(act)
 
 
 @pytest.mark.parametrize("name", ["f\u00fc\u4e2d", os.fsdecode(b"\xff")], ids=["UTF-8", "other"])
@@ -48,27 +47,25 @@ def test_names_are_printed_in_any_encoding(name):
         print(f"written: {name}")
         raise UserError(f"{name}: wrong")
 
-    out, err = ascii_streams()
-    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as end:
-        command(act)([])
-    assert end.value.code == 2
+    # As PYTHONIOENCODING=ascii makes them.
+    out, err = (io.TextIOWrapper(io.BytesIO(), "ascii") for _ in range(2))
+    with redirect_stdout(out), redirect_stderr(err):
+        with pytest.raises(SystemExit, match="2"):
+            command(act)([])
+        out.flush()
+        err.flush()
     escaped = name.encode("ascii", "backslashreplace")
-    assert printed(out) == b"written: " + escaped + b"\n"
-    assert printed(err) == b"error: " + escaped + b": wrong\n"
+    assert out.buffer.getvalue() == b"written: " + escaped + b"\n"
+    assert err.buffer.getvalue() == b"error: " + escaped + b": wrong\n"
     assert out.errors == "strict"  # as before
-
-
-def test_closed_stream_is_left_alone():
-    out, err = ascii_streams()
     with redirect_stdout(out), redirect_stderr(err), escape_unencodable():
-        out.close()
+        out.close()  # which is left alone
 
 
 def test_user_note_is_printed_as_a_line():
-    def act():
-        warnings.warn(UserNote("a.ply: clamped"), stacklevel=1)
-
-    outcome = run_in_process(command(act))
+    outcome = run_in_process(
+        command(lambda: warnings.warn(UserNote("a.ply: clamped"), stacklevel=1))
+    )
     assert (outcome.returncode, outcome.stdout) == (0, "note: a.ply: clamped\n")
     assert outcome.stderr == ""
 
@@ -77,7 +74,6 @@ def test_pillow_warnings_are_not_printed(tmp_path, monkeypatch):
     """Pillow warns of large images that are not too large for drgs."""
     write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
-
     with pytest.warns(Image.DecompressionBombWarning):
         image_size(tmp_path / "a.png")
     with warnings.catch_warnings(record=True) as caught:
@@ -86,18 +82,9 @@ def test_pillow_warnings_are_not_printed(tmp_path, monkeypatch):
     assert (outcome.returncode, outcome.stderr, caught) == (0, "", [])
 
 
-def test_error_with_newlines_is_printed_on_one_line():
-    def act():
-        raise UserError("a\nb.yml: wrong")
-
-    assert run_in_process(command(act)).stderr == "error: a b.yml: wrong\n"
-
-
-def test_long_error_is_shortened_in_the_middle():
-    def act():
-        raise UserError(f"a.yml: {'x' * 5000}; remove it")
-
-    line = run_in_process(command(act)).stderr
+def test_errors_are_printed_on_one_line_and_shortened_in_the_middle():
+    assert run_in_process(raising(UserError("a\nb.yml: wrong"))).stderr == "error: a b.yml: wrong\n"
+    line = run_in_process(raising(UserError(f"a.yml: {'x' * 5000}; remove it"))).stderr
     assert line.startswith("error: a.yml: xxx") and line.endswith("xxx; remove it\n")
     assert " ... " in line and len(line) < 1000
 
@@ -113,10 +100,7 @@ def test_home_folders_are_expanded_or_refused(monkeypatch):
     ("words", "message"),
     [
         (["--size", "0"], "argument --size: must be a whole number >= 1, got 0"),
-        (
-            ["--size", "9" * 4000],
-            "argument --size: must be at most 4,096 (as large as anything is)",
-        ),
+        (["--size", "9" * 4000], "argument --size: must be at most 4,096 (as large as anything is"),
         (["--size", "1" * 20 + "x"], "argument --size: must be a whole number >= 1, got 111"),
         (["--sise", "a\nb"], "unrecognized arguments: --sise a b"),
     ],
@@ -127,9 +111,6 @@ def test_invalid_command_line_is_reported_in_one_line(words, message):
     assert outcome.stderr.startswith(f"error: {message}")
     assert outcome.stderr.endswith("; see some command --help\n")
     assert outcome.stderr.count("\n") == 1 and len(outcome.stderr) < 300
-
-
-# Ctrl-C
 
 
 @pytest.fixture
@@ -174,36 +155,32 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(tmp_path):
     assert signal.getsignal(signal.SIGTERM) == before and not list(tmp_path.iterdir())
 
 
-def ended_process(*lines):
-    """Status and standard error output of a process that does this within a command."""
-    program = "\n".join([
-        "import signal",
-        "from drgs.cli.ending import exit_on_interrupt, interruptible_imports",
-        "signal.signal(signal.SIGINT, signal.default_int_handler)",
-        "with exit_on_interrupt():",
-        *(f"    {line}" for line in lines),
-    ])  # fmt: skip
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    return ended.returncode, ended.stderr
-
-
-def test_interrupt_within_exec_ends_a_process_with_its_status():
-    """CPython would end by SIGINT then; dataclasses are made so, while modules are imported."""
-    act = "exec('signal.raise_signal(signal.SIGINT)')"
-    assert ended_process(act) == (130, "interrupted\n")
+IMPORT = "with interruptible_imports():\n        try: signal.raise_signal(signal.{})\n"
+IMPORT += "        except BaseException: pass"
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"), [("SIGINT", (130, "interrupted\n")), ("SIGTERM", (143, "terminated\n"))]
+    ("act", "expected"),
+    [
+        ("exec('signal.raise_signal(signal.SIGINT)')", (130, "interrupted\n")),
+        (IMPORT.format("SIGINT"), (130, "interrupted\n")),
+        (IMPORT.format("SIGTERM"), (143, "terminated\n")),
+    ],
+    ids=["exec", "import", "SIGTERM in an import"],
 )
-def test_signal_during_an_import_ends_a_process_at_once(name, expected):
-    """Modules may hide what is raised."""
-    lines = "with interruptible_imports():", "  try:", f"    signal.raise_signal(signal.{name})"
-    assert ended_process(*lines, "  except BaseException:", "    pass") == expected
+def test_signal_while_modules_are_imported_ends_a_process_with_its_status(act, expected):
+    """Modules may hide what is raised; CPython would end by SIGINT within ``exec``."""
+    program = (
+        "import signal\n"
+        "from drgs.cli.ending import exit_on_interrupt, interruptible_imports\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"with exit_on_interrupt():\n    {act}"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == expected
 
 
-def test_unexpected_errors_keep_their_tracebacks():
-    with pytest.raises(ZeroDivisionError), exit_on_interrupt():
-        print(1 / 0)
-    with pytest.raises(SystemExit, match="3"), exit_on_interrupt():
-        sys.exit(3)
+@pytest.mark.parametrize("error", [ZeroDivisionError(), SystemExit(3)])
+def test_unexpected_errors_keep_their_tracebacks(error):
+    with pytest.raises(type(error)):
+        raising(error)([])
