@@ -36,32 +36,11 @@ def test_the_command_writes_its_table_and_plot(small, tmp_path, capsys):
     for row in rows:
         for name in ("both_ms", "both_ratio", "operations"):
             assert float(row[name]) > 0, row
-        plain = row["effect"] == "none"
-        if plain:
-            assert row["operations_more"] == "0"
+        assert row["effect"] != "none" or row["operations_more"] == "0"
     assert Image.open(tmp_path / "effects.png").size[0] > 500
     printed = capsys.readouterr().out
     assert "150 Gaussians, 32x32" in printed
     assert printed.count("| --- |") >= 2 and str(tmp_path / "effects.csv") in printed
-
-
-def test_effects_add_operations_and_lower_degrees_take_some_away(small):
-    """Operations are those of the kernels of an image and its derivatives, the table's last
-    column."""
-    gaussians = scenes.bench_gaussians(150)
-    cases = {(c.effect, c.variant): c for c in effects.rendering_cases()}
-    plain = effects.operations(effects.CaseRenderer(cases["none", "none"], gaussians))
-    chosen = [
-        ("view dependence", "SH degree 0", False),
-        ("background", "environment", True),
-        ("lens", "distortion: k1 k2 p1 p2", True),
-        ("depth of field", "thin lens", True),
-        ("antialiasing", "3D smoothing filter", True),
-        ("camera refinement", "pose and focal lengths", True),
-    ]
-    for effect, name, adds in chosen:
-        count = effects.operations(effects.CaseRenderer(cases[effect, name], gaussians))
-        assert (count > plain) == adds and count != plain, (effect, name, count, plain)
 
 
 def test_every_case_renders_a_different_image(small):
@@ -91,8 +70,7 @@ def test_derivatives_do_not_add_up_over_rounds(small):
     found = []
     for _ in range(2):
         renderer.forward_and_backward()
-        gradients = [np.array(dr.grad(renderer.params[n])) for n in renderer.differentiated]
-        found.append([np.asarray(gradient) for gradient in gradients])
+        found.append([np.array(dr.grad(renderer.params[n])) for n in renderer.differentiated])
     for first, second in zip(*found, strict=True):
         np.testing.assert_array_equal(first, second)
     assert sum(first.any() for first in found[0]) >= 6

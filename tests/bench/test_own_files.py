@@ -23,20 +23,18 @@ def measurement(text):
     return measure
 
 
-def test_a_measurement_is_replaced_by_the_next(tmp_path):
-    measurement("first")(tmp_path / "out")
-    measurement("second")(tmp_path / "out")
-    assert (tmp_path / "out" / "it.csv").read_text() == "second"
-
-
-@pytest.mark.parametrize("written_before", [False, True], ids=["foreign", "edited"])
-def test_foreign_file_is_not_overwritten(tmp_path, written_before):
-    if written_before:
-        measurement("first")(tmp_path)
+def test_a_measurement_is_replaced_by_the_next_and_nothing_else(tmp_path):
     (tmp_path / "it.csv").write_text("mine")
     with pytest.raises(UserError, match=r"holds it\.csv"):
-        measurement("second")(tmp_path)
-    assert (tmp_path / "it.csv").read_text() == "mine"
+        measurement("first")(tmp_path)
+    path = tmp_path / "out" / "it.csv"
+    measurement("first")(path.parent)
+    measurement("second")(path.parent)
+    assert path.read_text() == "second"
+    path.write_text("edited")
+    with pytest.raises(UserError, match=r"holds it\.csv"):
+        measurement("third")(path.parent)
+    assert path.read_text() == "edited"
 
 
 @pytest.mark.parametrize("name", COMMANDS)
