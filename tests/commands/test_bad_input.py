@@ -140,7 +140,6 @@ WRONG_INPUTS = [
     (write(CONFIG, b"\xff"), "a.yml: cannot read the configuration: not UTF"),
     (write(CONFIG, b"a: ["), "a.yml: line 1: not valid YAML"),
     (write(CONFIG, b"a: &a [1,1]\nb: &b [*a,*a]\nc: &c [*b,*b]\n"), "a.yml: data is missing: "),
-    (settings(data={"path": "none"}), "data.path: there is no folder"),
     (settings(data={"path": "a.yml"}), "cannot open the folder"),
     (settings(data={"path": "data/train"}), "but no cameras: find out where"),
     (folder_in_place_of(TRANSFORMS), "_train.json: cannot read the file: Is a directory"),
@@ -167,10 +166,6 @@ WRONG_INPUTS = [
         "r_1.png: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's mode CMYK",
     ),
     (bent_lens_and_exact_projection, "of view r_1 (opencv: k1), got exact; or set data.ignore_"),
-    (
-        settings(cameras={"optimise": True}, model={"sh_direction": "pixel"}),
-        "a.yml: model.sh_direction must be mean where cameras.optimise is true",
-    ),
     (without(POINTS), "points.ply: cannot read"),
     (folder_in_place_of(POINTS), "points.ply: cannot read"),
     (cut(POINTS), "points.ply: not a valid PLY file: element vertex must have the 5 rows"),

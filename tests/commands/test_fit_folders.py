@@ -205,19 +205,6 @@ def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     assert found.init.point_cloud == tmp_path / "elsewhere" / "points.ply"
 
 
-@pytest.mark.slow
-def test_path_may_be_edited_by_hand(stopped, projects, tmp_path):
-    (stopped / "data").rename(tmp_path / "elsewhere")
-    path = stopped / "out" / "config.yml"
-    values = yaml.safe_load(path.read_text())
-    values["data"]["path"] = str(tmp_path / "elsewhere")
-    text = f"# moved to elsewhere\n{yaml.safe_dump(values)}"
-    path.write_text(text)
-    assert_fits("--resume", stopped / "out")
-    assert path.read_text() == text
-    assert_as_uninterrupted(stopped, projects)
-
-
 def test_finished_fit_stays_finished_without_its_data(ended, tmp_path):
     before = contents(ended)
     for options in ([], ["--data", tmp_path]):

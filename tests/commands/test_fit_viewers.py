@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from support.commands import assert_ends_well
 from support.fit_command import (
     VALUES,
-    assert_fit_refused,
     assert_fits,
     without_images,
     write_project,
@@ -18,10 +16,9 @@ from support.fit_command import (
 from support.folders import contents
 from support.render_command import run as render
 from support.small_capture import decibels
-from support.small_fits import disturbed_blobs, double, photograph, true_blobs
+from support.small_fits import double, photograph
 
 from drgs import fit
-from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
@@ -29,7 +26,6 @@ from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
 from drgs.results.folder import remove_run
 from drgs.training import session
-from drgs.training.fit_folder import gaussians_on_page
 
 FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 
@@ -114,31 +110,3 @@ def test_fit_with_viewer_approximations_writes_one_file(tmp_path, monkeypatch):
     assert "viewers" not in json.loads((tmp_path / "out" / METRICS).read_text())
     assert not {"drgs.training.viewers", "drgs.effects.smoothing"} & set(sys.modules)
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None
-
-
-@pytest.mark.slow
-def test_foreign_file_is_not_replaced(tmp_path, monkeypatch):
-    without_images(monkeypatch)
-    config, out = write_project(tmp_path), tmp_path / "out"
-    assert_fits(config, "--out", out)
-    Gaussians.load(out / GAUSSIANS).save(out / GAUSSIANS_FOR_VIEWERS)
-    words, message = (config, "--out", out, "--overwrite"), f"got {GAUSSIANS_FOR_VIEWERS}; move"
-    assert_fit_refused(*words, folder=out, message=message)
-
-
-@pytest.mark.parametrize(
-    ("approximations", "is_own"),
-    [({}, True), (FITTED_WITH, True), ({"order": "pixel", "low_pass": 0.1}, False)],
-)
-def test_page_shows_the_gaussians_of_the_fit_if_supported(approximations, is_own):
-    own, other = true_blobs(), disturbed_blobs()
-    found = gaussians_on_page(own, Approximations(**approximations), other)
-    assert found.gaussians is (own if is_own else other)
-    assert found.approximations == Approximations(**(approximations if is_own else {}))
-
-
-def test_page_shows_gaussians_with_the_filter_baked_in():
-    own = true_blobs()
-    own = replace(own, smoothing=np.full(own.num_gaussians, 0.2, np.float32))
-    found = gaussians_on_page(own, Approximations(), None).gaussians
-    assert found.smoothing is None and (found.scales > own.scales).all()
