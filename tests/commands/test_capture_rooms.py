@@ -10,7 +10,6 @@ from conftest import REPOSITORY
 from support.commands import assert_ends_well, assert_refused
 from support.render_command import write_scene
 
-from drgs import fit
 from drgs.capture import __main__ as capture
 from drgs.capture import dataset
 from drgs.capture.path_tracing import lit_part
@@ -79,18 +78,6 @@ def test_output_ends_with_the_command_to_fit_the_result(inside):
     assert (len(dataset.train), len(dataset.test)) == (10, 2)
     positions, _ = read_points(inside[1] / "points3d.ply")
     assert initial_gaussians(config, dataset).means.tolist() == positions.tolist()
-
-
-@pytest.mark.slow
-def test_a_fit_of_a_room_shows_the_room(cornell, tmp_path):
-    """On views that it has not seen; an image's mean colour alone is at 12 dB."""
-    larger = ["--views", 40, "--test-views", 8, "--size", 32, 32, "--spp", 64, "--points", 4000]
-    outcome = run(cornell, tmp_path / "room", *larger)
-    path, words = fitting_command(outcome)
-    few = ["--set", "iterations=400", "--out", tmp_path / "fit"]
-    assert_ends_well(fit.main, path, *words, *few)
-    metrics = json.loads((tmp_path / "fit" / "metrics.json").read_text())
-    assert metrics["test"]["psnr"] > 20
 
 
 @pytest.mark.parametrize(

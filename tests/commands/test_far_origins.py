@@ -23,14 +23,12 @@ from support.small_capture import (
 )
 from support.small_capture import view as small_view
 
-from drgs import export, view
-from drgs.cli.commands import CommandParser
+from drgs import export
 from drgs.core.errors import UserNote
 from drgs.datasets import load_dataset
 from drgs.datasets.viewpoints import read_viewpoints
 from drgs.gaussians.parameters import Gaussians
 from drgs.results.files import VIEWS
-from drgs.results.model import load_model
 from drgs.results.refined_cameras import write_views
 
 PLACE = np.array([4.2e6, 1.7e5, -4.78e6])
@@ -65,13 +63,10 @@ def test_cameras_are_written_in_world_coordinates_with_the_origin(far):
     np.testing.assert_allclose(centers, expected, rtol=0, atol=1e-6)
 
 
-def test_the_views_of_the_photographs_are_rendered(far, tmp_path):
+def test_cameras_of_files_and_by_hand_are_in_world_coordinates(far, tmp_path):
     run(far, "--out", tmp_path)
     for camera in make_dataset().test:
         assert_shows(tmp_path / f"{camera.name}.png", camera, WHITE)
-
-
-def test_cameras_of_a_file_and_by_hand_are_in_world_coordinates(far, tmp_path):
     run(far, "--camera", far / VIEWS, "--out", tmp_path / "file")
     for index, camera in enumerate(make_dataset().train):
         assert_shows(tmp_path / "file" / f"camera_{index}.png", camera, WHITE)
@@ -79,17 +74,7 @@ def test_cameras_of_a_file_and_by_hand_are_in_world_coordinates(far, tmp_path):
     place, target = (PLACE + point for point in (pose[:3, 3], FOCUS))
     hand = ["--fov", np.degrees(FIELD_OF_VIEW), "--size", WIDTH, HEIGHT, "--out", tmp_path / "hand"]
     run(far, "--origin", *place, "--target", *target, *hand)
-    camera = small_view("a", pose, np.zeros((1, 1, 3), np.float32))
-    assert_shows(tmp_path / "hand" / "camera.png", camera, WHITE)
-
-
-def test_the_page_starts_at_the_training_cameras(far):
-    parser, model = CommandParser(), load_model(far)
-    view.add_arguments(parser)
-    cameras = view.cameras_of(parser.parse_args([str(far)]), model)
-    for camera, expected in zip(cameras, make_dataset().train, strict=True):
-        center = camera.center + model.gaussians.origin
-        np.testing.assert_allclose(center, expected.center + PLACE, rtol=0, atol=1e-6)
+    assert_shows(tmp_path / "hand" / "camera.png", small_view("a", pose, None), WHITE)
 
 
 def test_exports_keep_the_origin_and_crop_in_world_coordinates(far, tmp_path):

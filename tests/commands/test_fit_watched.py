@@ -8,7 +8,6 @@ from types import ModuleType
 from unittest.mock import Mock
 
 import pytest
-import yaml
 from support.fit_command import (
     assert_fit_refused,
     assert_fits,
@@ -18,6 +17,7 @@ from support.fit_command import (
 )
 from support.small_capture import HEIGHT, WIDTH, pose_around
 
+from drgs.config.load import load_config
 from drgs.training import fit_folder
 from drgs.viewer import training_viewer
 from drgs.viewer.frames import FrameRequest, ViewerCamera
@@ -98,31 +98,24 @@ def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, viewer_
 
 
 @pytest.mark.slow
-def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page):
-    config, out = write_project(tmp_path), tmp_path / "out"
-    viewer_page(end_at=4)
-    outcome = assert_fits(config, "--out", out, "--view")
-    assert "5 iterations in" in outcome.stdout
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["iterations"] == metrics["config"]["iterations"] == 5
-    assert yaml.safe_load((out / "config.yml").read_text())["iterations"] == 5
-    assert not (out / "checkpoint.npz").exists()
-    assert "finished" in assert_fits("--resume", out).stdout
-    assert_fits(out / "config.yml", "--out", tmp_path / "again")
-    assert files_of(tmp_path / "again") == files_of(out)
-
-
-@pytest.mark.slow
-def test_fit_ended_early_and_killed_writes_its_results_on_resume(
-    tmp_path, viewer_page, monkeypatch
-):
+@pytest.mark.parametrize("killed", [False, True])
+def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page, monkeypatch, killed):
+    """Also if it is killed before its results are written, and resumed."""
     config, out = write_project(tmp_path), tmp_path / "out"
     viewer_page(end_at=4)
     with monkeypatch.context() as patch:
-        patch.setattr(fit_folder, "write_images", Mock(side_effect=KeyboardInterrupt))
-        assert run_fit(config, "--out", out, "--view").returncode == 130
-    assert_fits("--resume", out)
-    assert json.loads((out / "metrics.json").read_text())["iterations"] == 5
+        if killed:
+            patch.setattr(fit_folder, "write_images", Mock(side_effect=KeyboardInterrupt))
+        outcome = run_fit(config, "--out", out, "--view")
+        assert outcome.returncode == (130 if killed else 0)
+        assert ("5 iterations in" in outcome.stdout) != killed
+    assert ("finished" in assert_fits("--resume", out).stdout) != killed
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["iterations"] == metrics["config"]["iterations"] == 5
+    assert load_config(out / "config.yml").iterations == 5
+    assert not (out / "checkpoint.npz").exists()
+    assert_fits(out / "config.yml", "--out", tmp_path / "again")
+    assert files_of(tmp_path / "again") == files_of(out)
 
 
 @pytest.mark.parametrize(
