@@ -1,6 +1,7 @@
 """The measurements run, write what they say, and measure what they say."""
 
 import csv
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -95,3 +96,16 @@ def test_exponents_of_a_power_law_are_recovered():
     ]
     assert scaling.exponent(found, "milliseconds") == pytest.approx(1.5)
     assert scaling.exponent(found, "device_bytes") == pytest.approx(1)
+
+
+def test_entries_per_gaussian_stay_constant_as_their_number_grows():
+    """In the first sweep the film grows and the Gaussians shrink."""
+    ratios = []
+    for point in scaling.points(quick=True):
+        if point.sweep.startswith("constant"):
+            gaussians = scenes.bench_gaussians(point.count)
+            scales = gaussians.log_scales + np.float32(np.log(point.scale))
+            gaussians = replace(gaussians, log_scales=scales)
+            scene = scenes.Scene("", gaussians, scenes.bench_camera(point.size))
+            ratios.append(timing.count_work(scenes.frame_of(scene)).entries / point.count)
+    assert len(ratios) >= 2 and max(ratios) / min(ratios) < 1.1

@@ -108,11 +108,27 @@ def test_configuration_edited_before_the_first_checkpoint_is_kept(stopped):
     assert path.read_text() == text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["history.csv", "renders/test/mine.png"])
 def test_files_that_are_not_a_fits_are_not_removed(ended, name):
-    (ended / "out" / name).write_text("with remarks")
-    words = (ended / "a.yml", "--out", ended / "out", "--overwrite")
-    assert_fit_refused(*words, folder=ended, message=f"got {name}; move")
+    """Whether the fit has recorded its files or, as by earlier versions, not."""
+    out = ended / "out"
+    (out / name).write_text("with remarks")
+    words, message = (ended / "a.yml", "--out", out, "--overwrite"), f"got {name}; move"
+    assert_fit_refused(*words, folder=ended, message=message)
+    (out / ".drgs-fit.json").unlink()
+    if name == "history.csv":
+        assert_fits(*words)
+    else:
+        assert_fit_refused(*words, folder=ended, message=message)
+
+
+def test_existing_user_image_is_kept(stopped):
+    test = stopped / "out" / "renders" / "test"
+    test.mkdir(parents=True)
+    (test / "r_1.png").symlink_to(stopped / "data" / "test" / "r_1.png")
+    message = "out: holds renders/test/r_1.png, which this command would replace"
+    assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
 
 
 def test_record_of_a_finished_fit_lists_every_file(ended):
