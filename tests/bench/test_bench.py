@@ -1,6 +1,8 @@
-"""The measurements run, write what they say, and measure what they say."""
+"""The measurements run, write what they say and nothing else, and measure what they say."""
 
+import argparse
 import csv
+import importlib
 from dataclasses import replace
 
 import drjit as dr
@@ -13,6 +15,10 @@ from support.helpers import Case, clear, device_camera, device_gaussians
 
 from drgs.bench import __main__ as bench
 from drgs.bench import scaling, scenes, speed, stability, timing
+from drgs.bench.__main__ import COMMANDS
+from drgs.bench.output import add_out
+from drgs.cli.commands import CommandParser
+from drgs.core.errors import UserError
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -109,3 +115,41 @@ def test_entries_per_gaussian_stay_constant_as_their_number_grows():
             scene = scenes.Scene("", gaussians, scenes.bench_camera(point.size))
             ratios.append(timing.count_work(scenes.frame_of(scene)).entries / point.count)
     assert len(ratios) >= 2 and max(ratios) / min(ratios) < 1.1
+
+
+def measurement(text):
+    """``measure(folder)``, which writes ``text`` as ``it.csv``."""
+    parser = argparse.ArgumentParser()
+    add_out(parser, lambda args: (args.out / "it.csv").write_text(text), "it.csv")
+
+    def measure(folder):
+        args = parser.parse_args(["--out", str(folder)])
+        args.run(args)
+
+    return measure
+
+
+def test_a_measurement_is_replaced_by_the_next_and_nothing_else(tmp_path):
+    (tmp_path / "it.csv").write_text("mine")
+    with pytest.raises(UserError, match=r"holds it\.csv"):
+        measurement("first")(tmp_path)
+    path = tmp_path / "out" / "it.csv"
+    measurement("first")(path.parent)
+    measurement("second")(path.parent)
+    assert path.read_text() == "second"
+    path.write_text("edited")
+    with pytest.raises(UserError, match=r"holds it\.csv"):
+        measurement("third")(path.parent)
+    assert path.read_text() == "edited"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_existing_output_is_refused_before_measuring(name, tmp_path):
+    module = importlib.import_module(f"drgs.bench.{name}")
+    parser = CommandParser()
+    module.add_arguments(parser)
+    (tmp_path / f"{name}.csv").write_text("mine")
+    args = parser.parse_args(["--out", str(tmp_path)])
+    with pytest.raises(UserError, match=rf"holds .*{name}\.csv"):
+        args.run(args)
+    assert [p.name for p in tmp_path.iterdir()] == [f"{name}.csv"]

@@ -1,5 +1,9 @@
-"""``drgs.export``: fits and files for other programs."""
+"""``drgs.export``: fits and files for other programs, and pages of them."""
 
+import base64
+import gzip
+import json
+import re
 import sys
 from dataclasses import replace
 
@@ -44,12 +48,17 @@ def fit(tmp_path):
     """A folder as a fit leaves it, whose cameras are held with z up."""
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "config.yml").write_text("")
-    replace(gaussians_within_ranges(20), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
-    viewers = replace(gaussians_within_ranges(30), rendered_with=VIEWER_RENDERING)
+    configure(folder, FITTED_WITH)
+    replace(blobs(20), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
+    viewers = replace(blobs(30), rendered_with=VIEWER_RENDERING)
     viewers.save(folder / "point_cloud_viewers.ply")
     write_views(folder / "views.json", make_dataset(6, 1))
     return folder
+
+
+def configure(folder, model, **sections):
+    data = {"path": "photographs", "background": [0.25, 0.5, 0.75]}
+    (folder / "config.yml").write_text(yaml.safe_dump({"data": data, "model": model, **sections}))
 
 
 @pytest.mark.parametrize("each", readable_formats(), ids=lambda each: each.name)
@@ -96,8 +105,8 @@ def test_file_with_drgs_approximations_is_exported_with_a_hint(fit):
 def test_playcanvas_export_uses_the_file_with_the_nearer_low_pass(fit, low_pass, is_nearer):
     """Its viewers add 0.075 square pixels, and 0.1875 is in the middle to 0.3."""
     fitted = {"antialiased": True, "low_pass": low_pass}
-    replace(gaussians_within_ranges(20), rendered_with=fitted).save(fit / "point_cloud.ply")
-    (fit / "config.yml").write_text(yaml.safe_dump({"data": {"path": "data"}, "model": fitted}))
+    replace(blobs(20), rendered_with=fitted).save(fit / "point_cloud.ply")
+    configure(fit, fitted)
     outcome = run(fit, "--format", "compressed-ply")
     name = "point_cloud.ply: 20" if is_nearer else "point_cloud_viewers.ply: 30"
     assert outcome.stdout.splitlines()[0] == f"{fit}/{name} Gaussians"
@@ -224,8 +233,7 @@ def test_up_direction_uses_refined_cameras(fit, optimise):
     dataset = make_dataset(6, 1)
     views = [replace(v, camera_to_world=turn @ v.camera_to_world) for v in dataset.train]
     write_views(fit / "cameras.json", replace(dataset, train=views))
-    config = {"data": {"path": "data"}, "cameras": {"optimise": optimise}}
-    (fit / "config.yml").write_text(yaml.safe_dump(config))
+    configure(fit, FITTED_WITH, cameras={"optimise": optimise})
     outcome = run(fit, "--format", "glb", "--up", "cameras")
     up = "0 -1 0" if optimise else "0 0 1"
     assert f"up: {up} (the training cameras')" in outcome.stdout
@@ -266,3 +274,39 @@ def test_foreign_file_is_kept_and_own_file_is_replaced(model):
     first = out.read_bytes()
     run(model, "--format", "spz", "--min-opacity", 0.5)
     assert out.read_bytes() != first
+
+
+def exported(what, out, *options):
+    """Return the command's output, the page's scene and its Gaussians."""
+    outcome = assert_ends_well(export.main, what, "--out", out, *options)
+    page = out.read_text("utf-8")
+    scene, splats = (re.search(rf'id="{name}">([^<]*)<', page)[1] for name in ("scene", "splats"))
+    model = out.with_suffix(".ply")
+    model.write_bytes(gzip.decompress(base64.b64decode(splats)))
+    return outcome.stdout, page, json.loads(scene), Gaussians.load(model)
+
+
+@pytest.mark.parametrize("order", ["center", "pixel"])
+def test_page_of_a_fit_shows_its_own_gaussians_if_the_page_supports_them(fit, tmp_path, order):
+    configure(fit, {**FITTED_WITH, "order": order})
+    said, page, scene, gaussians = exported(fit, tmp_path / "a.html")
+    is_own = order == "center"
+    name, count = ("point_cloud.ply", 20) if is_own else ("point_cloud_viewers.ply", 30)
+    assert said.splitlines()[0] == f"{fit}/{name}: {count} Gaussians"
+    assert "note" not in said and gaussians.num_gaussians == count
+    expected = (0.1, True) if is_own else (0.3, False)
+    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(expected[0]), expected[1])
+    assert scene["settings"]["background"]["color"] == [0.25, 0.5, 0.75]
+    assert "<title>run: Gaussian splats</title>" in page
+
+
+@pytest.mark.parametrize("options", [(), ("--up", 0, 0, 1)])
+def test_file_is_shown_as_a_whole_with_z_up(fit, tmp_path, options):
+    what = fit / "point_cloud.ply" if not options else fit
+    _, _, scene, gaussians = exported(what, tmp_path / "a.html", *options)
+    heights = np.sort(-gaussians.means[:, 1])
+    expected = np.sort(blobs(20).means[:, 2])
+    correlation = np.corrcoef(heights, expected)[0, 1]
+    assert correlation > 0.9999  # rounded to 10 bits
+    black = scene["settings"]["background"]["color"] == [0, 0, 0]
+    assert black == (not options)

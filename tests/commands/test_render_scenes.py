@@ -91,20 +91,6 @@ def test_scene_without_splats_is_rendered(tmp_path):
     assert rendered(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
 
 
-def test_ellipsoids_match_the_same_file_loaded_by_the_integrator(tmp_path):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    run(path, "--out", tmp_path / "file")
-    name = '<string name="filename" value="model.ply"/>'
-    text = path.read_text()
-    assert name in text
-    shape = f'<shape type="ellipsoids">{name}</shape>'
-    path.write_text(text.replace(name, "").replace("</scene>", f"{shape}</scene>"))
-    run(path, "--out", tmp_path / "shape")
-    pair = (np.array(read_exr(tmp_path / d / "blobs.exr")) for d in ("file", "shape"))
-    # float32's exp, log and sigmoid: 1e-7 each, as in tests/integrator/test_ellipsoids.py.
-    np.testing.assert_allclose(*pair, atol=1e-5)
-
-
 def test_parameters_of_a_scene_file_can_be_given(tmp_path):
     path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
     run(path, "--out", tmp_path / "written")
