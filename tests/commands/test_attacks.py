@@ -12,7 +12,7 @@ from support.attacks.catalogue import KNOWN_FAILURES, attacks, some
 from support.attacks.server import Server
 
 COUNTS = {
-    "schema": 570,
+    "schema": 810,
     "option": 1020,
     "instead": 360,
     "damaged": 390,

@@ -3,7 +3,6 @@
 Each mutation is made by a generator with its own seed, which a failure prints.
 """
 
-import io
 import json
 import time
 
@@ -11,9 +10,10 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import yaml
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from support.attacks.mutations import mutate_bytes, mutate_chunks, mutate_header, mutate_tree
 from support.colmap_models import Model, write_binary
+from support.small_capture import blobs
 
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import DataConfig, FitConfig
@@ -50,21 +50,6 @@ def folder(photographs):
     return photographs
 
 
-def gaussians_file(text):
-    """Bytes of a PLY of three degree-0 Gaussians with colours, and a face."""
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]
-    names += ["scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    rows = np.zeros(3, [(n, "f4") for n in names] + [(n, "u1") for n in ("red", "green", "blue")])
-    for i, name in enumerate(names):
-        rows[name] = 0.1 * i
-    faces = np.zeros(1, [("vertex_indices", object)])
-    faces["vertex_indices"][0] = np.arange(3, dtype=np.int32)
-    stream = io.BytesIO()
-    elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(faces, "face")]
-    PlyData(elements, text=text, byte_order="<").write(stream)
-    return stream.getvalue()
-
-
 def is_refused(seed, file, read):
     """Whether ``file`` is not read; an error must be the user's, name the file, and fill a line."""
     started, refused = time.process_time(), False
@@ -99,11 +84,19 @@ def check(files, mutate, read, least=0.3):
 
 @pytest.mark.parametrize("read", [Gaussians.load, read_points])
 def test_damaged_ply_files_are_read_or_refused(tmp_path, read):
+    path, contents = tmp_path / "a.ply", []
+    for text in (False, True):
+        blobs(3).save(path)
+        data = PlyData.read(str(path), mmap=False)
+        data.text = text
+        data.write(str(path))
+        contents.append(path.read_bytes())
+
     def mutate(rng, seed):
         change = mutate_header if seed % 2 else mutate_bytes
-        return change(rng, gaussians_file(text=seed % 3 == 0))
+        return change(rng, contents[seed % 3 == 0])
 
-    check([tmp_path / "a.ply"], mutate, read)
+    check([path], mutate, read)
 
 
 def test_damaged_transforms_files_are_read_or_refused(folder):

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from drgs import render
 from drgs.config.load import load_config
 from drgs.core.folders import sole_writer
 from drgs.results.folder import continue_run
-from drgs.training import session
 
 POINTS = "out/point_cloud.ply"
 
@@ -149,20 +147,6 @@ def test_folder_in_use_by_another_fit_is_refused(stopped):
         for words in (same, ("--resume", out), (*same, "--overwrite")):
             assert_fit_refused(*words, folder=stopped, message=MESSAGE)
     assert_fits("--resume", out)
-
-
-def test_second_of_two_simultaneous_fits_is_refused(tmp_path, monkeypatch):
-    """The first makes the folder while the second reads its data."""
-    out, load_dataset = tmp_path / "out", session.load_dataset
-    with ExitStack() as first:
-
-        def load(config, **others):
-            first.enter_context(sole_writer(out))()
-            return load_dataset(config, **others)
-
-        monkeypatch.setattr(session, "load_dataset", load)
-        config = write_project(tmp_path)
-        assert_fit_refused(config, "--out", out, folder=tmp_path, message=MESSAGE)
 
 
 def replace_an_image(data):

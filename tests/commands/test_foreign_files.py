@@ -1,7 +1,5 @@
 """No command replaces a file that it did not write: refused in one line, with nothing changed."""
 
-import json
-
 import pytest
 import yaml
 from support.commands import assert_ends_well, assert_refused, run_in_process
@@ -119,11 +117,3 @@ def test_images_of_an_interrupted_command_are_replaced(fitted, tmp_path, monkeyp
     (out / "r_0.png").write_bytes(rendered)
     assert_ends_well(render.main, fitted, "--out", out)
     assert contents(out) == contents(expected)
-
-
-def test_the_record_of_a_finished_command_names_every_file(fitted, tmp_path):
-    out = tmp_path / "out"
-    assert_ends_well(render.main, fitted, *VIEWS["orbit"], "--out", out)
-    files = json.loads((out / ".drgs-render.json").read_text())["files"]
-    assert set(files) == set(contents(out)) - {".drgs-render.json"}
-    assert all(files.values())

@@ -5,7 +5,7 @@ import json
 import os
 import signal
 import warnings
-from dataclasses import dataclass
+from dataclasses import make_dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -118,18 +118,14 @@ def test_cloud_of_coinciding_and_distant_points_is_fitted(scene, monkeypatch):
     assert outcome.stderr == ""
 
 
-@dataclass(frozen=True)
-class Planned:
-    config: FitConfig
-    end: float = 0.0
+Planned = make_dataclass("Planned", [("config", FitConfig), ("end", float, 0.0)])
 
 
 @pytest.fixture
 def planned(monkeypatch):
     """When iterations end, and for which configuration, by a clock that says 0."""
-    monkeypatch.setattr(
-        budget, "seconds_of_results", lambda *_: Seconds(6.0, renders=1.0, report=1.0)
-    )
+    seconds = Seconds(6.0, renders=1.0, report=1.0)
+    monkeypatch.setattr(budget, "seconds_of_results", lambda *_: seconds)
     monkeypatch.setattr(budget, "seconds_of_curves", lambda: 2.0)
     monkeypatch.setattr(budget, "make_plan", lambda config, *_: Planned(config))
     monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=lambda: 0.0))
