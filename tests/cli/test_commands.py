@@ -1,14 +1,193 @@
-"""``drgs COMMAND``: what is called by which words, and what a wrong word is told."""
+"""How commands are called, and how they end: one line, and no traceback of Ctrl-C."""
 
 import argparse
+import io
+import os
+import signal
+import subprocess
+import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 from support.commands import run_in_process
 
 from drgs import __main__ as commands
 from drgs import fit
 from drgs.bench import __main__ as bench
-from drgs.cli.commands import CommandParser, bounded_int, finite_number
+from drgs.cli.commands import CommandParser, bounded_int, file_or_folder, finite_number, run_command
+from drgs.cli.ending import escape_unencodable
+from drgs.core.errors import UserError, UserNote
+from drgs.core.files import atomic_path
+from drgs.io.images import image_size, write_png
+
+
+def command(act):
+    """``main`` of a command that does nothing else."""
+
+    def add_arguments(parser):
+        parser.add_argument("--size", type=bounded_int(1, 4096, "as large as anything is"))
+        parser.set_defaults(run=lambda args: act())
+
+    return lambda words: run_command(add_arguments, "some command", words)
+
+
+def raising(error):
+    """``main`` of a command that raises."""
+
+    def act():
+        raise error
+
+    return command(act)
+
+
+@pytest.mark.parametrize("name", ["f\u00fc\u4e2d", os.fsdecode(b"\xff")], ids=["UTF-8", "other"])
+def test_names_are_printed_in_any_encoding(name):
+    def act():
+        print(f"written: {name}")
+        raise UserError(f"{name}: wrong")
+
+    # As PYTHONIOENCODING=ascii makes them.
+    out, err = (io.TextIOWrapper(io.BytesIO(), "ascii") for _ in range(2))
+    with redirect_stdout(out), redirect_stderr(err):
+        with pytest.raises(SystemExit, match="2"):
+            command(act)([])
+        out.flush()
+        err.flush()
+    escaped = name.encode("ascii", "backslashreplace")
+    assert out.buffer.getvalue() == b"written: " + escaped + b"\n"
+    assert err.buffer.getvalue() == b"error: " + escaped + b": wrong\n"
+    assert out.errors == "strict"  # as before
+    with redirect_stdout(out), redirect_stderr(err), escape_unencodable():
+        out.close()  # which is left alone
+
+
+def test_user_note_is_printed_as_a_line():
+    outcome = run_in_process(
+        command(lambda: warnings.warn(UserNote("a.ply: clamped"), stacklevel=1))
+    )
+    assert (outcome.returncode, outcome.stdout) == (0, "note: a.ply: clamped\n")
+    assert outcome.stderr == ""
+
+
+def test_pillow_warnings_are_not_printed(tmp_path, monkeypatch):
+    """Pillow warns of large images that are not too large for drgs."""
+    write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
+    with pytest.warns(Image.DecompressionBombWarning):
+        image_size(tmp_path / "a.png")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        outcome = run_in_process(command(lambda: image_size(tmp_path / "a.png")))
+    assert (outcome.returncode, outcome.stderr, caught) == (0, "", [])
+
+
+def test_errors_are_printed_on_one_line_and_shortened_in_the_middle():
+    assert run_in_process(raising(UserError("a\nb.yml: wrong"))).stderr == "error: a b.yml: wrong\n"
+    line = run_in_process(raising(UserError(f"a.yml: {'x' * 5000}; remove it"))).stderr
+    assert line.startswith("error: a.yml: xxx") and line.endswith("xxx; remove it\n")
+    assert " ... " in line and len(line) < 1000
+
+
+def test_home_folders_are_expanded_or_refused(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert file_or_folder("~/out") == Path("/home/somebody/out")
+    with pytest.raises(argparse.ArgumentTypeError, match=r"home directory.*: ~no-such-user/out"):
+        file_or_folder("~no-such-user/out")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--size", "0"], "argument --size: must be a whole number >= 1, got 0"),
+        (["--size", "9" * 4000], "argument --size: must be at most 4,096 (as large as anything is"),
+        (["--size", "1" * 20 + "x"], "argument --size: must be a whole number >= 1, got 111"),
+        (["--sise", "a\nb"], "unrecognized arguments: --sise a b"),
+    ],
+)
+def test_invalid_command_line_is_reported_in_one_line(words, message):
+    outcome = run_in_process(command(lambda: None), *words)
+    assert outcome.returncode == 2 and outcome.stdout == ""
+    assert outcome.stderr.startswith(f"error: {message}")
+    assert outcome.stderr.endswith("; see some command --help\n")
+    assert outcome.stderr.count("\n") == 1 and len(outcome.stderr) < 300
+
+
+@pytest.fixture
+def sigint_handler_is_restored():
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupted():
+    signal.raise_signal(signal.SIGINT)
+
+
+def raise_interrupt_in_a_callback():
+    """Raise as Dr.Jit does, whose own error hides the exception raised within it."""
+    try:
+        interrupted()
+    except KeyboardInterrupt as cause:
+        raise RuntimeError("drjit.backward(): failed (see above)") from cause
+
+
+@pytest.mark.usefixtures("sigint_handler_is_restored")
+@pytest.mark.parametrize("act", [interrupted, raise_interrupt_in_a_callback])
+def test_an_interrupt_ends_a_command_without_a_traceback(act):
+    outcome = run_in_process(command(act))
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL  # what comes now ends it at once
+
+
+@pytest.mark.usefixtures("sigint_handler_is_restored")
+def test_sigterm_ends_a_command_as_ctrl_c_does(tmp_path):
+    """Files that it was writing are removed. Afterwards the signal is what it was."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    def act():
+        with atomic_path(tmp_path / "a.png") as temporary:
+            temporary.touch()
+            signal.raise_signal(signal.SIGTERM)
+
+    outcome = run_in_process(command(act))
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (143, "", "terminated\n")
+    assert signal.getsignal(signal.SIGTERM) == before and not list(tmp_path.iterdir())
+
+
+IMPORT = "with interruptible_imports():\n        try: signal.raise_signal(signal.{})\n"
+IMPORT += "        except BaseException: pass"
+
+
+@pytest.mark.parametrize(
+    ("act", "expected"),
+    [
+        ("exec('signal.raise_signal(signal.SIGINT)')", (130, "interrupted\n")),
+        (IMPORT.format("SIGINT"), (130, "interrupted\n")),
+        (IMPORT.format("SIGTERM"), (143, "terminated\n")),
+    ],
+    ids=["exec", "import", "SIGTERM in an import"],
+)
+def test_signal_while_modules_are_imported_ends_a_process_with_its_status(act, expected):
+    """Modules may hide what is raised; CPython would end by SIGINT within ``exec``."""
+    program = (
+        "import signal\n"
+        "from drgs.cli.ending import exit_on_interrupt, interruptible_imports\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"with exit_on_interrupt():\n    {act}"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == expected
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError(), SystemExit(3)])
+def test_unexpected_errors_keep_their_tracebacks(error):
+    with pytest.raises(type(error)):
+        raising(error)([])
+
 
 NAMES = [*commands.COMMANDS, *(f"bench {name}" for name in bench.COMMANDS)]
 

@@ -57,16 +57,6 @@ def test_a_fit_is_rendered_from_its_test_views_and_measured(fit, tmp_path, capsy
     assert (metrics["split"], metrics["num_views"], metrics["num_gaussians"]) == ("test", 4, 30)
 
 
-def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
-    run(fit, "--split", "train", "--out", tmp_path / "fit")
-    ply = fit / "point_cloud.ply"
-    run(ply, "--scene", fit / "config.yml", "--split", "train", "--out", tmp_path / "ply")
-    names = visible(tmp_path / "fit")
-    assert names == {"metrics.json", *(f"r_{i}.png" for i in range(8))}
-    for name in names:
-        assert (tmp_path / "fit" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("optimised", [True, False])
 def test_refined_cameras_are_used_or_mentioned(tmp_path, capsys, optimised):

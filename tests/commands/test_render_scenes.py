@@ -60,20 +60,6 @@ def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
     assert_images_agree(exr, expected.image, expected, 1e-4)
 
 
-def test_a_scene_in_display_space_inside_aov_is_not_encoded_again(tmp_path):
-    """Both files have what the rays of ``aov`` see, at points of its own."""
-    settings = '<boolean name="srgb_primitives" value="false"/>'
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), settings=settings)
-    begin, end = '<integrator type="splats">', "</integrator>"
-    aov = '<integrator type="aov"><string name="aovs" value="d:depth"/>'
-    path.write_text(path.read_text().replace(begin, aov + begin).replace(end, end + end))
-    run(path, "--out", tmp_path / "out")
-    root = read_exr(tmp_path / "out" / "blobs.exr").split()[0][1]
-    colors = np.clip(np.array(root.convert(mi.Bitmap.PixelFormat.RGB)), 0, 1)
-    assert np.abs(rendered(tmp_path / "out" / "blobs.png") - colors).max() <= EIGHT_BITS
-    assert np.abs(to_srgb(colors) - colors).max() > 0.1
-
-
 def test_every_sensor_of_a_scene_is_rendered(tmp_path):
     sensors = sensor(pose_around(0.8, 0.3)), sensor(pose_around(2.0, 0.3), "rgba")
     run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")

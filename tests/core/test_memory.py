@@ -6,9 +6,7 @@ import sys
 from types import SimpleNamespace
 
 import drjit as dr
-import numpy as np
 import pytest
-from drjit.llvm.ad import Float
 
 from drgs.core import memory
 from drgs.core.errors import UserError
@@ -134,23 +132,3 @@ def test_drjit_malloc_cache_counts_as_available(monkeypatch):
     for _ in range(2):
         assert memory.too_large_reason(3000, 3000) is None
         assert len(rooms) == 2
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="glibc's malloc_trim")
-def test_unused_memory_is_returned_to_the_system():
-    """Below a block that is used, glibc keeps what was freed; Dr.Jit keeps all of its arrays.
-
-    Of blocks there are 128 MB, of arrays 116 MB or, with Dr.Jit's powers of two, 122.
-    """
-    blocks = [np.ones(8_000) for _ in range(2_000)]
-    arrays = [dr.full(Float, i, 1_000_000) for i in range(30)]
-    dr.make_opaque(arrays)
-    dr.sync_thread()
-    with_all = memory.resident_memory()
-    blocks, arrays = blocks[-1:], arrays[-1:]
-    dr.flush_malloc_cache()
-    with_blocks = memory.resident_memory()
-    assert with_blocks < with_all - 100e6
-    memory.release_unused_memory()
-    assert memory.resident_memory() < with_blocks - 100e6
-    assert blocks[0][0] == 1 and arrays[0][0] == 29
