@@ -16,8 +16,6 @@ from support.helpers import reference_gaussians
 from drgs.bench import __main__ as bench
 from drgs.bench import accuracy
 from drgs.bench.scenes import bench_camera, bench_gaussians
-from drgs.config.load import dump_config
-from drgs.config.schema import FitConfig
 from drgs.datasets.types import View
 from drgs.reference import rays as reference_rays
 from drgs.results import metrics
@@ -145,7 +143,7 @@ def test_measurement_includes_the_smoothing_filter(tmp_path, subject):
 @pytest.mark.parametrize("has", ["lens distortion", "motion"])
 def test_views_other_than_static_pinholes_are_refused(tmp_path, has):
     """A fit's folder is refused; its Gaussians can be measured alone."""
-    small_capture.write_dataset(tmp_path / "data", small_capture.make_dataset(2, 1))
+    fit = small_capture.write_fit(tmp_path, small_capture.make_dataset(2, 1))
     path = tmp_path / "data" / "transforms_test.json"
     transforms = json.loads(path.read_text())
     if has == "motion":
@@ -156,9 +154,6 @@ def test_views_other_than_static_pinholes_are_refused(tmp_path, has):
     else:
         transforms["k1"] = 0.1
     path.write_text(json.dumps(transforms))
-    fit = tmp_path / "fit"
-    dump_config(FitConfig(data={"path": str(tmp_path / "data")}), fit / "config.yml")
-    bench_gaussians(10).save(fit / "point_cloud.ply")
     message = f"has {has}, expected pinhole cameras at rest"
     line = assert_refused(bench.main, "accuracy", fit, folder=tmp_path, message=message)
     assert f"give {fit / 'point_cloud.ply'} instead" in line

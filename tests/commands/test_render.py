@@ -26,6 +26,7 @@ from support.small_capture import (
     make_dataset,
     pose_around,
     write_dataset,
+    write_fit,
 )
 from support.small_capture import view as small_view
 
@@ -61,12 +62,9 @@ def test_a_fit_is_rendered_from_its_test_views_and_measured(fit, tmp_path, capsy
 @pytest.mark.parametrize("optimised", [True, False])
 def test_refined_cameras_are_used_or_mentioned(tmp_path, capsys, optimised):
     """Whether the fit's folder or its PLY file is named, as its configuration says."""
-    dataset, found = make_dataset(2, 1), tmp_path / "run"
+    dataset = make_dataset(2, 1)
+    found = write_fit(tmp_path, dataset, cameras={"optimise": optimised})
     path = found / "cameras.json"
-    write_dataset(tmp_path / "data", dataset)
-    blobs().save(found / "point_cloud.ply")
-    config = {"data": {"path": str(tmp_path / "data")}, "cameras": {"optimise": optimised}}
-    (found / "config.yml").write_text(yaml.safe_dump(config))
     refined = [replace(v, camera_to_world=pose_around(1.4, 0.6)) for v in dataset.train]
     write_views(path, replace(dataset, train=refined))
     path.write_text(json.dumps(json.loads(path.read_text()) | {"lens_change": {}}))
@@ -91,14 +89,12 @@ def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
 
 def test_depths_are_not_opened(tmp_path):
     """There are none: nothing that is rendered looks at them."""
-    write_dataset(tmp_path / "data", make_dataset(1, 1))
+    fit = write_fit(tmp_path, make_dataset(1, 1))
     for path in (tmp_path / "data").glob("transforms_*.json"):
         values = json.loads(path.read_text())
         values["frames"][0]["depth_file_path"] = "nowhere.png"
         path.write_text(json.dumps(values))
-    blobs().save(tmp_path / "blobs.ply")
-    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
-    run(tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", "--out", tmp_path / "out")
+    run(fit, "--out", tmp_path / "out")
     assert (tmp_path / "out" / "r_0.png").is_file()
 
 

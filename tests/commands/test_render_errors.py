@@ -5,7 +5,6 @@ import os
 from dataclasses import replace
 
 import pytest
-import yaml
 from PIL import Image
 from support.commands import assert_ends_well, assert_refused, run_in_process
 from support.folders import contents, visible
@@ -16,7 +15,7 @@ from support.small_capture import (
     blobs,
     make_dataset,
     pose_around,
-    write_dataset,
+    write_fit,
 )
 
 from drgs import fit as fit_command
@@ -98,13 +97,10 @@ def test_wrong_words_are_refused(fit, tmp_path, words, message):
 @pytest.mark.parametrize("mode", ["--camera", "--split"])
 def test_exact_projection_with_distortion_is_refused(tmp_path, mode):
     """Without the distortion it is rendered."""
-    write_dataset(tmp_path / "data", make_dataset(1, 1))
-    blobs().save(tmp_path / "blobs.ply")
-    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
+    fit = write_fit(tmp_path, make_dataset(1, 1))
     path = tmp_path / "data" / "transforms_test.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"k1": 0.1}))
-    words = [tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml"]
-    words += ["--set", "model.projection=exact", mode]
+    words = [fit, "--set", "model.projection=exact", mode]
     words += ["test"] if mode == "--split" else [path, "--size", WIDTH, HEIGHT]
     message = (
         "model.projection must be ewa or unscented for lenses that are no pinholes, such as that "
@@ -263,12 +259,7 @@ def test_a_wrong_header_is_refused(tmp_path):
 
 @pytest.fixture
 def fitted(tmp_path):
-    """A folder as a fit leaves it, with its dataset beside it."""
-    write_dataset(tmp_path / "data", make_dataset(2, 2))
-    blobs().save(tmp_path / "run" / "point_cloud.ply")
-    config = {"data": {"path": str(tmp_path / "data")}}
-    (tmp_path / "run" / "config.yml").write_text(yaml.safe_dump(config))
-    return tmp_path / "run"
+    return write_fit(tmp_path, make_dataset(2, 2))
 
 
 def assert_kept(fitted, *words, message):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+import yaml
 
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -109,6 +110,15 @@ def write_dataset(folder: Path, dataset: Dataset, alpha: float = 0.5) -> None:
             frames.append({"file_path": f"./{split}/{v.name}", "transform_matrix": opengl.tolist()})
         transforms = {"camera_angle_x": FIELD_OF_VIEW, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(transforms))
+
+
+def write_fit(folder: Path, dataset: Dataset, **sections: object) -> Path:
+    """``data/``, and ``run/`` as a fit leaves it, with other sections of its configuration."""
+    write_dataset(folder / "data", dataset)
+    blobs().save(folder / "run" / "point_cloud.ply")
+    config = {"data": {"path": str(folder / "data")}, **sections}
+    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    return folder / "run"
 
 
 def decibels(image, target) -> float:
