@@ -1,4 +1,4 @@
-"""What a fit leaves with ``--view``, and its Gaussians for viewers that render otherwise.
+"""Results of a fit with ``--view``, and Gaussians for viewers that render otherwise.
 
 The page itself is tested in ``tests/viewer``.
 """

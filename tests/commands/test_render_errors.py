@@ -1,4 +1,4 @@
-"""What ``python -m drgs.render`` cannot show, hold or write: one line, and no file is replaced."""
+"""Refusals of ``python -m drgs.render``: one line, nothing is written, and no file replaced."""
 
 import json
 import os
