@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from support import small_capture
+from support.commands import assert_refused
 from support.helpers import reference_gaussians
 
 from drgs.bench import __main__ as bench
 from drgs.bench import accuracy
-from drgs.bench.scenes import bench_camera, bench_gaussians, stress_scene
-from drgs.config.load import dump_config
-from drgs.config.schema import FitConfig
+from drgs.bench.scenes import bench_camera, bench_gaussians
 from drgs.datasets.types import View
 from drgs.reference import rays as reference_rays
 from drgs.results import metrics
@@ -57,11 +56,10 @@ def test_each_rung_comes_closer_to_the_most_accurate_image(subject):
 
 
 def test_most_accurate_image_is_close_to_one_without_cuts(subject):
-    accurate = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
-    # Three hundred alphas of less than a millionth.
-    assert 0 < accuracy.check_on_crops(subject, accurate) < 3e-4
-    rough = accuracy.most_accurate(subject, subject.cameras[0], 1e-2)
-    assert accuracy.check_on_crops(subject, rough) > 1e-3
+    for min_alpha, low, high in ((accuracy.MIN_ALPHA, 0, 3e-4), (1e-2, 1e-3, 1)):
+        image = accuracy.most_accurate(subject, subject.cameras[0], min_alpha)
+        # The first: three hundred alphas of less than a millionth.
+        assert low < accuracy.check_on_crops(subject, image) < high
 
 
 def test_measurement_matches_its_columns(subject):
@@ -83,9 +81,9 @@ def test_measurement_matches_its_columns(subject):
     assert 1000 < default.operations < sampled.operations
 
 
-def measurement(name, milliseconds, psnr, is_approximation=True):
+def measurement(name, ms, psnr, is_approximation=True):
     return accuracy.AccuracyMeasurement(
-        "scene", name, is_approximation, milliseconds, 2 * milliseconds, 1, psnr, 0.9, 0.1, None
+        "scene", name, is_approximation, ms, 2 * ms, 1, psnr, 0.9, 0.1, None
     )
 
 
@@ -96,25 +94,6 @@ def test_pareto_front_contains_undominated_measurements():
     text = accuracy.table([a, b, c, d, other])
     assert "| a * | 1 ms, 1.00x | 2 ms, 1.00x | 1 | 30.0 dB |" in text
     assert "| c | 3 ms" in text and "| (other) | 0 ms" in text
-
-
-def test_stress_scene_has_crossing_layers_and_large_near_splats():
-    """Its layers cross in the middle of the image, and splats are large and near."""
-    gaussians, (camera,) = stress_scene(64)
-    assert 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) == pytest.approx(110, abs=1e-3)
-    first, second = gaussians.means[:700], gaussians.means[700:1400]
-    for layer, sign in ((first, 1), (second, -1)):
-        x, _, z = layer.T
-        np.testing.assert_allclose(z - 3, sign * np.tan(0.7) * x, rtol=1e-4, atol=1e-5)
-    thin = np.exp(gaussians.log_scales[:1400])
-    assert (thin[:, 2] < 0.05 * thin[:, 0]).all()
-    normals = accuracy.reference.quat_to_rotation(gaussians.quats[:1400])[:, :, 2]
-    # Across their planes, whose directions are (cos, 0, +-sin).
-    for rows, sign in ((slice(0, 700), 1), (slice(700, 1400), -1)):
-        along = [np.cos(0.7), 0, sign * np.sin(0.7)]
-        assert np.abs(normals[rows] @ along).max() < 1e-6
-    near = gaussians.means[1400:1460]
-    assert (near[:, 2] < 3).all() and np.exp(gaussians.log_scales[1400:1460]).min() > 0.05
 
 
 @pytest.mark.slow
@@ -162,10 +141,9 @@ def test_measurement_includes_the_smoothing_filter(tmp_path, subject):
 
 
 @pytest.mark.parametrize("has", ["lens distortion", "motion"])
-def test_views_other_than_static_pinholes_are_refused(tmp_path, capsys, has):
+def test_views_other_than_static_pinholes_are_refused(tmp_path, has):
     """A fit's folder is refused; its Gaussians can be measured alone."""
-    dataset = small_capture.make_dataset(2, 1)
-    small_capture.write_dataset(tmp_path / "data", dataset)
+    fit = small_capture.write_fit(tmp_path, small_capture.make_dataset(2, 1))
     path = tmp_path / "data" / "transforms_test.json"
     transforms = json.loads(path.read_text())
     if has == "motion":
@@ -176,20 +154,8 @@ def test_views_other_than_static_pinholes_are_refused(tmp_path, capsys, has):
     else:
         transforms["k1"] = 0.1
     path.write_text(json.dumps(transforms))
-    fit = tmp_path / "fit"
-    fit.mkdir()
-    bench_gaussians(10).save(fit / "point_cloud.ply")
-    dump_config(FitConfig(data={"path": str(tmp_path / "data")}), fit / "config.yml")
-    with pytest.raises(SystemExit) as stop:
-        bench.main(["accuracy", str(fit)])
-    assert stop.value.code == 2
-    message = capsys.readouterr().err
-    assert f"has {has}, expected pinhole cameras at rest" in message
-    assert f"give {fit / 'point_cloud.ply'} instead" in message
-
-
-def test_a_folder_without_a_fit_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        bench.main(["accuracy", str(tmp_path)])
-    assert stop.value.code == 2
-    assert "must be the folder of a finished fit" in capsys.readouterr().err
+    message = f"has {has}, expected pinhole cameras at rest"
+    line = assert_refused(bench.main, "accuracy", fit, folder=tmp_path, message=message)
+    assert f"give {fit / 'point_cloud.ply'} instead" in line
+    message = "must be the folder of a finished fit"
+    assert_refused(bench.main, "accuracy", tmp_path, folder=tmp_path, message=message)

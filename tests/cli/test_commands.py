@@ -1,73 +1,233 @@
-"""``drgs COMMAND``: what is called by which words, and what a wrong word is told."""
+"""How commands are called, and how they end: one line, and no traceback of Ctrl-C."""
 
 import argparse
+import io
+import os
+import signal
+import subprocess
+import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
+from support.commands import run_in_process
 
 from drgs import __main__ as commands
-from drgs import fit, render
+from drgs import fit
 from drgs.bench import __main__ as bench
-from drgs.capture import __main__ as capture
-from drgs.cli.commands import CommandParser, bounded_int, finite_number, run_command
-
-NAMES = [*commands.COMMANDS, *(f"bench {name}" for name in bench.COMMANDS)]
-
-
-def ended(capsys, call, *words):
-    """(exit status, standard output, standard error) of a command that ends early."""
-    with pytest.raises(SystemExit) as exit_info:
-        call(list(words))
-    return exit_info.value.code, *capsys.readouterr()
+from drgs.cli.commands import CommandParser, bounded_int, file_or_folder, finite_number, run_command
+from drgs.cli.ending import escape_unencodable
+from drgs.core.errors import UserError, UserNote
+from drgs.core.files import atomic_path
+from drgs.io.images import image_size, write_png
 
 
-@pytest.mark.parametrize("name", ["", *NAMES])
-def test_help_shows_the_command_with_an_example(capsys, name):
-    status, out, _ = ended(capsys, commands.main, *name.split(), "--help")
-    called = f"drgs {name}".strip()
-    assert status == 0
-    assert out.startswith(f"usage: {called} ")
-    _, separator, examples = out.partition("\nexample")
-    assert separator and f"  {called} " in examples
-    assert "%(prog)s" not in out
+def command(act):
+    """``main`` of a command that does nothing else."""
+
+    def add_arguments(parser):
+        parser.add_argument("--size", type=bounded_int(1, 4096, "as large as anything is"))
+        parser.set_defaults(run=lambda args: act())
+
+    return lambda words: run_command(add_arguments, "some command", words)
 
 
-@pytest.mark.parametrize("command", [fit, render, capture, bench])
-def test_help_of_modules_shows_python_m(capsys, command):
-    status, out, _ = ended(capsys, command.main, "--help")
-    module = command.__name__.removesuffix(".__main__")
-    assert status == 0 and out.startswith(f"usage: python -m {module} ")
-    assert f"\n  python -m {module} " in out.partition("\nexample")[2]
+def raising(error):
+    """``main`` of a command that raises."""
+
+    def act():
+        raise error
+
+    return command(act)
+
+
+@pytest.mark.parametrize("name", ["f\u00fc\u4e2d", os.fsdecode(b"\xff")], ids=["UTF-8", "other"])
+def test_names_are_printed_in_any_encoding(name):
+    def act():
+        print(f"written: {name}")
+        raise UserError(f"{name}: wrong")
+
+    # As PYTHONIOENCODING=ascii makes them.
+    out, err = (io.TextIOWrapper(io.BytesIO(), "ascii") for _ in range(2))
+    with redirect_stdout(out), redirect_stderr(err):
+        with pytest.raises(SystemExit, match="2"):
+            command(act)([])
+        out.flush()
+        err.flush()
+    escaped = name.encode("ascii", "backslashreplace")
+    assert out.buffer.getvalue() == b"written: " + escaped + b"\n"
+    assert err.buffer.getvalue() == b"error: " + escaped + b": wrong\n"
+    assert out.errors == "strict"  # as before
+    with redirect_stdout(out), redirect_stderr(err), escape_unencodable():
+        out.close()  # which is left alone
+
+
+def test_user_note_is_printed_as_a_line():
+    outcome = run_in_process(
+        command(lambda: warnings.warn(UserNote("a.ply: clamped"), stacklevel=1))
+    )
+    assert (outcome.returncode, outcome.stdout) == (0, "note: a.ply: clamped\n")
+    assert outcome.stderr == ""
+
+
+def test_pillow_warnings_are_not_printed(tmp_path, monkeypatch):
+    """Pillow warns of large images that are not too large for drgs."""
+    write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
+    with pytest.warns(Image.DecompressionBombWarning):
+        image_size(tmp_path / "a.png")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        outcome = run_in_process(command(lambda: image_size(tmp_path / "a.png")))
+    assert (outcome.returncode, outcome.stderr, caught) == (0, "", [])
+
+
+def test_errors_are_printed_on_one_line_and_shortened_in_the_middle():
+    assert run_in_process(raising(UserError("a\nb.yml: wrong"))).stderr == "error: a b.yml: wrong\n"
+    line = run_in_process(raising(UserError(f"a.yml: {'x' * 5000}; remove it"))).stderr
+    assert line.startswith("error: a.yml: xxx") and line.endswith("xxx; remove it\n")
+    assert " ... " in line and len(line) < 1000
+
+
+def test_home_folders_are_expanded_or_refused(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert file_or_folder("~/out") == Path("/home/somebody/out")
+    with pytest.raises(argparse.ArgumentTypeError, match=r"home directory.*: ~no-such-user/out"):
+        file_or_folder("~no-such-user/out")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            ["fot"],
-            "only fit, poses, render, export, view, capture and bench; did you mean fit?",
-        ),
-        (["rendre"], "did you mean render?"),
-        (
-            ["xyz"],
-            "no command xyz, only fit, poses, render, export, view, capture and bench; see drgs",
-        ),
-        (["bench", "sped"], "; did you mean speed?"),
-        ([], "the following arguments are required: COMMAND"),
-        (["bench"], "the following arguments are required: MEASUREMENT"),
-        (["fit"], "one of the arguments CONFIG.yml|FOLDER --resume is required"),
-        (["fit", "a.yml", "--resume", "out"], "not allowed with argument"),
-        (["fit", "--resume", "out", "--out", "x"], "configuration from out/config.yml: leave out"),
-        (["fit", "a.yml", "--budget", "soon"], "argument --budget: "),
-        (["capture", "a.xml", "--out", "x", "--spp", "0"], "argument --spp: must be a whole"),
-        (["capture", "a.xml", "--out", "x", "--fov", "inf"], "argument --fov: must be a finite"),
-        (["render", "a.ply"], "the following arguments are required: --out"),
+        (["--size", "0"], "argument --size: must be a whole number >= 1, got 0"),
+        (["--size", "9" * 4000], "argument --size: must be at most 4,096 (as large as anything is"),
+        (["--size", "1" * 20 + "x"], "argument --size: must be a whole number >= 1, got 111"),
+        (["--sise", "a\nb"], "unrecognized arguments: --sise a b"),
     ],
 )
-def test_invalid_command_lines_exit_with_2_and_the_reason(capsys, words, message):
-    status, out, error = ended(capsys, commands.main, *words)
-    assert (status, out) == (2, "")
-    assert message in error and "Traceback" not in error
+def test_invalid_command_line_is_reported_in_one_line(words, message):
+    outcome = run_in_process(command(lambda: None), *words)
+    assert outcome.returncode == 2 and outcome.stdout == ""
+    assert outcome.stderr.startswith(f"error: {message}")
+    assert outcome.stderr.endswith("; see some command --help\n")
+    assert outcome.stderr.count("\n") == 1 and len(outcome.stderr) < 300
+
+
+@pytest.fixture
+def sigint_handler_is_restored():
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupted():
+    signal.raise_signal(signal.SIGINT)
+
+
+def raise_interrupt_in_a_callback():
+    """Raise as Dr.Jit does, whose own error hides the exception raised within it."""
+    try:
+        interrupted()
+    except KeyboardInterrupt as cause:
+        raise RuntimeError("drjit.backward(): failed (see above)") from cause
+
+
+@pytest.mark.usefixtures("sigint_handler_is_restored")
+@pytest.mark.parametrize("act", [interrupted, raise_interrupt_in_a_callback])
+def test_an_interrupt_ends_a_command_without_a_traceback(act):
+    outcome = run_in_process(command(act))
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL  # what comes now ends it at once
+
+
+@pytest.mark.usefixtures("sigint_handler_is_restored")
+def test_sigterm_ends_a_command_as_ctrl_c_does(tmp_path):
+    """Files that it was writing are removed. Afterwards the signal is what it was."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    def act():
+        with atomic_path(tmp_path / "a.png") as temporary:
+            temporary.touch()
+            signal.raise_signal(signal.SIGTERM)
+
+    outcome = run_in_process(command(act))
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (143, "", "terminated\n")
+    assert signal.getsignal(signal.SIGTERM) == before and not list(tmp_path.iterdir())
+
+
+IMPORT = "with interruptible_imports():\n        try: signal.raise_signal(signal.{})\n"
+IMPORT += "        except BaseException: pass"
+
+
+@pytest.mark.parametrize(
+    ("act", "expected"),
+    [
+        ("exec('signal.raise_signal(signal.SIGINT)')", (130, "interrupted\n")),
+        (IMPORT.format("SIGINT"), (130, "interrupted\n")),
+        (IMPORT.format("SIGTERM"), (143, "terminated\n")),
+    ],
+    ids=["exec", "import", "SIGTERM in an import"],
+)
+def test_signal_while_modules_are_imported_ends_a_process_with_its_status(act, expected):
+    """Modules may hide what is raised; CPython would end by SIGINT within ``exec``."""
+    program = (
+        "import signal\n"
+        "from drgs.cli.ending import exit_on_interrupt, interruptible_imports\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"with exit_on_interrupt():\n    {act}"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == expected
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError(), SystemExit(3)])
+def test_unexpected_errors_keep_their_tracebacks(error):
+    with pytest.raises(type(error)):
+        raising(error)([])
+
+
+NAMES = [*commands.COMMANDS, *(f"bench {name}" for name in bench.COMMANDS)]
+
+
+@pytest.mark.parametrize("name", ["", *NAMES])
+def test_help_shows_the_command_with_an_example(name):
+    outcome, called = run_in_process(commands.main, *name.split(), "--help"), f"drgs {name}".strip()
+    assert outcome.returncode == 0
+    assert outcome.stdout.startswith(f"usage: {called} ")
+    assert f"  {called} " in outcome.stdout.partition("\nexample")[2]
+    assert "%(prog)s" not in outcome.stdout
+
+
+@pytest.mark.parametrize("command", [fit, bench])
+def test_help_of_modules_shows_python_m(command):
+    outcome = run_in_process(command.main, "--help")
+    called = f"python -m {command.__name__.removesuffix('.__main__')} "
+    assert outcome.returncode == 0 and outcome.stdout.startswith(f"usage: {called}")
+    assert f"\n  {called}" in outcome.stdout.partition("\nexample")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("fot", "only fit, poses, render, export, view, capture and bench; did you mean fit?"),
+        ("xyz", "no command xyz, only fit, poses, render, export, view, capture and bench; see"),
+        ("bench sped", "; did you mean speed?"),
+        ("", "the following arguments are required: COMMAND"),
+        ("bench", "the following arguments are required: MEASUREMENT"),
+        ("fit", "one of the arguments CONFIG.yml|FOLDER --resume is required"),
+        ("fit a.yml --resume out", "not allowed with argument"),
+        ("fit --resume out --out x", "configuration from out/config.yml: leave out"),
+        ("fit a.yml --budget soon", "argument --budget: "),
+        ("render a.ply", "the following arguments are required: --out"),
+    ],
+)
+def test_invalid_command_lines_exit_with_2_and_the_reason(words, message):
+    outcome = run_in_process(commands.main, *words.split())
+    assert (outcome.returncode, outcome.stdout) == (2, "")
+    assert message in outcome.stderr and "Traceback" not in outcome.stderr
 
 
 def test_listing_commands_imports_none_of_them(run_python):
@@ -84,22 +244,11 @@ def test_listing_commands_imports_none_of_them(run_python):
     assert run_python(program).stdout.splitlines()[-1] == "[]"
 
 
-def test_command_receives_its_arguments_and_program_name():
-    seen = []
-
-    def add_arguments(parser):
-        parser.add_argument("--count", type=int)
-        parser.set_defaults(run=seen.append, prog=parser.prog)
-
-    run_command(add_arguments, "some command", ["--count", "3"])
-    assert (seen[0].count, seen[0].prog) == (3, "some command")
-
-
 def test_parser_adds_arguments_of_a_command_once():
     parser = CommandParser(prog="drgs", module="drgs.__main__")
     for _ in range(2):
         args, _ = parser.parse_known_args(["fit", "a.yml"])
-        assert args.config == Path("a.yml")
+        assert args.config.name == "a.yml"
 
 
 @pytest.mark.parametrize("text", ["", "0", "-3", "1.5", "two", "1e3"])
@@ -109,7 +258,7 @@ def test_non_integers_and_small_numbers_are_refused(text):
     assert bounded_int(0)("0") == 0 and bounded_int(1)("+7") == 7
 
 
-@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e999", "x"])
+@pytest.mark.parametrize("text", ["", "nan", "-inf", "1e999", "x"])
 def test_nonfinite_numbers_are_refused(text):
     with pytest.raises(argparse.ArgumentTypeError, match="must be a finite number, got"):
         finite_number(text)

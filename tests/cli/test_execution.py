@@ -7,16 +7,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.fit_command import write_scene
+from support.commands import run_in_process
+from support.fit_command import assert_fits, run_fit, without_images, write_project
 from support.folders import visible
 from support.small_capture import blobs
-from support.viewer_rendering import VIEWER_RENDERING
 
-from drgs import fit, render
+from drgs import render
 from drgs.cli.execution import execution_settings
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
-from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
 
 DEBUG = dr.JitFlag.Debug
@@ -44,27 +43,20 @@ def write_beyond_the_end():
     dr.eval(array)
 
 
-# ----------------------------------------------------------------------------------------------
-# Context manager
-# ----------------------------------------------------------------------------------------------
+def test_settings_hold_within_the_block():
+    """Dr.Jit notes the lines that operations come from by a trace function."""
+    before = sys.gettrace()
 
-
-def test_range_checks_are_on_only_within_the_block_and_if_enabled():
-    for debug in (False, True):
-        with execution_settings(threads=None, debug=debug):
-            assert dr.flag(DEBUG) == debug
-        assert not dr.flag(DEBUG)
-
-
-def test_trace_function_of_a_debugger_is_restored():
     def trace(*_):
         return None
 
-    before = sys.gettrace()
     sys.settrace(trace)
     try:
-        with execution_settings(threads=None, debug=True):
-            assert sys.gettrace() is not trace  # Dr.Jit notes the lines that operations come from
+        for threads, debug in ((None, False), (1, True), (dr.thread_count() + 1, False)):
+            with execution_settings(threads, debug):
+                assert dr.flag(DEBUG) == debug
+                assert (sys.gettrace() is trace) != debug
+                assert dr.thread_count() == threads or threads is None
         assert sys.gettrace() is trace
     finally:
         sys.settrace(before)
@@ -97,20 +89,6 @@ def test_error_of_the_block_is_not_replaced_by_a_report():
         1 / 0  # noqa: B018
 
 
-def test_number_of_threads_is_set_within_the_block():
-    before = dr.thread_count()
-    for count in (1, before + 1):
-        with execution_settings(threads=count, debug=False):
-            assert dr.thread_count() == count
-        assert dr.thread_count() == before
-
-
-def denormal_product(count):
-    """1e-40, where denormal numbers are kept; computed by Dr.Jit."""
-    small, smaller = dr.opaque(mi.Float, 1e-30, count), dr.opaque(mi.Float, 1e-10, count)
-    return np.array(small * smaller)
-
-
 @pytest.mark.skipif(
     (platform.libc_ver()[0], platform.machine()) != ("glibc", "x86_64"),
     reason="the mode is only known there",
@@ -119,7 +97,8 @@ def denormal_product(count):
 def test_denormals_are_flushed_on_any_number_of_threads(count):
     with execution_settings(threads=count, debug=False):
         for size in (1, 64, 1_000_000):
-            assert np.all(denormal_product(size) == 0)
+            small, smaller = dr.opaque(mi.Float, 1e-30, size), dr.opaque(mi.Float, 1e-10, size)
+            assert np.all(np.array(small * smaller) == 0)
     # The calling thread's own mode is given back.
     assert np.float32(1e-30) * np.float32(1e-10) > 0
 
@@ -140,63 +119,32 @@ def test_refused_number_of_threads_is_a_user_error(monkeypatch):
         pass
 
 
-# ----------------------------------------------------------------------------------------------
-# In the commands
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    write_scene(
-        folder,
-        model={"sh_degree": 1, "sh_increase_every": 2, **VIEWER_RENDERING},
-        densify={
-            "start": 1,
-            "stop": 4,
-            "every": 2,
-            "strategy": "adc",
-            "adc": {"reset_every": 3, "grad_threshold": 1e-6},
-        },
-        iterations=3,
-        output={"checkpoint_every": 1},
-    )
-    blobs().save(folder / "blobs.ply")
-    return folder
-
-
 @pytest.fixture
-def step_callbacks(monkeypatch):
-    """Calls of ``Trainer.step`` call these, with the trainer, when they are done."""
-    acts, step = [], Trainer.step
+def config(tmp_path, monkeypatch):
+    without_images(monkeypatch)
+    return write_project(tmp_path, iterations=3, output={"checkpoint_every": 1})
+
+
+def after_each_step(monkeypatch, act):
+    step = Trainer.step
 
     def step_and_act(trainer):
         report = step(trainer)
-        for act in acts:
-            act(trainer)
+        act(trainer)
         return report
 
     monkeypatch.setattr(Trainer, "step", step_and_act)
-    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
-    return acts
-
-
-def fails(capsys, command, *arguments):
-    with pytest.raises(SystemExit) as exit_info:
-        command.main([str(argument) for argument in arguments])
-    assert exit_info.value.code == 2
-    return capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, step_callbacks, capsys):
+def test_fit_with_range_checks_gives_the_same_bytes(config, tmp_path, monkeypatch):
     """Across a change of the population, of the SH degree, and an opacity reset."""
     flags = []
-    step_callbacks.append(lambda trainer: flags.append(dr.flag(DEBUG)))
+    after_each_step(monkeypatch, lambda trainer: flags.append(dr.flag(DEBUG)))
     for name, options in (("plain", []), ("checked", ["--debug", "--threads", "1"])):
-        fit.main([str(scene / "a.yml"), "--out", str(tmp_path / name), *options])
+        outcome = assert_fits(config, "--out", tmp_path / name, *options)
+        assert "out-of-bounds" not in outcome.stderr
     assert flags == [False] * 3 + [True] * 3
-    assert "out-of-bounds" not in capsys.readouterr().err
     assert Gaussians.load(tmp_path / "plain" / "point_cloud.ply").num_gaussians > 40
     for name in ("point_cloud.ply", "renders/test/r_0.png"):
         plain, checked = ((tmp_path / run / name).read_bytes() for run in ("plain", "checked"))
@@ -205,57 +153,20 @@ def test_fit_with_range_checks_gives_the_same_bytes(scene, tmp_path, step_callba
 
 @pytest.mark.slow
 def test_fit_stops_at_out_of_range_access_and_keeps_the_last_checkpoint(
-    scene, tmp_path, step_callbacks, capsys
+    config, tmp_path, monkeypatch
 ):
-    step_callbacks.append(lambda trainer: trainer.iteration == 2 and read_beyond_the_end())
-    out = tmp_path / "out"
-    message = fails(capsys, fit, scene / "a.yml", "--out", out, "--debug").splitlines()[-1]
-    assert message.startswith("error: --debug: drjit.gather(): out-of-bounds read from position 7")
-    assert visible(out) == {"checkpoint.npz", "config.yml"}
-    assert np.load(out / "checkpoint.npz")["trainer.iteration"] == 1
+    after_each_step(monkeypatch, lambda t: t.iteration == 2 and read_beyond_the_end())
+    outcome = run_fit(config, "--out", tmp_path / "out", "--debug")
+    assert outcome.returncode == 2
+    assert "error: --debug: drjit.gather(): out-of-bounds read from position 7" in outcome.stderr
+    assert visible(tmp_path / "out") == {"checkpoint.npz", "config.yml"}
+    assert np.load(tmp_path / "out" / "checkpoint.npz")["trainer.iteration"] == 1
 
 
-def test_render_gives_the_same_bytes_with_range_checks(scene, tmp_path, monkeypatch, capsys):
-    flags, render_views = [], render.render_views
-
-    def render_and_note(*arguments):
-        for image in render_views(*arguments):
-            flags.append(dr.flag(DEBUG))
-            yield image
-
-    monkeypatch.setattr(render, "render_views", render_and_note)
-    for name, options in (("plain", ()), ("checked", ("--debug", "--threads", "1"))):
-        camera = ("--origin", "0", "-4", "1", "--size", "32", "24", "--out", tmp_path / name)
-        render.main([str(a) for a in (scene / "blobs.ply", *camera, *options)])
-    assert flags == [False, True]
-    assert "out-of-bounds" not in capsys.readouterr().err
-    plain, checked = ((tmp_path / run / "camera.png").read_bytes() for run in ("plain", "checked"))
-    assert plain == checked
-
-
-def test_render_fails_after_out_of_range_access(scene, tmp_path, monkeypatch, capsys):
+def test_render_fails_after_out_of_range_access(tmp_path, monkeypatch):
+    blobs().save(tmp_path / "blobs.ply")
     monkeypatch.setattr(render, "render_cameras", lambda *_: [read_beyond_the_end()])
-    camera = ("--origin", "0", "-4", "1", "--out", tmp_path / "out")
-    message = fails(capsys, render, scene / "blobs.ply", *camera, "--debug").splitlines()[-1]
-    assert message.startswith("error: --debug: drjit.gather(): out-of-bounds read from position 7")
-
-
-@pytest.mark.parametrize("command", [fit, render])
-@pytest.mark.parametrize(
-    ("count", "message"),
-    [
-        ("0", "argument --threads: must be a whole number >= 1, got 0"),
-        ("-2", "argument --threads: must be a whole number >= 1, got -2"),
-        ("two", "argument --threads: must be a whole number >= 1, got two"),
-        (
-            "4294967296",
-            "argument --threads: must be at most 4,096 (no machine has more",
-        ),
-    ],
-)
-def test_invalid_numbers_of_threads_are_refused(scene, tmp_path, capsys, command, count, message):
-    what = scene / ("a.yml" if command is fit else "blobs.ply")
-    arguments = (what, "--out", tmp_path / "out", "--threads", count)
-    errors = fails(capsys, command, *arguments)
-    assert message in errors and errors.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+    words = (tmp_path / "blobs.ply", "--origin", 0, -4, 1, "--out", tmp_path / "out", "--debug")
+    outcome = run_in_process(render.main, *words)
+    assert outcome.returncode == 2
+    assert "error: --debug: drjit.gather(): out-of-bounds read from position 7" in outcome.stderr

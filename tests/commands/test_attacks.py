@@ -1,77 +1,169 @@
 """Attacks on the commands: see ``support.attacks``, which documents the rules.
 
-By default some hundreds that are over in milliseconds, in this process; the slow test has
-thousands, in a process of their own. A failure names the attacks; to repeat one of them:
+Each rule is also broken here by a command of a few lines, and that is noticed.
+
+A failure names the attacks; to repeat one of them:
 
     PYTHONPATH=tests python -m support.attacks NAME
 """
 
+import os
+import sys
+import time
+import warnings
+from pathlib import Path
+
 import mitsuba as mi
+import numpy as np
 import pytest
-from support.attacks.attack_folder import AttackFolder
-from support.attacks.catalogue import FAMILIES, KNOWN_FAILURES, attacks, some
+from support.attacks.attack import Attack
+from support.attacks.attack_folder import AttackFolder, contents
+from support.attacks.catalogue import KNOWN_FAILURES, attacks, some
+from support.attacks.observer import Fault
 from support.attacks.server import Server
 from support.attacks.trial import trial
 
-QUICK = {
-    "schema": 120,
-    "option": 120,
-    "instead": 60,
-    "damaged": 40,
-    "special": 6,
-    "together": 40,
-    "folder": 20,
-    "name": 8,
-    "fault": 8,
-    "size": 4,
-}
-"""How many of a family are tried by default."""
+from drgs.core.files import atomic_path
 
-SLOW = {
-    "schema": 450,
-    "option": 900,
-    "instead": 300,
-    "damaged": 350,
-    "special": 93,
-    "together": 400,
-    "folder": 200,
-    "name": 100,
-    "fault": 150,
-    "size": 20,
+COUNTS = {
+    "schema": 810,
+    "option": 1020,
+    "instead": 360,
+    "damaged": 390,
+    "special": 99,
+    "together": 440,
+    "folder": 220,
+    "name": 108,
+    "fault": 158,
+    "size": 24,
     "drawn": 4,
     "property": 300,
     "object": 100,
 }
-"""And how many are when there is time."""
+"""How many of a family are tried."""
 
 
 @pytest.fixture(scope="module")
-def attack_folder(tmp_path_factory):
+def full_folder(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     return AttackFolder(tmp_path_factory.mktemp("attacks"))
 
 
-def check(found):
-    """found: by name of an attack, what is wrong."""
-    wrong = {name: lines for name, lines in found.items() if lines}
-    new = {name: lines for name, lines in wrong.items() if name not in KNOWN_FAILURES}
-    report = [f"{name}: {line}" for name, lines in new.items() for line in lines]
-    assert not new, "\n".join([f"{len(new)} of {len(found)}", *report])
-    mended = [name for name in found if name in KNOWN_FAILURES and name not in wrong]
+@pytest.mark.slow
+@pytest.mark.parametrize("family", COUNTS)
+def test_attacks_end_in_results_or_a_one_line_error(full_folder, tmp_path, family):
+    with Server(tmp_path) as server:
+        chosen = some(attacks(family, full_folder), COUNTS[family])
+        found = {attack.name: server.trial(attack.name, attack.seconds) for attack in chosen}
+    wrong = {name: lines for name, lines in found.items() if lines and name not in KNOWN_FAILURES}
+    report = [f"{name}: {line}" for name, lines in wrong.items() for line in lines]
+    assert not wrong, "\n".join([f"{len(wrong)} of {len(found)}", *report])
+    mended = [name for name in KNOWN_FAILURES if found.get(name) == []]
     assert not mended, f"no failures any more: {mended}"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("family", QUICK)
-def test_attacks_end_in_results_or_a_one_line_error(attack_folder, family):
-    found = [a for a in attacks(family, attack_folder) if not a.risky and not a.is_long]
-    chosen = some(found, QUICK[family])
-    check({attack.name: trial(attack, attack_folder) for attack in chosen})
+@pytest.fixture(scope="module")
+def attack_folder(tmp_path_factory):
+    """Without what the commands themselves would write, which takes seconds."""
+    return AttackFolder(tmp_path_factory.mktemp("attacks"), with_results=False)
+
+
+def refuse(*lines):
+    print(*lines, sep="\n", file=sys.stderr)
+    sys.exit(2)
+
+
+def write(path):
+    with atomic_path(path) as temporary:
+        temporary.write_text("x")
+
+
+def write_and_refuse(path):
+    write(path)
+    refuse("error: no")
+
+
+def write_elsewhere():
+    write("../elsewhere")
+    os.unlink("../elsewhere")
+
+
+def leave_a_temporary_file():
+    os.mkdir("out")
+    Path("out/.a.7.tmp.txt").touch()
+
+
+BREACHES = {
+    "exception": (lambda: 1 / 0, "ZeroDivisionError: division by zero"),
+    "status": (lambda: sys.exit(1), "ended with status 1"),
+    "silence": (lambda: sys.exit(2), "a refusal of 0 lines"),
+    "two lines": (lambda: refuse("error: a", "error: b"), "a refusal of 2 lines"),
+    "no error": (lambda: refuse("no"), "a refusal that is none: no"),
+    "long line": (lambda: refuse("error: " + "x" * 3000), "a line of 3007 characters"),
+    "unnamed": (lambda: refuse("error: no"), "does not name a.yml: error: no"),
+    "no refusal": (lambda: None, "was not refused"),
+    "warning": (lambda: warnings.warn("of what?", stacklevel=1), "error: UserWarning: of what?"),
+    "memory": (lambda: np.ones(1 << 26).sum(), "MB more"),
+    "time": (lambda: time.sleep(5), "TimeLimitExceeded"),
+    "file of the user's": (lambda: write("mine/notes.txt"), "changed mine/notes.txt"),
+    "removed": (lambda: os.unlink("sky.png"), "removed sky.png"),
+    "beside the output": (lambda: write("new/a"), "made new/a"),
+    "refused too late": (lambda: write_and_refuse("out/a"), "made out/a"),
+    "elsewhere": (write_elsewhere, "wrote outside"),
+    "temporary": (leave_a_temporary_file, "left out/.a.7.tmp.txt"),
+    "encoding": (lambda: print("\u00e4"), "UnicodeEncodeError"),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", FAMILIES)
-def test_many_attacks_end_in_results_or_a_one_line_error(attack_folder, tmp_path, family):
-    with Server(tmp_path) as server:
-        chosen = some(attacks(family, attack_folder), SLOW[family], seed=1)
-        check({attack.name: server.trial(attack.name, attack.seconds) for attack in chosen})
+@pytest.mark.parametrize("name", BREACHES)
+def test_forbidden_behaviour_is_detected(attack_folder, monkeypatch, name):
+    command, message = BREACHES[name]
+    monkeypatch.setattr("drgs.render.main", lambda words: command())
+    more = {"seconds": 0.5} if name == "time" else {}
+    attack = Attack("x", "render", (), encoding="ascii", named="a.yml", must_refuse=True, **more)
+    wrong = trial(attack, attack_folder)
+    assert any(message in line for line in wrong), wrong
+
+
+def test_allowed_behaviour_is_not(attack_folder, monkeypatch):
+    assert trial(Attack("x", "capture", ("--help",)), attack_folder) == []
+    monkeypatch.setattr("drgs.render.main", lambda words: refuse("error: a.yml: no"))
+    assert trial(Attack("x", "render", (), named="a.yml"), attack_folder) == []
+
+
+def work(words):
+    """Two files, the second of which needs what the first holds."""
+    if not os.path.exists("out/a"):
+        write("out/a")
+    write("out/b")
+
+
+def forgetful_work(words):
+    write("out/b")
+    if not os.path.exists("out/b.done"):
+        write("out/b.done")
+        write("out/a")
+
+
+@pytest.mark.parametrize(("command", "is_right"), [(work, True), (forgetful_work, False)])
+def test_work_lost_after_a_kill_is_detected(attack_folder, monkeypatch, command, is_right):
+    monkeypatch.setattr("drgs.render.main", command)
+    found = []
+    for at in range(14):
+        words, results = (command.__name__,), ("a", "b")
+        attack = Attack("x", "render", words, fault=Fault("kill", at), results=results)
+        found += trial(attack, attack_folder)
+    stale = [line for line in found if ".tmp" not in line]
+    assert (stale == []) is is_right, found
+
+
+def test_attack_folder_is_restored(attack_folder):
+    before, folder = contents(attack_folder.folder), attack_folder.folder
+    (folder / "sky.png").unlink()
+    (folder / "mine" / "notes.txt").write_text("changed")
+    (folder / "photos").rename(folder / "images")
+    (folder / "new").mkdir()
+    os.mkfifo(folder / "new" / "pipe")
+    attack_folder.restore_files()
+    assert contents(folder) == before

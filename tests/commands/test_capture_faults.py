@@ -7,17 +7,13 @@ from pathlib import Path
 
 import mitsuba as mi
 import pytest
-from support.commands import run_in_process
+from support.commands import assert_ends_well, assert_refused, run_in_process
+from support.folders import contents
 
 from drgs.capture import __main__ as capture
 from drgs.core import files, memory
 
-BALL = """
-<scene version="3.0.0">
-    <emitter type="constant"/>
-    <shape type="sphere"/>
-</scene>
-"""
+BALL = '<scene version="3.0.0"><emitter type="constant"/><shape type="sphere"/></scene>'
 
 TINY = ["--views", 2, "--test-views", 1, "--size", 4, 4, "--spp", 1, "--points", 8]
 FILES = 7
@@ -37,30 +33,19 @@ def ball(tmp_path_factory):
 
 
 def run(scene, out, *options):
-    return run_in_process(capture.main, scene, "--out", out, *TINY, *options)
+    assert_ends_well(capture.main, scene, "--out", out, *TINY, *options)
+
+
+def refused(scene, out, *options, folder, message):
+    words = (scene, "--out", out, *TINY, *options)
+    return assert_refused(capture.main, *words, folder=folder, message=message)
 
 
 @pytest.fixture(scope="module")
 def captured(ball, tmp_path_factory):
     out = tmp_path_factory.mktemp("captured") / "ball"
-    assert run(ball, out).returncode == 0
+    run(ball, out)
     return contents(out)
-
-
-def contents(folder):
-    """Bytes by name, hidden files included."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
-
-
-def refused(outcome):
-    """The one line that a refusal consists of."""
-    assert outcome.returncode == 2
-    (line,) = outcome.stderr.splitlines()
-    return line
 
 
 def test_edited_files_are_kept(ball, captured, tmp_path):
@@ -70,7 +55,7 @@ def test_edited_files_are_kept(ball, captured, tmp_path):
     for name in edited:
         (tmp_path / "out" / name).write_text("mine")
     (tmp_path / "out" / "transforms_test.json").unlink()
-    assert run(ball, tmp_path / "out").returncode == 0
+    run(ball, tmp_path / "out")
     assert contents(tmp_path / "out") == {**captured, **dict.fromkeys(edited, b"mine")}
 
 
@@ -101,7 +86,7 @@ def test_capture_killed_at_any_file_resumes_to_the_same_bytes(
             run(ball, out)
     left = [name for name in contents(out) if name.endswith(".tmp", 0, name.rfind("."))]
     assert len(left) == (place == "before")
-    assert run(ball, out).returncode == 0
+    run(ball, out)
     assert contents(out) == captured
 
 
@@ -124,89 +109,125 @@ def test_full_disk_is_reported_in_one_line_and_the_capture_resumes(
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full(Path.write_bytes))
         patch.setattr(Path, "write_text", lambda path, text: path.write_bytes(text.encode()))
-        line = refused(run(ball, out))
+        outcome = run_in_process(capture.main, ball, "--out", out, *TINY)
+    (line,) = outcome.stderr.splitlines()
+    assert outcome.returncode == 2
     assert "cannot write the file: No space left on device; free some space" in line
     assert not [name for name in contents(out) if ".tmp" in name]
-    assert run(ball, out).returncode == 0
+    run(ball, out)
     assert contents(out) == captured
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--size", 10**9, 10**9], "size must be at most 16,777,216 px"),
-        (["--size", 10**20, 1], "--size: must be at most 2,147,483,647"),
-        (["--points", 10**9], "--points: must be at most 5,000,000"),
-        (["--views", 10**9], "--views: must be at most 100,000"),
-        (["--test-views", 10**9], "--test-views: must be at most 100,000"),
-        (["--spp", 10**9], "--spp: must be at most 1,048,576"),
-        (["--max-depth", 10**9], "--max-depth: must be at most 65,536"),
-        (["--seed", "9" * 5000], "--seed: must be a whole number"),
-        (["--distance", 1e300], "no camera may be farther from the scene than 100000 of its"),
-        (["--target", 1e300, 0, 0], "no camera may be farther from the scene than 100000"),
-    ],
-)
-def test_sizes_beyond_limits_are_refused_with_the_limit(ball, tmp_path, options, message):
-    line = refused(run(ball, tmp_path / "out", *options))
-    assert message in line
-    assert len(line) < 300
-    assert not (tmp_path / "out").exists()
+OPTIONS = [
+    (["--views", 0], "--views: must be a whole number >= 1, got 0"),
+    (["--test-views", -1], "--test-views: must be a whole number >= 0, got -1"),
+    (["--size", 400], "--size: expected 2 arguments: --size W H"),
+    (["--size", 0, 9], "--size: must be a whole number >= 1, got 0"),
+    (["--size", 10**9, 10**9], "size must be at most 16,777,216 px"),
+    (["--size", 10**20, 1], "--size: must be at most 2,147,483,647"),
+    (["--size", 4000, 4000], "4000 x 4000 px need about 4 GB of memory, of which 2 GB are avail"),
+    (["--fov", 181], "--fov: must be between 0 and 180 degrees, got 181"),
+    (["--fov", 0], "--fov: must be between 0 and 180 degrees, got 0"),
+    (["--fov", "nan"], "--fov: must be a finite number, got nan"),
+    (["--distance", -1], "distance must be > 0, got -1"),
+    (["--distance", 1e300], "no camera may be farther from the scene than 100000 of its"),
+    (["--distance", 3, "--target", 900, 0, 0], "the cameras see nothing of the scene"),
+    (["--target", 0, "inf", 0], "--target: must be a finite number, got inf"),
+    (["--target", 1e300, 0, 0], "no camera may be farther from the scene than 100000"),
+    (["--points", 10**9], "--points: must be at most 5,000,000"),
+    (["--views", 10**9], "--views: must be at most 100,000"),
+    (["--spp", 10**9], "--spp: must be at most 1,048,576"),
+    (["--max-depth", 10**9], "--max-depth: must be at most 65,536"),
+    (["--seed", "9" * 5000], "--seed: must be a whole number"),
+    (["--out", "/dev/null/out"], "/dev/null"),
+]
 
 
-def test_images_larger_than_memory_are_refused(ball, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("options", "message"), OPTIONS, ids=[str(o)[:30] for o, _ in OPTIONS])
+def test_wrong_options_are_refused_before_images_are_taken(
+    ball, tmp_path, monkeypatch, options, message
+):
     monkeypatch.setattr(memory, "available_memory", lambda: 2 * 10**9)
-    line = refused(run(ball, tmp_path / "out", "--size", 4000, 4000))
-    assert "--size: 4000 x 4000 px need about 4 GB of memory, of which 2 GB are available" in line
-    assert not (tmp_path / "out").exists()
+    refused(ball, tmp_path / "out", *options, folder=tmp_path, message=message)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("[" * 200_000, "not valid JSON"),
-        (" " * (1 << 20) + "{}", "more than 1,048,576 bytes"),
-        ("nonsense", "not valid JSON"),
-        ('{"scene": "' + 9000 * "x" + '"}', "the folder holds another capture: scene is"),
-        ("[]", "the folder holds another capture: scene is null"),
-    ],
-    ids=["nested without end", "too long", "no JSON", "long value", "a list"],
-)
+XML = '<scene version="3.0.0">{}</scene>'
+SCENE_THAT = "import mitsuba as mi\ndef scene():\n    {}\n    return {{'type': 'scene'}}"
+OTHER_VARIANT = "mi.set_variant('scalar_rgb')"
+SCENES = [
+    ("missing.xml", None, "there is no such scene file"),
+    ("a.xml", "no XML", "Mitsuba cannot load the scene"),
+    ("a.xml", XML.format('<shape type="ball"/>'), "cannot load the scene"),
+    ("a.xml", '<bsdf version="3.0.0" type="diffuse"/>', "a.xml"),
+    ("a.xml", XML.format('<emitter type="constant"/>'), "no surfaces"),
+    ("a.py", "x = 1", "must define a function scene()"),
+    ("a.py", "def scene():\n    return []", 'must return a dictionary with "type": "scene"'),
+    ("a.py", "def scene():\n    return {'type': 'sphere'}", 'with "type": "scene"'),
+    ("a.py", "def scene():\n\n    return 1 / 0", "a.py:3: ZeroDivisionError: division by zero"),
+    ("a.py", "import nothing_of_that_name", "a.py:1: ModuleNotFoundError"),
+    ("a.py", "def scene(:", "a.py:1: SyntaxError"),
+    ("a.py", "def scene():\n    return {'type': 'scene', 's': {'type': 'ball'}}", "ball"),
+    ("a.py", SCENE_THAT.format("pass") + f"\n{OTHER_VARIANT}", "must leave Mitsuba's variant at"),
+    ("a.py", SCENE_THAT.format(OTHER_VARIANT), "must leave Mitsuba's variant at"),
+    ("a.py", "raise SystemExit(0)", "SystemExit"),
+    ("a.py", SCENE_THAT.format("raise SystemExit(0)"), "SystemExit"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "message"), SCENES)
+def test_wrong_scenes_are_refused(tmp_path, name, text, message):
+    path = tmp_path / name
+    if text is not None:
+        path.write_text(text)
+    refused(path, tmp_path / "out", folder=tmp_path, message=message)
+    assert mi.variant() == "llvm_ad_rgb"
+
+
+CONTENTS = {
+    "nested without end": ("[" * 200_000, "not valid JSON"),
+    "too long": (" " * (1 << 20) + "{}", "more than 1,048,576 bytes"),
+    "no JSON": ("nonsense", "not valid JSON"),
+    "long value": ('{"scene": "' + 9000 * "x" + '"}', "the folder holds another capture: scene is"),
+    "a list": ("[]", "the folder holds another capture: scene is null"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), CONTENTS.values(), ids=CONTENTS)
 def test_damaged_capture_json_is_refused_and_kept(ball, tmp_path, content, message):
     path = tmp_path / "capture.json"
     path.write_text(content)
-    line = refused(run(ball, tmp_path))
-    assert line.startswith(f"error: {path}: ") and message in line
-    assert len(line) < 600
-    assert contents(tmp_path) == {"capture.json": content.encode()}
+    line = refused(ball, tmp_path, folder=tmp_path, message=message)
+    assert line.startswith(f"error: {path}: ") and len(line) < 600
+
+
+def test_foreign_folders_are_left_alone(ball, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    message = "the folder is not empty and holds no capture.json"
+    refused(ball, tmp_path, folder=tmp_path, message=message)
+    message = "--out must be a folder"
+    refused(ball, tmp_path / "notes.txt", folder=tmp_path, message=message)
+    out = tmp_path / "out"
+    run(ball, out)
+    for options, message in (
+        (["--spp", 17], "spp is 1, requested is 17"),
+        (["--size", 4, 8], "size is [4, 4], requested is [4, 8]"),
+        (["--fov", 50], "fov is 39.5978, requested is 50.0"),
+    ):
+        refused(ball, out, *options, folder=out, message=message)
+    other = tmp_path / "ball.xml"
+    other.write_text(f"{BALL}<!-- changed -->")
+    message = "the folder holds another capture: scene_sha256"
+    refused(other, out, folder=out, message=message)
 
 
 def test_captured_image_of_another_size_is_refused(ball, captured, tmp_path):
-    assert run(ball, tmp_path / "out").returncode == 0
-    assert run(ball, tmp_path / "other", "--size", 5, 4).returncode == 0
+    run(ball, tmp_path / "out")
+    run(ball, tmp_path / "other", "--size", 5, 4)
     path = tmp_path / "out" / "train" / "r_1.png"
     path.write_bytes((tmp_path / "other" / "train" / "r_1.png").read_bytes())
     (tmp_path / "out" / "points3d.ply").unlink()  # or no image would be looked at
-    line = refused(run(ball, tmp_path / "out"))
-    assert f"{path}: must be an RGBA image of 4 x 4 px of this capture, got 5 x 4" in line
+    message = f"{path}: must be an RGBA image of 4 x 4 px of this capture, got 5 x 4"
+    refused(ball, tmp_path / "out", folder=tmp_path, message=message)
     path.unlink()
-    assert run(ball, tmp_path / "out").returncode == 0
+    run(ball, tmp_path / "out")
     assert contents(tmp_path / "out") == captured
-
-
-@pytest.mark.parametrize(
-    ("program", "message"),
-    [
-        ("mi.set_variant('scalar_rgb')", "must leave Mitsuba's variant at llvm_ad_rgb, got"),
-        ("raise SystemExit(0)", "SystemExit"),
-    ],
-)
-@pytest.mark.parametrize("inside", [True, False])
-def test_scene_that_modifies_the_process_is_refused(tmp_path, program, message, inside):
-    lines = ["import mitsuba as mi", "def scene():", "    pass", "    return {'type': 'scene'}"]
-    lines.insert(*((3, f"    {program}") if inside else (1, program)))
-    path = tmp_path / "s.py"
-    path.write_text("\n".join(lines))
-    line = refused(run(path, tmp_path / "out"))
-    assert line.startswith(f"error: {path}") and message in line
-    assert not (tmp_path / "out").exists()
-    assert mi.variant() == "llvm_ad_rgb"

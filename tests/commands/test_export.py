@@ -1,5 +1,9 @@
-"""``drgs.export``: fits and files for other programs."""
+"""``drgs.export``: fits and files for other programs, and pages of them."""
 
+import base64
+import gzip
+import json
+import re
 import sys
 from dataclasses import replace
 
@@ -44,22 +48,27 @@ def fit(tmp_path):
     """A folder as a fit leaves it, whose cameras are held with z up."""
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "config.yml").write_text("")
-    replace(gaussians_within_ranges(20), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
-    viewers = replace(gaussians_within_ranges(30), rendered_with=VIEWER_RENDERING)
+    configure(folder, FITTED_WITH)
+    replace(blobs(20), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
+    viewers = replace(blobs(30), rendered_with=VIEWER_RENDERING)
     viewers.save(folder / "point_cloud_viewers.ply")
     write_views(folder / "views.json", make_dataset(6, 1))
     return folder
 
 
+def configure(folder, model, **sections):
+    data = {"path": "photographs", "background": [0.25, 0.5, 0.75]}
+    (folder / "config.yml").write_text(yaml.safe_dump({"data": data, "model": model, **sections}))
+
+
 @pytest.mark.parametrize("each", readable_formats(), ids=lambda each: each.name)
 def test_each_format_is_written_beside_its_source(model, each):
+    out = model.with_name(f"model{each.value.suffix}")
+    options = []
     if each.name == "ply":
-        outcome = run(model, "--format", "ply", "--out", model.with_name("out.ply"))
         out = model.with_name("out.ply")
-    else:
-        outcome = run(model, "--format", each.name)
-        out = model.with_name(f"model{each.value.suffix}")
+        options = ["--out", out]
+    outcome = run(model, "--format", each.name, *options)
     assert f"written: {out} (" in outcome.stdout
     expected = Gaussians.load(model)
     assert_within(PRECISION[each.name], expected, matched(expected, Gaussians.load(out)))
@@ -96,8 +105,8 @@ def test_file_with_drgs_approximations_is_exported_with_a_hint(fit):
 def test_playcanvas_export_uses_the_file_with_the_nearer_low_pass(fit, low_pass, is_nearer):
     """Its viewers add 0.075 square pixels, and 0.1875 is in the middle to 0.3."""
     fitted = {"antialiased": True, "low_pass": low_pass}
-    replace(gaussians_within_ranges(20), rendered_with=fitted).save(fit / "point_cloud.ply")
-    (fit / "config.yml").write_text(yaml.safe_dump({"data": {"path": "data"}, "model": fitted}))
+    replace(blobs(20), rendered_with=fitted).save(fit / "point_cloud.ply")
+    configure(fit, fitted)
     outcome = run(fit, "--format", "compressed-ply")
     name = "point_cloud.ply: 20" if is_nearer else "point_cloud_viewers.ply: 30"
     assert outcome.stdout.splitlines()[0] == f"{fit}/{name} Gaussians"
@@ -107,28 +116,20 @@ def test_playcanvas_export_uses_the_file_with_the_nearer_low_pass(fit, low_pass,
     assert ("made to be rendered with" in outcome.stdout) == (not is_nearer)
 
 
-def test_export_does_not_overwrite_its_source(model):
-    run(model, "--format", "spz")
-    source = model.with_name("model.spz")
-    message = f"--out {source}: is the input; choose another name"
-    words = [source, "--format", "spz", "--min-opacity", "0.9"]
-    assert_refused(export.main, *words, folder=model.parent, message=message)
-
-
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb"])
 def test_exported_file_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
-    blobs().save(tmp_path / f"model{suffix}")
-    Gaussians.load(tmp_path / f"model{suffix}").save(tmp_path / "again.ply")
-    camera = ["--origin", 0, -4, 1, "--size", 24, 16]
-    for name in (f"model{suffix}", "again.ply"):
-        render.main(
-            [str(word) for word in (tmp_path / name, *camera, "--out", tmp_path / name[:5])]
-        )
-    images = [(tmp_path / folder / "camera.png").read_bytes() for folder in ("model", "again")]
+    path, again = tmp_path / f"model{suffix}", tmp_path / "again.ply"
+    blobs().save(path)
+    expected = Gaussians.load(path)
+    expected.save(again)
+    images = []
+    for file in (path, again):
+        words = [file, "--origin", 0, -4, 1, "--size", 24, 16, "--out", tmp_path / "out"]
+        assert_ends_well(render.main, *words)
+        images.append((tmp_path / "out" / "camera.png").read_bytes())
     assert images[0] == images[1]
     mi.set_variant("llvm_ad_rgb")
-    plugin = mi.load_dict({"type": "splats", "filename": str(tmp_path / f"model{suffix}")})
-    expected = Gaussians.load(tmp_path / "again.ply")
+    plugin = mi.load_dict({"type": "splats", "filename": str(path)})
     np.testing.assert_array_equal(np.array(plugin.gaussians.means), expected.means)
     np.testing.assert_array_equal(np.array(plugin.gaussians.shN), expected.shN)
 
@@ -174,11 +175,10 @@ def test_usd_is_written_if_openusd_is_installed(model):
 
 def test_equal_gaussians_give_equal_usd_bytes(model):
     pytest.importorskip("pxr.UsdVol")
-    contents = []
-    for name in ("a.usdc", "b.usdc"):
-        run(model, "--out", model.with_name(name))
-        contents.append(model.with_name(name).read_bytes())
-    assert contents[0] == contents[1]
+    files = [model.with_name(name) for name in ("a.usdc", "b.usdc")]
+    for file in files:
+        run(model, "--out", file)
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_missing_openusd_is_reported_with_what_to_install(model, monkeypatch):
@@ -187,35 +187,18 @@ def test_missing_openusd_is_reported_with_what_to_install(model, monkeypatch):
     assert_refused(export.main, model, "--format", "usd", folder=model.parent, message=message)
 
 
-# ----------------------------------------------------------------------------------------------
-# Selection and orientation
-# ----------------------------------------------------------------------------------------------
-
-
 def test_options_select_the_exported_gaussians(model):
     out = model.with_name("out.ply")
     limits = ["--crop", -1, -1, -1, 1, 1, 2, "--min-opacity", 0.2, "--max-size", 0.3]
-    outcome = run(model, "--out", out, *limits)
+    outcome = run(model, "--out", out, *limits, "--order", "morton")
     g = Gaussians.load(model)
     inside = ((g.means >= -1) & (g.means <= [1, 1, 2])).all(axis=1)
     kept = inside & (g.opacities >= 0.2) & (g.scales.max(axis=1) <= 0.3)
     assert 0 < kept.sum() < 300
     assert f"kept: {kept.sum()}; left out by box {(~inside).sum()}, opacity " in outcome.stdout
-    np.testing.assert_array_equal(Gaussians.load(out).means, g.means[kept])
-
-
-def test_morton_order_keeps_neighbours_together(model):
-    out = model.with_name("out.ply")
-    run(model, "--out", out, "--order", "morton")
-    before, after = (Gaussians.load(path).means for path in (model, out))
-    assert sorted(map(tuple, before)) == sorted(map(tuple, after))
-    steps = [np.linalg.norm(np.diff(means, axis=0), axis=1).mean() for means in (before, after)]
-    assert steps[1] < steps[0] / 2
-
-
-def means_of(path):
-    """In the axes of the file."""
-    return read_gaussians(path)[1]["means"]
+    found = Gaussians.load(out).means
+    assert found.tolist() != g.means[kept].tolist()
+    assert sorted(found.tolist()) == sorted(g.means[kept].tolist())
 
 
 @pytest.mark.parametrize(
@@ -228,73 +211,57 @@ def test_up_direction_is_kept_in_the_file(model, suffix, up):
     run(model, "--out", out, "--up", *(1e100 * direction))  # of any length
     heights = np.sort(Gaussians.load(model).means @ direction)
     precision = PRECISION["compressed-ply"].means * 2 if "ply" in suffix else 1e-3
-    np.testing.assert_allclose(np.sort(means_of(out) @ np.array(up)), heights, atol=precision)
+    np.testing.assert_allclose(
+        np.sort(read_gaussians(out)[1]["means"] @ np.array(up)), heights, atol=precision
+    )
 
 
-def test_world_with_expected_axes_is_unchanged(model):
-    out = model.with_name("out.ply")
+def test_files_are_not_rotated_by_default_nor_where_axes_are_as_expected(fit, model):
+    out, expected = model.with_name("out.ply"), Gaussians.load(model)
     run(model, "--out", out, "--up", 0, -1, 0)
-    expected = Gaussians.load(model)
     assert_within(replace(PRECISION["glb"], means=4 * FLOAT32), expected, Gaussians.load(out))
-
-
-def test_files_without_axes_are_not_rotated_by_default(fit, model):
-    out = model.with_name("out.ply")
     assert "up:" not in run(model, "--out", out).stdout
-    np.testing.assert_array_equal(Gaussians.load(out).means, Gaussians.load(model).means)
+    np.testing.assert_array_equal(Gaussians.load(out).means, expected.means)
     outcome = run(fit, "--out", out.with_name("fit.ply"), "--up", "cameras")
     assert "up: 0 0 1 (the training cameras')" in outcome.stdout
 
 
 @pytest.mark.parametrize("optimise", [True, False])
 def test_up_direction_uses_refined_cameras(fit, optimise):
-    turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     dataset = make_dataset(6, 1)
-    turned_views = [replace(v, camera_to_world=pose_turned(v, turn)) for v in dataset.train]
-    write_views(fit / "cameras.json", replace(dataset, train=turned_views))
-    config = {"data": {"path": "data"}, "cameras": {"optimise": optimise}}
-    (fit / "config.yml").write_text(yaml.safe_dump(config))
+    views = [replace(v, camera_to_world=turn @ v.camera_to_world) for v in dataset.train]
+    write_views(fit / "cameras.json", replace(dataset, train=views))
+    configure(fit, FITTED_WITH, cameras={"optimise": optimise})
     outcome = run(fit, "--format", "glb", "--up", "cameras")
     up = "0 -1 0" if optimise else "0 0 1"
     assert f"up: {up} (the training cameras')" in outcome.stdout
 
 
-def pose_turned(view, rotation):
-    pose = np.eye(4)
-    pose[:3] = rotation @ view.camera_to_world[:3]
-    return pose
+TO_SPZ = ("model.ply", "--format", "spz")
+REFUSED = [
+    (("model.ply",), "one of ply, compressed-ply, spz, glb, splat, usd, html, got none"),
+    (("model.ply", "--format", "splt"), "got splt; did you mean splat?"),
+    (("model.ply", "--out", "a.obj"), "--format: must be one of"),
+    ((*TO_SPZ, "--out", "a.glb"), "name of a spz file must end in .spz"),
+    (("model.ply", "--format", "ply", "--out", "a.compressed.ply"), "that of a compressed-ply"),
+    (("model.ply", "--format", "ply"), "model.ply: is the input; choose another name"),
+    (("none.ply", "--format", "spz"), "none.ply: there is no such file or folder"),
+    ((".", "--format", "spz"), "must be the output folder of a fit that has ended"),
+    ((*TO_SPZ, "--up", "cameras"), "--up cameras: needs the output"),
+    ((*TO_SPZ, "--up", 0, 0, 0), "--up: must be cameras, or thr"),
+    ((*TO_SPZ, "--up", "inf", 0, 0), "--up: must be cameras, or t"),
+    ((*TO_SPZ, "--min-opacity", 2), "--min-opacity: must be between"),
+    ((*TO_SPZ, "--max-size", 0), "--max-size: must be above 0, got 0"),
+    ((*TO_SPZ, "--max-size", 1e-9), "nothing is left; crop and filt"),
+]
 
 
-# ----------------------------------------------------------------------------------------------
-# Errors
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ["model.ply"],
-            "one of ply, compressed-ply, spz, glb, splat, usd, html, got none",
-        ),
-        (["model.ply", "--format", "splt"], "got splt; did you mean splat?"),
-        (["model.ply", "--out", "a.obj"], "--format: must be one of"),
-        (["model.ply", "--format", "spz", "--out", "a.glb"], "name of a spz file must end in .spz"),
-        (["model.ply", "--format", "ply", "--out", "a.compressed.ply"], "that of a compressed-ply"),
-        (["model.ply", "--format", "ply"], "is the input; choose another name"),
-        (["none.ply", "--format", "spz"], "none.ply: there is no such file or folder"),
-        ([".", "--format", "spz"], "must be the output folder of a fit that has ended"),
-        (["model.ply", "--format", "spz", "--up", "cameras"], "--up cameras: needs the output"),
-        (["model.ply", "--format", "spz", "--up", "0", "0", "0"], "--up: must be cameras, or thr"),
-        (["model.ply", "--format", "spz", "--up", "inf", "0", "0"], "--up: must be cameras, or t"),
-        (["model.ply", "--format", "spz", "--min-opacity", "2"], "--min-opacity: must be between"),
-        (["model.ply", "--format", "spz", "--max-size", "0"], "--max-size: must be above 0, got 0"),
-        (["model.ply", "--format", "spz", "--max-size", "1e-9"], "nothing is left; crop and filt"),
-    ],
-)
-def test_invalid_exports_are_refused(model, monkeypatch, arguments, message):
+@pytest.mark.parametrize(("words", "message"), REFUSED)
+def test_invalid_exports_are_refused(model, monkeypatch, words, message):
     monkeypatch.chdir(model.parent)
-    assert_refused(export.main, *arguments, folder=model.parent, message=message)
+    assert_refused(export.main, *words, folder=model.parent, message=message)
 
 
 def test_foreign_file_is_kept_and_own_file_is_replaced(model):
@@ -307,3 +274,39 @@ def test_foreign_file_is_kept_and_own_file_is_replaced(model):
     first = out.read_bytes()
     run(model, "--format", "spz", "--min-opacity", 0.5)
     assert out.read_bytes() != first
+
+
+def exported(what, out, *options):
+    """Return the command's output, the page's scene and its Gaussians."""
+    outcome = assert_ends_well(export.main, what, "--out", out, *options)
+    page = out.read_text("utf-8")
+    scene, splats = (re.search(rf'id="{name}">([^<]*)<', page)[1] for name in ("scene", "splats"))
+    model = out.with_suffix(".ply")
+    model.write_bytes(gzip.decompress(base64.b64decode(splats)))
+    return outcome.stdout, page, json.loads(scene), Gaussians.load(model)
+
+
+@pytest.mark.parametrize("order", ["center", "pixel"])
+def test_page_of_a_fit_shows_its_own_gaussians_if_the_page_supports_them(fit, tmp_path, order):
+    configure(fit, {**FITTED_WITH, "order": order})
+    said, page, scene, gaussians = exported(fit, tmp_path / "a.html")
+    is_own = order == "center"
+    name, count = ("point_cloud.ply", 20) if is_own else ("point_cloud_viewers.ply", 30)
+    assert said.splitlines()[0] == f"{fit}/{name}: {count} Gaussians"
+    assert "note" not in said and gaussians.num_gaussians == count
+    expected = (0.1, True) if is_own else (0.3, False)
+    assert (scene["lowPass"], scene["antialiased"]) == (pytest.approx(expected[0]), expected[1])
+    assert scene["settings"]["background"]["color"] == [0.25, 0.5, 0.75]
+    assert "<title>run: Gaussian splats</title>" in page
+
+
+@pytest.mark.parametrize("options", [(), ("--up", 0, 0, 1)])
+def test_file_is_shown_as_a_whole_with_z_up(fit, tmp_path, options):
+    what = fit / "point_cloud.ply" if not options else fit
+    _, _, scene, gaussians = exported(what, tmp_path / "a.html", *options)
+    heights = np.sort(-gaussians.means[:, 1])
+    expected = np.sort(blobs(20).means[:, 2])
+    correlation = np.corrcoef(heights, expected)[0, 1]
+    assert correlation > 0.9999  # rounded to 10 bits
+    black = scene["settings"]["background"]["color"] == [0, 0, 0]
+    assert black == (not options)

@@ -21,6 +21,7 @@ from support.small_capture import blobs
 
 from drgs import render
 from drgs.config.load import load_config
+from drgs.core.folders import sole_writer
 from drgs.results.folder import continue_run
 
 POINTS = "out/point_cloud.ply"
@@ -75,84 +76,55 @@ def assert_as_uninterrupted(folder, projects):
     assert len(rows) == ITERATIONS + 1
 
 
-# ----------------------------------------------------------------------------------------------
-# Files of others
-# ----------------------------------------------------------------------------------------------
-
-
 def test_foreign_configuration_is_kept(tmp_path):
     """Whether it is the one to be fitted, or another; also with --overwrite."""
-    config = write_project(tmp_path)
-    config = config.rename(tmp_path / "config.yml")
-    text = config.read_text()
+    config = write_project(tmp_path).rename(tmp_path / "config.yml")
     mine = tmp_path / "mine"
     mine.mkdir()
-    (mine / "config.yml").write_text(f"# by hand\n{text.replace('path: data', 'path: ../data')}")
-    for file in (config, mine / "config.yml"):
-        message = (
-            f"{mine / 'config.yml'}: would be replaced, and was not written by a fit, or changed"
-        )
-        assert_fit_refused(file, "--out", mine, folder=tmp_path, message=message)
-        message = f"{mine}: must hold nothing but a run to be replaced, got config.yml; move"
-        assert_fit_refused(file, "--out", mine, "--overwrite", folder=tmp_path, message=message)
-    arguments = (config, "--out", tmp_path)
-    for options, expected in (([], "would be replaced"), (["--budget", 60], "new or empty")):
-        assert_fit_refused(*arguments, *options, folder=tmp_path, message=expected)
-
-
-@pytest.mark.slow
-def test_configuration_written_by_a_fit_can_be_fitted_in_place(ended, projects):
-    (ended / "again").mkdir()
-    shutil.copy(ended / "out" / "config.yml", ended / "again")
-    arguments = (ended / "again" / "config.yml", "--data", ended / "data")
-    assert_fits(*arguments, "--out", ended / "again")
-    expected = (projects / "ended" / POINTS).read_bytes()
-    assert (ended / "again" / "point_cloud.ply").read_bytes() == expected
+    text = config.read_text().replace("path: data", "path: ../data")
+    (mine / "config.yml").write_text(f"# by hand\n{text}")
+    replaced = "config.yml: would be replaced, and was not written by a fit, or changed"
+    for words, message in (
+        ((config, "--out", mine), replaced),
+        ((mine / "config.yml", "--out", mine), replaced),
+        ((config, "--out", mine, "--overwrite"), "to be replaced, got config.yml; move"),
+        ((mine / "config.yml", "--out", mine, "--overwrite"), "replaced, got config.yml; move"),
+        ((config, "--out", tmp_path), "would be replaced"),
+        ((config, "--out", tmp_path, "--budget", 60), "new or empty"),
+    ):
+        assert_fit_refused(*words, folder=tmp_path, message=message)
 
 
 def test_configuration_edited_before_the_first_checkpoint_is_kept(stopped):
     (stopped / "out" / "checkpoint.npz").unlink()
     path = stopped / "out" / "config.yml"
-    path.write_text(f"# by hand\n{path.read_text()}")
-    arguments = (stopped / "a.yml", "--out", stopped / "out")
-    assert_fit_refused(
-        *arguments, "--set", "seed=7", folder=stopped, message=f"{path}: would be replaced"
-    )
-    text = path.read_text()
-    continue_run(stopped / "out", load_config(stopped / "out" / "config.yml"))
+    text = f"# by hand\n{path.read_text()}"
+    path.write_text(text)
+    words = (stopped / "a.yml", "--out", stopped / "out", "--set", "seed=7")
+    assert_fit_refused(*words, folder=stopped, message=f"{path}: would be replaced")
+    continue_run(stopped / "out", load_config(path))
     assert path.read_text() == text
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["notes.txt", "renders/mine.png", "renders/test/mine.png", "side_by_side/.mine"]
-)
-@pytest.mark.parametrize("recorded", [True, False])
-def test_foreign_files_are_not_removed_with_a_run(ended, name, recorded):
+@pytest.mark.parametrize("name", ["history.csv", "renders/test/mine.png"])
+def test_files_that_are_not_a_fits_are_not_removed(ended, name):
+    """Whether the fit has recorded its files or, as by earlier versions, not."""
     out = ended / "out"
-    if not recorded:
-        (out / ".drgs-fit.json").unlink()
-    (out / name).parent.mkdir(exist_ok=True)
-    (out / name).write_text("mine")
-    message = f"must hold nothing but a run to be replaced, got {name}; move that away"
-    arguments = (ended / "a.yml", "--out", out, "--overwrite")
-    assert_fit_refused(*arguments, folder=ended, message=message)
-    if name == "notes.txt" and recorded:
-        (out / name).unlink()
-        assert_fits(*arguments)
-
-
-def test_modified_results_are_not_removed(ended):
-    (ended / "out" / "history.csv").write_text("with remarks")
-    arguments = (ended / "a.yml", "--out", ended / "out", "--overwrite")
-    assert_fit_refused(*arguments, folder=ended, message="got history.csv; move")
+    (out / name).write_text("with remarks")
+    words, message = (ended / "a.yml", "--out", out, "--overwrite"), f"got {name}; move"
+    assert_fit_refused(*words, folder=ended, message=message)
+    (out / ".drgs-fit.json").unlink()
+    if name == "history.csv":
+        assert_fits(*words)
+    else:
+        assert_fit_refused(*words, folder=ended, message=message)
 
 
 def test_existing_user_image_is_kept(stopped):
-    (stopped / "out" / "renders" / "test").mkdir(parents=True)
-    (stopped / "out" / "renders" / "test" / "r_1.png").symlink_to(
-        stopped / "data" / "test" / "r_1.png"
-    )
+    test = stopped / "out" / "renders" / "test"
+    test.mkdir(parents=True)
+    (test / "r_1.png").symlink_to(stopped / "data" / "test" / "r_1.png")
     message = "out: holds renders/test/r_1.png, which this command would replace"
     assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
 
@@ -163,81 +135,35 @@ def test_record_of_a_finished_fit_lists_every_file(ended):
     assert all(files.values())
 
 
-# ----------------------------------------------------------------------------------------------
-# Changed data
-# ----------------------------------------------------------------------------------------------
-
-
-def edit(folder, change, split="train"):
-    """Change the parsed frames of a split."""
-    path = folder / f"transforms_{split}.json"
-    values = json.loads(path.read_text())
-    change(values["frames"])
-    path.write_text(json.dumps(values))
-
-
-def another_image(folder, split="train"):
-    shutil.copy(folder / split / "r_0.png", folder / split / "r_1.png")
-
-
-def resize_training_images(folder):
-    """Return other sizes for all training images."""
-    from PIL import Image
-
-    for path in (folder / "train").iterdir():
-        with Image.open(path) as image:
-            image.resize((16, 12)).save(path)
-
-
-def moved_camera(frames):
-    frames[2]["transform_matrix"][0][3] += 1e-3
-
-
-def masked(folder):
-    from PIL import Image
-
-    Image.new("L", (32, 24), 255).save(folder / "mask.png")
-    edit(folder, lambda frames: frames[0].update(mask_path="mask.png"))
-
-
-CHANGES = {
-    "training view r_1 is missing": lambda data: edit(data, lambda frames: frames.pop(1)),
-    "training view r_9 is new": lambda data: (
-        shutil.copy(data / "train" / "r_0.png", data / "train" / "r_9.png"),
-        edit(data, lambda frames: frames.append({**frames[0], "file_path": "train/r_9"})),
-    ),
-    "the training views are in another order": lambda data: edit(data, list.reverse),
-    "the image of training view r_1": another_image,
-    "the size (32x24, now 16x12) of training view r_0, the image of training view r_0, the size "
-    "(32x24, now 16x12) of training view r_1 and 3 more": resize_training_images,
-    "the camera of training view r_2": lambda data: edit(data, moved_camera),
-    "the mask of training view r_0": masked,
-    "the image of test view r_1": lambda data: another_image(data, "test"),
-}
+MESSAGE = "out: another command is writing to this folder; wait until it has ended, or choose an"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", CHANGES)
-def test_fit_with_changed_data_is_not_continued(stopped, text):
-    CHANGES[text](stopped / "data")
+def test_folder_in_use_by_another_fit_is_refused(stopped):
+    """Whether it is resumed, replaced or begun again; afterwards it goes on."""
+    out = stopped / "out"
+    same = (stopped / "a.yml", "--out", out)
+    with sole_writer(out):
+        for words in (same, ("--resume", out), (*same, "--overwrite")):
+            assert_fit_refused(*words, folder=stopped, message=MESSAGE)
+    assert_fits("--resume", out)
+
+
+def replace_an_image(data):
+    shutil.copy(data / "train" / "r_0.png", data / "train" / "r_1.png")
+
+
+@pytest.mark.slow
+def test_fit_with_changed_data_is_not_continued(stopped, projects):
     out, data = stopped / "out", stopped / "data"
-    for arguments in (["--resume", out], [stopped / "a.yml", "--out", out]):
-        message = f"checkpoint.npz: belongs to other data than {data}: {text}; give the folder"
-        assert_fit_refused(*arguments, folder=stopped, message=message)
-
-
-@pytest.mark.slow
-def test_rewritten_identical_images_are_the_same_data(stopped, projects):
-    for path in (stopped / "data").rglob("*"):
-        if path.is_file():
-            path.write_bytes(path.read_bytes())
-    assert "continues at iteration 4" in assert_fits("--resume", stopped / "out").stdout
+    image = (data / "train" / "r_1.png").read_bytes()
+    replace_an_image(data)
+    message = f"checkpoint.npz: belongs to other data than {data}: the image of training view r_1;"
+    for words in (["--resume", out], [stopped / "a.yml", "--out", out]):
+        assert_fit_refused(*words, folder=stopped, message=message)
+    (data / "train" / "r_1.png").write_bytes(image)
+    assert "continues at iteration 4" in assert_fits("--resume", out).stdout
     assert_as_uninterrupted(stopped, projects)
-
-
-# ----------------------------------------------------------------------------------------------
-# Moved
-# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("by", ["resume", pytest.param("same command", marks=pytest.mark.slow)])
@@ -253,7 +179,12 @@ def test_moved_project_is_continued(stopped, projects, tmp_path, by):
     assert_as_uninterrupted(moved, projects)
 
 
-def test_moved_data_is_reported(stopped, projects, tmp_path):
+def test_other_and_moved_data_are_reported(stopped, projects, tmp_path):
+    shutil.copytree(stopped / "data", tmp_path / "other")
+    replace_an_image(tmp_path / "other")
+    words = ("--resume", stopped / "out", "--data", tmp_path / "other")
+    message = f"belongs to other data than {tmp_path / 'other'}: the image of training view r_1;"
+    assert_fit_refused(*words, folder=stopped, message=message)
     (stopped / "data").rename(tmp_path / "elsewhere")
     message = f"data.path: there is no folder {stopped / 'data'}; say where it is (--data DIR)"
     assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
@@ -272,27 +203,6 @@ def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     assert_fits("--resume", tmp_path / "out", "--data", tmp_path / "elsewhere")
     found = load_config(tmp_path / "out" / "config.yml")
     assert found.init.point_cloud == tmp_path / "elsewhere" / "points.ply"
-
-
-@pytest.mark.slow
-def test_path_may_be_edited_by_hand(stopped, projects, tmp_path):
-    (stopped / "data").rename(tmp_path / "elsewhere")
-    path = stopped / "out" / "config.yml"
-    values = yaml.safe_load(path.read_text())
-    values["data"]["path"] = str(tmp_path / "elsewhere")
-    text = f"# moved to elsewhere\n{yaml.safe_dump(values)}"
-    path.write_text(text)
-    assert_fits("--resume", stopped / "out")
-    assert path.read_text() == text
-    assert_as_uninterrupted(stopped, projects)
-
-
-def test_different_data_is_refused_by_content(stopped, tmp_path):
-    shutil.copytree(stopped / "data", tmp_path / "other")
-    another_image(tmp_path / "other")
-    arguments = ("--resume", stopped / "out", "--data", tmp_path / "other")
-    message = f"belongs to other data than {tmp_path / 'other'}: the image of training view r_1;"
-    assert_fit_refused(*arguments, folder=stopped, message=message)
 
 
 def test_finished_fit_stays_finished_without_its_data(ended, tmp_path):
@@ -346,11 +256,10 @@ def test_views_of_a_moved_project_are_rendered(ended, tmp_path):
 
 def test_folder_is_fitted_without_a_configuration(tmp_path):
     write_project(tmp_path)
-    folder, few = tmp_path / "data", ["--set", "iterations=2", "--set", "output.report=false"]
-    few += ["--set", "output.save_renders=false", "--out", tmp_path / "out"]
-    outcome = run_fit(folder, *few)
-    assert outcome.returncode == 0, outcome.stderr
-    first = outcome.stdout.splitlines()[0]
+    folder, words = tmp_path / "data", ["--out", tmp_path / "out"]
+    for setting in ("iterations=2", "output.report=false", "output.save_renders=false"):
+        words += ["--set", setting]
+    first = assert_fits(folder, *words).stdout.splitlines()[0]
     assert first.startswith(
         "no configuration is given, so that it follows from the folder: cut-out"
     )

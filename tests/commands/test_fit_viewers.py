@@ -1,29 +1,169 @@
-"""``point_cloud_viewers.ply``: Gaussians for viewers that render otherwise than the fit."""
+"""Results of a fit with ``--view``, and Gaussians for viewers that render otherwise.
+
+The page itself is tested in ``tests/viewer``.
+"""
 
 import json
+import socket
 import sys
-from dataclasses import replace
+from contextlib import contextmanager
+from types import ModuleType
+from unittest.mock import Mock
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.commands import assert_ends_well
-from support.fit_command import VALUES, assert_fits, without_images, write_project
+from support.fit_command import (
+    VALUES,
+    assert_fit_refused,
+    assert_fits,
+    run_fit,
+    without_images,
+    write_project,
+)
 from support.folders import contents
 from support.render_command import run as render
-from support.small_capture import decibels
-from support.small_fits import disturbed_blobs, double, photograph, true_blobs
+from support.small_capture import HEIGHT, WIDTH, decibels, pose_around
+from support.small_fits import double, photograph
 
 from drgs import fit
-from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
 from drgs.results.folder import remove_run
-from drgs.training import session
-from drgs.training.fit_folder import gaussians_on_page
+from drgs.training import fit_folder
+from drgs.viewer import training_viewer
+from drgs.viewer.frames import FrameRequest, ViewerCamera
+from drgs.viewer.scheduler import RenderRequests
+from drgs.viewer.training_viewer import EarlyStop, TrainingViewer
+
+EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
+
+
+class Screen:
+    """Somebody who asks for more with each image, and for an end at an iteration."""
+
+    def __init__(self, queue, end_at):
+        self.queue, self.end_at, self.shown = queue, end_at, 0
+
+    def show(self, client, request, frame, is_whole):
+        self.shown += 1
+        self.queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT + self.shown % 2))
+
+    def show_progress(self, trainer, history, total):
+        if trainer.iteration == self.end_at:
+            self.queue.end()
+
+    def refuse(self, client, reason):
+        raise AssertionError(reason)
+
+    def show_end(self, iterations):
+        self.iterations = iterations
+
+
+@pytest.fixture
+def viewer_page(monkeypatch):
+    """Makes ``--view`` a page for the screen above, without a server."""
+
+    @contextmanager
+    def run_server(*arguments):
+        yield "server"
+
+    server = ModuleType("drgs.viewer.server")
+    server.run_server, server.url, server.ADDRESS = run_server, lambda _: "http://here", "127.0.0.1"
+    monkeypatch.setitem(sys.modules, "drgs.viewer.server", server)
+    monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
+    monkeypatch.setattr("drgs.viewer.training_viewer.PROGRESS_SECONDS", 0.0)
+
+    def attach_viewer(end_at=None):
+        screens = []
+
+        def watch(server, trainer, dataset, length):
+            queue = RenderRequests()
+            screens.append(Screen(queue, end_at))
+            queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT))
+            length = EarlyStop(length, queue)
+            return TrainingViewer(queue, screens[0], dataset, length), length
+
+        monkeypatch.setattr(training_viewer, "watch", watch)
+        return screens
+
+    without_images(monkeypatch)
+    return attach_viewer
+
+
+def files_of(out):
+    """The bytes of what does not tell the time."""
+    paths = (p for p in out.rglob("*") if p.is_file() and p.suffix in (".ply", ".png"))
+    return {path.relative_to(out): path.read_bytes() for path in paths}
+
+
+@pytest.mark.slow
+def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, viewer_page):
+    config, screens = write_project(tmp_path), viewer_page()
+    outcome = assert_fits(config, "--out", tmp_path / "watched", "--view")
+    assert "look on at http://here" in outcome.stdout
+    assert screens[0].shown == screens[0].iterations == 8
+    assert_fits(config, "--out", tmp_path / "alone")
+    assert files_of(tmp_path / "watched") == files_of(tmp_path / "alone")
+    first, second = ((tmp_path / n / "config.yml").read_text() for n in ("watched", "alone"))
+    assert first.replace("watched", "alone") == second
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [False, True])
+def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page, monkeypatch, killed):
+    """Also if it is killed before its results are written, and resumed."""
+    config, out = write_project(tmp_path), tmp_path / "out"
+    viewer_page(end_at=4)
+    with monkeypatch.context() as patch:
+        if killed:
+            patch.setattr(fit_folder, "write_images", Mock(side_effect=KeyboardInterrupt))
+        outcome = run_fit(config, "--out", out, "--view")
+        assert outcome.returncode == (130 if killed else 0)
+        assert ("5 iterations in" in outcome.stdout) != killed
+    assert ("finished" in assert_fits("--resume", out).stdout) != killed
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["iterations"] == metrics["config"]["iterations"] == 5
+    assert load_config(out / "config.yml").iterations == 5
+    assert not (out / "checkpoint.npz").exists()
+    assert_fits(out / "config.yml", "--out", tmp_path / "again")
+    assert files_of(tmp_path / "again") == files_of(out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--view-port", "8080"), "--view-port: needs --view"),
+        (("--view-address", "::1"), "--view-address: needs --view"),
+        (("--view", "--view-port", "0"), "--view-port: must be a whole number >= 1, got 0"),
+        (("--view", "--view-port", "65536"), "--view-port: must be at most 65,535"),
+        (("--view", "--view-address", "192.0.2.1"), "192.0.2.1: cannot listen at 192.0.2.1"),
+        (("--view", "--view-address", "no address"), "no address: cannot listen at no address"),
+    ],
+)
+def test_wrong_options_are_refused(tmp_path, arguments, message):
+    pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
+    assert_fit_refused(write_project(tmp_path), *arguments, folder=tmp_path, message=message)
+
+
+def test_occupied_port_is_refused(tmp_path):
+    pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        words = (write_project(tmp_path), "--view", "--view-port", port)
+        message = f"--view-port {port}: cannot listen at 127.0.0.1: Address already in use"
+        assert_fit_refused(*words, folder=tmp_path, message=message)
+
+
+def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    message = "--view: needs viser, which is not installed; pip install 'drgs[viewer]'"
+    assert_fit_refused(write_project(tmp_path), "--view", folder=tmp_path, message=message)
+
 
 FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 
@@ -41,10 +181,9 @@ def fitted(tmp_path_factory):
 
 def test_both_files_record_their_approximations(fitted):
     out, _ = fitted
-    assert Gaussians.load(out / GAUSSIANS).rendered_with == FITTED_WITH
-    usual = {"antialiased": False, "low_pass": 0.3}
-    assert Gaussians.load(out / GAUSSIANS_FOR_VIEWERS).rendered_with == usual
     native, other = (Gaussians.load(out / name) for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS))
+    assert native.rendered_with == FITTED_WITH
+    assert other.rendered_with == {"antialiased": False, "low_pass": 0.3}
     assert native.num_gaussians == other.num_gaussians and (native.means != other.means).any()
 
 
@@ -73,16 +212,10 @@ def test_plugin_renders_the_file_like_the_fit(fitted):
     out, _ = fitted
     config = load_config(out / "config.yml")
     dataset = load_dataset(config.data)
-    gaussians = Gaussians.load(out / GAUSSIANS)
-    scene = make_scene(gaussians, config.model, dataset.background)
+    scene = make_scene(Gaussians.load(out / GAUSSIANS), config.model, dataset.background)
     (expected,) = render_views(scene, dataset.test[:1])
-    integrator = {
-        "type": "splats",
-        "filename": str(out / GAUSSIANS),
-        "background": list(dataset.background),
-        "near": 0.2,
-        "srgb_primitives": False,
-    }
+    integrator = {"type": "splats", "filename": str(out / GAUSSIANS), "near": 0.2}
+    integrator |= {"background": list(dataset.background), "srgb_primitives": False}
     (sensor,) = make_sensors(dataset.test[:1])
     by_name = mi.render(mi.load_dict({"type": "scene", "integrator": integrator}), sensor=sensor)
     np.testing.assert_array_equal(np.clip(np.array(by_name), 0, 1), expected)
@@ -95,7 +228,7 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     config = write_project(tmp_path, model={**VALUES["model"], **FITTED_WITH})
     without_images(monkeypatch)
     with monkeypatch.context() as broken:
-        broken.setattr(session.FitSession, "_fit_for_viewers", lambda *_: sys.exit(7))
+        broken.setattr("drgs.training.viewers.for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
             fit.main([str(config), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
@@ -115,42 +248,3 @@ def test_fit_with_viewer_approximations_writes_one_file(tmp_path, monkeypatch):
     assert "viewers" not in json.loads((tmp_path / "out" / METRICS).read_text())
     assert not {"drgs.training.viewers", "drgs.effects.smoothing"} & set(sys.modules)
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None
-
-
-@pytest.mark.slow
-def test_foreign_file_is_not_replaced(tmp_path, monkeypatch):
-    without_images(monkeypatch)
-    config = write_project(tmp_path)
-    assert_fits(config, "--out", tmp_path / "out")
-    replace(Gaussians.load(tmp_path / "out" / GAUSSIANS), rendered_with=None).save(
-        tmp_path / "out" / GAUSSIANS_FOR_VIEWERS
-    )
-    with pytest.raises(SystemExit) as end:
-        fit.main([str(config), "--out", str(tmp_path / "out"), "--overwrite"])
-    assert end.value.code == 2 and (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
-
-
-@pytest.mark.parametrize(
-    ("approximations", "shown"),
-    [
-        (Approximations(), "the fit's own"),
-        (Approximations(**FITTED_WITH), "the fit's own"),
-        (Approximations(order="pixel", low_pass=0.1), "those for viewers"),
-    ],
-)
-def test_page_shows_the_gaussians_of_the_fit_if_supported(approximations, shown):
-    own, other = true_blobs(), disturbed_blobs()
-    found = gaussians_on_page(own, approximations, other)
-    if shown == "the fit's own":
-        assert found.gaussians is own and found.approximations == approximations
-    else:
-        assert found.gaussians is other and found.approximations == Approximations()
-
-
-def test_page_shows_gaussians_with_the_filter_baked_in():
-    own = true_blobs()
-    own = replace(own, smoothing=np.full(own.num_gaussians, 0.2, np.float32))
-    found = gaussians_on_page(own, Approximations(), None).gaussians
-    assert found.smoothing is None
-    expected = np.sqrt(np.square(own.scales.astype(np.float64)) + 0.2**2)
-    np.testing.assert_allclose(found.scales, expected, rtol=1e-5)  # float32 logarithms

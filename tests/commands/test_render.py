@@ -1,22 +1,20 @@
 """``python -m drgs.render``, against the float64 reference and PSNR computed plainly."""
 
 import json
+from dataclasses import replace
+from itertools import combinations
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import Rotation
 from support.folders import visible
 from support.render_command import (
     BLACK,
-    EIGHT_BITS,
     WHITE,
     assert_shows,
     rendered,
     run,
-    sensor,
-    write_scene,
 )
 from support.small_capture import (
     FIELD_OF_VIEW,
@@ -26,25 +24,20 @@ from support.small_capture import (
     blobs,
     decibels,
     make_dataset,
-    photograph,
     pose_around,
     write_dataset,
+    write_fit,
 )
 from support.small_capture import view as small_view
 
-from drgs import render
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
+from drgs.results.refined_cameras import write_views
 
 
 def photo(fit, name, background, split="test"):
     """A photograph of the dataset over a background."""
     rgba = iio.imread(fit.parent / "data" / split / f"{name}.png") / 255
     return rgba[:, :, :3] * rgba[:, :, 3:] + np.array(background) * (1 - rgba[:, :, 3:])
-
-
-# ----------------------------------------------------------------------------------------------
-# Views with photographs
-# ----------------------------------------------------------------------------------------------
 
 
 def test_a_fit_is_rendered_from_its_test_views_and_measured(fit, tmp_path, capsys):
@@ -65,50 +58,24 @@ def test_a_fit_is_rendered_from_its_test_views_and_measured(fit, tmp_path, capsy
     assert (metrics["split"], metrics["num_views"], metrics["num_gaussians"]) == ("test", 4, 30)
 
 
-def test_a_ply_is_rendered_under_a_configuration(fit, tmp_path):
-    run(fit, "--split", "train", "--out", tmp_path / "fit")
-    ply = fit / "point_cloud.ply"
-    run(ply, "--scene", fit / "config.yml", "--split", "train", "--out", tmp_path / "ply")
-    names = visible(tmp_path / "fit")
-    assert names == {"metrics.json", *(f"r_{i}.png" for i in range(8))}
-    for name in names:
-        assert (tmp_path / "fit" / name).read_bytes() == (tmp_path / "ply" / name).read_bytes()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("optimised", [True, False])
 def test_refined_cameras_are_used_or_mentioned(tmp_path, capsys, optimised):
     """Whether the fit's folder or its PLY file is named, as its configuration says."""
     dataset = make_dataset(2, 1)
-    write_dataset(tmp_path / "data", dataset)
-    found = tmp_path / "run"
-    blobs().save(found / "point_cloud.ply")
-    config = {"data": {"path": str(tmp_path / "data")}, "cameras": {"optimise": optimised}}
-    (found / "config.yml").write_text(yaml.safe_dump(config))
-    refined = [
-        small_view(v.name, pose_around(0.4 + i, 0.6), None) for i, v in enumerate(dataset.train)
-    ]
-    frames = [
-        {"file_path": v.name, "transform_matrix": (v.camera_to_world * [1, -1, -1, 1]).tolist()}
-        for v in refined
-    ]
-    (found / "cameras.json").write_text(json.dumps({"lens_change": {}, "frames": frames}))
-    for name, what in (
-        ("folder", [found]),
-        ("file", [found / "point_cloud.ply", "--scene", found / "config.yml"]),
-    ):
-        run(*what, "--split", "train", "--out", tmp_path / name)
-        printed = capsys.readouterr().out.splitlines()
-        said = [line for line in printed if "cameras.json" in line]
-        assert said == [
-            f"cameras: as refined, from {found / 'cameras.json'}"
-            if optimised
-            else f"cameras: as the dataset has them; those of {found / 'cameras.json'} are used "
-            "with --set cameras.optimise=true"
-        ]
-        for view, moved in zip(dataset.train, refined, strict=True):
-            seen_from = moved if optimised else view
-            assert_shows(tmp_path / name / f"{view.name}.png", seen_from, WHITE)
+    found = write_fit(tmp_path, dataset, cameras={"optimise": optimised})
+    path = found / "cameras.json"
+    refined = [replace(v, camera_to_world=pose_around(1.4, 0.6)) for v in dataset.train]
+    write_views(path, replace(dataset, train=refined))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"lens_change": {}}))
+    said = f"cameras: as refined, from {path}\n"
+    if not optimised:
+        said = f"cameras: as the dataset has them; those of {path} are used with --set cameras.opti"
+    for what in ([found], [found / "point_cloud.ply", "--scene", found / "config.yml"]):
+        run(*what, "--split", "train", "--out", tmp_path / "out")
+        assert said in capsys.readouterr().out
+        for view in refined if optimised else dataset.train:
+            assert_shows(tmp_path / "out" / f"{view.name}.png", view, WHITE)
 
 
 def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
@@ -122,31 +89,13 @@ def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
 
 def test_depths_are_not_opened(tmp_path):
     """There are none: nothing that is rendered looks at them."""
-    write_dataset(tmp_path / "data", make_dataset(1, 1))
-    for split in ("train", "test"):
-        path = tmp_path / "data" / f"transforms_{split}.json"
+    fit = write_fit(tmp_path, make_dataset(1, 1))
+    for path in (tmp_path / "data").glob("transforms_*.json"):
         values = json.loads(path.read_text())
         values["frames"][0]["depth_file_path"] = "nowhere.png"
         path.write_text(json.dumps(values))
-    blobs().save(tmp_path / "blobs.ply")
-    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
-    run(tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", "--out", tmp_path / "out")
+    run(fit, "--out", tmp_path / "out")
     assert (tmp_path / "out" / "r_0.png").is_file()
-
-
-def test_values_of_the_configuration_can_be_set(fit, tmp_path):
-    run(fit, "--set", "data.image_size=16", "--out", tmp_path)
-    assert rendered(tmp_path / "r_0.png").shape == (HEIGHT // 2, WIDTH // 2, 3)
-
-
-def test_infinite_psnr_is_null_in_json():
-    quality = {"psnr": float("inf"), "views": {"a": {"psnr": 3.5}}}
-    assert render._replace_infinities(quality) == {"psnr": None, "views": {"a": {"psnr": 3.5}}}
-
-
-# ----------------------------------------------------------------------------------------------
-# Views without
-# ----------------------------------------------------------------------------------------------
 
 
 def test_orbit_is_around_the_focus_of_the_photographs(fit, tmp_path):
@@ -177,9 +126,9 @@ def test_cameras_of_a_transforms_file_render_the_images_of_the_split(fit, tmp_pa
         assert (tmp_path / "cameras" / f"camera_{index}.png").read_bytes() == expected
 
 
-def write_camera(path, begin, end=None, **says):
+def write_camera(path, begin, end=None, **values):
     """Write a small camera in the layout of transforms.json; end: its second pose."""
-    frame = {"transform_matrix": (begin * [1, -1, -1, 1]).tolist(), **says}
+    frame = {"transform_matrix": (begin * [1, -1, -1, 1]).tolist(), **values}
     if end is not None:
         frame["transform_matrix_close"] = (end * [1, -1, -1, 1]).tolist()
     values = {"camera_angle_x": FIELD_OF_VIEW, "w": WIDTH, "h": HEIGHT, "frames": [frame]}
@@ -188,78 +137,102 @@ def write_camera(path, begin, end=None, **says):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("samples", [None, 3])
-def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path, samples):
+def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path):
     """A global shutter that closes where it opened shows what one that stands still does."""
     begin, end = (pose_around(azimuth, 0.3) for azimuth in (0.8, 0.9))
     end[:3, 3] += 0.4 * end[:3, 0]
-    settings = ["--set", f"data.shutter_samples={samples}"] if samples else []
-    for name, close, shutter in (
-        ("still", None, "global"),
-        ("same", begin, "global"),
-        ("global", end, "global"),
-        ("rolling", end, "rolling"),
+    for name, close, shutter, samples in (
+        ("still", None, "global", 3),
+        ("same", begin, "global", 3),
+        ("one", end, "global", 1),
+        ("global", end, "global", 3),
+        ("rolling", end, "rolling", 3),
     ):
         camera = write_camera(tmp_path / f"{name}.json", begin, close, shutter=shutter)
-        run(fit, "--camera", camera, *settings, "--out", tmp_path / name)
+        setting = ("--set", f"data.shutter_samples={samples}")
+        run(fit, "--camera", camera, *setting, "--out", tmp_path / name)
     shown = {path.parent.name: rendered(path) for path in tmp_path.glob("*/camera_0.png")}
     # The average of equal images, rounded to 8 bits.
     assert np.abs(shown["same"] - shown["still"]).max() <= 1 / 255 + 1e-9
-    for name in ("global", "rolling"):
-        assert np.abs(shown[name] - shown["still"]).max() > 0.1
-    assert np.abs(shown["global"] - shown["rolling"]).max() > 0.05
-    # In the middle of equal times, each by the reference.
-    count = samples or 8
-    times = [(k + 0.5) / count for k in range(count)]
-    cameras = [small_view("", pose_between(begin, end, time), None) for time in times]
-    parts = [photograph(blobs(), camera, WHITE) for camera in cameras]
-    clear = ~np.any([part.near_threshold for part in parts], axis=0)
-    expected = np.clip(np.mean([part.image for part in parts], axis=0), 0, 1)
-    assert clear.mean() > 0.8
-    assert np.abs(shown["global"] - expected)[clear].max() <= EIGHT_BITS
+    for first, second in combinations(("still", "one", "global", "rolling"), 2):
+        assert np.abs(shown[first] - shown[second]).max() > 0.05, (first, second)
 
 
 @pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
 def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys, ignored):
-    """Cameras come from a file, and from a Mitsuba scene whose first camera is plain."""
-    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3))
+    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3), pose_around(0.8, 0.3), k1=0.1)
     values = json.loads(path.read_text())
-    close = {"transform_matrix_close": values["frames"][0]["transform_matrix"]}
-    values["frames"].append({**values["frames"][0], **close, "k1": 0.1})
-    path.write_text(json.dumps(values))
+    plain = {"transform_matrix": values["frames"][0]["transform_matrix"]}
+    path.write_text(json.dumps(values | {"frames": [plain, *values["frames"]]}))
     ignore = ["--ignore", *ignored] if ignored else []
-    run(fit, "--camera", path, *ignore, "--out", tmp_path / "file")
-    of_file = capsys.readouterr().out
-    bent = sensor(pose_around(2.0, 0.3)).replace("perspective", "calibrated")
-    lens = '<string name="lens" value="opencv"/><float name="k1" value="0.1"/>'
-    bent = bent.replace("<film", f"{lens}<film")
-    bent = bent.replace(f'<float name="fov" value="{np.degrees(FIELD_OF_VIEW)}"/>', "")
-    settings = f'<string name="ignore" value="{", ".join(ignored)}"/>'
-    scene = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), bent, settings=settings)
-    run(scene, "--out", tmp_path / "scene")
-    of_scene = capsys.readouterr().out
+    run(fit, "--camera", path, *ignore, "--out", tmp_path / "out")
+    said = capsys.readouterr().out
     if ignored:
-        assert "  not simulated: lens distortion (ignored), motion (ignored), anti" in of_file
-        assert "  not simulated: lens (ignored), depth of field, motion, anti" in of_scene
+        assert "  not simulated: lens distortion (ignored), motion (ignored), anti" in said
     else:
-        assert "  lens distortion: opencv (k1) (1 of 2 cameras)\n" in of_file
-        assert "  motion: global shutter (1 of 2 cameras)\n" in of_file
-        assert "  lens: RadialTangential (k1) (1 of 2 sensors)\n" in of_scene
-
-
-def pose_between(begin, end, time):
-    """The pose at a time: the centre on a line, turning at a constant rate."""
-    turn = Rotation.from_matrix(end[:3, :3] @ begin[:3, :3].T).as_rotvec()
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(time * turn).as_matrix() @ begin[:3, :3]
-    pose[:3, 3] = (1 - time) * begin[:3, 3] + time * end[:3, 3]
-    return pose
+        assert "  lens distortion: opencv (k1) (1 of 2 cameras)\n" in said
+        assert "  motion: global shutter (1 of 2 cameras)\n" in said
 
 
 def test_camera_set_by_options_is_used(fit, tmp_path):
+    """A file's background is black; a folder's is that of its configuration."""
     pose = pose_around(0.8, 0.3)
-    fov = np.degrees(FIELD_OF_VIEW)
-    arguments = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", fov]
-    size = ("--size", WIDTH, HEIGHT)
-    run(fit / "point_cloud.ply", *arguments, *size, "--out", tmp_path)
-    assert_shows(tmp_path / "camera.png", small_view("", pose, None), BLACK)
+    words = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", np.degrees(FIELD_OF_VIEW)]
+    words += ["--size", WIDTH, HEIGHT, "--out", tmp_path]
+    for what, background in ((fit / "point_cloud.ply", BLACK), (fit, WHITE)):
+        run(what, *words)
+        assert_shows(tmp_path / "camera.png", small_view("", pose, None), background)
+
+
+HEADER = {"antialiased": True, "low_pass": 0.02}
+VIEWERS = {"antialiased": False, "low_pass": 0.3}
+CAMERA = ["--origin", 0, -4, 1, "--size", 24, 16]
+LINES = {
+    "  antialiasing: opacities compensated for the low-pass filter (set by the file)",
+    "  approximations: low_pass = 0.02 (set by the file)",
+}
+
+
+@pytest.fixture
+def shown(tmp_path, capsys):
+    """Images of words, in a folder with files and configurations; and what was printed."""
+    for name, header in (("plain", None), ("native", HEADER), ("viewers", VIEWERS)):
+        replace(blobs(), rendered_with=header).save(tmp_path / f"{name}.ply")
+    write_dataset(tmp_path / "data", make_dataset(1, 1))
+    config = {"data": {"path": str(tmp_path / "data")}}
+    (tmp_path / "plain.yml").write_text(yaml.safe_dump(config))
+    (tmp_path / "native.yml").write_text(yaml.safe_dump({**config, "model": HEADER}))
+
+    def render(name, *words, config=None):
+        words = [*words, *(["--scene", tmp_path / f"{config}.yml"] if config else CAMERA)]
+        run(tmp_path / f"{name}.ply", *words, "--out", tmp_path / "out")
+        (image,) = (tmp_path / "out").glob("*.png")
+        content = image.read_bytes()
+        image.unlink()
+        return content, capsys.readouterr().out
+
+    return render
+
+
+def test_single_file_is_rendered_with_its_header(shown):
+    own, said = shown("native")
+    plain, plainly_said = shown("plain")
+    assert set(said.splitlines()) >= LINES
+    assert own != plain and "set by the file" not in plainly_said
+
+
+@pytest.mark.slow
+def test_header_overrides_configuration_and_set_overrides_header(shown):
+    own, _ = shown("native", config="native")
+    plain, _ = shown("plain", config="plain")
+    assert own != plain
+    assert shown("native", config="plain")[0] == own
+    assert shown("viewers", config="native")[0] == plain
+    sets = [
+        [word for name, value in values.items() for word in ("--set", f"model.{name}={value}")]
+        for values in (HEADER, VIEWERS)
+    ]
+    assert shown("plain", *sets[0][:2], config="plain")[0] != own
+    assert shown("plain", *sets[0], config="plain")[0] == own
+    image, said = shown("native", *sets[1], config="plain")
+    assert image == plain and "set by the file" not in said

@@ -1,187 +1,361 @@
-"""Errors of ``python -m drgs.render``: one line, and nothing is written."""
+"""Refusals of ``python -m drgs.render``: one line, nothing is written, and no file replaced."""
 
 import json
-import subprocess
-import sys
+import os
+from dataclasses import replace
 
 import pytest
-import yaml
-from conftest import REPOSITORY
-from support.render_command import run, sensor, write_scene
+from PIL import Image
+from support.commands import assert_ends_well, assert_refused, run_in_process
+from support.folders import contents, visible
+from support.render_command import sensor, write_scene
 from support.small_capture import (
     HEIGHT,
     WIDTH,
     blobs,
     make_dataset,
     pose_around,
-    write_dataset,
+    write_fit,
 )
 
-
-def fails(capsys, *arguments):
-    """The one line that the command prints, with 2."""
-    with pytest.raises(SystemExit) as exit_info:
-        run(*arguments)
-    assert exit_info.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line.partition("error: ")[2]
+from drgs import fit as fit_command
+from drgs import render
+from drgs.capture import __main__ as capture
+from drgs.core import memory
+from drgs.core.errors import UserError
+from drgs.io.images import check_animation
 
 
-@pytest.mark.parametrize(
-    ("what", "arguments", "message"),
-    [
-        ("nowhere.ply", [], "there is no such file or folder"),
-        ("../data", [], "there is no config.yml in it"),
-        ("config.yml", [], "must be a file of Gaussians (.ply, .compressed.ply, .spz,"),
-        ("point_cloud.ply", [], "choose the cameras: --orbit N"),
-        ("point_cloud.ply", ["--split", "test"], "needs photographs"),
-        (
-            "point_cloud.ply",
-            ["--orbit", "2", "--data", "x"],
-            "--orbit but without --scene",
-        ),
-        (
-            "point_cloud.ply",
-            ["--orbit", "0"],
-            "--orbit: must be a whole number >= 1",
-        ),
-        ("point_cloud.ply", ["--orbit", "2", "--up", "0", "0", "0"], "up must not be zero"),
-        ("point_cloud.ply", ["--orbit", "2", "--variant", "scalar_rgb"], "--variant: must be"),
-        ("", ["--orbit", "2", "--split", "test"], "--split: not allowed with argument --orbit"),
-        (
-            "",
-            ["--orbit", "2", "--up", "0", "0", "1"],
-            "--orbit, where it follows",
-        ),
-        ("", ["--size", "8", "8"], "--size: is not used with Gaussians and --split"),
-        ("", ["--origin", "0", "0", "0"], "must not be zero or parallel"),
-        ("", ["--origin", "0", "0", "nan"], "--origin: must be a finite number, got nan"),
-        ("", ["--origin", "3", "0", "0", "--fov", "180"], "--fov: must be between 0 and 180"),
-        (
-            "",
-            ["--origin", "3", "0", "0", "--size", "0", "9"],
-            "--size: must be a whole",
-        ),
-        ("", ["--background", "pink"], "or an image's file, got pink"),
-        ("", ["--background", "0", "0", "1.5"], "got 0 0 1.5"),
-        ("", ["--camera", "nowhere.json", "--size", "8", "8"], "nowhere.json: cannot read"),
-        ("", ["--data", "nowhere"], "data.path: there is no folder"),
-        ("", ["--set", "data.imagesize=3"], "did you mean data.image_size?"),
-        ("", ["-D", "model=x.ply"], "--define: is not used with Gaussians"),
-    ],
-)
-def test_user_errors_are_one_line_and_write_no_files(
-    fit, tmp_path, capsys, what, arguments, message
-):
-    assert message in fails(capsys, fit / what, *arguments, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+@pytest.fixture(autouse=True)
+def eight_gigabytes(monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: 8 * 10**9)
 
 
-EXACT = ["--set", "model.projection=exact"]
+def refused(tmp_path, *words, message):
+    words = (*words, "--out", tmp_path / "out")
+    return assert_refused(render.main, *words, folder=tmp_path, message=message)
+
+
+PLY = "point_cloud.ply"
+CAMERA = ("--origin", 3, 0, 0)
+MOST_PIXELS = 8 * 10**9 // memory.IMAGE_BYTES
+
+WRONG_WORDS = [
+    (("nowhere.ply",), "there is no such file or folder"),
+    (("../data",), "there is no config.yml in it"),
+    (("config.yml",), "must be a file of Gaussians (.ply, .compressed.ply, .spz,"),
+    ((PLY,), "choose the cameras: --orbit N"),
+    ((PLY, "--split", "test"), "needs photographs"),
+    ((PLY, "--orbit", 2, "--data", "x"), "--orbit but without --scene"),
+    ((PLY, "--orbit", 0), "--orbit: must be a whole number >= 1"),
+    ((PLY, "--orbit", 10**9), "argument --orbit: must be at most 10,000, got 1000000000"),
+    (
+        (PLY, "--orbit", 10_000, "--size", 3000, 2000),
+        "at most 2.1 GB, got 10,000 of 3000 x",
+    ),
+    ((PLY, "--orbit", 2, "--size", 16384, 1), "must be at most 16,383 px wide and high, got 16384"),
+    ((PLY, "--orbit", 2, "--size", 1, 16384), "must be at most 16,383 px wide and high, got 1 x"),
+    ((PLY, "--orbit", 2, "--up", 0, 0, 0), "up must not be zero"),
+    ((PLY, "--orbit", 2, "--variant", "scalar_rgb"), "--variant: must be"),
+    ((PLY, *CAMERA, "--size", 400), "argument --size: expected 2 arguments: --size W H"),
+    ((PLY, *CAMERA, "--size", 10**20, 10**20), "argument --size: must be at most 2,147,483,647"),
+    ((PLY, *CAMERA, "--size", "9" * 5000, 1), "argument --size: must be a whole number"),
+    (
+        (PLY, *CAMERA, "--size", 20000, 20000),
+        f"view camera: 20000 x 20000 px need about {4e8 * memory.IMAGE_BYTES / 1e9:.3g} GB of "
+        f"memory, of which 8 GB are available; at most {MOST_PIXELS:,} pixels fit; give a smaller",
+    ),
+    ((PLY, *CAMERA, "--size", 70000, 70000), "are too many for Dr.Jit, whose arrays end at 2^32"),
+    ((PLY, "--camera", "x" * 300), "cannot read the file: File name too long"),
+    ((PLY, "--camera", "x/" * 2000), "cannot read the file: "),
+    (("", "--orbit", 2, "--split", "test"), "--split: not allowed with argument --orbit"),
+    (("", "--orbit", 2, "--up", 0, 0, 1), "--orbit, where it follows"),
+    (("", "--size", 8, 8), "--size: is not used with Gaussians and --split"),
+    (("", "--origin", 0, 0, 0), "must not be zero or parallel"),
+    (("", "--origin", 0, 0, "nan"), "--origin: must be a finite number, got nan"),
+    (("", *CAMERA, "--fov", 180), "--fov: must be between 0 and 180"),
+    (("", *CAMERA, "--size", 0, 9), "--size: must be a whole"),
+    (("", "--background", "pink"), "or an image's file, got pink"),
+    (("", "--background", 0, 0, 1.5), "got 0 0 1.5"),
+    (("", "--camera", "nowhere.json", "--size", 8, 8), "nowhere.json: cannot read"),
+    (("", "--data", "nowhere"), "data.path: there is no folder"),
+    (("", "--set", "data.imagesize=3"), "did you mean data.image_size?"),
+    (("", "-D", "model=x.ply"), "--define: is not used with Gaussians"),
+    (("", "--threads", 0), "argument --threads: must be a whole number >= 1, got 0"),
+    (("", "--threads", -2), "argument --threads: must be a whole number >= 1, got -2"),
+    (("", "--threads", "two"), "argument --threads: must be a whole number >= 1, got two"),
+    (("", "--threads", 2**32), "argument --threads: must be at most 4,096 (no machine has more"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG_WORDS, ids=[m[:50] for _, m in WRONG_WORDS])
+def test_wrong_words_are_refused(fit, tmp_path, words, message):
+    line = refused(tmp_path, fit / words[0], *words[1:], message=message)
+    assert len(line) < 600
 
 
 @pytest.mark.parametrize("mode", ["--camera", "--split"])
-def test_exact_projection_with_distortion_is_refused(tmp_path, capsys, mode):
-    """With status 2, before anything is written; without the distortion it is rendered."""
-    write_dataset(tmp_path / "data", make_dataset(1, 1))
-    blobs().save(tmp_path / "blobs.ply")
-    (tmp_path / "a.yml").write_text(yaml.safe_dump({"data": {"path": "data"}}))
+def test_exact_projection_with_distortion_is_refused(tmp_path, mode):
+    """Without the distortion it is rendered."""
+    fit = write_fit(tmp_path, make_dataset(1, 1))
     path = tmp_path / "data" / "transforms_test.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"k1": 0.1}))
-    arguments = [tmp_path / "blobs.ply", "--scene", tmp_path / "a.yml", *EXACT]
-    if mode == "--split":
-        arguments += ["--split", "test"]
-    else:
-        arguments += ["--camera", path, "--size", WIDTH, HEIGHT]
-    message = fails(capsys, *arguments, "--out", tmp_path / "out")
-    assert message.startswith(
+    words = [fit, "--set", "model.projection=exact", mode]
+    words += ["test"] if mode == "--split" else [path, "--size", WIDTH, HEIGHT]
+    message = (
         "model.projection must be ewa or unscented for lenses that are no pinholes, such as that "
         f"of view {'r_0' if mode == '--split' else 'camera_0'} (opencv: k1), got exact; or "
         "give --ignore distortion"
     )
-    assert not (tmp_path / "out").exists()
-    run(*arguments, "--ignore", "distortion", "--out", tmp_path / "out")
-    assert list((tmp_path / "out").glob("*.png"))
-
-
-def test_the_folder_of_a_fit_is_not_overwritten(fit, capsys):
-    assert "holds a fit" in fails(capsys, fit, "--out", fit)
-
-
-def test_an_output_folder_that_is_a_file_is_an_error(fit, tmp_path, capsys):
-    (tmp_path / "out").write_text("mine")
-    assert "cannot write" in fails(capsys, fit, "--out", tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "mine"
+    refused(tmp_path, *words, message=message)
+    assert_ends_well(render.main, *words, "--ignore", "distortion", "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("values", "message"),
     [
-        ("no xml", "blobs.xml: "),
-        ('<scene version="3.0.0"/>', "must hold an integrator and at least one sensor"),
-        (
-            '<scene version="3.0.0"><integrator type="splats">'
-            '<string name="filename" value="nowhere.ply"/></integrator></scene>',
-            "nowhere.ply: cannot read the file",
-        ),
-        (
-            '<scene version="3.0.0"><integrator type="splats">'
-            '<string name="filename" value="model.ply"/></integrator>'
-            '<sensor type="irradiancemeter"/></scene>',
-            "the sensor must be of type perspective, thinlens, orthographic or calibrated",
-        ),
-        (
-            '<scene version="3.0.0"><integrator type="splats"/>'
-            '<sensor type="perspective"/></scene>',
-            "splats: there are no Gaussians: give the integrator 'filename' or tensors",
-        ),
+        ({"w": 1e9, "h": 1e9}, ".json: w must be <= 16777216, got "),
+        ({"w": 1e300, "h": 1e300}, ".json: w must be <= 16777216, got "),
+        ({"w": 800, "h": 800}, "800 x 800 px with 1,000 samples each need about "),
     ],
-    ids=["not XML", "empty", "model missing", "wrong sensor", "no Gaussians"],
 )
-def test_errors_of_a_mitsuba_scene_are_one_line(tmp_path, capsys, content, message):
-    path = write_scene(tmp_path)
-    path.write_text(content)
-    assert message in fails(capsys, path, "--out", tmp_path / "out")
+def test_camera_file_beyond_limits_is_refused(fit, tmp_path, values, message):
+    """The last: an image that would fit once does not a thousand times."""
+    pose, close = ((pose_around(x, 0.3) * [1, -1, -1, 1]).tolist() for x in (0.8, 0.9))
+    frames = [{"transform_matrix": pose, "transform_matrix_close": close}]
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames, **values}))
+    words = (fit, "--camera", path, "--set")
+    line = refused(tmp_path, *words, "data.shutter_samples=1000", message=message)
+    assert len(line) < 300
+    message = "data.shutter_samples must be <= 1000, got 1001"
+    refused(tmp_path, *words, "data.shutter_samples=1001", message=message)
 
 
-def test_options_for_gaussians_are_refused_with_a_scene(tmp_path, capsys):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    message = fails(capsys, path, "--orbit", "3", "--out", tmp_path / "out")
-    assert message.startswith("--orbit: is not used with a Mitsuba scene")
+def test_a_folder_that_must_stay_is_not_written(fit, tmp_path):
+    assert_refused(render.main, fit, "--out", fit, folder=fit, message="holds a fit")
+    (tmp_path / "out").write_text("mine")
+    refused(tmp_path, fit, message="cannot write")
 
 
-@pytest.mark.parametrize("word", ["model", "=model.ply"])
-def test_parameters_without_a_name_or_a_value_are_refused(tmp_path, capsys, word):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    message = fails(capsys, path, "-D", word, "--out", tmp_path / "out")
-    assert message.startswith("argument --define/-D: must be NAME=VALUE")
-    assert f"got {word}" in message
+SENSOR = sensor(pose_around(0.8, 0.3))
+MODEL = '<string name="filename" value="model.ply"/>'
+SAMPLES = '"sample_count" value="{}"'
+SCENES = {
+    "not XML": (None, "no xml", "blobs.xml: "),
+    "empty": (None, '<scene version="3.0.0"/>', "must hold an integrator and at least one sensor"),
+    "model missing": ("model.ply", "nowhere.ply", "nowhere.ply: cannot read the file"),
+    "no Gaussians": (MODEL, "", "splats: there are no Gaussians: give the integrator 'filename'"),
+    "wrong sensor": (
+        *(SENSOR, '<sensor type="irradiancemeter"/>'),
+        "the sensor must be of type perspective, thinlens, orthographic or calibrated",
+    ),
+    "no samples": (SAMPLES.format(1), SAMPLES.format(0), "a sample_count of at least"),
+    "many samples": (SAMPLES.format(1), SAMPLES.format(10**9), "at most 4,096 samp"),
+    "wide": (f'"width" value="{WIDTH}"', '"width" value="1000000000"', "too many for Dr.Jit"),
+    "nested samples": (
+        *(MODEL, f'{MODEL}<integer name="nested_spp" value="4294967296"/>'),
+        "from 0 to 2147483647, got",
+    ),
+    "unknown name": (MODEL, f'{MODEL}<float name="neer" value="1"/>', "did you mean near?"),
+    "not UTF-8": ("splats", "spl\udca9ts", "not a valid scene: it holds bytes that are not UTF-8"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "message"), SCENES.values(), ids=SCENES)
+def test_errors_of_a_mitsuba_scene_are_one_line(tmp_path, old, new, message):
+    path = write_scene(tmp_path, SENSOR)
+    text = path.read_text().replace(old, new) if old else new
+    path.write_bytes(os.fsencode(text))
+    refused(tmp_path, path, message=message)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--orbit", 3), "--orbit: is not used with a Mitsuba scene"),
+        (("-D", "model"), "taken by Mitsuba's loader, got model; see"),
+        (("-D", "=model.ply"), "taken by Mitsuba's loader, got =model.ply"),
+        (("-D", "colour=1"), "colour"),
+    ],
+)
+def test_wrong_options_with_a_scene_are_refused(tmp_path, words, message):
+    refused(tmp_path, write_scene(tmp_path, SENSOR), *words, message=message)
 
 
 @pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
-def test_reserved_parameters_of_mitsubas_loader_are_refused(tmp_path, capsys, name):
+def test_reserved_parameters_of_mitsubas_loader_are_refused(tmp_path, name):
     """Also where the file has one: it cannot be given from Python."""
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    path = write_scene(tmp_path, SENSOR)
     path.write_text(path.read_text().replace("model.ply", f"${name}"))
-    message = fails(capsys, path, "-D", f"{name}=model.ply", "--out", tmp_path / "out")
-    assert message.startswith("argument --define/-D: must be NAME=VALUE with a name other than")
-    assert "taken by Mitsuba's loader" in message
+    message = "argument --define/-D: must be NAME=VALUE with a name other than"
+    line = refused(tmp_path, path, "-D", f"{name}=model.ply", message=message)
+    assert "taken by Mitsuba's loader" in line
 
 
-def test_unknown_scene_parameters_are_refused(tmp_path, capsys):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    message = fails(capsys, path, "-D", "colour=1", "--out", tmp_path / "out")
-    assert message.startswith(f"{path}: ") and "colour" in message
+def test_the_largest_animation_is_allowed():
+    check_animation(60, 800, 800)
+    check_animation(10_000, 1, 1)
+    with pytest.raises(UserError, match="choose a smaller size"):
+        check_animation(1, 16_384, 1)
+
+
+@pytest.mark.parametrize("suffix", ["webp", "gif", "ico", "tif"])
+def test_a_background_that_mitsuba_cannot_read_is_refused(fit, tmp_path, suffix):
+    mode = "CMYK" if suffix == "tif" else "RGB"
+    path = tmp_path / f"a.{suffix}"
+    Image.new(mode, (16, 16)).save(path)
+    message = "mode CMYK" if mode == "CMYK" else "must be a PNG, JPEG, BMP, PPM or TGA image, got "
+    refused(tmp_path, fit, *CAMERA, "--background", path, message=message)
+
+
+@pytest.mark.parametrize("name", ["pipe.ply", "pipe.xml", "pipe.json", "pipe.png"])
+def test_pipe_is_refused_without_blocking(fit, tmp_path, name):
+    pipe = tmp_path / name
+    os.mkfifo(pipe)
+    words = {
+        "pipe.ply": (pipe, *CAMERA),
+        "pipe.xml": (pipe,),
+        "pipe.json": (fit, "--camera", pipe),
+        "pipe.png": (fit, *CAMERA, "--background", pipe),
+    }[name]
+    line = refused(tmp_path, *words, message="must be a regular file")
+    assert f"{pipe}: cannot read the " in line
+
+
+@pytest.mark.parametrize("main", [fit_command.main, render.main, capture.main])
+def test_names_that_are_too_long_are_refused(tmp_path, main):
+    for what in ("x" * 300, "x" * 300 + ".ply"):
+        words = (what, "--out", tmp_path / "out")
+        line = assert_refused(main, *words, folder=tmp_path, message="error: ")
+        assert "255 bytes" in line or "File name too long" in line
+    if main is not capture.main:
+        (tmp_path / "a.yml").write_text("data: {path: .}\n")
+        words = (tmp_path / "a.yml", "--out", tmp_path / ("x" * 300))
+        assert_refused(main, *words, folder=tmp_path, message="File name too long")
+
+
+def test_odd_names_are_read_or_refused(fit, tmp_path):
+    """Windows programs write suffixes in capital letters."""
+    (tmp_path / "MODEL.PLY").write_bytes((fit / PLY).read_bytes())
+    words = (tmp_path / "MODEL.PLY", *CAMERA, "--size", 8, 6)
+    assert_ends_well(render.main, *words, "--out", tmp_path / "a")
+    scene = write_scene(tmp_path, sensor(pose_around(0.3, 0.5)))
+    scene = scene.rename(scene.with_name("x" * 251 + ".xml"))
+    assert_ends_well(render.main, scene, "--out", tmp_path / "b")
+    assert visible(tmp_path / "b") == {"x" * 200 + ".exr", "x" * 200 + ".png"}
+    scene = scene.rename(scene.with_name(os.fsdecode(b"\xff.xml")))
+    refused(tmp_path, scene, message="Mitsuba takes names in UTF-8 only")
+
+
+def test_a_wrong_header_is_refused(tmp_path):
+    replace(blobs(), rendered_with={"low_pass": -1.0}).save(tmp_path / "a.ply")
+    message = (
+        f"{tmp_path / 'a.ply'}: the header's low_pass must be finite and not negative, got -1.0; "
+        "correct the line, or remove it"
+    )
+    refused(tmp_path, tmp_path / "a.ply", *CAMERA, message=message)
+
+
+@pytest.fixture
+def fitted(tmp_path):
+    return write_fit(tmp_path, make_dataset(2, 2))
+
+
+def assert_kept(fitted, *words, message):
+    assert_refused(render.main, fitted, *words, folder=fitted.parent, message=message)
+
+
+VIEWS = {
+    "split": [],
+    "orbit": ["--orbit", 2, "--size", 8, 6],
+    "origin": ["--origin", 3, 0, 1, "--size", 8, 6],
+}
+
+
+@pytest.mark.parametrize("way", VIEWS)
+def test_images_are_not_written_into_a_photograph_folder(fitted, way):
+    test = fitted.parent / "data" / "test"
+    message = f"--out {test}: holds images of the dataset (r_0.png, r_1.png); choose"
+    assert_kept(fitted, *VIEWS[way], "--out", test, message=message)
+
+
+@pytest.mark.parametrize(
+    ("way", "name", "content"),
+    [
+        ("split", "r_1.png", ""),
+        *(("split", "metrics.json", text) for text in ("[", "[]", '{"split": "test"}', "7")),
+        ("orbit", "orbit_001.png", ""),
+        ("orbit", "orbit.gif", ""),
+        ("origin", "camera.png", ""),
+    ],
+)
+def test_user_file_is_not_replaced(fitted, tmp_path, way, name, content):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text(content)
+    message = f"{out}: holds {name}, which this command would replace and has not written"
+    assert_kept(fitted, *VIEWS[way], "--out", out, message=message)
+
+
+def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):
+    """Mitsuba's own command writes it there."""
+    scene = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    (tmp_path / "blobs.exr").write_text("reference")
+    message = "holds blobs.exr, which this command would replace"
+    assert_refused(render.main, scene, "--out", tmp_path, folder=tmp_path, message=message)
+    (tmp_path / "blobs.exr").unlink()
+    assert_ends_well(render.main, scene, "--out", tmp_path)
+    assert_ends_well(render.main, scene, "--out", tmp_path)
 
 
 @pytest.mark.slow
-def test_module_runs_as_a_command(fit, tmp_path):
-    result = subprocess.run(
-        [sys.executable, "-m", "drgs.render", fit, "--orbit", "1", "--out", tmp_path / "out"],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert result.returncode == 0, result.stderr
-    assert f"orbit_000: {WIDTH}x{HEIGHT}" in result.stdout
+def test_own_images_are_replaced_unless_modified(fitted, tmp_path):
+    out = tmp_path / "out"
+    for options in ((), ("--background", "black")):
+        for words in VIEWS.values():
+            assert_ends_well(render.main, fitted, *words, *options, "--out", out)
+    (out / "r_0.png").write_bytes((fitted.parent / "data" / "test" / "r_0.png").read_bytes())
+    message = "holds r_0.png, which this command would replace and has not written, or which chang"
+    assert_kept(fitted, "--out", out, message=message)
+
+
+def test_folder_in_use_by_another_command_is_refused(fitted, tmp_path, monkeypatch):
+    """The one that was refused leaves what the other notes of its images alone."""
+    out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
+    write_png, others = render.write_png, []
+
+    def write_while_another_begins(path, image):
+        write_png(path, image)
+        if not others:
+            others.append(path)
+            assert_kept(fitted, "--out", out, message=message)
+
+    monkeypatch.setattr(render, "write_png", write_while_another_begins)
+    assert_ends_well(render.main, fitted, "--out", out)
+    assert others and visible(out) == {"r_0.png", "r_1.png", "metrics.json"}
+
+
+@pytest.mark.slow
+def test_images_of_an_interrupted_command_are_replaced(fitted, tmp_path, monkeypatch):
+    expected, out = tmp_path / "whole", tmp_path / "out"
+    assert_ends_well(render.main, fitted, "--out", expected)
+    write_png, written = render.write_png, []
+
+    def write_one(path, image):
+        if written:
+            raise KeyboardInterrupt
+        written.append(path)
+        write_png(path, image)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(render, "write_png", write_one)
+        assert run_in_process(render.main, fitted, "--out", out).returncode == 130
+    assert visible(out) == {"r_0.png"}
+    rendered = (out / "r_0.png").read_bytes()
+    (out / "r_0.png").write_text("mine")
+    message = "holds r_0.png, which this command would replace"
+    assert_kept(fitted, "--out", out, message=message)
+    (out / "r_0.png").write_bytes(rendered)
+    assert_ends_well(render.main, fitted, "--out", out)
+    assert contents(out) == contents(expected)

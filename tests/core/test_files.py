@@ -1,5 +1,6 @@
 import errno
 import os
+import re
 
 import pytest
 
@@ -18,20 +19,12 @@ def test_atomic_path_replaces_the_file_and_creates_folders(tmp_path):
     path = tmp_path / "new" / "a.txt"
     with atomic_path(path) as temporary:
         temporary.write_text("1")
-        assert not path.exists()
-        assert temporary.suffix == ".txt"
-    assert path.read_text() == "1"
-    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
-
-
-def test_atomic_path_keeps_the_old_file_after_an_error(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_text("old")
+        assert not path.exists() and temporary.suffix == ".txt"
     with pytest.raises(RuntimeError), atomic_path(path) as temporary:
         temporary.write_text("half")
         raise RuntimeError
-    assert path.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert path.read_text() == "1"
+    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
 
 
 @pytest.mark.parametrize(
@@ -61,70 +54,17 @@ def test_file_system_errors_are_user_errors(tmp_path, monkeypatch, stage, number
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_folder_is_not_replaced_by_a_file(tmp_path):
-    (tmp_path / "a.txt").mkdir()
-    message = "Is a directory; remove or rename the folder"
-    with pytest.raises(UserError, match=message), atomic_path(tmp_path / "a.txt") as temporary:
-        temporary.write_text("1")
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
-
-
-def test_file_is_not_replaced_by_a_folder(tmp_path):
-    (tmp_path / "a").write_text("old")
-    message = "choose another folder: a part of this path is a file"
-    with pytest.raises(UserError, match=message), atomic_path(tmp_path / "a" / "b.txt"):
-        pass
-    assert (tmp_path / "a").read_text() == "old"
-
-
-def test_text_is_read_up_to_a_limit(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_bytes(b"\xc3\xa4b")
-    assert read_text(path, "poem", 3) == "äb"
-    (tmp_path / "marked.txt").write_bytes(b"\xef\xbb\xbfa")  # as editors of Windows begin files
-    assert read_text(tmp_path / "marked.txt", "poem", 4) == "a"
-    with pytest.raises(UserError) as error:
-        read_text(path, "poem", 2)
-    assert str(error.value) == f"{path}: cannot read the poem: more than 2 bytes"
-    path.write_bytes(b"ab\xff")
-    with pytest.raises(UserError) as error:
-        read_text(path, "poem", 9)
-    assert str(error.value) == f"{path}: cannot read the poem: not UTF-8 text (byte 2)"
-    with pytest.raises(UserError, match="cannot read the poem: Is a directory"):
-        read_text(tmp_path, "poem", 9)
-
-
-def test_only_regular_files_are_read_and_pipes_do_not_block(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "link").symlink_to(tmp_path / "pipe")
-    for path, kind in ((tmp_path / "pipe", "a named pipe"), (tmp_path / "link", "a named pipe")):
-        with pytest.raises(UserError) as error:
-            read_text(path, "poem", 9)
-        assert str(error.value) == (
-            f"{path}: cannot read the poem: must be a regular file, got {kind}"
-        )
-    with pytest.raises(UserError, match=r"/dev/zero: .* must be a regular file, got a device"):
-        open_regular("/dev/zero")
-    with pytest.raises(UserError, match="cannot read the file: embedded null byte"):
-        open_regular("a\0b")
-    (tmp_path / "a.txt").write_text("x")
-    (tmp_path / "link").unlink()
-    (tmp_path / "link").symlink_to(tmp_path / "a.txt")
-    assert read_text(tmp_path / "link", "poem", 9) == "x"
-
-
-def test_names_are_shortened_between_characters():
-    assert shorten_stem("a" * 200) == "a" * 200
-    assert shorten_stem("a" * 201) == "a" * 200
-    assert shorten_stem("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
-    assert shorten_stem(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9
-
-
-def test_file_over_the_size_limit_is_not_opened(tmp_path):
-    (tmp_path / "a.txt").write_bytes(b"abc")
-    open_regular(tmp_path / "a.txt", "poem", 3).close()
-    with pytest.raises(UserError, match=r"a.txt: cannot read the poem: more than 2 bytes"):
-        open_regular(tmp_path / "a.txt", "poem", 2)
+def test_files_and_folders_do_not_replace_each_other(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("old")
+    for name, message in (
+        ("folder", "Is a directory; remove or rename the folder"),
+        ("file/b.txt", "choose another folder: a part of this path is a file"),
+    ):
+        with pytest.raises(UserError, match=message), atomic_path(tmp_path / name) as temporary:
+            temporary.write_text("1")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder"]
+    assert (tmp_path / "file").read_text() == "old"
 
 
 @pytest.mark.parametrize("letter", ["x", "\u00e4"])
@@ -137,12 +77,53 @@ def test_atomic_path_accepts_the_longest_file_names(tmp_path, letter):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-def test_reading_allocates_no_more_than_the_file_size(tmp_path):
-    (tmp_path / "a").write_bytes(b"abc")
-    assert read_bytes(tmp_path / "a", "file", 1 << 60) == b"abc"
-    with pytest.raises(UserError, match=r"a: cannot read the file: more than 2 bytes"):
-        read_bytes(tmp_path / "a", "file", 2)
-    with (tmp_path / "a").open("wb") as file:
-        file.truncate(1 << 40)
-    with pytest.raises(UserError, match=r"a: cannot read the file: more than 4,096 bytes"):
-        read_bytes(tmp_path / "a", "file", 4096)
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """The current folder, with files of all kinds."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.txt").write_bytes(b"\xc3\xa4b")
+    (tmp_path / "marked.txt").write_bytes(b"\xef\xbb\xbfa")  # as editors of Windows begin files
+    (tmp_path / "damaged.txt").write_bytes(b"ab\xff")
+    (tmp_path / "link").symlink_to("a.txt")
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link to a pipe").symlink_to("pipe")
+    (tmp_path / "hole").touch()
+    os.truncate(tmp_path / "hole", 1 << 40)
+
+
+REFUSED = [
+    (read_text, "a.txt", 2, "more than 2 bytes"),
+    (read_bytes, "a.txt", 2, "more than 2 bytes"),
+    (open_regular, "a.txt", 2, "more than 2 bytes"),
+    (read_bytes, "hole", 4096, "more than 4,096 bytes"),
+    (read_text, "damaged.txt", 9, "not UTF-8 text (byte 2)"),
+    (read_text, "folder", 9, "Is a directory"),
+    (read_text, "pipe", 9, "must be a regular file, got a named pipe"),
+    (read_text, "link to a pipe", 9, "must be a regular file, got a named pipe"),
+    (open_regular, "/dev/zero", 9, "must be a regular file, got a device"),
+    (open_regular, "a\0b", 9, "embedded null byte"),
+]
+
+
+@pytest.mark.parametrize(("read", "name", "limit", "message"), REFUSED)
+@pytest.mark.usefixtures("files")
+def test_only_regular_files_are_read_up_to_a_limit(read, name, limit, message):
+    message = re.escape(f"{name}: cannot read the poem: {message}").replace(r"\x00", ".*")
+    with pytest.raises(UserError, match=message):
+        read(name, "poem", limit)
+
+
+@pytest.mark.usefixtures("files")
+def test_contents_are_read():
+    assert read_text("a.txt", "poem", 3) == read_text("link", "poem", 3) == "äb"
+    assert read_text("marked.txt", "poem", 4) == "a"
+    assert read_bytes("a.txt", "file", 1 << 60) == b"\xc3\xa4b"  # takes no memory of such a size
+    open_regular("a.txt", "poem", 3).close()
+
+
+def test_names_are_shortened_between_characters():
+    assert shorten_stem("a" * 200) == "a" * 200
+    assert shorten_stem("a" * 201) == "a" * 200
+    assert shorten_stem("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
+    assert shorten_stem(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9

@@ -6,9 +6,7 @@ import sys
 from types import SimpleNamespace
 
 import drjit as dr
-import numpy as np
 import pytest
-from drjit.llvm.ad import Float
 
 from drgs.core import memory
 from drgs.core.errors import UserError
@@ -32,10 +30,6 @@ def kernel(tmp_path, monkeypatch):
     monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: machine)
     write(tmp_path / "proc" / "self", cgroup="")
     return tmp_path
-
-
-def test_without_limits_the_machine_s_memory_is_available(kernel):
-    assert memory.available_memory() == 8_000_000 * 1024
 
 
 @pytest.mark.parametrize("path", ["/a/b", "/"])
@@ -67,7 +61,7 @@ def test_a_control_group_of_version_2_limits_it(kernel, path):
 def test_out_of_memory_is_distinguished_from_other_errors(kernel, error, is_exhausted):
     reason = memory.out_of_memory_reason(error)
     assert (reason is not None) == is_exhausted
-    assert reason is None or "8.19 GB are available; close other programs" in reason
+    assert not is_exhausted or "8.19 GB are available; close other programs" in reason
 
 
 def test_memory_request_beyond_available_memory_is_refused(kernel):
@@ -105,34 +99,22 @@ def test_process_memory_limit_counts():
     assert 2.5e9 < int(done.stdout) < 3e9
 
 
-@pytest.mark.parametrize(
-    ("count", "text"),
-    [(24.06e9, "24.1 GB"), (999.9e6, "1 GB"), (5e12, "5,000 GB"), (123_456, "123 kB")],
-)
-def test_byte_counts_are_written_with_three_digits(count, text):
-    assert memory.format_bytes(count) == text
+def test_byte_counts_are_written_with_three_digits():
+    counts = (24.06e9, 999.9e6, 5e12, 123_456)
+    texts = [memory.format_bytes(count) for count in counts]
+    assert texts == ["24.1 GB", "1 GB", "5,000 GB", "123 kB"]
 
 
-@pytest.fixture
-def eight_gigabytes(monkeypatch):
+def test_images_that_do_not_fit_are_refused_with_numbers(monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 8 * GB)
-
-
-def test_an_image_that_fits_is_not_refused(eight_gigabytes):
-    assert memory.too_large_reason(400, 400) is None
     assert memory.too_large_reason(4000, 5000) is None
-
-
-def test_an_image_that_does_not_fit_is_refused_with_numbers(eight_gigabytes):
     needed = 20_000**2 * memory.IMAGE_BYTES / GB
     assert memory.too_large_reason(20_000, 20_000) == (
         f"20000 x 20000 px need about {needed:g} GB of memory, of which 8 GB are available; at "
         f"most {8 * GB // memory.IMAGE_BYTES:,} pixels fit"
     )
     assert "with 1,000 samples each need about" in memory.too_large_reason(400, 400, samples=1000)
-
-
-def test_image_that_fits_into_memory_may_exceed_drjit_array_size(monkeypatch):
+    # In the largest memory, Dr.Jit's arrays are the limit.
     monkeypatch.setattr(memory, "available_memory", lambda: 10**15)
     assert memory.too_large_reason(2**15, 2**15 - 1) is None
     assert memory.too_large_reason(10**9, 100) == (
@@ -147,27 +129,6 @@ def test_drjit_malloc_cache_counts_as_available(monkeypatch):
     rooms = [10**9]
     monkeypatch.setattr(memory, "available_memory", lambda: rooms[-1])
     monkeypatch.setattr(dr, "flush_malloc_cache", lambda: rooms.append(8 * GB))
-    assert memory.too_large_reason(3000, 3000) is None
-    assert len(rooms) == 2
-    assert memory.too_large_reason(3000, 3000) is None
-    assert len(rooms) == 2
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="glibc's malloc_trim")
-def test_unused_memory_is_returned_to_the_system():
-    """Below a block that is used, glibc keeps what was freed; Dr.Jit keeps all of its arrays.
-
-    Of blocks there are 128 MB, of arrays 116 MB or, with Dr.Jit's powers of two, 122.
-    """
-    blocks = [np.ones(8_000) for _ in range(2_000)]
-    arrays = [dr.full(Float, i, 1_000_000) for i in range(30)]
-    dr.make_opaque(arrays)
-    dr.sync_thread()
-    with_all = memory.resident_memory()
-    blocks, arrays = blocks[-1:], arrays[-1:]
-    dr.flush_malloc_cache()
-    with_blocks = memory.resident_memory()
-    assert with_blocks < with_all - 100e6
-    memory.release_unused_memory()
-    assert memory.resident_memory() < with_blocks - 100e6
-    assert blocks[0][0] == 1 and arrays[0][0] == 29
+    for _ in range(2):
+        assert memory.too_large_reason(3000, 3000) is None
+        assert len(rooms) == 2

@@ -1,14 +1,16 @@
-"""A command knows the files that it wrote into a folder, and replaces no others."""
+"""A folder has one writer, which knows the files that it wrote and replaces no others."""
 
 import json
+import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 
 import pytest
 
 from drgs.core.errors import UserError
-from drgs.core.folders import FolderRecord, digest
+from drgs.core.folders import FolderRecord, digest, sole_writer
 
 
 def record(folder, command="render"):
@@ -23,8 +25,8 @@ def write(folder, **files):
 def refusal(function, *arguments, **options):
     with pytest.raises(UserError) as error:
         function(*arguments, **options)
-    assert len(str(error.value).splitlines()) == 1
-    return str(error.value)
+    (line,) = str(error.value).splitlines()
+    return line
 
 
 def test_existing_file_is_foreign(tmp_path):
@@ -45,19 +47,12 @@ def test_claimed_file_may_be_rewritten_until_sealed(tmp_path):
 
 
 def test_file_changed_after_sealing_is_foreign(tmp_path):
-    record(tmp_path).claim(["a", "b"])
+    record(tmp_path).claim("abc")
     write(tmp_path, a="ours", b="ours")
     record(tmp_path).seal()
-    write(tmp_path, b="theirs")
-    assert "holds b, which this command would replace" in refusal(record(tmp_path).claim, "ab")
-    assert not record(tmp_path).foreign_files(["a", "c"])
-
-
-def test_file_recreated_after_deletion_is_foreign(tmp_path):
-    record(tmp_path).claim(["a"])
-    record(tmp_path).seal()
-    write(tmp_path, a="theirs")
-    assert record(tmp_path).foreign_files(["a"]) == ["a"]
+    write(tmp_path, b="theirs", c="theirs")  # c did not exist when the record was sealed
+    assert "holds b, c, which this command would replace" in refusal(record(tmp_path).claim, "abc")
+    assert not record(tmp_path).foreign_files(["a", "d"])
 
 
 def test_symlink_or_folder_in_place_of_a_file_is_foreign(tmp_path):
@@ -120,3 +115,56 @@ def test_temporary_files_of_killed_writers_are_removed(tmp_path):
         (tmp_path / name).touch()
     record(tmp_path).claim(["a.png", "metrics.json", "notes"])
     assert {path.name for path in tmp_path.iterdir()} == {*kept, ".drgs-render.json"}
+
+
+def test_folder_has_one_writer(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    with sole_writer(folder) as keep:
+        assert keep()
+        message = r"out: another command is writing to this folder; wait"
+        with pytest.raises(UserError, match=message), sole_writer(folder):
+            pass
+        with sole_writer(tmp_path / "other"):
+            pass
+        assert os.listdir(folder) == []
+    with pytest.raises(KeyError), sole_writer(folder):
+        raise KeyError
+    with sole_writer(folder):
+        pass
+
+
+def test_lock_creates_a_new_folder_on_demand(tmp_path):
+    folder = tmp_path / "new" / "out"
+    with sole_writer(folder) as keep, sole_writer(folder) as keep_as_well:
+        assert not folder.exists()
+        assert keep() and folder.is_dir()
+        with pytest.raises(UserError, match="another command is writing to this folder"):
+            keep_as_well()
+
+
+def _keep(folder, pipe):
+    with sole_writer(folder):
+        pipe.send("kept")
+        pipe.recv()
+
+
+@pytest.mark.slow
+def test_a_killed_process_leaves_no_lock(tmp_path):
+    ours, theirs = multiprocessing.get_context("spawn").Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_keep, args=(tmp_path, theirs))
+    process.start()
+    assert ours.recv() == "kept"
+    with pytest.raises(UserError), sole_writer(tmp_path):
+        pass
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with sole_writer(tmp_path):
+        pass
+
+
+def test_path_that_cannot_be_locked_is_not_locked(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "out", tmp_path / "file"):
+        with sole_writer(path) as keep:
+            assert not keep()

@@ -42,11 +42,16 @@ def assert_ends_well(main: Callable[[list[str]], None], *arguments: object) -> O
 
 def assert_refused(
     main: Callable[[list[str]], None], *arguments: object, folder: Path, message: str
-) -> None:
-    """With status 2, in one line that holds ``message``, and every file of ``folder`` as it was."""
+) -> str:
+    """With status 2, in one line that holds ``message``, and every file of ``folder`` as it was.
+
+    Returns the line.
+    """
     before = contents(folder)
     outcome = run_in_process(main, *arguments)
     assert outcome.returncode == 2, outcome.stdout + outcome.stderr
-    assert len(outcome.stderr.splitlines()) == 1, outcome.stderr
-    assert message in outcome.stderr
+    (line,) = outcome.stderr.splitlines()
+    assert line.startswith("error: ") and message in line, line
+    assert len(line) < 1000
     assert contents(folder) == before
+    return line

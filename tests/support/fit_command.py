@@ -53,9 +53,9 @@ def assert_fits(*arguments: object) -> Outcome:
     return assert_ends_well(fit.main, *arguments)
 
 
-def assert_fit_refused(*arguments: object, folder: Path, message: str) -> None:
+def assert_fit_refused(*arguments: object, folder: Path, message: str) -> str:
     """See :func:`assert_refused`."""
-    assert_refused(fit.main, *arguments, folder=folder, message=message)
+    return assert_refused(fit.main, *arguments, folder=folder, message=message)
 
 
 def without_images(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+import yaml
 
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -96,19 +97,28 @@ def make_dataset(train=8, test=4, seed=0) -> Dataset:
     )
 
 
-def write_dataset(folder: Path, dataset: Dataset) -> None:
-    """The same views in the NeRF-synthetic layout, with half transparent photographs."""
+def write_dataset(folder: Path, dataset: Dataset, alpha: float = 0.5) -> None:
+    """The same views in the NeRF-synthetic layout; alpha: of every pixel."""
     for split, views in (("train", dataset.train), ("test", dataset.test)):
         (folder / split).mkdir(parents=True)
         frames = []
         for v in views:
-            alpha = np.full((HEIGHT, WIDTH, 1), 0.5)
-            rgba = np.round(np.concatenate([v.image, alpha], axis=2) * 255).astype(np.uint8)
+            rgba = np.dstack([v.image, np.full((HEIGHT, WIDTH), alpha)])
+            rgba = np.round(rgba * 255).astype(np.uint8)
             iio.imwrite(folder / split / f"{v.name}.png", rgba)
             opengl = v.camera_to_world * [1, -1, -1, 1]
             frames.append({"file_path": f"./{split}/{v.name}", "transform_matrix": opengl.tolist()})
         transforms = {"camera_angle_x": FIELD_OF_VIEW, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(transforms))
+
+
+def write_fit(folder: Path, dataset: Dataset, **sections: object) -> Path:
+    """``data/``, and ``run/`` as a fit leaves it, with other sections of its configuration."""
+    write_dataset(folder / "data", dataset)
+    blobs().save(folder / "run" / "point_cloud.ply")
+    config = {"data": {"path": str(folder / "data")}, **sections}
+    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    return folder / "run"
 
 
 def decibels(image, target) -> float:

@@ -17,16 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 CHANGES = {
-    "open": 0,
-    "os.rename": 1,
-    "os.remove": 0,
-    "os.mkdir": 0,
-    "os.rmdir": 0,
-    "os.truncate": 0,
-    "os.link": 1,
-    "os.symlink": 1,
-    "os.chmod": 0,
-    "os.chown": 0,
+    **dict.fromkeys(("open", "os.remove", "os.mkdir", "os.rmdir", "os.truncate"), 0),
+    **dict.fromkeys(("os.chmod", "os.chown"), 0),
+    **dict.fromkeys(("os.rename", "os.link", "os.symlink"), 1),
 }
 """Events that change files, and which of their arguments is the path."""
 
@@ -40,8 +33,7 @@ SMALL_FILES = "small files"
 
 
 class Killed(BaseException):
-    """An exception in place of SIGKILL: from here on nothing that the program does has an
-    effect."""
+    """In place of SIGKILL: from here on nothing that the program does has an effect."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +66,6 @@ class Changes:
     inside: list[tuple[str, str]] = field(default_factory=list)  # (event, path in the folder)
     outside: list[str] = field(default_factory=list)  # paths
 
-    @property
-    def struck(self) -> bool:
-        """Whether the fault happened."""
-        return self.fault is not None and len(self.inside) > self.fault.at
-
     def add(self, event: str, path: str) -> None:
         """Note one; may raise what the fault raises."""
         if not f"{path}{os.sep}".startswith(f"{self.folder}{os.sep}"):
@@ -100,15 +87,11 @@ def _hook(event: str, arguments: tuple) -> None:
     path = arguments[CHANGES[event]]
     if not isinstance(path, (str, bytes, os.PathLike)):
         return  # a file that is open already
-    if event == "open" and not _writes(*arguments[1:3]):
-        return
+    if event == "open":
+        _, mode, flags = arguments
+        if not (flags & WRITING if mode is None else set(mode) & set("wax+")):
+            return
     _observing[0].add(event, os.path.abspath(os.fsdecode(path)))
-
-
-def _writes(mode: str | None, flags: int) -> bool:
-    if mode is not None:
-        return any(letter in mode for letter in "wax+")
-    return bool(flags & WRITING)
 
 
 @contextmanager

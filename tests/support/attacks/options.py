@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -15,40 +15,40 @@ import numpy as np
 import yaml
 
 from support.attacks.attack import Attack
-from support.attacks.attack_folder import CAPTURE, SETTINGS, capture_size
+from support.attacks.attack_folder import CAPTURE, SETTINGS
 
-OPTIONS = {
-    "fit": {
-        "config": ("fit.yml",),
-        "--resume": ("--resume", "stopped"),
-        "--data": ("--data", "lego"),
-        "--out": ("--out", "out"),
-        "--overwrite": ("--overwrite",),
-        "--set": ("--set", "seed=1"),
-        "--threads": ("--threads", "1"),
-        "--budget": ("--budget", "0.01s"),
-    },
-    "render": {
-        "--split": ("--split", "test"),
-        "--orbit": ("--orbit", "2"),
-        "--camera": ("--camera", "camera.json"),
-        "--origin": ("--origin", "3", "0", "1"),
-        "--target": ("--target", "0", "0", "0.5"),
-        "--up": ("--up", "0", "1", "0"),
-        "--fov": ("--fov", "50"),
-        "--size": ("--size", "8", "6"),
-        "--background": ("--background", "black"),
-        "--background image": ("--background", "sky.png"),
-        "--ignore": ("--ignore", "motion"),
-        "--scene": ("--scene", "photos.yml"),
-        "--data": ("--data", "lego"),
-        "--set": ("--set", "data.image_size=10"),
-        "--define": ("--define", "a=b"),
-        "--threads": ("--threads", "1"),
-        "--variant": ("--variant", "scalar_rgb"),
-    },
-}
-"""Options that are valid on their own, by command and name."""
+FIT_OPTIONS = (
+    ("fit.yml",),
+    ("--resume", "stopped"),
+    ("--data", "lego"),
+    ("--out", "out"),
+    ("--overwrite",),
+    ("--set", "seed=1"),
+    ("--threads", "1"),
+    ("--budget", "0.01s"),
+)
+"""Arguments of ``fit`` that are valid on their own."""
+
+RENDER_OPTIONS = (
+    ("--split", "test"),
+    ("--orbit", "2"),
+    ("--camera", "camera.json"),
+    ("--origin", "3", "0", "1"),
+    ("--target", "0", "0", "0.5"),
+    ("--up", "0", "1", "0"),
+    ("--fov", "50"),
+    ("--size", "8", "6"),
+    ("--background", "black"),
+    ("--background", "sky.png"),
+    ("--ignore", "motion"),
+    ("--scene", "photos.yml"),
+    ("--data", "lego"),
+    ("--set", "data.image_size=10"),
+    ("--define", "a=b"),
+    ("--threads", "1"),
+    ("--variant", "scalar_rgb"),
+)
+"""Those of ``render``."""
 
 SUBJECTS = ("run", "gaussians.ply", "splats.xml", "stopped", "photos")
 """Inputs of ``render``."""
@@ -56,20 +56,15 @@ SUBJECTS = ("run", "gaussians.ply", "splats.xml", "stopped", "photos")
 
 def combination_attacks() -> Iterator[Attack]:
     """Every two options of ``fit``, and every two of ``render`` for each kind of subject."""
-    for left, right in combinations(OPTIONS["fit"], 2):
-        words = OPTIONS["fit"][left] + OPTIONS["fit"][right]
+    for left, right in combinations(FIT_OPTIONS, 2):
+        words = (*left, *right)
         out = "stopped" if "--resume" in words else "out"
-        yield Attack(f"together/fit/{left} {right}", "fit", words, out=out)
+        yield Attack(f"together/fit/{' '.join(words)}", "fit", words, out=out)
     for subject in SUBJECTS:
-        for left, right in combinations(OPTIONS["render"], 2):
-            words = OPTIONS["render"][left] + OPTIONS["render"][right]
-            name = f"together/render {subject}/{left} {right}"
-            yield Attack(name, "render", (subject, *words, "--out", "out"))
+        for left, right in combinations(RENDER_OPTIONS, 2):
+            words = (subject, *left, *right)
+            yield Attack(f"together/render/{' '.join(words)}", "render", (*words, "--out", "out"))
 
-
-# ----------------------------------------------------------------------------------------------
-# Folders of others
-# ----------------------------------------------------------------------------------------------
 
 COMMANDS = {
     "fit": ("fit", ("fit.yml",)),
@@ -80,41 +75,17 @@ COMMANDS = {
     "camera": ("render", ("gaussians.ply", "--camera", "camera.json")),
     "origin": ("render", ("gaussians.ply", "--origin", "3", "0", "1", "--size", "8", "6")),
     "scene": ("render", ("splats.xml",)),
-    "capture": ("capture", ("ball.xml", *CAPTURE, *capture_size(4))),
+    "capture": ("capture", CAPTURE),
 }
 """Every way to write a folder; ``--out`` is added."""
 
-FOREIGN = (
-    "config.yml",
-    "metrics.json",
-    "point_cloud.ply",
-    "checkpoint.npz",
-    "report.html",
-    "viewer.html",
-    "orbit.webp",
-    "orbit.gif",
-    "orbit_0.png",
-    "orbit_000.png",
-    "camera.png",
-    "camera_0.png",
-    "r_0.png",
-    "splats.png",
-    "splats.exr",
-    "plan.txt",
-    "cameras.json",
-    "history.csv",
-    "density.csv",
-    "capture.json",
-    "points3d.ply",
-    "transforms_train.json",
-    "train/r_0.png",
-    "renders/test/r_0.png",
-    "renders/test/mine.png",
-    "side_by_side/notes.txt",
-    "renders/keep",
-    "thesis.tex",
-    ".hidden",
-)
+FOREIGN = """
+    config.yml metrics.json point_cloud.ply checkpoint.npz report.html viewer.html plan.txt
+    history.csv density.csv cameras.json orbit.webp orbit.gif orbit_0.png orbit_000.png camera.png
+    camera_0.png r_0.png splats.png splats.exr capture.json points3d.ply transforms_train.json
+    train/r_0.png renders/test/r_0.png renders/test/mine.png side_by_side/notes.txt renders/keep
+    thesis.tex .hidden
+"""
 """Files of the user's that a folder might hold, some of them named as those that commands write."""
 
 
@@ -143,38 +114,26 @@ def _config_inside(folder: Path) -> None:
 def folder_attacks() -> Iterator[Attack]:
     """Every way to write a folder, into folders that hold something of the user's."""
     for name, (command, words) in COMMANDS.items():
-        for file in FOREIGN:
-            yield _into(f"folder/{name}/{file}", command, words, partial(_add, file), file)
+        into_out = (*words, "--out", "out")
+        for file in FOREIGN.split():
+            theirs, change = (f"out/{file}",), partial(_add, file)
+            yield Attack(f"folder/{name}/{file}", command, into_out, change, theirs=theirs)
         for target in ("lego/test", "photos", "mine", "run", "captured", "stopped", "."):
-            theirs = (*words, "--out", target)
-            label = f"folder/{name}/{target.replace('/', ' ')} itself"
-            yield Attack(label, command, theirs, out=target)
+            label = f"folder/{name}/{target.replace('/', ' ')}"
+            yield Attack(f"{label} itself", command, (*words, "--out", target), out=target)
             change = partial(_link, target)
-            yield Attack(
-                f"folder/{name}/{target.replace('/', ' ')} by a link",
-                command,
-                (*words, "--out", "out"),
-                change,
-                out=target,
-            )
+            yield Attack(f"{label} by a link", command, into_out, change, out=target)
     for file in ("renders/test/mine.png", "renders/keep", "side_by_side/notes.txt", "thesis.tex"):
-        words = ("fit.yml", "--overwrite")
-        change = partial(_add_to_result, file)
-        yield _into(f"folder/fit over a result/{file}", "fit", words, change, file)
-    for name in ("fit", "fit over"):
-        words = ("out/config.yml", *COMMANDS[name][1][1:])
-        change = _config_inside
-        yield _into(f"folder/{name}/its configuration", "fit", words, change, "config.yml")
+        theirs, change = (f"out/{file}",), partial(_add_to_result, file)
+        words = ("fit.yml", "--overwrite", "--out", "out")
+        yield Attack(f"folder/fit over a result/{file}", "fit", words, change, theirs=theirs)
+    for name, options in (("fit", ()), ("fit over", ("--overwrite",))):
+        words = ("out/config.yml", *options, "--out", "out")
+        theirs = ("out/config.yml",)
+        yield Attack(
+            f"folder/{name}/its configuration", "fit", words, _config_inside, theirs=theirs
+        )
 
-
-def _into(name: str, command: str, words: tuple[str, ...], change: Callable, file: str) -> Attack:
-    theirs = (os.path.join("out", file),)
-    return Attack(name, command, (*words, "--out", "out"), change, theirs=theirs)
-
-
-# ----------------------------------------------------------------------------------------------
-# Names, encodings
-# ----------------------------------------------------------------------------------------------
 
 NAMES = {
     "spaces": "a b  c",
@@ -208,65 +167,32 @@ def _renamed_image(stem: str, folder: Path) -> None:
     path = folder / "lego" / "transforms_test.json"
     if len(os.fsencode(f"{stem}.png")) <= 255:
         (folder / "lego" / "test" / "r_0.png").rename(folder / "lego" / "test" / f"{stem}.png")
-    text = path.read_text().replace("r_0", json_text(stem))
-    path.write_text(text, errors="surrogateescape")
-
-
-def json_text(text: str) -> str:
-    """Return the text as it is written within quotes."""
-    return json.dumps(text, ensure_ascii=False)[1:-1]
+    in_json = json.dumps(stem, ensure_ascii=False)[1:-1]
+    path.write_text(path.read_text().replace("r_0", in_json), errors="surrogateescape")
 
 
 def name_attacks() -> Iterator[Attack]:
     """Strange names of everything, with output that is UTF-8 or ASCII."""
     for label, name in NAMES.items():
-        for encoding in ("utf-8", "ascii"):
-            kind = f"{label} in {encoding}"
-            more = {"encoding": encoding}
-            out = name if not name.startswith("-") else f"./{name}"
-            yield Attack(
-                f"name/output of a fit/{kind}", "fit", ("fit.yml", "--out", out), out=name, **more
-            )
-            yield Attack(
-                f"name/output of a rendering/{kind}",
+        path = f"./{name}" if name.startswith("-") else name
+        fit = ("fit.yml", "--out", "out")
+        uses = {
+            "output of a fit": ("fit", ("fit.yml", "--out", path), None),
+            "output of a rendering": ("render", ("run", "--out", path), None),
+            "data": ("fit", (*fit, "--data", path), partial(_moved, "lego", name)),
+            "configuration": ("fit", (f"{path}.yml",), partial(_moved, "fit.yml", f"{name}.yml")),
+            "image": ("fit", fit, partial(_renamed_image, name)),
+            "scene": (
                 "render",
-                ("run", "--out", out),
-                out=name,
-                **more,
-            )
-            yield Attack(
-                f"name/data/{kind}",
-                "fit",
-                ("fit.yml", "--data", out, "--out", "out"),
-                partial(_moved, "lego", name),
-                **more,
-            )
-            yield Attack(
-                f"name/configuration/{kind}",
-                "fit",
-                (f"{out}.yml",),
-                partial(_moved, "fit.yml", f"{name}.yml"),
-                **more,
-            )
-            yield Attack(
-                f"name/image/{kind}",
-                "fit",
-                ("fit.yml", "--out", "out"),
-                partial(_renamed_image, name),
-                **more,
-            )
-            yield Attack(
-                f"name/scene/{kind}",
-                "render",
-                (f"{out}.xml", "--out", "out"),
+                (f"{path}.xml", "--out", "out"),
                 partial(_moved, "splats.xml", f"{name}.xml"),
-                **more,
-            )
-
-
-# ----------------------------------------------------------------------------------------------
-# Images of a fit
-# ----------------------------------------------------------------------------------------------
+            ),
+        }
+        for use, (command, words, change) in uses.items():
+            more = {"change": change} if change else {"out": name}
+            for encoding in ("utf-8", "ascii"):
+                full = f"name/{use}/{label} in {encoding}"
+                yield Attack(full, command, words, encoding=encoding, **more)
 
 
 def _tiny_images(folder: Path) -> None:
@@ -278,14 +204,14 @@ def _tiny_images(folder: Path) -> None:
 def drawn_attacks() -> Iterator[Attack]:
     """Fits with everything that they draw, which takes seconds each."""
     words = ("fit.yml", "--out", "out")
-    changes = {
-        "as it is": (words, lambda folder: None),
-        "markup": (words, partial(_renamed_image, NAMES["markup"])),
-        "not UTF-8": (words, partial(_renamed_image, NAMES["not UTF-8"])),
-        "newline": (("fit.yml", "--out", NAMES["newline"]), lambda folder: None),
-        "one pixel": (words, _tiny_images),
-        "photographs": (("photos.yml", "--out", "out"), lambda folder: None),
-        "one iteration": ((*words, "--set", "iterations=1"), lambda folder: None),
+    attacks = {
+        "as it is": (words, {}),
+        "markup": (words, {"change": partial(_renamed_image, NAMES["markup"])}),
+        "not UTF-8": (words, {"change": partial(_renamed_image, NAMES["not UTF-8"])}),
+        "newline": (("fit.yml", "--out", NAMES["newline"]), {"out": NAMES["newline"]}),
+        "one pixel": (words, {"change": _tiny_images}),
+        "photographs": (("photos.yml", "--out", "out"), {}),
+        "one iteration": ((*words, "--set", "iterations=1"), {}),
     }
-    for name, (line, change) in changes.items():
-        yield Attack(f"drawn/{name}", "fit", line, change, out=line[2], draws=True, is_long=True)
+    for name, (line, more) in attacks.items():
+        yield Attack(f"drawn/{name}", "fit", line, draws=True, **more)

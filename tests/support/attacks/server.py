@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import os
-import select
-import subprocess
-import sys
+from functools import cache
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 
-from conftest import REPOSITORY, TESTS
+import drjit as dr
+import mitsuba as mi
+
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+from support.attacks.attack_folder import AttackFolder
+from support.attacks.catalogue import attacks
+from support.attacks.trial import trial
 
 GRACE_SECONDS = 40.0
 """Seconds beyond an attack's own, after which its process is ended: more than it takes to start."""
@@ -22,8 +26,7 @@ class Server:
     """
 
     def __init__(self, base: Path) -> None:
-        self._base, self._started = base, 0
-        self._process: subprocess.Popen | None = None
+        self._base, self._started, self._process = base, 0, None
 
     def __enter__(self) -> Server:
         return self
@@ -34,67 +37,46 @@ class Server:
     def trial(self, name: str, seconds: float) -> list[str]:
         """Return the faults of an attack; seconds: its time limit."""
         if self._process is None:
-            self._start()
-        process = self._process
-        process.stdin.write(f"{json.dumps(name)}\n")
-        process.stdin.flush()
-        ready, _, _ = select.select([process.stdout], [], [], seconds + GRACE_SECONDS)
-        answer = process.stdout.readline() if ready else ""
-        if answer:
-            return json.loads(answer)
-        status = self._stop()
-        return [f"the process ended with {status}" if ready else "did not end, in native code"]
-
-    def _start(self) -> None:
-        self._started += 1
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "support.attacks.server", self._base / f"{self._started}"],
-            cwd=TESTS,
-            env=None,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
+            self._started += 1
+            context = get_context("spawn")
+            self._pipe, theirs = context.Pipe()
+            folder = self._base / f"{self._started}"
+            self._process = context.Process(target=serve, args=(folder, theirs))
+            self._process.start()
+            theirs.close()
+        self._pipe.send(name)
+        if not self._pipe.poll(seconds + GRACE_SECONDS):
+            self._stop()
+            return ["did not end, in native code"]
+        try:
+            return self._pipe.recv()
+        except (EOFError, OSError):
+            return [f"the process ended with {self._stop()}"]
 
     def _stop(self) -> int | None:
         process, self._process = self._process, None
         if process is None:
             return None
-        process.stdin.close()
-        try:
-            process.wait(timeout=5)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        process.stdout.close()
-        return process.returncode
+        self._pipe.close()
+        process.join(timeout=5)
+        process.kill()
+        process.join()
+        return process.exitcode
 
 
-def serve(base: Path) -> None:
-    """The other end: answers names, a line each, with what is wrong."""
-    import drjit as dr
-    import mitsuba as mi
-
-    import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
-    from support.attacks.attack_folder import AttackFolder
-    from support.attacks.catalogue import attacks
-    from support.attacks.trial import trial
-
-    # Libraries and commands print to what is the standard output.
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
+def serve(base: Path, pipe: Connection) -> None:
+    """The other end: answers names with what is wrong."""
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
-    attack_folder, families = AttackFolder(base), {}
-    for line in sys.stdin:
-        name = json.loads(line)
-        family = name.partition("/")[0]
-        if family not in families:
-            families[family] = {attack.name: attack for attack in attacks(family, attack_folder)}
-        print(json.dumps(trial(families[family][name], attack_folder)), file=answers, flush=True)
+    attack_folder = AttackFolder(base)
 
+    @cache
+    def of_family(family: str) -> dict:
+        return {attack.name: attack for attack in attacks(family, attack_folder)}
 
-if __name__ == "__main__":
-    sys.path.insert(0, str(REPOSITORY))
-    serve(Path(sys.argv[1]))
+    while True:
+        try:
+            name = pipe.recv()
+        except (EOFError, OSError):
+            return
+        pipe.send(trial(of_family(name.partition("/")[0])[name], attack_folder))

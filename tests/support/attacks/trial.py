@@ -8,12 +8,11 @@ import re
 import resource
 import signal
 import sys
-import time
 import traceback
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -21,9 +20,6 @@ from drgs.__main__ import COMMANDS
 from support.attacks.attack import Attack
 from support.attacks.attack_folder import AttackFolder, contents, current_folder, stub_results
 from support.attacks.observer import Changes, Killed, observed
-
-KILLED_STATUS = 137
-INTERRUPTED_STATUS = 130
 
 PIPE_BYTES = 1 << 20
 """Limit of a command's output."""
@@ -41,12 +37,7 @@ MAX_REFUSAL_CHARS = 2000
 ADDRESS_SPACE = 4 << 30
 """Bytes by which it may grow: threads and compilers reserve much more than they use."""
 
-
-MAY_CHANGE = {
-    "fit": {"out", "stopped", "run"},
-    "render": {"out"},
-    "capture": {"out", "captured"},
-}
+MAY_CHANGE = {"fit": {"out", "stopped", "run"}, "render": {"out"}, "capture": {"out", "captured"}}
 """Folders in which a command may change existing files."""
 
 
@@ -56,12 +47,10 @@ class TimeLimitExceeded(BaseException):
 
 @dataclass
 class Outcome:
-    """Exit status and output of a process."""
+    """Exit status and standard error output of a process."""
 
     status: int | None = None  # None: another exception ended it
-    out: str = ""
     err: str = ""
-    seconds: float = 0.0
     megabytes: float = 0.0  # by which memory grew at its peak
     changes: Changes = field(default_factory=lambda: Changes(Path()))
 
@@ -72,33 +61,32 @@ def trial(attack: Attack, attack_folder: AttackFolder) -> list[str]:
         with current_folder(attack_folder.folder):
             attack.change(attack_folder.folder)
             before = contents(attack_folder.folder)
-            outcome = run(attack, attack.words)
+            outcome = run(attack)
             wrong = [*faults_of(attack, outcome), *damage(attack, outcome, before, attack_folder)]
-            if attack.again and outcome.status != 0:
+            if attack.results and outcome.status != 0:
                 wrong += recovery(attack, attack_folder)
         return wrong
     finally:
         attack_folder.restore_files()
 
 
-def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outcome:
+def run(attack: Attack) -> Outcome:
     """Call the command as its process would be; in the current folder."""
     main = import_module(COMMANDS[attack.command].module).main
-    outcome, fault = Outcome(), attack.fault if with_fault else None
-    drawings = nullcontext() if attack.draws else stub_results()
+    outcome = Outcome()
     with (
-        drawings,
+        nullcontext() if attack.draws else stub_results(),
         _captured(attack.encoding, outcome),
         _measured(outcome, attack.seconds),
-        observed(Path.cwd(), fault) as outcome.changes,
+        observed(Path.cwd(), attack.fault) as outcome.changes,
     ):
         try:
-            main(list(words))
+            main(list(attack.words))
             outcome.status = 0
         except SystemExit as end:
             outcome.status = end.code if isinstance(end.code, int) else 0 if not end.code else 1
         except Killed:
-            outcome.status = KILLED_STATUS
+            outcome.status = 137
         except TimeLimitExceeded:
             print(f"did not end within {attack.seconds:g} s", file=sys.stderr)
             traceback.print_exc()
@@ -107,22 +95,13 @@ def run(attack: Attack, words: tuple[str, ...], with_fault: bool = True) -> Outc
     return outcome
 
 
-# ----------------------------------------------------------------------------------------------
-# Violations
-# ----------------------------------------------------------------------------------------------
-
-
 def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
     """Return faults of its end and its output."""
     wrong = []
-    expected = {0, 2}
-    if attack.fault is not None:
-        own = {"kill": KILLED_STATUS, "interrupt": INTERRUPTED_STATUS}.get(attack.fault.kind, 2)
-        expected = {0, own}
-    if outcome.status not in expected:
+    kind = attack.fault.kind if attack.fault else None
+    if outcome.status not in (0, {"kill": 137, "interrupt": 130}.get(kind, 2)):
         reached = "an exception" if outcome.status is None else f"status {outcome.status}"
-        wrong.append(f"ended with {reached}: {_last_lines(outcome.err)}")
-        return wrong
+        return [f"ended with {reached}: {_last_lines(outcome.err)}"]
     if attack.must_refuse and outcome.status == 0:
         wrong.append("was not refused")
     if outcome.status == 2:
@@ -143,8 +122,7 @@ def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
 
 
 def _wrong_refusal(attack: Attack, err: str) -> list[str]:
-    wrong = []
-    lines = err.splitlines()
+    wrong, lines = [], err.splitlines()
     if len(lines) != 1:
         wrong.append(f"a refusal of {len(lines)} lines: {_last_lines(err)}")
     elif "error: " not in lines[0]:
@@ -175,21 +153,16 @@ def damage(
             wrong.append(f"{'changed' if path in after else 'removed'} {path}")
     for path in after.keys() - before.keys():
         if TEMPORARY.search(path):
-            if not _cannot_clean_up(attack):
+            if attack.fault is None or attack.fault.kind not in ("kill", "denied"):
                 wrong.append(f"left {path}")
         elif not (kept and (is_own(path) or own.startswith(f"{path}/"))):
             wrong.append(f"made {path}")
     return sorted(wrong)
 
 
-def _cannot_clean_up(attack: Attack) -> bool:
-    """Whether its fault leaves no chance to remove what is temporary."""
-    return attack.fault is not None and attack.fault.kind in ("kill", "denied")
-
-
 def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
     """Return faults after the command was run again, as its user would."""
-    outcome = run(attack, attack.again, with_fault=False)
+    outcome = run(replace(attack, fault=None))
     if outcome.status != 0:
         return [f"again: ended with {outcome.status}: {_last_lines(outcome.err)}"]
     found = contents(attack_folder.folder / attack.out)
@@ -213,7 +186,7 @@ def files_without_faults(attack: Attack, attack_folder: AttackFolder) -> dict[st
     if key not in _undisturbed:
         attack_folder.restore_files()
         attack.change(attack_folder.folder)
-        outcome = run(attack, attack.words, with_fault=False)
+        outcome = run(replace(attack, fault=None))
         assert outcome.status == 0, outcome.err
         _undisturbed[key] = contents(attack_folder.folder / attack.out)
     return _undisturbed[key]
@@ -223,17 +196,9 @@ def _last_lines(text: str) -> str:
     lines = [line.strip() for line in text.strip().splitlines() if line.strip(" ^~")]
     if any("Traceback" in line for line in lines):
         places = [line for line in lines if line.startswith("File ") and "/drgs/" in line]
-        lines = [*(_place(line) for line in places[-1:]), lines[-1]]
+        place = re.compile(r'File ".*/(drgs/[^"]*)", line (\d+), in (\w+)')
+        lines = [*(place.sub(r"\1:\2 \3", line) for line in places[-1:]), lines[-1]]
     return " | ".join(line[:400] for line in lines[-3:])
-
-
-def _place(line: str) -> str:
-    return re.sub(r'File ".*/(drgs/[^"]*)", line (\d+), in (\w+)', r"\1:\2 \3", line)
-
-
-# ----------------------------------------------------------------------------------------------
-# Around a command
-# ----------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -270,12 +235,11 @@ def _captured(encoding: str, outcome: Outcome) -> Iterator[None]:
         for number, copy in kept.items():
             os.dup2(copy, number)  # closes the pipe's end
             os.close(copy)
-        outcome.out, outcome.err = (_all_of(start) for start, _ in pipes.values())
-
-
-def _all_of(pipe: int) -> str:
-    with open(pipe, "rb") as file:
-        return file.read().decode("utf-8", "replace")
+        texts = []
+        for start, _ in pipes.values():
+            with open(start, "rb") as file:
+                texts.append(file.read().decode("utf-8", "replace"))
+        _, outcome.err = texts
 
 
 def _show_warning(message: object, category: type, *others: object, **more: object) -> None:
@@ -292,9 +256,8 @@ def _measured(outcome: Outcome, seconds: float) -> Iterator[None]:
     previous, interrupt = signal.signal(signal.SIGALRM, ring), signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    start, resident = time.perf_counter(), _memory("VmRSS")
+    resident, hard = _memory("VmRSS"), limits[1]
     most = _memory("VmSize") * 1024 + ADDRESS_SPACE
-    hard = limits[1]
     resource.setrlimit(resource.RLIMIT_AS, (most if hard < 0 else min(most, hard), hard))
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
     signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -305,7 +268,6 @@ def _measured(outcome: Outcome, seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, previous)
         signal.signal(signal.SIGINT, interrupt)
         resource.setrlimit(resource.RLIMIT_AS, limits)
-        outcome.seconds = time.perf_counter() - start
         outcome.megabytes = (_memory("VmHWM") - resident) / 1024
 
 
