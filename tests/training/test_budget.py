@@ -5,7 +5,6 @@ from argparse import ArgumentTypeError
 from dataclasses import replace
 from types import SimpleNamespace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import make_dataset, write_dataset
@@ -27,11 +26,6 @@ from drgs.training.rates import rates_over_time
 from drgs.training.trainer import Trainer
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [("90", 90), ("90s", 90), ("5m", 300), ("1h30m", 5400), ("0.5h", 1800), ("1m30s", 90)],
@@ -48,10 +42,6 @@ def test_invalid_durations_are_refused(text):
     with pytest.raises(ArgumentTypeError, match="must be a time such as 90s, 5m or 1h30m"):
         parse_duration(text)
 
-
-# ----------------------------------------------------------------------------------------------
-# Curves
-# ----------------------------------------------------------------------------------------------
 
 # Time grows as n^1.5, PSNR by 2 dB with every doubling.
 POWER = Curve((100, 200, 400), (1000.0, 1000 * 2**1.5, 8000.0), (20.0, 22.0, 24.0))
@@ -73,10 +63,6 @@ def test_every_strategy_has_measured_curves():
             assert curve.iterations_in(seconds) == n
             assert curve.psnr_at(n) == pytest.approx(psnr)
 
-
-# ----------------------------------------------------------------------------------------------
-# Plans
-# ----------------------------------------------------------------------------------------------
 
 SLOW = Curve((1000, 2000), (1000.0, 2000.0), (30.0, 31.0))
 FAST = Curve((1000, 2000), (500.0, 1000.0), (29.5, 30.5))
@@ -166,11 +152,6 @@ def test_fraction_is_planned_only_with_a_target_number():
     assert [candidate.strategy for candidate in result.candidates] == [plan.STRATEGIES[0]]
     assert "at most 1,000,000 Gaussians" in result.reasons
     assert "at most 900 Gaussians" in make_plan(growing, 900, 400, 100, 0.1, curves).reasons
-
-
-# ----------------------------------------------------------------------------------------------
-# The end
-# ----------------------------------------------------------------------------------------------
 
 
 class Clock:
@@ -273,11 +254,6 @@ def test_rescheduling_past_iterations_is_refused():
     trainer.reschedule(50, 9)
     with pytest.raises(ValueError, match="cannot change from 9 to 4 after iteration 4"):
         trainer.reschedule(50, 4)
-
-
-# ----------------------------------------------------------------------------------------------
-# The command
-# ----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import json
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import make_dataset
@@ -15,11 +14,6 @@ from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoin
 from drgs.training.loop import History
 
 RESOLVED_DEFAULTS = {"data.background": "white", "model.near": 0.2}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture

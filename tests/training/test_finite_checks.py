@@ -26,19 +26,9 @@ from drgs.training.trainer import Trainer
 ROW = 17
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def view_name(trainer, iteration):
     views = trainer.stages[-1].views
     return views[view_of(iteration, len(views), trainer.config.seed)].name
-
-
-# ----------------------------------------------------------------------------------------------
-# Poison
-# ----------------------------------------------------------------------------------------------
 
 
 def with_value(vector, row, value):
@@ -75,10 +65,6 @@ def poison_value(trainer, name, value=np.nan, row=ROW):
     host[(row, *(-1,) * (host.ndim - 1))] = value
     trainer.population.replace(name, type(old)(host))
 
-
-# ----------------------------------------------------------------------------------------------
-# Losses and gradients
-# ----------------------------------------------------------------------------------------------
 
 DEGREE_1_AT_ONCE = {"sh_degree": 1, "sh_increase_every": 1}
 
@@ -179,11 +165,6 @@ def test_restored_trainer_has_no_fault(monkeypatch):
     trainer.check()
 
 
-# ----------------------------------------------------------------------------------------------
-# Values
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
@@ -275,11 +256,6 @@ def test_check_values_names_the_first_row_of_any_shape():
         check_values(7, {"sh": mi.TensorXf(values)})
 
 
-# ----------------------------------------------------------------------------------------------
-# Cost of the guards in a good fit
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_guards_do_not_change_the_bytes_of_a_fit(monkeypatch):
     """Across changes of the population and an opacity reset."""
@@ -338,11 +314,6 @@ def test_finite_checks_launch_only_small_kernels():
     for _ in range(5):
         trainer.step()
     assert all(size <= 4 for _, size in history_of(trainer.watch.check))
-
-
-# ----------------------------------------------------------------------------------------------
-# The command
-# ----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

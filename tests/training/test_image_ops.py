@@ -37,11 +37,6 @@ def to_numpy(value) -> np.ndarray:
     return np.array(value).astype(np.float64)
 
 
-# ----------------------------------------------------------------------------------------------
-# Operations, computed twice
-# ----------------------------------------------------------------------------------------------
-
-
 def numpy_split(image, count):
     return image[..., :count], image[..., count:]
 
@@ -170,11 +165,6 @@ def random_directions(operation):
     return {k: random(*v.shape, seed=20) for k, v in operation.inputs.items()}
 
 
-# ----------------------------------------------------------------------------------------------
-# Values and derivatives
-# ----------------------------------------------------------------------------------------------
-
-
 @both_precisions
 @all_operations
 def test_values_match_numpy(name, precision):
@@ -286,11 +276,6 @@ def test_comparisons_detect_one_percent_errors(monkeypatch):
                 check()
 
 
-# ----------------------------------------------------------------------------------------------
-# Unused inputs
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("used", [0, 1])
 def test_unused_half_of_a_split_has_no_derivative(used):
     operation = split_operation()
@@ -333,11 +318,6 @@ def test_equal_depths_have_no_slope():
     weights = depth_inputs()[2].reshape(HEIGHT, WIDTH)
     assert (gradient[0, :3] == 0).all()
     assert ((gradient[..., 0] != 0) == (weights > 0))[1:].all()
-
-
-# ----------------------------------------------------------------------------------------------
-# The same in every run
-# ----------------------------------------------------------------------------------------------
 
 
 @all_operations

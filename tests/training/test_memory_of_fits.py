@@ -61,11 +61,6 @@ def estimated(config, dataset, scale=1.0):
     return memory.estimate(config, dataset, gaussians, TARGET_BYTES, scale)
 
 
-# ----------------------------------------------------------------------------------------------
-# The estimate
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("size", "start", "most", "views", "measured_mb"),
     [
@@ -145,11 +140,6 @@ def test_each_time_of_a_shutter_counts():
 def test_a_population_grows_to_its_cap_if_there_is_time(changes, expected):
     config = config_of(500, 10**6, **changes)
     assert memory.max_num_gaussians(config, 1000) == expected
-
-
-# ----------------------------------------------------------------------------------------------
-# Refusals
-# ----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -243,10 +233,6 @@ def test_a_trainer_checks_memory_before_it_allocates(available):
     with pytest.raises(UserError, match=r"^memory: the fit needs about "):
         Trainer(config, dataset, initial_gaussians(config, dataset))
 
-
-# ----------------------------------------------------------------------------------------------
-# The peak itself
-# ----------------------------------------------------------------------------------------------
 
 MEASURED = """
 import sys

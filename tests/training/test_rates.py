@@ -1,18 +1,11 @@
 """Learning rates over a fit, and steps of several views."""
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.trainers import make_trainer
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
 
 FIXED_POPULATION = {"start": 1, "stop": 2}
 """The population does not change."""

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.fit_command import VALUES, write_project
@@ -19,11 +18,6 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.loop import RootDecides, iterations
 from drgs.training.losses import Loss
 from drgs.training.session import FitSession
-
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.mark.slow

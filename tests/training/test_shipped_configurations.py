@@ -79,11 +79,6 @@ def test_every_shipped_configuration_is_tested():
     assert set(CONFIGURATIONS) == {*ALIKE, *FASTER_OR_BETTER, "lego_paper"}
 
 
-# ----------------------------------------------------------------------------------------------
-# Small fits
-# ----------------------------------------------------------------------------------------------
-
-
 def nerf_synthetic(folder):
     return SHARED_DATA / "nerf_synthetic" / "lego"
 

@@ -1,7 +1,6 @@
 """Fits with the 3D smoothing filter."""
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from support import small_capture as capture
@@ -14,12 +13,6 @@ from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects as reference_effects
 from drgs.reference import splatting as reference
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
 
 GROWING = {
     "start": 3,

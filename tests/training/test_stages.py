@@ -1,6 +1,5 @@
 """Prepared targets stay on the device while there is room, else they are prepared again."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support import small_fits as fits
@@ -11,11 +10,6 @@ from drgs.training import steps as training_steps
 from drgs.training.losses import TARGET_BYTES
 
 PIXELS = 20 * 16
-
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def indices_on_device(trainer):

@@ -20,11 +20,6 @@ from drgs.training.steps import view_of
 VALUE = 2e-6
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def attached(values):
     """A tensor with derivatives enabled."""
     tensor = mi.TensorXf(np.asarray(values, np.float32))
@@ -41,10 +36,6 @@ def numpy_loss(image, target, weight=0.2) -> float:
 def random_image(seed, *shape) -> np.ndarray:
     return single(np.random.default_rng(seed).uniform(0.05, 0.95, shape))
 
-
-# ----------------------------------------------------------------------------------------------
-# Masks
-# ----------------------------------------------------------------------------------------------
 
 HEIGHT, WIDTH = 24, 32
 
@@ -175,10 +166,6 @@ def test_coarse_masks_drop_partially_masked_pixels():
     assert 0 < blocks.mean() < 1
     fits.steps(trainer, 3)
 
-
-# ----------------------------------------------------------------------------------------------
-# Depth
-# ----------------------------------------------------------------------------------------------
 
 DEPTH_WEIGHT = 0.7
 
@@ -385,10 +372,6 @@ def test_a_fit_with_depths_and_masks_resumes_to_the_same_bytes():
 def test_no_kernel_is_compiled_after_all_views_were_seen(dataset):
     fits.assert_no_new_kernels(fits.make_trainer(dataset()))
 
-
-# ----------------------------------------------------------------------------------------------
-# Random backgrounds
-# ----------------------------------------------------------------------------------------------
 
 GREY = (0.25, 0.5, 0.75)
 

@@ -15,11 +15,6 @@ from drgs.initialization.start import Start, gaussians_at
 from drgs.training.density import adc
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def test_views_are_shuffled_every_round():
     from drgs.training.steps import view_of
 

@@ -1,6 +1,5 @@
 """Gaussians that are fitted further as viewers render them."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support import small_fits as fits
@@ -16,11 +15,6 @@ from drgs.training.trainer import Trainer
 from drgs.training.viewers import for_viewers, num_iterations, tuning
 
 NON_VIEWER_SETTINGS = {"model.antialiased": True, "model.low_pass": 0.02}
-
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def ended_fit(iterations=20, **changes):

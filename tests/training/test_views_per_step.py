@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -11,11 +10,6 @@ from support import small_fits as fits
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training.steps import step_of, view_of
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def make_trainer(views_per_step, dataset=None, **changes):

@@ -36,7 +36,6 @@ def seen(strategy, gradient, visible, width, height):
     strategy.update_statistics(StepInfo(1, width, height, gradient, visible, {}))
 
 
-# ---- statistics
 @pytest.mark.parametrize("as_tensor", [False, True])
 def test_statistics_are_gradient_norms_in_ndc_over_visible_views(as_tensor):
     width, height, num = 40, 26, 5
@@ -64,7 +63,6 @@ def test_invisible_gradients_are_ignored_even_if_they_are_nan():
     np.testing.assert_array_equal(result.gradient_norms, [0, 1])
 
 
-# ---- schedule
 @pytest.mark.parametrize("white", [False, True])
 def test_schedule_matches_the_reference_training_loop(white):
     config = DensifyConfig(
@@ -87,7 +85,6 @@ def test_extra_reset_can_be_disabled():
     assert not any(strategy.resets(i) for i in range(1, 3000))
 
 
-# ---- single decisions
 def test_small_gaussian_is_cloned_in_place():
     optimizer = make([SMALL, SMALL], 0.5)
     before, (m, v) = values(optimizer), moments(optimizer, "means")
@@ -212,7 +209,6 @@ def test_degree_0_has_no_higher_coefficients():
     assert "shN" not in optimizer
 
 
-# ---- cap
 def test_cap_takes_the_largest_gradients_and_breaks_ties_by_index():
     optimizer = make([SMALL] * 6, 0.5)
     before = values(optimizer)["means"]
@@ -241,7 +237,6 @@ def test_full_population_only_shrinks():
     assert report == DensityReport(pruned=1, refused=5, num_gaussians=5)
 
 
-# ---- everything together
 def naive_decisions(norms, scales, opacities, large_is_pruned, config):
     """The rules, one Gaussian after the other: (kept, cloned, split) row numbers."""
     limit = config.adc.prune_scale * EXTENT if large_is_pruned else math.inf
@@ -316,7 +311,6 @@ def test_equal_seeds_give_equal_bytes():
     assert population(3, EARLY + 100) != first
 
 
-# ---- opacity reset
 def test_reset_lowers_opacities_and_clears_only_their_moments():
     config = DensifyConfig()
     optimizer = make([SMALL] * 3, [0.9, 0.01001, 0.007])

@@ -3,7 +3,6 @@
 import math
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from drjit.llvm.ad import Float, TensorXf, TensorXf64
@@ -149,12 +148,6 @@ def test_a_population_that_would_vanish_is_refused():
         strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).refine(rows_of(optimizer), 500)
 
 
-# ---- in a fit
-@pytest.fixture(scope="module")
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 GROWING = {
     "strategy": "budget",
     "start": 4,
@@ -165,7 +158,7 @@ GROWING = {
 
 
 @pytest.mark.slow
-def test_errors_are_accumulated_in_scheduled_iterations(variant):
+def test_errors_are_accumulated_in_scheduled_iterations():
     trainer = make_trainer(densify=GROWING)
     gathered = []
     original = trainer.density.update_statistics
@@ -193,7 +186,7 @@ def test_each_change_has_accumulated_errors(every, stop, error_every):
 
 
 @pytest.mark.slow
-def test_fit_grows_along_the_curve_and_resumes_to_the_same_bytes(variant):
+def test_fit_grows_along_the_curve_and_resumes_to_the_same_bytes():
     uninterrupted, first = make_trainer(densify=GROWING), make_trainer(densify=GROWING)
     counts = []
     for iteration in range(1, 31):
@@ -222,7 +215,7 @@ def test_target_is_reached_with_coarse_images_until_the_end_of_growth():
 
 
 @pytest.mark.slow
-def test_coarse_images_have_fewer_gaussians_and_a_constant_means_rate(variant):
+def test_coarse_images_have_fewer_gaussians_and_a_constant_means_rate():
     coarse = [{"until": 9, "factor": 4}, {"until": 17, "factor": 2}]
     trainer, counts, rates = make_trainer(densify=GROWING, coarse=coarse), [], []
     for _ in range(50):
@@ -239,12 +232,12 @@ def test_coarse_images_have_fewer_gaussians_and_a_constant_means_rate(variant):
     assert rates[17:] == pytest.approx([first * 100 ** (-k / 33) for k in range(1, 34)])
 
 
-def test_default_number_follows_from_the_image_size(variant):
+def test_default_number_follows_from_the_image_size():
     trainer = make_trainer(densify={"strategy": "budget"})
     assert trainer.config.densify.budget.gaussians == round(250 * math.sqrt(20 * 16))
 
 
-def test_opacities_of_halves_have_logits(variant):
+def test_opacities_of_halves_have_logits():
     optimizer = make_optimizer(
         {
             "means": TensorXf(Float([0.0] * 3), (1, 3)),

@@ -32,7 +32,6 @@ def act(optimizer, iteration=600, seed=0, **config):
     return strategy(**config).refine(rows_of(optimizer, seed), iteration)
 
 
-# ---- what copies look like
 @pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
 def test_copies_composite_to_the_original_opacity(opacity, count):
@@ -56,7 +55,6 @@ def test_opacity_of_one_has_finite_copies():
     assert 0 < factors[0] < 1
 
 
-# ---- relocation
 def test_transparent_gaussians_become_copies_of_opaque_ones():
     optimizer = make([SIZE] * 6, [0.5, DEAD, 0.0051, DEAD, 0.6, DEAD], tensor_type=TensorXf64)
     before, kept_moments = values(optimizer), moments(optimizer, "quats")
@@ -143,7 +141,6 @@ def test_nan_gaussians_are_relocated():
     assert np.isfinite(values(optimizer)["logit_opacities"]).all()
 
 
-# ---- growth
 def test_population_grows_by_a_fraction_up_to_its_cap():
     optimizer = make([SIZE] * 100, 0.5)
     sizes = [act(optimizer, 100 * i, gaussians=117).num_gaussians for i in range(6, 11)]
@@ -208,7 +205,6 @@ def test_refine_is_due_between_start_and_stop():
     assert acting == list(range(600, 15_000, 100))
 
 
-# ---- noise
 def test_noise_follows_the_covariance_of_transparent_gaussians():
     num, rate, seed, iteration = 4000, 1e-3, 7, 12
     optimizer = make(np.full(num, 0.3), 0.02, tensor_type=TensorXf64)
@@ -268,7 +264,6 @@ def test_noise_compiles_one_kernel():
     assert hashes[0] == hashes[1] == hashes[2]
 
 
-# ---- regularisers
 def test_penalties_are_mean_opacity_and_mean_scale():
     optimizer = make([0.1, 0.2, 0.4], [0.1, 0.5, 0.9], tensor_type=TensorXf64)
     parameters = dict(optimizer.items())

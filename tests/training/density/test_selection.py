@@ -32,7 +32,6 @@ class Step:
         self.weighted_sums = {"coverage": Float(weights)}
 
 
-# ---- schedule
 def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
     schedule = Importance(config_of(to=100))
     assert (schedule.start, schedule.stop) == (2000, 3000)
@@ -71,7 +70,6 @@ def test_the_best_stay_in_their_order_with_their_moments():
             np.testing.assert_array_equal(moment, expected[[0, 2, 3]])
 
 
-# ---- natural selection
 def test_as_many_fall_below_the_threshold_as_are_to_go():
     random = np.random.default_rng(0)
     opacities = random.uniform(0.005, 0.02, 200)
@@ -157,7 +155,6 @@ def test_random_populations_end_with_the_number(seed):
     assert left == min(num, to)
 
 
-# ---- importance
 def test_those_that_show_least_in_the_phase_go():
     """Not since the last change: that is fewer views than there are."""
     optimizer = make([SIZE] * 8, 0.5)
@@ -199,7 +196,6 @@ def test_a_phase_resumes_from_its_state(method):
         np.testing.assert_array_equal(value, values(again)[name])
 
 
-# ---- the configuration
 def test_a_phase_that_would_end_before_it_begins_is_refused():
     with pytest.raises(ValueError, match=r"prune\.stop must be > densify\.stop"):
         config_of(to=5, stop=1999)

@@ -22,19 +22,9 @@ from drgs.training.density.strategy import (
 from drgs.training.rates import revised_stops
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def trainer_with(monkeypatch, strategy, **changes):
     monkeypatch.setattr(trainer_module, "density_strategy", lambda *_: strategy)
     return make_trainer(**changes)
-
-
-# ----------------------------------------------------------------------------------------------
-# Calls by the trainer
-# ----------------------------------------------------------------------------------------------
 
 
 def red(image, photograph):
@@ -135,11 +125,6 @@ def test_learning_rates_are_scaled_in_the_given_iterations(monkeypatch):
     assert rates[0] == rates[1]
 
 
-# ----------------------------------------------------------------------------------------------
-# Values without moments
-# ----------------------------------------------------------------------------------------------
-
-
 def test_setting_values_keeps_moments_and_step_count():
     optimizer = make([0.1, 0.2, 0.3], 0.5)
     before = {name: entry[1:] for name, entry in optimizer.state.items()}
@@ -153,11 +138,6 @@ def test_setting_values_keeps_moments_and_step_count():
         assert all(now is then for now, then in zip(entry[1:], before[name], strict=True)), name
     with pytest.raises(ValueError, match=r"set_values\(\): means has shape \(3, 3\), the new valu"):
         rows.set_values("means", rows.take(dr.llvm.ad.UInt(0))["means"])
-
-
-# ----------------------------------------------------------------------------------------------
-# Strategies that follow one another
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -224,11 +204,6 @@ def test_phases_act_as_one_strategy_and_restart_after_row_changes():
     again = Phases((Phase("first", {2}), Phase("last", {2})))
     again.restore(phases.state())
     assert [phase.seen for phase in again.phases] == [5, 6]
-
-
-# ----------------------------------------------------------------------------------------------
-# Configurations
-# ----------------------------------------------------------------------------------------------
 
 
 def test_every_configured_strategy_is_created():

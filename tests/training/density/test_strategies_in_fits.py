@@ -2,7 +2,6 @@
 
 import sys
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support import small_fits as fits
@@ -32,11 +31,6 @@ STRATEGIES = {
     },
     "mcmc and selection": MCMC | {"densify__prune__to": 20},
 }
-
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def many_blobs(count=48) -> Gaussians:

@@ -1,14 +1,8 @@
 """However many processes share a fit, it is the same."""
 
-import mitsuba as mi
 import pytest
 from support import parallel_processes
 from support import small_fits as fits
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def settings(views_per_step=4, **changes):
