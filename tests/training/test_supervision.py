@@ -46,8 +46,12 @@ def spoiled_dataset(color=(1.0, 0.0, 1.0), depth=77):
     return replace(fits.true_dataset(), train=tuple(views))
 
 
+def masked_trainer(**changes):
+    return fits.make_trainer(spoiled_dataset(), loss__depth_weight=0.0, **changes)
+
+
 def test_default_configuration_has_effects_of_masks_alone():
-    config = fits.config_of()
+    config = fits.config_of(**{"loss.depth_weight": 0.0})
     assert training_effects(config, fits.plain_dataset()) == []
     (effect,) = training_effects(config, spoiled_dataset())
     assert effect.name == "masks" and effect.state() == {}
@@ -56,7 +60,7 @@ def test_default_configuration_has_effects_of_masks_alone():
 @pytest.mark.parametrize("weight", [0.0, 0.2])
 def test_loss_is_computed_on_masked_images(weight):
     """Masked pixels have no derivative, though SSIM's windows reach into them; others have one."""
-    trainer = fits.make_trainer(spoiled_dataset(), loss__dssim_weight=weight)
+    trainer = masked_trainer(loss__dssim_weight=weight)
     for index in (0, 3):
         view, photo = trainer.views[index], spoiled_dataset().train[index]
         values, mask = random_image(index), mask_of(index)[..., None]
@@ -72,7 +76,7 @@ def test_loss_is_computed_on_masked_images(weight):
 
 
 def test_derivatives_of_a_masked_loss_equal_central_differences():
-    trainer = fits.make_trainer(spoiled_dataset())
+    trainer = masked_trainer()
     view, photo, mask = trainer.views[2], spoiled_dataset().train[2], mask_of(2)[..., None]
     values = random_image(2)
     image = mi.TensorXf(values)
@@ -93,7 +97,7 @@ def test_derivatives_of_a_masked_loss_equal_central_differences():
 
 
 def test_psnr_of_an_iteration_uses_kept_pixels():
-    trainer, views = fits.make_trainer(spoiled_dataset()), set()
+    trainer, views = masked_trainer(), set()
     for _ in range(3):
         before = [rendered(trainer, view) for view in trainer.views]
         report = trainer.step()
@@ -117,7 +121,7 @@ def test_masked_pixels_do_not_affect_a_fit(weight):
 
 def test_coarse_masks_drop_partially_masked_pixels():
     """A large pixel counts where all small ones do."""
-    trainer = fits.make_trainer(spoiled_dataset(), coarse=[{"until": 2, "factor": 4}])
+    trainer = masked_trainer(coarse=[{"until": 2, "factor": 4}])
     view = trainer.stages[0].views[3]
     blocks = mask_of(3).reshape(6, 4, 8, 4).min(axis=(1, 3))
     uploaded = np.array(view.uploads["masks"])
