@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.populations import make, rows_of
 from support.trainers import make_trainer
 
 from drgs.config.density import DensifyConfig
@@ -123,21 +122,6 @@ def test_learning_rates_are_scaled_in_the_given_iterations(monkeypatch):
         fit.step()
         rates.append([entry[2] for entry in fit.optimizer.state.values()])
     assert rates[0] == rates[1]
-
-
-def test_setting_values_keeps_moments_and_step_count():
-    optimizer = make([0.1, 0.2, 0.3], 0.5)
-    before = {name: entry[1:] for name, entry in optimizer.state.items()}
-    rows = rows_of(optimizer)
-    means = rows.value("means") + 1
-    expected = rows.host("means") + 1
-    rows.set_values("means", means)
-    np.testing.assert_allclose(rows.host("means"), expected, rtol=1e-6)
-    assert dr.grad_enabled(optimizer["means"])
-    for name, entry in optimizer.state.items():
-        assert all(now is then for now, then in zip(entry[1:], before[name], strict=True)), name
-    with pytest.raises(ValueError, match=r"set_values\(\): means has shape \(3, 3\), the new valu"):
-        rows.set_values("means", rows.take(dr.llvm.ad.UInt(0))["means"])
 
 
 @dataclass
