@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from support.fit_command import assert_fits, run_fit
 from support.small_capture import make_dataset, write_dataset
-from support.trainers import make_trainer
 
 from drgs import fit
 from drgs.config.changes import with_changes
@@ -222,15 +221,6 @@ def test_plan_of_a_slowing_fit_is_revised(clock):
     assert len(trainer.config.optimizer.means_lr_aims) == 10
     # Without revisions after the fit became slower, it would have fallen half the way: 1.7e-5.
     assert trainer.rates.means.final < rates[-1] < 2 * trainer.rates.means.final
-
-
-def test_rescheduling_past_iterations_is_refused():
-    trainer = make_trainer(densify={"start": 2, "stop": 5})
-    for _ in range(4):
-        trainer.step()
-    trainer.reschedule(50, 9)
-    with pytest.raises(ValueError, match="cannot change from 9 to 4 after iteration 4"):
-        trainer.reschedule(50, 4)
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from drgs.training.optimizer import (
     LARGE_WIDTH,
     make_optimizer,
 )
-from drgs.training.rates import ExponentialDecay
 
 RATES = {name: 0.01 * (k + 1) for k, name in enumerate(PARAMETER_NAMES)}
 
@@ -230,23 +229,3 @@ def test_new_values_keep_step_count_and_rate(keeps_moments):
         np.testing.assert_array_equal(after["means"][k], before["means"][k])
     with pytest.raises(ValueError, match=r"has shape \(4,\), the new values \(3,\)"):
         act("logit_opacities", Float(1, 2, 3))
-
-
-def test_decay_is_a_straight_line_in_the_logarithm():
-    rate = ExponentialDecay(1.6e-4, 1.6e-6, ((0, 30_000),))
-    assert rate(0) == pytest.approx(1.6e-4)
-    assert rate(15_000) == pytest.approx(1.6e-5)
-    assert rate(30_000) == rate(40_000) == pytest.approx(1.6e-6)
-    ratios = [rate(i + 1) / rate(i) for i in (0, 10_000, 29_999)]
-    np.testing.assert_allclose(ratios, 0.01 ** (1 / 30_000), rtol=1e-12)
-    with pytest.raises(ValueError, match="must be > 0"):
-        ExponentialDecay(1e-3, 0.0, ((0, 10),))
-
-
-def test_a_decay_that_is_revised_spreads_what_is_left():
-    """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
-    rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
-    once = ExponentialDecay(1.0, 1e-4, ((0, 100),))
-    assert [rate(i) for i in range(51)] == [once(i) for i in range(51)]
-    exponents = [math.log10(rate(i)) for i in (50, 75, 100, 150, 200)]
-    np.testing.assert_allclose(exponents, [-2, -2.5, -3, -4, -4], rtol=1e-12)

@@ -143,39 +143,6 @@ def test_image_size_changes_with_the_first_step_after_a_stage():
     assert begun == [False, False, True, False]
 
 
-EFFECTS = {
-    "colors__lr": 0.02,
-    "cameras__optimise": True,
-    "cameras__focal_lr": 1e-3,
-    "model__smoothing": True,
-    "data__random_background": True,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {
-            "densify__strategy": strategy,
-            "densify__start": 2,
-            "densify__stop": 30,
-            "densify__every": 5,
-        }
-        for strategy in ("adc", "budget", "mcmc")
-    ]
-    + [EFFECTS, {"coarse": [{"until": 6, "factor": 2}], "optimizer__views": 8}],
-    ids=["adc", "budget", "mcmc", "effects", "coarse"],
-)
-def test_resumed_fit_continues_to_the_same_bytes(changes):
-    dataset = fits.true_dataset() if changes is EFFECTS else None
-
-    def make():
-        return make_trainer(4, dataset, iterations=40, **changes)
-
-    fits.assert_resumes_to_the_same_bytes(make, 3, 4)
-
-
 def test_effects_use_the_same_parameters_for_all_views_of_a_step():
     """Focal lengths, which all share, move once the last view of the step was rendered."""
     trainer = make_trainer(3, cameras__optimise=True, cameras__focal_lr=1e-3)
@@ -207,6 +174,41 @@ def test_late_steps_consist_of_whole_steps():
         trainer.step()
         counts.append(trainer.last_step.num_averaged)
     assert counts == [6] * 6 and steps == [306, 312]
+
+
+def test_late_step_uses_the_mean_gradient_of_its_views():
+    late = {"optimizer__views": 3, "optimizer__views_from": 0.5, "iterations": 10}
+    trainer = make_trainer(1, **late, densify__start=1, densify__stop=2)
+    trainer.iteration, trainer.integrator.sh_degree = 6, 1
+    views = [trainer.plan(iteration).views[0].view for iteration in (7, 8, 9)]
+    gradients = [fits.gradients_of_loss(trainer, view) for view in views]
+    dr.set_grad(trainer.optimizer, 0)
+    found = []
+    trainer.optimizer.step = lambda: found.append(
+        {name: np.array(dr.grad(value)) for name, value in trainer.optimizer.items()}
+    )
+    fits.steps(trainer, 3)
+    (found,) = found
+    for name, values in found.items():
+        expected = np.mean([gradient[name] for gradient in gradients], axis=0)
+        # Sums in another order, in single precision.
+        np.testing.assert_allclose(values, expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("densify", "first"),
+    [
+        ({"stop": 30}, 31),
+        ({"stop": 14, "prune__to": 20, "prune__stop": 24}, 25),
+    ],
+)
+def test_views_are_averaged_only_after_the_last_density_change(densify, first):
+    densify = {f"densify__{name}": value for name, value in {"start": 2, **densify}.items()}
+    trainer = make_trainer(
+        1, iterations=50, optimizer__views=4, optimizer__views_from=0.2, **densify
+    )
+    counts = [trainer.plan(iteration).num_averaged for iteration in range(1, 51)]
+    assert counts == [1] * (first - 1) + [4] * (51 - first)
 
 
 def test_late_steps_must_be_a_multiple():
