@@ -18,6 +18,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
 from drgs.training import session
 from drgs.training.finite_checks import NonFiniteError
+from drgs.training.losses import prepare_target
 from drgs.training.steps import view_of
 from drgs.training.trainer import Trainer
 
@@ -102,8 +103,6 @@ def test_first_row_and_its_first_parameter_are_named(monkeypatch):
 )
 def test_nonfinite_loss_names_iteration_and_view(dssim_weight, gradient):
     """SSIM's gradient tells as well; that of L1 is 0 at a NaN."""
-    from drgs.training.losses import prepare_target
-
     trainer = make_trainer(loss={"dssim_weight": dssim_weight})
     spoilt = view_of(4, 4, seed=0)
     photo = np.full((16, 20, 3), 0.5, np.float32)
@@ -111,8 +110,7 @@ def test_nonfinite_loss_names_iteration_and_view(dssim_weight, gradient):
     target = prepare_target(mi.TensorXf(photo))
     views = trainer.stages[-1].views
     views[spoilt].replacement = target
-    for _ in range(3):
-        trainer.step()
+    fits.steps(trainer, 3)
     trainer.check()
     trainer.step()
     message = f"^iteration 4, view v{spoilt}: the loss is nan{gradient}$"
@@ -136,8 +134,7 @@ def test_nothing_is_saved_returned_or_edited_after_a_fault(monkeypatch, event):
     densify, act = EVENTS[event]
     trainer = make_trainer(densify=densify)
     poison_gradient(monkeypatch, trainer, "log_scales", iteration=2)
-    for _ in range(3):
-        trainer.step()
+    fits.steps(trainer, 3)
     for attempt in (act, type(trainer).state):  # nor by who has caught the error
         with pytest.raises(NonFiniteError, match=r"^iteration 2, "):
             attempt(trainer)

@@ -207,8 +207,8 @@ def write_photographs(folder, size, count):
     y, x = np.mgrid[:size, :size]
     frames = []
     for index, view in enumerate(dataset_of(size, size, count - 2).train):
-        waves = [127 + 100 * np.sin(x / (7 + c) + index) * np.cos(y / (9 + c)) for c in range(3)]
-        Image.fromarray(np.stack(waves, axis=2).astype(np.uint8)).save(folder / f"{index}.jpg")
+        wave = (127 + 100 * np.sin(x / 7 + index) * np.cos(y / 9)).astype(np.uint8)
+        Image.fromarray(wave).convert("RGB").save(folder / f"{index}.jpg")
         pose = between_opencv_and_opengl(view.camera_to_world)
         frames.append({"file_path": f"{index}.jpg", "transform_matrix": pose.tolist()})
     values = {"camera_angle_x": math.radians(40), "frames": frames}

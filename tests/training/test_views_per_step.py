@@ -85,37 +85,30 @@ def test_step_is_adam_on_the_mean_gradient_with_scaled_rates_and_decays():
             assert np.abs(got - expected).mean() < 1e-3 * np.abs(expected).mean(), name
 
 
-def test_report_is_the_mean_over_the_views():
-    trainer, alone = make_trainer(3), make_trainer(1)
-    losses, psnrs = [], []
+def test_report_is_the_mean_of_single_views_and_statistics_are_their_sum():
+    settings = {"densify__start": 1, "densify__stop": 100, "densify__every": 50}
+    trainer, dataset, reports, norms = make_trainer(3, **settings), fits.plain_dataset(), [], 0.0
     for index in (view_of(i, 6, 0, 3) for i in (1, 2, 3)):
-        fits_one = fits.make_trainer(
-            replace(fits.plain_dataset(), train=(fits.plain_dataset().train[index],))
-        )
-        report = fits_one.step()
-        losses.append(report.loss)
-        psnrs.append(report.psnr)
+        alone = make_trainer(1, replace(dataset, train=(dataset.train[index],)), **settings)
+        reports.append(alone.step())
+        norms = norms + alone.state()["density/gradient_norms"].astype(np.float64)
     report = trainer.step()
     # Single precision.
-    assert report.loss == pytest.approx(np.mean(losses), rel=1e-6)
-    assert report.psnr == pytest.approx(np.mean(psnrs), abs=1e-5)
-    assert len({alone.step().loss for _ in range(2)}) == 2
-
-
-def test_density_statistics_are_those_of_single_views():
-    """The same after a step of three views as of each of them alone, and not a third."""
-    settings = {"densify__start": 1, "densify__stop": 100, "densify__every": 50}
-    trainer = make_trainer(3, **settings)
-    norms = 0.0
-    for index in (view_of(i, 6, 0, 3) for i in (1, 2, 3)):
-        one = replace(fits.plain_dataset(), train=(fits.plain_dataset().train[index],))
-        alone = fits.make_trainer(one, **settings)
-        alone.step()
-        norms = norms + alone.state()["density/gradient_norms"].astype(np.float64)
-    trainer.step()
+    assert report.loss == pytest.approx(np.mean([each.loss for each in reports]), rel=1e-6)
+    assert report.psnr == pytest.approx(np.mean([each.psnr for each in reports]), abs=1e-5)
+    assert len({each.loss for each in reports}) == 3
     # Single precision: gradients that were divided by three, and multiplied again.
     np.testing.assert_allclose(trainer.state()["density/gradient_norms"], norms, rtol=1e-4)
     assert norms.max() > 0
+
+
+def test_image_size_changes_with_the_first_step_after_a_stage():
+    trainer = make_trainer(4, coarse=[{"until": 6, "factor": 2}])
+    steps = [trainer.plan(iteration) for iteration in (1, 5, 9, 13)]
+    whole = fits.plain_dataset().train[0].width
+    widths = [step.views[-1].view.width for step in steps]
+    assert widths == [whole // 2, whole // 2, whole, whole]
+    assert [step.begins_stage for step in steps] == [False, False, True, False]
 
 
 def test_density_change_due_within_a_step_follows_the_step():
@@ -128,19 +121,6 @@ def test_density_change_due_within_a_step_follows_the_step():
         if report.density is not None:
             changes.append(report.iteration)
     assert changes == [8, 12, 20]  # of iterations 6, 12, 18 and 20
-
-
-def test_image_size_changes_with_the_first_step_after_a_stage():
-    trainer = make_trainer(4, coarse=[{"until": 6, "factor": 2}])
-    widths, begun = [], []
-    for _ in range(4):
-        report = trainer.step()
-        widths.append(trainer.last_step.views[-1].view.width)
-        begun.append(trainer.last_step.begins_stage)
-        assert trainer.iteration == report.iteration
-    whole = fits.plain_dataset().train[0].width
-    assert widths == [whole // 2, whole // 2, whole, whole]
-    assert begun == [False, False, True, False]
 
 
 def test_effects_use_the_same_parameters_for_all_views_of_a_step():
