@@ -307,7 +307,7 @@ LENSES = (
 
 
 def test_refined_cameras_survive_a_round_trip(tmp_path):
-    """Of all lenses; in a dataset at another size, and with both poses of a camera that moves."""
+    """All lenses; a dataset at another size, and both poses of a camera that moves."""
     dataset = fits.plain_dataset()
     views = [replace(v, lens=lens) for v, lens in zip(dataset.train, LENSES, strict=True)]
     dataset = replace(dataset, train=(moving(views[0]), *views[1:]))

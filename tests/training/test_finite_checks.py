@@ -249,7 +249,7 @@ def test_step_waits_for_two_values_and_a_check_is_small():
 
 @pytest.fixture
 def configuration(tmp_path, monkeypatch):
-    """Of a fit without reports whose population stays."""
+    """A fit without reports whose population stays."""
     without_images(monkeypatch)
     write_dataset(tmp_path / "data", make_dataset(train=4, test=1))
     values = {

@@ -115,7 +115,7 @@ def test_interrupted_fit_continues_to_the_same_bytes(dataset, changes, before, a
     ids=["masks", "depth", "random background", "cameras", "colors", "smoothing"],
 )
 def test_no_kernel_is_compiled_after_all_views_were_seen(dataset, changes):
-    """By hash: what Dr.Jit's caches hold from other runs does not matter."""
+    """Kernels by hash: what Dr.Jit's caches hold from other runs does not matter."""
     trainer, seen = fits.make_trainer(dataset(), **changes), set()
     for iteration in range(12):
 
