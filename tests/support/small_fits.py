@@ -81,9 +81,9 @@ def true_dataset(background=WHITE) -> Dataset:
     )
 
 
-def plain_dataset(background=WHITE) -> Dataset:
+def plain_dataset() -> Dataset:
     """The same photographs and nothing besides."""
-    return with_views(true_dataset(background), lambda v: replace(v, alpha=None, depth=None))
+    return with_views(true_dataset(), lambda v: replace(v, alpha=None, depth=None))
 
 
 def with_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:

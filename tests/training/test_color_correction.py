@@ -89,22 +89,6 @@ def test_loss_and_derivatives_of_a_transform_match_numpy():
     assert np.abs(penalty).max() > 0.01 * np.abs(expected).max()
 
 
-@pytest.mark.slow
-def test_common_colour_change_is_attributed_to_the_splats():
-    """Photographs that are all darker by the same factor change no transform.
-
-    Each photograph's own pull is down, by some 7 steps of the rate.
-    """
-    darker = fits.with_views(
-        fits.plain_dataset((0.0, 0.0, 0.0)), lambda v: replace(v, image=np.float32(0.5) * v.image)
-    )
-    trainer = fits.steps(make_trainer(darker, fits.true_blobs(), colors__lr=1e-2), 40)
-    gains = np.diagonal(matrices_of(trainer)[:, :, :3], axis1=1, axis2=2)
-    np.testing.assert_allclose(gains, 1, atol=0.015)
-    (effect,) = trainer.effects
-    assert (np.array(effect.common)[[0, 5, 10]] < -0.03).all()
-
-
 def test_background_is_untransformed_in_transparent_pixels():
     """No camera saw it. Between, the change is as large as the photograph is opaque."""
     dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
@@ -157,20 +141,6 @@ def test_identity_transform_gives_the_same_bits():
     for name in PARAMETER_NAMES:
         values = [getattr(trainer.gaussians(), name) for trainer in (plain, corrected)]
         np.testing.assert_array_equal(*values, err_msg=name)
-
-
-def test_penalty_pulls_towards_the_identity():
-    """Adam's steps by the penalty alone end there."""
-    trainer = with_matrices(make_trainer(colors__lr=0.01), random_matrices())
-    (effect,) = trainer.effects
-    view, start = trainer.views[1], random_matrices()[1]
-    for _ in range(60):
-        effect.before_render(trainer.fit_state(), view)
-        (penalty,) = effect.penalties(view)
-        dr.backward(penalty)
-        fits.end_view(effect, trainer, view)
-    left = np.abs(matrices_of(trainer)[1] - IDENTITY)
-    assert left.max() < 0.25 * np.abs(start - IDENTITY).max()
 
 
 def test_first_step_is_the_rate_which_decays_like_that_of_the_means():

@@ -204,14 +204,6 @@ def test_later_edits_of_other_sizes_compile_no_kernel():
     assert first and kernels(70, 41, 22) == first
 
 
-def test_taken_rows_are_detached_copies():
-    values = parameters(5)
-    rows = rows_of(make_optimizer(values, RATES)).take(UInt32(4, 4, 1))
-    for name in PARAMETER_NAMES:
-        np.testing.assert_array_equal(rows[name].numpy(), values[name].numpy()[[4, 4, 1]])
-        assert not dr.grad_enabled(rows[name])
-
-
 @pytest.mark.parametrize("keeps_moments", [False, True], ids=["replace", "set_values"])
 def test_new_values_keep_step_count_and_rate(keeps_moments):
     """``set_values`` keeps the moments as well."""

@@ -1,16 +1,12 @@
 """The parts of the training loop that can be stated without running a whole fit."""
 
-import time
-
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_fits import kernel_hashes, steps
 from support.trainers import make_trainer, small_dataset, small_view
 
-from drgs.config.schema import FitConfig
 from drgs.datasets.images import smaller_view
-from drgs.initialization.start import Start, gaussians_at
 from drgs.training.steps import view_of
 
 
@@ -48,56 +44,6 @@ def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population(
     assert len(populations) > 10
     # The first change is at 4; degrees rise at 12, 24 and 36.
     assert 4 in compiled and {i for i in compiled if i > 8} == {12, 24, 36}, compiled
-
-
-@pytest.mark.slow
-def test_first_frame_takes_15_seconds_cold_and_3_seconds_warm_at_most(run_python, tmp_path):
-    """Without and with a kernel cache (it lives in the home folder), import included."""
-    points = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
-    config = FitConfig.model_validate({"data": {"path": "."}, "init": {"opacity": 0.5}})
-    gaussians_at(Start(points, None, "random"), config).save(tmp_path / "points.ply")
-    program = f"""
-import drgs, drjit as dr, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-scene = mi.load_dict({{
-    "type": "scene",
-    "integrator": {{"type": "splats", "filename": {str(tmp_path / "points.ply")!r}}},
-    "sensor": {{
-        "type": "perspective",
-        "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-        "film": {{"type": "hdrfilm", "width": 400, "height": 400, "rfilter": {{"type": "box"}}}},
-    }},
-}})
-assert dr.all(dr.isfinite(mi.render(scene, spp=1).array))
-"""
-    (tmp_path / "home").mkdir()
-    for allowed in (15, 3):
-        started = time.perf_counter()
-        result = run_python(program, HOME=str(tmp_path / "home"))
-        assert result.returncode == 0, result.stderr
-        assert time.perf_counter() - started < allowed
-        assert any((tmp_path / "home" / ".drjit").iterdir())  # the cache
-
-
-def test_each_parameter_moves_by_its_rate_in_the_first_step():
-    """Adam's first step is rate * sign(gradient) wherever the gradient is not zero."""
-    trainer = make_trainer(model={"sh_increase_every": 10})
-    before = trainer.gaussians()
-    trainer.step()
-    after = trainer.gaussians()
-    extent = small_dataset().extent
-    rates = {
-        "means": 3.2e-4 * extent * 100 ** (-1 / 50),
-        "quats": 2e-3,
-        "log_scales": 1e-2,
-        "logit_opacities": 0.05,
-        "sh0": 5e-3,
-    }
-    for name, rate in rates.items():
-        moved = np.abs(getattr(after, name) - getattr(before, name)).ravel()
-        # Values of order 1 to 10 are stored in float32: 5e-7 absolute.
-        assert moved.max() == pytest.approx(rate, abs=1e-6 + 1e-3 * rate), name
-    assert np.array_equal(after.shN, before.shN)  # degree 0 is in use
 
 
 def test_reported_loss_and_psnr_are_measured_before_the_step():
