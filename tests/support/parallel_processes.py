@@ -12,10 +12,20 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
+
+from drgs.datasets.types import CameraMotion, View
+from drgs.training.finite_checks import NonFiniteError
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.trainer import Trainer
+from support import small_fits as fits
 
 TESTS = Path(__file__).resolve().parent.parent
 REPOSITORY = TESTS.parent
@@ -95,49 +105,35 @@ def ranks_of(word: str) -> list[int]:
 
 def _blurred() -> Any:
     """Photographs of which every other one was taken by a camera that moved."""
-    from dataclasses import replace
 
-    from drgs.datasets.types import CameraMotion
-    from support import small_fits as fits
+    def moving(view: View) -> View:
+        closed = view.camera_to_world.copy()
+        closed[:3, 3] += 0.05
+        return replace(view, motion=CameraMotion(closed, "global", samples=3))
 
     dataset = fits.plain_dataset()
-    views = list(dataset.train)
-    for index in range(0, len(views), 2):
-        closed = views[index].camera_to_world.copy()
-        closed[:3, 3] += 0.05
-        views[index] = replace(views[index], motion=CameraMotion(closed, "global", samples=3))
+    views = (view if k % 2 else moving(view) for k, view in enumerate(dataset.train))
     return replace(dataset, train=tuple(views))
 
 
-def _plain() -> Any:
-    from support import small_fits as fits
-
-    return fits.plain_dataset()
+DATASETS = {"plain": fits.plain_dataset, "transparent": fits.true_dataset, "blurred": _blurred}
 
 
-def _transparent() -> Any:
-    from support import small_fits as fits
-
-    return fits.true_dataset()
-
-
-DATASETS = {"plain": _plain, "transparent": _transparent, "blurred": _blurred}
+def _result_of(size: int, **task: Any) -> Any:
+    status, output, errors = run(size, ["-m", "support.parallel_processes", json.dumps(task)])
+    assert status == 0, errors
+    return json.loads(output)
 
 
 def fitted(size: int, steps: int, changes: Mapping[str, Any], data: str = "plain") -> list:
     """Return :func:`hashes_and_reports` of a small fit on so many processes; data: of DATASETS."""
-    task = json.dumps({"steps": steps, "changes": dict(changes), "data": data})
-    status, output, errors = run(size, ["-m", "support.parallel_processes", task])
-    assert status == 0, errors
-    return json.loads(output)
+    return _result_of(size, steps=steps, changes=dict(changes), data=data)
 
 
 def state_text(size: int, row: int) -> str:
     """Return :func:`spoiled` on so many processes."""
-    task = json.dumps({"spoiled": row, "changes": {"optimizer.views_per_step": 4}, "data": "plain"})
-    status, output, errors = run(size, ["-m", "support.parallel_processes", task])
-    assert status == 0, errors
-    return json.loads(output)
+    changes = {"optimizer.views_per_step": 4}
+    return _result_of(size, spoiled=row, changes=changes, data="plain")
 
 
 def hashes_and_reports(trainer: Any, steps: int) -> list:
@@ -151,15 +147,8 @@ def hashes_and_reports(trainer: Any, steps: int) -> list:
 
 def main() -> None:
     """A process's part of :func:`fitted`."""
-    import drjit as dr
-    import mitsuba as mi
-
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
-    from drgs.training.parallel.communicator import Communicator
-    from drgs.training.trainer import Trainer
-    from support import small_fits as fits
-
     task = json.loads(sys.argv[1])
     dataset = DATASETS[task["data"]]()
     comm = Communicator.world()
@@ -175,11 +164,6 @@ def main() -> None:
 
 def spoiled(trainer: Any, row: int) -> str:
     """Return the trainer's error on all processes, when an opacity of a row is NaN."""
-    import drjit as dr
-    import numpy as np
-
-    from drgs.training.finite_checks import NonFiniteError
-
     logits = trainer.population.value("logit_opacities")
     here = row - trainer.population.first_row
     changed = dr.select(

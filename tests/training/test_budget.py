@@ -5,11 +5,10 @@ from argparse import ArgumentTypeError
 from dataclasses import replace
 from types import SimpleNamespace
 
-import mitsuba as mi
 import numpy as np
 import pytest
+from support.fit_command import assert_fits, run_fit
 from support.small_capture import make_dataset, write_dataset
-from support.trainers import make_trainer
 
 from drgs import fit
 from drgs.config.changes import with_changes
@@ -25,11 +24,6 @@ from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoin
 from drgs.training.loop import History
 from drgs.training.rates import rates_over_time
 from drgs.training.trainer import Trainer
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.mark.parametrize(
@@ -49,10 +43,6 @@ def test_invalid_durations_are_refused(text):
         parse_duration(text)
 
 
-# ----------------------------------------------------------------------------------------------
-# Curves
-# ----------------------------------------------------------------------------------------------
-
 # Time grows as n^1.5, PSNR by 2 dB with every doubling.
 POWER = Curve((100, 200, 400), (1000.0, 1000 * 2**1.5, 8000.0), (20.0, 22.0, 24.0))
 
@@ -62,21 +52,6 @@ def test_power_law_is_interpolated_and_extrapolated(n):
     assert POWER.iterations_in(1000 * (n / 100) ** 1.5) == n
     assert POWER.psnr_at(n) == pytest.approx(20 + 2 * np.log2(n / 100))
 
-
-def test_every_strategy_has_measured_curves():
-    curves = load_curves()
-    assert set(curves) == {strategy.name for strategy in plan.STRATEGIES}
-    for curve in curves.values():
-        assert len(curve.iterations) >= 4
-        assert (np.diff(curve.time) > 0).all()
-        for n, seconds, psnr in zip(curve.iterations, curve.time, curve.psnr, strict=True):
-            assert curve.iterations_in(seconds) == n
-            assert curve.psnr_at(n) == pytest.approx(psnr)
-
-
-# ----------------------------------------------------------------------------------------------
-# Plans
-# ----------------------------------------------------------------------------------------------
 
 SLOW = Curve((1000, 2000), (1000.0, 2000.0), (30.0, 31.0))
 FAST = Curve((1000, 2000), (500.0, 1000.0), (29.5, 30.5))
@@ -91,28 +66,69 @@ def planned(seconds, side=400, start_s=0.1, **curves):
     return make_plan(CONFIG, 50, side, seconds, start_s, curves_of(**curves))
 
 
+def test_measured_curves_pass_through_their_points():
+    curves = load_curves()
+    assert set(curves) == {strategy.name for strategy in plan.STRATEGIES}
+    for curve in curves.values():
+        assert (np.diff(curve.time) > 0).all()
+        for n, seconds, psnr in zip(curve.iterations, curve.time, curve.psnr, strict=True):
+            assert curve.iterations_in(seconds) == n
+            assert curve.psnr_at(n) == pytest.approx(psnr)
+
+
 def test_best_strategy_within_the_time_is_chosen():
     """A thousand iterations as they are, or two thousand cheaper ones: 30 or 30.5 dB."""
     result = planned(100)
     assert [(c.iterations, c.psnr) for c in result.candidates] == [(1000, 30.0), (2000, 30.5)]
     assert result.chosen.strategy is plan.STRATEGIES[1]
-    assert result.config.iterations == 2000
+    assert result.config.iterations == 2000 and result.config.densify.stop == 1000
     assert [(s.until, s.factor) for s in result.config.coarse] == [(500, 2)]
-    assert result.config.densify.stop == 1000
+    assert "1,000 iterations, 30.00 dB there: as shipped" in result.reasons
+    assert "half size for the first quarter (chosen)" in result.reasons
     worse = planned(100, fast=replace(FAST, psnr=(28.5, 29.5)))
     assert worse.chosen.strategy is plan.STRATEGIES[0] and worse.config.coarse == []
+    assert planned(100, start_s=0.05).config.iterations == 4000  # of a faster machine
+    assert planned(100, side=50).chosen.strategy is plan.STRATEGIES[0]  # images stay as small
+    for seconds in (2, -3):
+        message = f"--budget: must leave time for 50 iterations, got {max(seconds, 0)} s"
+        with pytest.raises(UserError, match=message):
+            planned(seconds)
 
 
-def test_faster_machine_does_more_iterations():
-    assert planned(100, start_s=0.05).config.iterations == 4000
+@pytest.mark.parametrize(
+    ("start", "changes", "section", "expected"),
+    [
+        (50, {}, "budget", 200),
+        (300, {}, "budget", 300),
+        (50, {"densify.max_gaussians": 160}, "budget", 80),
+        (50, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600}, "mcmc", 300),
+        # A hull may have fewer points than were asked for.
+        (
+            *(310, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600}),
+            *("mcmc", 320),
+        ),
+    ],
+)
+def test_fraction_of_gaussians_is_at_least_the_start(start, changes, section, expected):
+    values = {"densify.budget.gaussians": 400, "init.num_points": 320 if start == 310 else 50}
+    half = Strategy("x", share=0.5).apply(with_changes(CONFIG, values | changes), start)
+    assert getattr(half.densify, section).gaussians == expected
 
 
-def test_reasons_list_all_candidates():
-    reasons = planned(100).reasons
-    assert "100 ms at the start" in reasons and "100 s are enough" in reasons
-    assert "1,000 iterations, 30.00 dB there: as shipped" in reasons
-    assert "2,000 iterations, 30.50 dB there: half size for the first quarter (chosen)" in reasons
-    assert "1/2 size until iteration 500, then full size" in reasons
+def test_fraction_is_planned_only_with_a_target_number():
+    """The population of adc comes out of a threshold."""
+    half = next(strategy for strategy in plan.STRATEGIES if strategy.share == 0.5)
+    curves = {plan.STRATEGIES[0].name: SLOW, half.name: replace(FAST, psnr=(31.0, 32.0))}
+    growing = with_changes(CONFIG, {"densify.budget.gaussians": 400})
+    adc = with_changes(CONFIG, {"densify.strategy": "adc"})
+    for config, start, strategies, number in (
+        (growing, 50, [plan.STRATEGIES[0], half], "200"),
+        (growing, 900, [plan.STRATEGIES[0], half], "900"),
+        (adc, 50, [plan.STRATEGIES[0]], "1,000,000"),
+    ):
+        result = make_plan(config, start, 400, 100, 0.1, curves)
+        assert [candidate.strategy for candidate in result.candidates] == strategies
+        assert f"at most {number} Gaussians" in result.reasons
 
 
 def test_configuration_that_cannot_shrink_gets_a_plan():
@@ -128,58 +144,13 @@ def test_configuration_that_cannot_shrink_gets_a_plan():
     assert [(s.until, s.factor) for s in result.config.coarse] == [(1, 4)]
 
 
-def test_small_images_are_not_downscaled():
-    assert planned(100, side=50).chosen.strategy is plan.STRATEGIES[0]
-
-
-def test_too_short_time_is_refused():
-    with pytest.raises(UserError, match=r"--budget: must leave time for 50 iterations, got 2 s"):
-        planned(2)
-    with pytest.raises(UserError, match="got 0 s"):
-        planned(-3)
-
-
-def test_fraction_of_gaussians_is_at_least_the_start():
-    half = Strategy("x", share=0.5)
-    growing = with_changes(CONFIG, {"densify.budget.gaussians": 400})
-    assert half.apply(growing, 50).densify.budget.gaussians == 200
-    assert half.apply(growing, 300).densify.budget.gaussians == 300
-    capped = with_changes(growing, {"densify.max_gaussians": 160})
-    assert half.apply(capped, 50).densify.budget.gaussians == 80
-    mcmc = with_changes(growing, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600})
-    assert half.apply(mcmc, 50).densify.mcmc.gaussians == 300
-    # A hull may have fewer points than were asked for.
-    more = with_changes(mcmc, {"init.num_points": 320})
-    assert half.apply(more, 310).densify.mcmc.gaussians == 320
-
-
-def test_fraction_is_planned_only_with_a_target_number():
-    """The population of adc comes out of a threshold."""
-    half = next(strategy for strategy in plan.STRATEGIES if strategy.share == 0.5)
-    curves = {plan.STRATEGIES[0].name: SLOW, half.name: replace(FAST, psnr=(31.0, 32.0))}
-    growing = with_changes(CONFIG, {"densify.budget.gaussians": 400})
-    result = make_plan(growing, 50, 400, 100, 0.1, curves)
-    assert result.chosen.strategy is half and result.config.densify.budget.gaussians == 200
-    assert "at most 200 Gaussians" in result.reasons
-    adc = with_changes(CONFIG, {"densify.strategy": "adc"})
-    result = make_plan(adc, 50, 400, 100, 0.1, curves)
-    assert [candidate.strategy for candidate in result.candidates] == [plan.STRATEGIES[0]]
-    assert "at most 1,000,000 Gaussians" in result.reasons
-    assert "at most 900 Gaussians" in make_plan(growing, 900, 400, 100, 0.1, curves).reasons
-
-
-# ----------------------------------------------------------------------------------------------
-# The end
-# ----------------------------------------------------------------------------------------------
-
-
-class Clock:
+@pytest.fixture
+def clock(monkeypatch):
     """Instead of time.perf_counter: seconds that a test decides."""
-
-    now = 100.0
-
-    def perf_counter(self):
-        return self.now
+    clock = SimpleNamespace(now=100.0)
+    clock.perf_counter = lambda: clock.now
+    monkeypatch.setattr(plan, "time", clock)
+    return clock
 
 
 class FakeTrainer:
@@ -203,22 +174,8 @@ class FakeTrainer:
         self.clock.now += self.second
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(plan, "time", clock)
-    return clock
-
-
 # Time is proportional to iterations.
 LINEAR = Curve((100, 200), (100.0, 200.0), (20.0, 21.0))
-
-
-def run_to_end(trainer, seconds):
-    deadline = Deadline(trainer, trainer.clock.now + seconds, LINEAR)
-    while deadline.should_continue(trainer):
-        trainer.step()
-    return trainer
 
 
 @pytest.mark.parametrize("second", [0.05, 0.1, 0.2])
@@ -227,13 +184,27 @@ def test_fit_ends_in_time_for_any_iteration_cost(clock, second):
 
     An iteration or two more or less: the clock is read between them.
     """
-    trainer = run_to_end(FakeTrainer(clock, second), 100)
+    trainer = FakeTrainer(clock, second)
+    deadline = Deadline(trainer, clock.now + 100, LINEAR)
+    assert deadline.num_iterations(trainer) == 1000
+    while deadline.should_continue(trainer):
+        trainer.step()
+        if trainer.iteration == 10:
+            assert deadline.num_iterations(trainer) == 100 / second
     assert 200 <= clock.now < 200 + 2 * second
     n = trainer.iteration
     assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
     assert trainer.config.densify.stop == pytest.approx(0.6 * n, abs=2)
     # Two iterations of 500 in five e-folds.
     assert trainer.rates.means(n) == pytest.approx(trainer.rates.means.final, rel=0.02)
+
+
+def test_density_changes_never_end_before_they_start(clock):
+    trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
+    deadline = Deadline(trainer, clock.now + 100, LINEAR)
+    while deadline.should_continue(trainer):
+        trainer.step()
+    assert trainer.config.densify.stop == 591
 
 
 def test_plan_of_a_slowing_fit_is_revised(clock):
@@ -252,91 +223,45 @@ def test_plan_of_a_slowing_fit_is_revised(clock):
     assert trainer.rates.means.final < rates[-1] < 2 * trainer.rates.means.final
 
 
-def test_the_expected_end_follows_the_clock(clock):
-    trainer = FakeTrainer(clock, 0.2)
-    deadline = Deadline(trainer, clock.now + 100, LINEAR)
-    assert deadline.num_iterations(trainer) == 1000
-    for _ in range(10):
-        trainer.step()
-    assert deadline.num_iterations(trainer) == 500
-
-
-def test_density_changes_never_end_before_they_start(clock):
-    trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
-    assert run_to_end(trainer, 100).config.densify.stop == 591
-
-
-def test_rescheduling_past_iterations_is_refused():
-    trainer = make_trainer(densify={"start": 2, "stop": 5})
-    for _ in range(4):
-        trainer.step()
-    trainer.reschedule(50, 9)
-    with pytest.raises(ValueError, match="cannot change from 9 to 4 after iteration 4"):
-        trainer.reschedule(50, 4)
-
-
-# ----------------------------------------------------------------------------------------------
-# The command
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("budget")
-    write_dataset(folder / "data", make_dataset(train=6, test=2))
-    (folder / "scene.yml").write_text(
-        f"data: {{path: {folder / 'data'}}}\n"
+@pytest.mark.slow
+def test_fit_ends_in_its_budget_and_its_plan_gives_the_same_bytes(tmp_path, monkeypatch):
+    """Without a clock."""
+    write_dataset(tmp_path / "data", make_dataset(train=6, test=2))
+    (tmp_path / "scene.yml").write_text(
+        f"data: {{path: {tmp_path / 'data'}}}\n"
         "init: {num_points: 300, half_extent: 1.0}\n"
         "densify: {every: 50, max_gaussians: 600}\n"
     )
-    return folder
-
-
-BUDGET = 30.0
-
-
-@pytest.fixture(scope="module")
-def fitted(scene):
-    """A fit in a given time: seconds it took, its folder."""
-    out = scene / "out"
-    start = time.perf_counter()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "LOADING_SECONDS", 0.0)  # they are loaded
-        fit.main([str(scene / "scene.yml"), "--out", str(out), "--budget", f"{BUDGET:g}"])
-    return SimpleNamespace(seconds=time.perf_counter() - start, out=out)
-
-
-@pytest.mark.slow
-def test_a_fit_ends_within_a_tenth_of_its_budget(fitted):
-    assert fitted.seconds == pytest.approx(BUDGET, rel=0.1)
-
-
-@pytest.mark.slow
-def test_the_plan_is_written_with_its_reasons(fitted):
-    text = (fitted.out / "plan.txt").read_text()
+    out, again, start = tmp_path / "out", tmp_path / "again", time.perf_counter()
+    monkeypatch.setattr(fit, "LOADING_SECONDS", 0.0)  # modules are loaded
+    assert_fits(tmp_path / "scene.yml", "--out", out, "--budget", "30")
+    assert time.perf_counter() - start == pytest.approx(30, rel=0.1)
+    text, config = (out / "plan.txt").read_text(), load_config(out / "config.yml")
     assert text.startswith("--budget 30s\n") and "(chosen)" in text
-    aims = load_config(fitted.out / "config.yml").optimizer.means_lr_aims
-    assert f"Planned: {aims[0].end:,} iterations" in text
+    assert f"Planned: {config.optimizer.means_lr_aims[0].end:,} iterations" in text
+    assert_fits(out / "config.yml", "--out", again)
+    name = "point_cloud.ply"
+    assert (out / name).read_bytes() == (again / name).read_bytes()
+    assert load_config(again / "config.yml") == with_changes(config, {"output.dir": again})
+    for folder, seconds, message in (
+        (out, "30", "must be new or empty for a fit with --budget"),
+        (tmp_path / "short", "1s", "--budget: must leave time"),
+    ):
+        arguments = (tmp_path / "scene.yml", "--out", folder, "--budget", seconds)
+        outcome = run_fit(*arguments)
+        assert outcome.returncode == 2 and message in outcome.stderr
+    assert not (tmp_path / "short").exists()
 
 
-@pytest.mark.slow
-def test_the_resolved_plan_gives_the_same_bytes(fitted, scene):
-    """Without a clock."""
-    again = scene / "again"
-    fit.main([str(fitted.out / "config.yml"), "--out", str(again)])
-    files = "point_cloud.ply", "config.yml"
-    first, second = ([(out / name).read_bytes() for name in files] for out in (fitted.out, again))
-    assert first[0] == second[0]
-    configs = [load_config(out / "config.yml") for out in (fitted.out, again)]
-    assert with_changes(configs[0], {"output.dir": None}) == with_changes(
-        configs[1], {"output.dir": None}
-    )
+def interrupt(*arguments, **others):
+    raise KeyboardInterrupt
 
 
 def test_plan_revised_after_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
     """Whatever ends the process while the next one is written: one of both plans goes on."""
     config = FitConfig(data={"path": tmp_path}, iterations=40_000)
-    state = empty_checkpoint()
+    data = Fingerprint(train=[], test=[])
+    state = Checkpoint({"iteration": np.array(7)}, *History().arrays(), 1.0, data)
     save_checkpoint(tmp_path, config, state)
     revised = with_changes(config, {"iterations": config.iterations + 10})
     for module, name, saved in (
@@ -350,40 +275,6 @@ def test_plan_revised_after_the_last_checkpoint_can_be_continued(tmp_path, monke
         assert load_checkpoint(tmp_path, config).config == saved
     save_checkpoint(tmp_path, revised, state)
     assert load_run_config(tmp_path) == revised
-    assert load_checkpoint(tmp_path, revised).config == revised
-
-
-def test_a_checkpoint_of_another_configuration_is_refused(tmp_path):
-    config = FitConfig(data={"path": tmp_path}, iterations=40_000)
-    save_checkpoint(tmp_path, config, empty_checkpoint())
-    other = with_changes(config, {"iterations": 50_000})
-    with pytest.raises(UserError, match="belongs to another configuration than"):
-        load_checkpoint(tmp_path, other)
-    moved = with_changes(config, {"data.path": tmp_path / "moved", "output.history_every": 3})
-    assert load_checkpoint(tmp_path, moved).config == moved
-
-
-def empty_checkpoint():
-    data = Fingerprint(train=[], test=[])
-    return Checkpoint({"iteration": np.array(7)}, *History().arrays(), 1.0, data)
-
-
-def interrupt(*arguments, **others):
-    raise KeyboardInterrupt
-
-
-@pytest.mark.slow
-def test_budget_needs_its_own_folder(fitted, scene, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        fit.main([str(scene / "scene.yml"), "--out", str(fitted.out), "--budget", "30"])
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
-    assert "must be new or empty for a fit with --budget" in error and "--overwrite" in error
-
-
-@pytest.mark.slow
-def test_too_short_budget_leaves_no_files(scene, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        fit.main([str(scene / "scene.yml"), "--out", str(scene / "short"), "--budget", "1s"])
-    assert stopped.value.code == 2 and "--budget: must leave time" in capsys.readouterr().err
-    assert not (scene / "short").exists()
+    moved = with_changes(revised, {"data.path": tmp_path / "moved", "output.history_every": 3})
+    for same in (revised, moved):
+        assert load_checkpoint(tmp_path, same).config == same

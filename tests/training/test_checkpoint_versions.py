@@ -2,7 +2,6 @@
 
 import json
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import make_dataset
@@ -14,32 +13,16 @@ from drgs.datasets.fingerprint import fingerprint_of
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from drgs.training.loop import History
 
-RESOLVED_DEFAULTS = {"data.background": "white", "model.near": 0.2}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "out").mkdir()
-    return tmp_path / "out"
-
 
 @pytest.fixture
 def config(tmp_path):
-    return with_changes(
-        FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000),
-        RESOLVED_DEFAULTS,
-    )
+    config = FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000)
+    return with_changes(config, {"data.background": "white", "model.near": 0.2})
 
 
 def saved_as(folder, config, change):
-    """The checkpoint of ``config``, whose words about it are changed."""
-    data = fingerprint_of(make_dataset(1, 1))
-    state = {"iteration": np.array(3)}
+    """Save a checkpoint of ``config``, and change its record of it."""
+    data, state = fingerprint_of(make_dataset(1, 1)), {"iteration": np.array(3)}
     save_checkpoint(folder, config, Checkpoint(state, *History().arrays(), 0.0, data))
     with np.load(folder / "checkpoint.npz") as file:
         arrays = dict(file)
@@ -59,20 +42,20 @@ def remove_new_keys(values):
     values["densify"] = {name: densify[name] for name in kept}
 
 
-def test_checkpoint_of_an_earlier_version_is_continued(folder, config):
-    saved_as(folder, config, remove_new_keys)
-    assert int(load_checkpoint(folder, config).trainer["iteration"]) == 3
+def test_checkpoint_of_an_earlier_version_is_continued(tmp_path, config):
+    saved_as(tmp_path, config, remove_new_keys)
+    assert int(load_checkpoint(tmp_path, config).trainer["iteration"]) == 3
 
 
 @pytest.mark.parametrize(
     ("section", "key", "value"),
     [("model", "near", 0.1), ("data", "background", "black"), ("densify", "stop", 15_000)],
 )
-def test_checkpoint_with_different_values_is_refused(folder, config, section, key, value):
+def test_checkpoint_with_different_values_is_refused(tmp_path, config, section, key, value):
     def change(values):
         remove_new_keys(values)
         values[section][key] = value
 
-    saved_as(folder, config, change)
+    saved_as(tmp_path, config, change)
     with pytest.raises(UserError, match="belongs to another configuration"):
-        load_checkpoint(folder, config)
+        load_checkpoint(tmp_path, config)

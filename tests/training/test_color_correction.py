@@ -10,16 +10,11 @@ import pytest
 from support import small_fits as fits
 from support.helpers import single
 
+from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.results.files import COLORS
 from drgs.results.metrics import ssim
-from drgs.training.effects.base import training_effects
 
 IDENTITY = np.eye(3, 4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def make_trainer(dataset=None, gaussians=None, **changes):
@@ -51,54 +46,15 @@ def random_matrices(count=6, seed=1) -> np.ndarray:
     return IDENTITY + changes - changes.mean(axis=0)
 
 
-# Rates of a fit that optimises colours only.
-FROZEN_GAUSSIANS = {
-    "optimizer__means_lr": 1e-20,
-    "optimizer__means_lr_final": 1e-20,
-    **{f"optimizer__{name}_lr": 0.0 for name in ("quats", "scales", "opacities", "sh0", "shN")},
-}
-
-
-# ----------------------------------------------------------------------------------------------
-# The start
-# ----------------------------------------------------------------------------------------------
-
-
-def test_identity_transform_gives_the_same_loss_and_gradient_bits():
-    plain, corrected = fits.make_trainer(fits.plain_dataset()), make_trainer()
-    for trainer in (plain, corrected):
-        trainer.iteration = 1
-    (effect,) = corrected.effects
-    for index in (0, 4):
-        effect.before_render(corrected, corrected.views[index])
-        expected = fits.gradients_of_loss(plain, plain.views[index])
-        got = fits.gradients_of_loss(corrected, corrected.views[index])
-        for name, values in expected.items():
-            np.testing.assert_array_equal(got[name], values, err_msg=name)
-    plain, corrected = fits.make_trainer(fits.plain_dataset()), make_trainer()
-    first, second = plain.step(), corrected.step()
-    assert first.loss == second.loss and first.psnr == second.psnr
-    np.testing.assert_array_equal(corrected.gaussians().means, plain.gaussians().means)
-
-
-def test_every_transform_starts_as_the_identity():
-    np.testing.assert_array_equal(matrices_of(make_trainer()), np.tile(IDENTITY, (6, 1, 1)))
-
-
-def test_colour_correction_is_off_by_default():
-    assert training_effects(fits.config_of(), fits.plain_dataset()) == []
-
-
-# ----------------------------------------------------------------------------------------------
-# Loss and derivatives
-# ----------------------------------------------------------------------------------------------
-
-
 def numpy_loss(image, matrix, target, identity_weight) -> float:
     """Return the loss of the transformed image, with the penalty; float64."""
     shown = np.einsum("ij,hwj->hwi", matrix[:, :3], image) + matrix[:, 3]
     loss = 0.8 * np.abs(shown - target).mean() + 0.2 * (1 - ssim(shown, target))
     return loss + identity_weight * np.square(matrix - IDENTITY).mean()
+
+
+def transformed(image, matrix) -> np.ndarray:
+    return (image @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
 
 
 def small_image(seed=3) -> np.ndarray:
@@ -133,102 +89,6 @@ def test_loss_and_derivatives_of_a_transform_match_numpy():
     assert np.abs(penalty).max() > 0.01 * np.abs(expected).max()
 
 
-def test_penalty_pulls_towards_the_identity():
-    """Adam's steps by the penalty alone end there, and have its sign from the start."""
-    trainer = with_matrices(make_trainer(colors__lr=0.01, **FROZEN_GAUSSIANS), random_matrices())
-    (effect,) = trainer.effects
-    view, start = trainer.views[1], random_matrices()[1]
-    for iteration in range(60):
-        effect.before_render(trainer.fit_state(), view)
-        (penalty,) = effect.penalties(view)
-        if iteration == 0:
-            expected = 0.1 * np.square(start - IDENTITY).mean()
-            assert float(penalty[0]) == pytest.approx(expected, rel=1e-5)
-        dr.backward(penalty)
-        fits.end_view(effect, trainer, view)
-        if iteration == 0:
-            moved = matrices_of(trainer) - random_matrices()
-            step = -0.01 * np.sign(start - IDENTITY)
-            np.testing.assert_allclose(moved[1], 5 / 6 * step, atol=1e-6)
-            np.testing.assert_allclose(moved[4], -1 / 6 * step, atol=1e-6)
-    left = np.abs(matrices_of(trainer)[1] - IDENTITY)
-    assert left.max() < 0.25 * np.abs(start - IDENTITY).max()
-
-
-# ----------------------------------------------------------------------------------------------
-# Which views move
-# ----------------------------------------------------------------------------------------------
-
-
-def test_only_the_transform_of_the_current_view_changes():
-    """But for what all have in common; the moments of all others stay, bit by bit."""
-    trainer = make_trainer()
-    (effect,) = trainer.effects
-    seen = set()
-    for _ in range(8):
-        before = effect.state()
-        trainer.iteration += 1
-        index = trainer.last_step.views[-1].view.index
-        trainer.iteration -= 1
-        trainer.step()
-        after = effect.state()
-        for key in ("matrices.value", "matrices.m", "matrices.v"):
-            rows = [state[key].reshape(6, 12) for state in (before, after)]
-            changed = np.flatnonzero((rows[0] != rows[1]).any(axis=1))
-            assert changed.tolist() == [index], key
-        seen.add(index)
-    assert len(seen) == 6
-
-
-def test_first_step_is_the_rate_which_decays_like_that_of_the_means():
-    for iterations, share in ((1, 0.01), (2, 0.1)):
-        trainer = make_trainer(colors__lr=3e-2, iterations=iterations)
-        trainer.step()
-        moved = np.sort(np.abs(matrices_of(trainer) - IDENTITY), axis=0)
-        # Adam's first step is rate * sign(gradient); stored beside a one. All give a part back.
-        np.testing.assert_allclose(moved[5], 5 / 6 * share * 3e-2, atol=2e-7)
-        np.testing.assert_allclose(moved[:5], 1 / 6 * share * 3e-2, atol=2e-7)
-
-
-def test_view_seen_later_starts_with_the_full_rate():
-    """Its optimizer counts its own steps. The rate stays, as that of the means does here."""
-    rates = {"optimizer__means_lr": 1e-4, "optimizer__means_lr_final": 1e-4}
-    trainer = make_trainer(colors__lr=3e-2, **rates)
-    (effect,) = trainer.effects
-    for _ in range(6):
-        trainer.step()
-    # Each was seen once.
-    values = effect.state()["matrices.value"].reshape(6, 3, 4)
-    np.testing.assert_allclose(np.abs(values - IDENTITY), 3e-2, atol=4e-7)
-
-
-@pytest.mark.slow
-def test_the_mean_of_all_transforms_is_the_identity():
-    """After any iteration; rounding of numbers of 1."""
-    trainer = make_trainer(colors__lr=3e-2)
-    for _ in range(20):
-        trainer.step()
-        matrices = matrices_of(trainer)
-        np.testing.assert_allclose(matrices.mean(axis=0), IDENTITY, atol=5e-7)
-    assert np.abs(matrices - IDENTITY).max() > 0.02
-
-
-@pytest.mark.slow
-def test_common_colour_change_is_attributed_to_the_splats():
-    """Photographs that are all darker by the same factor change no transform.
-
-    Each photograph's own pull is down, by some 7 steps of the rate.
-    """
-    darker = fits.with_views(
-        fits.plain_dataset((0.0, 0.0, 0.0)), lambda v: replace(v, image=np.float32(0.5) * v.image)
-    )
-    trainer = fits.steps(make_trainer(darker, fits.true_blobs(), colors__lr=1e-2), 40)
-    gains = np.diagonal(matrices_of(trainer)[:, :, :3], axis1=1, axis2=2)
-    np.testing.assert_allclose(gains, 1, atol=0.015)
-    (effect,) = trainer.effects
-    assert (np.array(effect.common)[[0, 5, 10]] < -0.03).all()
-
-
 def test_background_is_untransformed_in_transparent_pixels():
     """No camera saw it. Between, the change is as large as the photograph is opaque."""
     dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
@@ -244,17 +104,6 @@ def test_background_is_untransformed_in_transparent_pixels():
     np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
-# ----------------------------------------------------------------------------------------------
-# Recovered transforms
-# ----------------------------------------------------------------------------------------------
-
-WARM = np.array([[1.2, 0.05, 0.0, 0.02], [0.0, 0.9, 0.1, -0.03], [0.05, 0.0, 0.7, 0.05]])
-
-
-def transformed(image, matrix) -> np.ndarray:
-    return (image @ matrix[:, :3].T + matrix[:, 3]).astype(np.float32)
-
-
 @pytest.mark.slow
 def test_color_change_of_a_photograph_is_recovered():
     """Before true blobs that stay. Few colours are all that tell of its 12 numbers.
@@ -262,7 +111,8 @@ def test_color_change_of_a_photograph_is_recovered():
     The mean of the two transforms is the identity.
     """
     dataset = fits.plain_dataset()
-    photos, matrices = (dataset.train[3], dataset.train[4]), (WARM, 2 * IDENTITY - WARM)
+    warm = np.array([[1.2, 0.05, 0.0, 0.02], [0.0, 0.9, 0.1, -0.03], [0.05, 0.0, 0.7, 0.05]])
+    photos, matrices = (dataset.train[3], dataset.train[4]), (warm, 2 * IDENTITY - warm)
     changed = tuple(
         replace(photo, image=transformed(photo.image, matrix))
         for photo, matrix in zip(photos, matrices, strict=True)
@@ -272,7 +122,7 @@ def test_color_change_of_a_photograph_is_recovered():
         fits.true_blobs(),
         colors__lr=6e-3,
         colors__identity_weight=0.0,
-        **FROZEN_GAUSSIANS,
+        **fits.FROZEN_GAUSSIANS,
     )
     fits.steps(trainer, 500)
     for photo, target, matrix in zip(photos, changed, matrices_of(trainer), strict=True):
@@ -284,55 +134,69 @@ def test_color_change_of_a_photograph_is_recovered():
         assert np.abs(found[covered]).mean() < 0.1 * before[covered].mean()
 
 
-def exposed_dataset():
-    """Each photograph with an exposure and a white balance of its own, 1 on average."""
-    dataset = fits.plain_dataset()
-    gains = np.exp(np.random.default_rng(5).normal(0, 0.15, (6, 3)))
-    gains /= gains.mean(axis=0)
-    views = [
-        replace(view, image=(view.image * gain).astype(np.float32))
-        for view, gain in zip(dataset.train, gains, strict=True)
-    ]
-    return replace(dataset, train=tuple(views))
+def test_identity_transform_gives_the_same_bits():
+    plain, corrected = fits.make_trainer(fits.plain_dataset()), make_trainer()
+    first, second = plain.step(), corrected.step()
+    assert first.loss == second.loss and first.psnr == second.psnr
+    for name in PARAMETER_NAMES:
+        values = [getattr(trainer.gaussians(), name) for trainer in (plain, corrected)]
+        np.testing.assert_array_equal(*values, err_msg=name)
 
 
-@pytest.mark.slow
-def test_transforms_improve_fits_with_varying_exposure():
-    """Measured on held-out photographs of one exposure, without a transform."""
-    quality = {}
-    for lr in (None, 1e-2):
-        trainer = make_trainer(exposed_dataset(), colors__lr=lr)
-        quality[lr] = fits.test_psnr(fits.steps(trainer, 90), exposed_dataset())
-    assert quality[1e-2] > quality[None] + 1, quality
+def test_first_step_is_the_rate_which_decays_like_that_of_the_means():
+    for iterations, share in ((1, 0.01), (2, 0.1)):
+        trainer = make_trainer(colors__lr=3e-2, iterations=iterations)
+        trainer.step()
+        moved = np.sort(np.abs(matrices_of(trainer) - IDENTITY), axis=0)
+        # Adam's first step is rate * sign(gradient); the mean of all views stays the identity.
+        np.testing.assert_allclose(moved[5], 5 / 6 * share * 3e-2, atol=2e-7)
+        np.testing.assert_allclose(moved[:5], 1 / 6 * share * 3e-2, atol=2e-7)
 
 
-# ----------------------------------------------------------------------------------------------
-# Files and checkpoints
-# ----------------------------------------------------------------------------------------------
+def test_view_seen_later_starts_with_the_full_rate():
+    """Its optimizer counts its own steps. The rate stays, as that of the means does here."""
+    rates = {"optimizer__means_lr": 1e-4, "optimizer__means_lr_final": 1e-4}
+    trainer = fits.steps(make_trainer(colors__lr=3e-2, **rates), 6)  # each view is seen once
+    (effect,) = trainer.effects
+    values = effect.state()["matrices.value"].reshape(6, 3, 4)
+    np.testing.assert_allclose(np.abs(values - IDENTITY), 3e-2, atol=4e-7)
 
 
 def test_transforms_are_written_by_view_name(tmp_path):
     trainer = fits.steps(make_trainer(), 9)
     (effect,) = trainer.effects
-    dataset = fits.plain_dataset()
-    effect.write(tmp_path, dataset)
+    effect.write(tmp_path, fits.plain_dataset())
     written = json.loads((tmp_path / COLORS).read_text())
-    assert list(written) == [view.name for view in dataset.train]
+    assert list(written) == [view.name for view in fits.plain_dataset().train]
     np.testing.assert_array_equal(list(written.values()), matrices_of(trainer))
     assert len({str(matrix) for matrix in written.values()}) == 6
 
 
-def test_a_fit_resumes_to_the_same_bytes():
-    fits.assert_resumes_to_the_same_bytes(make_trainer, 4, 5)
-
-
-def test_transforms_are_part_of_the_state():
-    trainer = fits.steps(make_trainer(), 2)
-    state = trainer.state()
-    values = state["colors/matrices.value"]
-    values = (values - state["colors/common"]).reshape(6, 3, 4)
-    np.testing.assert_array_equal(values, matrices_of(trainer))
-
-
-def test_no_kernel_is_compiled_after_all_views_were_seen():
-    fits.assert_no_new_kernels(make_trainer())
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "numbers"),
+    [
+        ({"colors__lr": 2e-3}, {"matrices": 6}),
+        (
+            {"cameras__optimise": True, "cameras__focal_lr": 3e-3, "cameras__principal_lr": 4e-3},
+            {"turns": 6, "moves": 6, "log_focals": 1, "shifts": 1},
+        ),
+    ],
+    ids=["colors", "cameras"],
+)
+def test_only_rows_of_the_current_view_change(changes, numbers):
+    """And what all views share; numbers and moments of all others stay, bit by bit."""
+    trainer, seen = fits.make_trainer(fits.plain_dataset(), **changes), set()
+    (effect,) = trainer.effects
+    for _ in range(8):
+        before = effect.state()
+        trainer.step()
+        after = effect.state()
+        index = trainer.last_step.views[-1].view.index
+        for name, count in numbers.items():
+            for key in (f"{name}.value", f"{name}.m", f"{name}.v"):
+                rows = [state[key].reshape(count, -1) for state in (before, after)]
+                changed = np.flatnonzero((rows[0] != rows[1]).any(axis=1))
+                assert changed.tolist() == [index if count > 1 else 0], key
+        seen.add(index)
+    assert len(seen) == 6

@@ -7,13 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from support.commands import run_in_process
-from support.fit_command import write_scene
-
-from drgs import fit
-from drgs.core.errors import UserError
-from drgs.training import fit_folder
-from drgs.training.trainer import Trainer
+from support.fit_command import assert_fits, run_fit, stop_after, without_images, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +23,9 @@ def stopped(tmp_path_factory):
         densify={"stop": 100},  # the population stays
         output={"checkpoint_every": 1, "history_every": 1},
     )
-    step = Trainer.step
-
-    def step_or_stop(trainer):
-        if trainer.iteration == 2:
-            raise UserError("stopped")
-        return step(trainer)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "step", step_or_stop)
-        outcome = run_in_process(fit.main, folder / "a.yml", "--out", folder / "out")
-    assert outcome.stderr == "error: stopped\n"
+        stop_after(patch, 2)
+        assert run_fit(folder / "a.yml", "--out", folder / "out").returncode == 130
     return folder / "out"
 
 
@@ -50,16 +36,12 @@ def checkpoint(stopped, tmp_path):
     return tmp_path / "out" / "checkpoint.npz"
 
 
-def arrays_of(checkpoint):
-    with np.load(checkpoint) as file:
-        return dict(file)
-
-
 def edit(name, change):
-    """``change`` of one array; None removes it."""
+    """Return a damage: ``change`` of one array; None removes it."""
 
     def apply(checkpoint):
-        arrays = arrays_of(checkpoint)
+        with np.load(checkpoint) as file:
+            arrays = dict(file)
         changed = change(arrays.pop(name))
         if changed is not None:
             arrays[name] = changed
@@ -68,19 +50,19 @@ def edit(name, change):
     return apply
 
 
-def with_value(value):
-    """The last number of an array is another."""
+def spoil(name, value):
+    """Return a damage: the last number of an array is another."""
 
     def change(array):
         array = array.copy()
         array.reshape(-1)[-1:] = value
         return array
 
-    return change
+    return edit(f"trainer.{name}", change)
 
 
 def with_header(shape):
-    """The file holds one array, with such a header and nothing behind it."""
+    """Return a damage: the file holds one array, with such a header and nothing after it."""
 
     def apply(checkpoint):
         stream = io.BytesIO()
@@ -93,7 +75,8 @@ def with_header(shape):
 
 
 def compress(checkpoint):
-    np.savez_compressed(checkpoint, **arrays_of(checkpoint), zeros=np.zeros(10**7, np.uint8))
+    with np.load(checkpoint) as file:
+        np.savez_compressed(checkpoint, **file, zeros=np.zeros(10**7, np.uint8))
 
 
 def as_pipe(checkpoint):
@@ -119,8 +102,8 @@ DAMAGE = {
     "text": (edit("trainer.sh0.value", lambda a: a.astype("U")), "type float32, got"),
     "fewer views": (edit("trainer.cameras/turns.value", lambda a: a[1:]), "turns.value must be"),
     "fewer filters": (edit("trainer.smoothing/filter", lambda a: a[1:]), "filter must be of shape"),
-    "NaN": (edit("trainer.means.value", with_value(np.nan)), "means.value must hold finite num"),
-    "infinite": (edit("trainer.cameras/moves.m", with_value(np.inf)), "moves.m must hold finite"),
+    "NaN": (spoil("means.value", np.nan), "means.value must hold finite num"),
+    "infinite": (spoil("cameras/moves.m", np.inf), "moves.m must hold finite"),
     "negative iteration": (edit("trainer.iteration", lambda a: -a), "between 0 and 4, got -2"),
     "late iteration": (edit("trainer.iteration", lambda a: a + 9), "between 0 and 4, got 11"),
     "several iterations": (edit("trainer.iteration", lambda a: np.array([a, a])), "iteration must"),
@@ -156,7 +139,7 @@ def test_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
     damage(checkpoint)
     kept = checkpoint.read_bytes() if checkpoint.is_file() else None
     before = sorted(os.listdir(checkpoint.parent))
-    outcome = run_in_process(fit.main, "--resume", checkpoint.parent)
+    outcome = run_fit("--resume", checkpoint.parent)
     assert outcome.returncode == 2, outcome
     assert outcome.stderr.startswith(f"error: {checkpoint}: ") and message in outcome.stderr
     assert outcome.stderr.count("\n") == 1 and len(outcome.stderr) < 700
@@ -166,7 +149,5 @@ def test_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
 
 
 def test_intact_checkpoint_is_continued(checkpoint, monkeypatch):
-    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
-    outcome = run_in_process(fit.main, "--resume", checkpoint.parent)
-    assert outcome.returncode == 0, outcome.stderr
-    assert "continues at iteration 2" in outcome.stdout
+    without_images(monkeypatch)
+    assert "continues at iteration 2" in assert_fits("--resume", checkpoint.parent).stdout

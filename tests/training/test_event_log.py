@@ -5,26 +5,18 @@ import json
 import struct
 import sys
 
+import numpy as np
 import pytest
-from support.commands import run_in_process
 from support.fit_command import (
     assert_fit_refused,
     assert_fits,
+    run_fit,
     stop_after,
     without_images,
     write_project,
 )
 
-from drgs import fit
 from drgs.results.files import EVENTS, HISTORY, TENSORBOARD
-
-COLUMNS = {
-    "loss": "loss",
-    "PSNR/training_view": "psnr",
-    "PSNR/test_views": "test_psnr",
-    "Gaussians": "num_gaussians",
-    "learning_rate/means": "means_lr",
-}
 
 needs_tensorboardx = pytest.mark.skipif(
     "not __import__('importlib.util').util.find_spec('tensorboardX')",
@@ -59,49 +51,55 @@ def records(data):
         yield record
 
 
-def events_of(out):
-    """The file's version; and by tag the values over the iterations, in their order."""
+COLUMNS = {
+    "loss": "loss",
+    "PSNR/training_view": "psnr",
+    "PSNR/test_views": "test_psnr",
+    "Gaussians": "num_gaussians",
+    "learning_rate/means": "means_lr",
+}
+
+
+def curves_of(out):
+    """Return [(iteration, value)] by tag."""
     from tensorboardX.proto.event_pb2 import Event
 
     first, *others = (Event.FromString(r) for r in records((out / EVENTS).read_bytes()))
-    curves, times = {}, [event.wall_time for event in others]
+    assert first.file_version == "brain.Event:2"
+    times = [event.wall_time for event in others]
+    assert times == sorted(times)
+    curves = {}
     for event in others:
         for value in event.summary.value:
             curves.setdefault(value.tag, []).append((event.step, value.simple_value))
-    assert times == sorted(times)
-    return first.file_version, curves
+    return curves
 
 
-def curves_of_history(out):
+def assert_curves_match_the_history(out):
+    curves = curves_of(out)
     with (out / HISTORY).open() as file:
         rows = list(csv.DictReader(file))
-    return {
-        tag: [(int(row["iteration"]), float(row[column])) for row in rows if row[column]]
-        for tag, column in COLUMNS.items()
-    }
-
-
-def assert_agree(out):
-    version, curves = events_of(out)
-    expected = curves_of_history(out)
-    assert version == "brain.Event:2" and curves.keys() == expected.keys()
-    for tag, curve in expected.items():
-        assert [step for step, _ in curves[tag]] == [step for step, _ in curve]
+    assert curves.keys() == COLUMNS.keys()
+    for tag, column in COLUMNS.items():
+        expected = [(int(row["iteration"]), float(row[column])) for row in rows if row[column]]
         # history.csv has six digits, the events have single precision.
-        assert [v for _, v in curves[tag]] == pytest.approx([v for _, v in curve], rel=1e-5)
+        np.testing.assert_allclose(curves[tag], expected, rtol=1e-5)
 
 
 @pytest.mark.slow
 @needs_tensorboardx
 def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path):
-    config = write_project(tmp_path)
-    assert_fits(config, "--out", tmp_path / "with", "--tensorboard")
+    config, out = write_project(tmp_path), tmp_path / "with"
+    assert_fits(config, "--out", out, "--tensorboard")
     assert_fits(config, "--out", tmp_path / "without")
-    assert_agree(tmp_path / "with")
-    name = "point_cloud.ply"
-    assert (tmp_path / "with" / name).read_bytes() == (tmp_path / "without" / name).read_bytes()
+    assert_curves_match_the_history(out)
+    clouds = [(tmp_path / name / "point_cloud.ply").read_bytes() for name in ("with", "without")]
+    assert clouds[0] == clouds[1]
     assert not (tmp_path / "without" / TENSORBOARD).exists()
-    assert EVENTS in json.loads((tmp_path / "with" / ".drgs-fit.json").read_text())["files"]
+    assert EVENTS in json.loads((out / ".drgs-fit.json").read_text())["files"]
+    (out / TENSORBOARD / "mine.txt").write_text("mine")
+    arguments = (config, "--out", out, "--overwrite")
+    assert_fit_refused(*arguments, folder=tmp_path, message="tensorboard/mine.txt")
 
 
 @pytest.mark.slow
@@ -109,25 +107,13 @@ def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path):
 def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(tmp_path, monkeypatch):
     config, out = write_project(tmp_path), tmp_path / "out"
     with monkeypatch.context() as patch:
-        without_images(patch)
-        stop_after(patch, 5)  # behind the checkpoint of 4
-        assert run_in_process(fit.main, config, "--out", out, "--tensorboard").returncode == 130
-    steps = [step for step, _ in events_of(out)[1]["loss"]]
-    assert steps == [1, 2, 3, 4, 5]
+        stop_after(patch, 5)  # after the checkpoint of 4
+        assert run_fit(config, "--out", out, "--tensorboard").returncode == 130
+    assert [step for step, _ in curves_of(out)["loss"]] == [1, 2, 3, 4, 5]
     assert_fits("--resume", out, "--tensorboard")
-    assert_agree(out)
+    assert_curves_match_the_history(out)
     assert_fits(config, "--out", out, "--overwrite")
     assert not (out / TENSORBOARD).exists()
-
-
-@pytest.mark.slow
-@needs_tensorboardx
-def test_foreign_file_in_the_folder_is_kept(tmp_path):
-    config, out = write_project(tmp_path), tmp_path / "out"
-    assert_fits(config, "--out", out, "--tensorboard")
-    (out / TENSORBOARD / "mine.txt").write_text("mine")
-    arguments = (config, "--out", out, "--overwrite")
-    assert_fit_refused(*arguments, folder=tmp_path, message="tensorboard/mine.txt")
 
 
 def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):

@@ -17,8 +17,12 @@ from drgs.config.changes import with_changes
 from drgs.config.load import config_from, dump_config, load_config
 from drgs.core import registry
 from drgs.core.errors import UserError
+from drgs.fit import add_arguments
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator.summary import format_effects
 from drgs.training.effects.base import training_effects
 from drgs.training.losses import prepare_target
+from drgs.training.summary import summary_of_fit
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 NAMES = ("binary_opacity", "charbonnier", "halving", "vignetting")
@@ -27,11 +31,11 @@ NAMES = ("binary_opacity", "charbonnier", "halving", "vignetting")
 @pytest.fixture(autouse=True)
 def examples(monkeypatch):
     """The modules of the examples, found as those of an installed package are."""
-    mi.set_variant("llvm_ad_rgb")
     monkeypatch.syspath_prepend(EXAMPLES)
     points = [EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in NAMES]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     yield {name: importlib.import_module(name) for name in NAMES}
+    # Private names: nothing else forgets an extension.
     for each in registry._registries:
         for name in NAMES:
             each._extensions.pop(name, None)
@@ -74,27 +78,22 @@ def test_a_configuration_names_extensions_and_sets_their_sections(tmp_path):
     assert type(again.extensions["halving"]) is type(config.extensions["halving"])
 
 
-@pytest.mark.parametrize(
-    ("sections", "message"),
-    [
-        ({"halvin": {}}, "x.yml: extensions.halvin: no extension has this name; did you mean halv"),
-        ({"halving": {"after": 0}}, "x.yml: extensions.halving.after must be >= 1, got 0"),
-        (
-            {"halving": {"aftr": 3}},
-            "x.yml: unknown key extensions.halving.aftr; did you mean after?",
-        ),
-    ],
-)
-def test_wrong_sections_are_refused_with_their_place(sections, message):
+REFUSED = [
+    ({"extensions": {"halvin": {}}}, "extensions.halvin: no extension has this name; did you"),
+    ({"extensions": {"halving": {"after": 0}}}, "extensions.halving.after must be >= 1, got 0"),
+    ({"extensions": {"halving": {"aftr": 3}}}, "unknown key extensions.halving.aftr; did you mean"),
+    (
+        {"densify": {"strategy": "halvin"}},
+        "densify.strategy must be one of 'adc', 'budget', 'mcmc', 'halving'; did you mean halving",
+    ),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), REFUSED)
+def test_wrong_sections_are_refused_with_their_place(values, message):
     with pytest.raises(UserError) as caught:
-        configured(**sections)
-    assert str(caught.value).startswith(message)
-    assert "\n" not in str(caught.value)
-
-
-def test_an_unknown_strategy_lists_the_installed_ones():
-    with pytest.raises(UserError, match=r"must be one of 'adc', 'budget', 'mcmc', 'halving'; did"):
-        config_from({"data": {"path": "."}, "densify": {"strategy": "halvin"}}, "x.yml")
+        config_from({"data": {"path": "."}, **values}, "x.yml")
+    assert str(caught.value).startswith(f"x.yml: {message}") and "\n" not in str(caught.value)
 
 
 def test_strategy_provides_the_defaults_of_its_schedule(examples, monkeypatch):
@@ -107,40 +106,19 @@ def test_strategy_provides_the_defaults_of_its_schedule(examples, monkeypatch):
     assert (densify.start, densify.stop) == (250, 800)
 
 
-def test_a_trainer_takes_a_density_strategy(examples):
-    """The object changes rows, not the strategy of the configuration."""
-    config = configured()
-    values = config.model_dump() | {"densify": {}}
-    strategy = examples["halving"].Halving(config.extensions["halving"])
-    config = config_from(values, "x.yml")
-    start = fits.disturbed_blobs()
-    trainer = fits.Trainer(config, fits.plain_dataset(), start, density=strategy)
-    for _ in range(6):
-        trainer.step()
-    assert trainer.num_gaussians == start.num_gaussians - start.num_gaussians // 2
+def make_trainer():
+    return fits.Trainer(configured(), fits.plain_dataset(), fits.disturbed_blobs())
 
 
-def test_fit_uses_configured_extensions():
-    result = drgs.train(configured(), fits.plain_dataset())
-    trainer = result.trainer
-    (effect,) = trainer.effects
+def test_fit_uses_configured_extensions_and_resumes_to_the_same_bytes():
+    fits.assert_resumes_to_the_same_bytes(make_trainer, 5, 3)
+    trainer = make_trainer()
+    start, (effect,) = trainer.num_gaussians, trainer.effects
     assert type(trainer.density).__name__ == "Halving" and effect.name == "vignetting"
-    assert [row.num_gaussians for row in result.history][-1] == trainer.num_gaussians
-    start = fits.Trainer(configured(), fits.plain_dataset(), fits.disturbed_blobs()).num_gaussians
-    trainer = fits.Trainer(configured(), fits.plain_dataset(), fits.disturbed_blobs())
     reports = [trainer.step() for _ in range(8)]
     assert trainer.num_gaussians == start - start // 2
     assert [bool(report.density) for report in reports] == [False] * 5 + [True] + [False] * 2
     assert float(effect.state()["strength.value"][0, 0]) != 0
-
-
-def test_effect_applies_depending_on_the_dataset(examples, monkeypatch):
-    """Return whether its section is present."""
-    needs = lambda config, dataset: any(view.depth is not None for view in dataset.train)  # noqa: E731
-    monkeypatch.setattr(examples["vignetting"].Vignetting, "is_used", needs)
-    for dataset, used in ((fits.plain_dataset(), []), (fits.true_dataset(), ["vignetting"])):
-        effects = training_effects(configured(), dataset)
-        assert [effect.name for effect in effects if effect.name != "depth"] == used
 
 
 @pytest.mark.slow
@@ -150,31 +128,16 @@ def test_objects_and_names_give_the_same_bytes(examples):
     named = drgs.train(config, fits.plain_dataset()).gaussians
     values = config.model_dump() | {"densify": {}, "loss": {}}
     values["extensions"] = {"binary_opacity": {"weight": 0.5}}
-    section = config.extensions
+    section, charbonnier = config.extensions, examples["charbonnier"]
     given = drgs.train(
         values,
         fits.plain_dataset(),
         strategy=examples["halving"].Halving(section["halving"]),
         effects=[examples["vignetting"].Vignetting(section["vignetting"])],
-        loss=examples["charbonnier"].Charbonnier(examples["charbonnier"].CharbonnierSection()),
+        loss=charbonnier.Charbonnier(charbonnier.CharbonnierSection()),
     ).gaussians
-    for name in ("means", "sh0", "logit_opacities"):
+    for name in PARAMETER_NAMES:
         np.testing.assert_array_equal(getattr(given, name), getattr(named, name))
-
-
-@pytest.mark.slow
-def test_fit_resumes_from_a_checkpoint_to_the_same_bytes():
-    def trainer():
-        return fits.Trainer(configured(), fits.plain_dataset(), fits.disturbed_blobs())
-
-    whole, first, second = trainer(), trainer(), trainer()
-    fits.steps(whole, 10)
-    fits.steps(first, 7)
-    state = first.state()
-    assert "vignetting/strength.value" in state
-    second.restore(state)
-    fits.steps(second, 3)
-    assert fits.everything_of(second) == fits.everything_of(whole)
 
 
 def test_loss_and_its_term_match_numpy(examples):
@@ -191,15 +154,22 @@ def test_loss_and_its_term_match_numpy(examples):
     dr.backward(found)
     expected = difference / distance / difference.size
     np.testing.assert_allclose(np.array(dr.grad(shown)), expected, rtol=1e-4, atol=1e-8)
-    plain = fits.Trainer(configured(binary_opacity={"weight": 0}), *fit_inputs())
-    heavy = fits.Trainer(configured(binary_opacity={"weight": 2.0}), *fit_inputs())
-    opacities = 1 / (1 + np.exp(-fits.disturbed_blobs().logit_opacities.astype(np.float64)))
-    more = 2 * (opacities * (1 - opacities)).mean()
-    assert heavy.step().loss - plain.step().loss == pytest.approx(more, rel=1e-4)
+    inputs = fits.plain_dataset(), fits.disturbed_blobs()
+    plain, heavy = (
+        fits.Trainer(configured(binary_opacity={"weight": weight}), *inputs).step().loss
+        for weight in (0.0, 2.0)
+    )
+    opacities = 1 / (1 + np.exp(-inputs[1].logit_opacities.astype(np.float64)))
+    assert heavy - plain == pytest.approx(2 * (opacities * (1 - opacities)).mean(), rel=1e-4)
 
 
-def fit_inputs():
-    return fits.plain_dataset(), fits.disturbed_blobs()
+def test_effect_applies_depending_on_the_dataset(examples, monkeypatch):
+    """Return whether its section is present."""
+    needs = lambda config, dataset: any(view.depth is not None for view in dataset.train)  # noqa: E731
+    monkeypatch.setattr(examples["vignetting"].Vignetting, "is_used", needs)
+    for dataset, used in ((fits.plain_dataset(), []), (fits.true_dataset(), ["vignetting"])):
+        effects = training_effects(configured(), dataset)
+        assert [effect.name for effect in effects if effect.name != "depth"] == used
 
 
 def test_errors_of_an_extension_are_reported_with_its_name(examples, monkeypatch):
@@ -211,10 +181,6 @@ def test_errors_of_an_extension_are_reported_with_its_name(examples, monkeypatch
 
 
 def test_summary_and_help_list_extensions():
-    from drgs.fit import add_arguments
-    from drgs.integrator.summary import format_effects
-    from drgs.training.summary import summary_of_fit
-
     text = format_effects(summary_of_fit(configured(), fits.plain_dataset()))
     assert "vignetting: effect: Renderings are darkened" in text and "extensions.vignetting" in text
     assert "halving: density strategy: Keeps the more" in text

@@ -1,9 +1,7 @@
 """A fit whose numbers are no longer finite: where it says the trouble began, and what it keeps."""
 
 import re
-from collections import Counter
 from dataclasses import replace
-from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,34 +9,20 @@ import numpy as np
 import pytest
 import yaml
 from support import small_fits as fits
+from support.fit_command import assert_fits, run_fit, without_images
 from support.folders import visible
 from support.small_capture import make_dataset, write_dataset
 from support.trainers import make_trainer
 
-from drgs import fit
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
-from drgs.training import fit_folder, session
-from drgs.training.finite_checks import GradientWatch, NonFiniteError, check_values
+from drgs.training import session
+from drgs.training.finite_checks import NonFiniteError
+from drgs.training.losses import prepare_target
 from drgs.training.steps import view_of
 from drgs.training.trainer import Trainer
 
 ROW = 17
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
-def view_name(trainer, iteration):
-    views = trainer.stages[-1].views
-    return views[view_of(iteration, len(views), trainer.config.seed)].name
-
-
-# ----------------------------------------------------------------------------------------------
-# Poison
-# ----------------------------------------------------------------------------------------------
 
 
 def with_value(vector, row, value):
@@ -51,7 +35,7 @@ def with_value(vector, row, value):
 
 def poison_gradient(monkeypatch, trainer, name, iteration, value=np.nan, row=ROW):
     """One component of one row's gradient is ``value`` in that iteration."""
-    real = rendering._back_to_rows
+    real = rendering._back_to_rows  # private: gradients of rows before they are checked
 
     def poisoned(*arguments):
         d_rows, visible, numbers = real(*arguments)
@@ -76,21 +60,14 @@ def poison_value(trainer, name, value=np.nan, row=ROW):
     trainer.population.replace(name, type(old)(host))
 
 
-# ----------------------------------------------------------------------------------------------
-# Losses and gradients
-# ----------------------------------------------------------------------------------------------
-
-DEGREE_1_AT_ONCE = {"sh_degree": 1, "sh_increase_every": 1}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 def test_nonfinite_gradient_is_named_although_detected_later(monkeypatch, name):
-    trainer = make_trainer(model=DEGREE_1_AT_ONCE)
+    trainer = make_trainer(model={"sh_degree": 1, "sh_increase_every": 1})
     poison_gradient(monkeypatch, trainer, name, iteration=3)
-    for _ in range(6):
-        trainer.step()
-    expected = f"iteration 3, view {view_name(trainer, 3)}: the gradient of {name} in row {ROW} is"
+    fits.steps(trainer, 6)
+    view = trainer.views[view_of(3, 4, trainer.config.seed)].name
+    expected = f"iteration 3, view {view}: the gradient of {name} in row {ROW} is"
     with pytest.raises(NonFiniteError, match=f"^{re.escape(expected)} not finite"):
         trainer.watch.check()
 
@@ -126,8 +103,6 @@ def test_first_row_and_its_first_parameter_are_named(monkeypatch):
 )
 def test_nonfinite_loss_names_iteration_and_view(dssim_weight, gradient):
     """SSIM's gradient tells as well; that of L1 is 0 at a NaN."""
-    from drgs.training.losses import prepare_target
-
     trainer = make_trainer(loss={"dssim_weight": dssim_weight})
     spoilt = view_of(4, 4, seed=0)
     photo = np.full((16, 20, 3), 0.5, np.float32)
@@ -135,8 +110,7 @@ def test_nonfinite_loss_names_iteration_and_view(dssim_weight, gradient):
     target = prepare_target(mi.TensorXf(photo))
     views = trainer.stages[-1].views
     views[spoilt].replacement = target
-    for _ in range(3):
-        trainer.step()
+    fits.steps(trainer, 3)
     trainer.check()
     trainer.step()
     message = f"^iteration 4, view v{spoilt}: the loss is nan{gradient}$"
@@ -160,8 +134,7 @@ def test_nothing_is_saved_returned_or_edited_after_a_fault(monkeypatch, event):
     densify, act = EVENTS[event]
     trainer = make_trainer(densify=densify)
     poison_gradient(monkeypatch, trainer, "log_scales", iteration=2)
-    for _ in range(3):
-        trainer.step()
+    fits.steps(trainer, 3)
     for attempt in (act, type(trainer).state):  # nor by who has caught the error
         with pytest.raises(NonFiniteError, match=r"^iteration 2, "):
             attempt(trainer)
@@ -179,21 +152,14 @@ def test_restored_trainer_has_no_fault(monkeypatch):
     trainer.check()
 
 
-# ----------------------------------------------------------------------------------------------
-# Values
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_nonfinite_value_is_named(name, value):
-    trainer = make_trainer(model=DEGREE_1_AT_ONCE)
-    trainer.step()
+    trainer = fits.steps(make_trainer(model={"sh_degree": 1, "sh_increase_every": 1}), 1)
     poison_value(trainer, name, value)
-    with pytest.raises(
-        NonFiniteError, match=f"^after iteration 1: {name} is {value} in row {ROW}$"
-    ):
+    message = f"^after iteration 1: {name} is {value} in row {ROW}$"
+    with pytest.raises(NonFiniteError, match=message):
         trainer.check()
 
 
@@ -244,10 +210,8 @@ def poison_effect(trainer, name, index, value, part="value"):
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["value", "m", "v"])
 @pytest.mark.parametrize("name", EFFECTS)
-def test_nonfinite_parameters_of_an_effect_are_named(name, part):
-    """And so are its moments."""
+def test_nonfinite_numbers_of_an_effect_are_named(name, part):
     trainer = fits.steps(fits.make_trainer(fits.plain_dataset(), **EFFECTS[name]), 2)
-    trainer.check()
     where = poison_effect(trainer, name, 3, np.inf, part)
     shown = name if part == "value" else f"{name}.{part}"
     for act in (Trainer.check, Trainer.state, Trainer.gaussians):
@@ -267,92 +231,32 @@ def test_nonfinite_iteration_names_the_effect_that_caused_it(name):
         trainer.check()
 
 
-def test_check_values_names_the_first_row_of_any_shape():
-    values = np.zeros((5, 2, 3), np.float32)
-    check_values(1, {"sh": mi.TensorXf(values)})
-    values[2, 1, 0], values[3, 0, 0] = np.inf, np.nan
-    with pytest.raises(NonFiniteError, match=r"^after iteration 7: sh is inf in row 2$"):
-        check_values(7, {"sh": mi.TensorXf(values)})
-
-
-# ----------------------------------------------------------------------------------------------
-# Cost of the guards in a good fit
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_guards_do_not_change_the_bytes_of_a_fit(monkeypatch):
-    """Across changes of the population and an opacity reset."""
-    changes = {
-        "densify": {
-            "start": 2,
-            "stop": 40,
-            "every": 5,
-            "strategy": "adc",
-            "adc": {"reset_every": 8, "grad_threshold": 1e-6},
-        },
-        "model": {"sh_degree": 2, "sh_increase_every": 4},
-    }
-
-    def result():
-        trainer = make_trainer(**changes)
-        for _ in range(12):
-            trainer.step()
-        assert trainer.num_gaussians != 40
-        return [getattr(trainer.gaussians(), name).tobytes() for name in PARAMETER_NAMES]
-
-    guarded = result()
-    monkeypatch.setattr(rendering, "_nonfinite_flags", lambda d_rows, visible: mi.UInt32(0))
-    monkeypatch.setattr(GradientWatch, "append", lambda *arguments: None)
-    assert result() == guarded
-
-
-def history_of(act):
-    """Kernels, reductions and copies that ``act`` launches, in order, as (type, size)."""
-    dr.sync_thread()
-    dr.kernel_history_clear()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        act()
+def test_step_waits_for_two_values_and_a_check_is_small():
+    """Each copy is a value that the host waits for: the numbers of entries, made and composited."""
+    trainer = fits.steps(make_trainer(), 5)
+    for act in (trainer.step, trainer.watch.check):
         dr.sync_thread()
-    return [(entry["type"], entry["size"]) for entry in dr.kernel_history()]
-
-
-def test_guards_add_two_reductions_and_no_synchronisation(monkeypatch):
-    trainer = make_trainer()
-    for _ in range(5):
-        trainer.step()
-    guarded = Counter(kind for kind, _ in history_of(trainer.step))
-    # dr.min reduces the faults, which the gradients' own kernel computes.
-    without_min = SimpleNamespace(**{**vars(dr), "min": lambda faults: faults})
-    monkeypatch.setattr(rendering, "dr", without_min)
-    plain = Counter(kind for kind, _ in history_of(trainer.step))
-    for kind in guarded | plain:
-        allowed = 2 if kind == dr.KernelType.BlockReduce else 0
-        assert 0 <= guarded[kind] - plain[kind] <= allowed, kind
-    # Each copy is a value that the host waits for: the numbers of entries, made and composited.
-    assert guarded[dr.KernelType.Memcpy] == 2
-
-
-def test_finite_checks_launch_only_small_kernels():
-    trainer = make_trainer()
-    for _ in range(5):
-        trainer.step()
-    assert all(size <= 4 for _, size in history_of(trainer.watch.check))
-
-
-# ----------------------------------------------------------------------------------------------
-# The command
-# ----------------------------------------------------------------------------------------------
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            act()
+            dr.sync_thread()
+        history = dr.kernel_history()
+        if act == trainer.step:
+            assert [entry["type"] for entry in history].count(dr.KernelType.Memcpy) == 2
+        else:
+            assert all(entry["size"] <= 4 for entry in history)
 
 
 @pytest.fixture
-def configuration(tmp_path):
+def configuration(tmp_path, monkeypatch):
+    """A fit without reports whose population stays."""
+    without_images(monkeypatch)
     write_dataset(tmp_path / "data", make_dataset(train=4, test=1))
     values = {
         "data": {"path": "data"},
         "init": {"num_points": 40, "half_extent": 0.5},
         "model": {"sh_degree": 0},
-        "densify": {"stop": 100},  # the population stays
+        "densify": {"stop": 100},
         "iterations": 7,
         "output": {"checkpoint_every": 2, "history_every": 3, "save_renders": False},
     }
@@ -360,23 +264,9 @@ def configuration(tmp_path):
     return tmp_path / "a.yml"
 
 
-@pytest.fixture
-def saved(monkeypatch):
-    """The bytes of every checkpoint, as they were written; there are no reports."""
-    monkeypatch.setattr(fit_folder, "write_results", lambda *arguments: None)
-    saved, save = [], session.save_checkpoint
-
-    def save_and_remember(folder, *rest):
-        save(folder, *rest)
-        saved.append((folder / "checkpoint.npz").read_bytes())
-
-    monkeypatch.setattr(session, "save_checkpoint", save_and_remember)
-    return saved
-
-
-def spoil_photograph(monkeypatch, iteration):
-    """The photograph that the fit visits first in that iteration is NaN in one pixel."""
-    spoilt, load = view_of(iteration, 4, seed=0), session.load_dataset
+def spoil_photograph(monkeypatch):
+    """The photograph that the fit visits first in iteration 4 is NaN in one pixel."""
+    spoilt, load = view_of(4, 4, seed=0), session.load_dataset
 
     def load_and_spoil(config, **others):
         dataset = load(config, **others)
@@ -387,16 +277,16 @@ def spoil_photograph(monkeypatch, iteration):
         return replace(dataset, train=tuple(train))
 
     monkeypatch.setattr(session, "load_dataset", load_and_spoil)
-    return f"iteration {iteration}, view r_{spoilt}: the loss is nan"
+    return f"iteration 4, view r_{spoilt}: the loss is nan"
 
 
-def spoil_value(monkeypatch, iteration):
-    """After that iteration a scale is infinite."""
+def spoil_value(monkeypatch):
+    """After iteration 4 a scale is infinite."""
     step = Trainer.step
 
     def step_and_spoil(trainer):
         report = step(trainer)
-        if trainer.iteration == iteration:
+        if trainer.iteration == 4:
             poison_value(trainer, "log_scales", np.inf)
         return report
 
@@ -404,51 +294,42 @@ def spoil_value(monkeypatch, iteration):
     return f"after iteration 4: log_scales is inf in row {ROW}"
 
 
-def fails(capsys, *arguments):
-    with pytest.raises(SystemExit) as exit_info:
-        fit.main([str(argument) for argument in arguments])
-    assert exit_info.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line.removeprefix("error: ")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("spoil", [spoil_photograph, spoil_value])
 def test_stopped_fit_keeps_the_last_good_checkpoint_and_resumes(
-    monkeypatch, capsys, tmp_path, configuration, saved, spoil
+    monkeypatch, tmp_path, configuration, spoil
 ):
-    out = tmp_path / "out"
+    out, saved, save = tmp_path / "out", [], session.save_checkpoint
+
+    def save_and_remember(folder, *rest):
+        save(folder, *rest)
+        saved.append((folder / "checkpoint.npz").read_bytes())
+
     with monkeypatch.context() as spoiling:
-        expected = spoil(spoiling, iteration=4)
-        message = fails(capsys, configuration, "--out", out)
-    assert message.startswith(expected)
+        spoiling.setattr(session, "save_checkpoint", save_and_remember)
+        expected = spoil(spoiling)
+        message = run_fit(configuration, "--out", out).stderr
+    assert message.startswith(f"error: {expected}") and message.count("\n") == 1
     assert f"the last checkpoint is kept. --resume {out} --debug repeats this" in message
     assert visible(out) == {"checkpoint.npz", "config.yml"}
     assert [(out / "checkpoint.npz").read_bytes()] == saved  # that of iteration 2
-
-    fit.main(["--resume", str(out)])
-    assert "continues at iteration 2\n" in capsys.readouterr().out
-    fit.main([str(configuration), "--out", str(tmp_path / "good")])
+    assert "continues at iteration 2\n" in assert_fits("--resume", out).stdout
+    assert_fits(configuration, "--out", tmp_path / "good")
     expected = (tmp_path / "good" / "point_cloud.ply").read_bytes()
     assert (out / "point_cloud.ply").read_bytes() == expected
 
 
-def test_fit_stops_at_the_next_row_of_its_history(monkeypatch, capsys, tmp_path, configuration):
-    expected = spoil_photograph(monkeypatch, iteration=4)
-    steps, step = [], Trainer.step
-    monkeypatch.setattr(Trainer, "step", lambda self: steps.append(self) or step(self))
-    arguments = ("--set", "output.checkpoint_every=null")
-    message = fails(capsys, configuration, "--out", tmp_path / "out", *arguments)
-    assert message.startswith(expected)
-    assert len(steps) == 6  # history_every is 3
-
-
-def test_fault_in_the_last_iteration_leaves_no_results(
-    monkeypatch, capsys, tmp_path, configuration
+@pytest.mark.parametrize(
+    ("spoil", "iterations", "done"),
+    [(spoil_photograph, 7, 6), (spoil_value, 4, 4)],
+    ids=["at the next row of the history", "in the last iteration"],
+)
+def test_fit_without_checkpoints_stops_and_leaves_no_results(
+    monkeypatch, tmp_path, configuration, spoil, iterations, done
 ):
-    out = tmp_path / "out"
-    spoil_value(monkeypatch, iteration=4)
-    arguments = ("--set", "iterations=4", "--set", "output.checkpoint_every=null")
-    message = fails(capsys, configuration, "--out", out, *arguments)
-    assert message.startswith(f"after iteration 4: log_scales is inf in row {ROW}; nothing was")
-    assert visible(out) == {"config.yml"}
+    expected, steps, step = spoil(monkeypatch), [], Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda self: steps.append(self) or step(self))
+    few = ("--set", f"iterations={iterations}", "--set", "output.checkpoint_every=null")
+    outcome = run_fit(configuration, "--out", tmp_path / "out", *few)
+    assert outcome.returncode == 2 and outcome.stderr.startswith(f"error: {expected}")
+    assert len(steps) == done and visible(tmp_path / "out") == {"config.yml"}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
-import mitsuba as mi
-import numpy as np
 import pytest
 import yaml
 from support.small_capture import make_dataset, write_dataset
@@ -14,9 +11,6 @@ from drgs import fit
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
 from drgs.training import fit_folder
-from drgs.training.density.strategy import DensityStrategy
-from drgs.training.effects.base import TrainingEffect
-from drgs.training.losses import Loss
 
 CONFIG = {
     "data": {"path": "data"},
@@ -66,56 +60,6 @@ def test_callback_receives_each_iteration_and_may_end_the_fit(folder):
     assert result.gaussians.num_gaussians == reports[3].num_gaussians
     result.trainer.step()
     assert result.trainer.iteration == 5
-
-
-class Still(DensityStrategy):
-    """Leaves the population as it is."""
-
-
-class Blue(TrainingEffect):
-    """Renderings are compared without red and green."""
-
-    name = "blue"
-
-    def adjust(self, image, view):
-        return image * type(image)(mi.Float([0.0, 0.0, 1.0]), (1, 1, 3))
-
-
-class Squares(Loss):
-    """The mean squared error."""
-
-    def __call__(self, image, target):
-        return dr.mean(dr.square(image.array - target.image.array))
-
-
-def test_objects_override_configured_names(folder):
-    reports = []
-    plain = drgs.train(CONFIG)
-    assert plain.gaussians.num_gaussians != 40
-    objects = {"strategy": Still(), "effects": [Blue()], "loss": Squares()}
-    found = drgs.train(CONFIG, None, reports.append, **objects)
-    assert found.gaussians.num_gaussians == 40
-    (view,) = found.trainer.views[-1:]
-    image = dr.zeros(mi.TensorXf, (view.height, view.width, 3)) + 0.5
-    adjusted, loss, _ = found.trainer.compare(image, view)
-    expected = np.array([0, 0, 0.5]) - np.array(view.target.image)
-    assert np.array(adjusted)[0, 0].tolist() == [0, 0, 0.5]
-    assert float(loss[0]) == pytest.approx(np.square(expected).mean(), rel=1e-5)
-
-
-def test_folder_is_fitted_like_by_the_command(folder):
-    few = ["--set", "iterations=2", "--set", "output.save_renders=false"]
-    fit.main(["data", *few, "--out", "out"])
-    config = load_config("out/config.yml")
-    given = drgs.train("data", callback=lambda report: True).trainer.config
-    assert given.data == config.data and given.iterations == 4500
-
-
-def test_trainer_renders_test_views(folder):
-    result = drgs.train(CONFIG)
-    (view,) = drgs.load_dataset("data").test
-    (rendered,) = result.trainer.images((view,))
-    assert rendered.shape == view.image.shape
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,6 @@ from dataclasses import replace
 from functools import cache
 from unittest.mock import Mock
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
@@ -20,8 +18,6 @@ from drgs.core.errors import UserError
 from drgs.datasets.types import CameraMotion, Dataset, LazyImage, View
 from drgs.datasets.viewpoints import look_at, pinhole
 from drgs.initialization.start import initial_gaussians
-from drgs.integrator.scene import make_scene, make_sensors
-from drgs.splatting import rasterize
 from drgs.training import memory
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.parallel.communicator import Communicator
@@ -61,19 +57,12 @@ def estimated(config, dataset, scale=1.0):
     return memory.estimate(config, dataset, gaussians, TARGET_BYTES, scale)
 
 
-# ----------------------------------------------------------------------------------------------
-# The estimate
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("size", "start", "most", "views", "measured_mb"),
     [
         (100, 5_000, 10_000, 10, 271),
         (400, 50_000, 100_000, 20, 728),
         (800, 50_000, 100_000, 10, 1044),
-        pytest.param(400, 150_000, 300_000, 10, 1264, marks=pytest.mark.slow),
-        (1000, 10_000, 20_000, 20, 1431),
         (1000, 50_000, 100_000, 10, 1407),
         pytest.param(1000, 150_000, 300_000, 6, 2105, marks=pytest.mark.slow),
     ],
@@ -83,31 +72,6 @@ def test_estimates_are_what_was_measured(size, start, most, views, measured_mb):
     dataset = dataset_of(size, size, views)
     peak = estimated(config_of(start, most), dataset)
     assert (peak.required_bytes + peak.targets) / 2**20 == pytest.approx(measured_mb, rel=0.18)
-
-
-def test_entries_and_slots_at_the_start_are_those_of_a_rendering(monkeypatch):
-    mi.set_variant("llvm_ad_rgb")
-    dataset = dataset_of(200, 150, 8)
-    config = config_of(3000, 3000)
-    gaussians = initial_gaussians(config, dataset)
-    scene = make_scene(gaussians, config.model, (1.0, 1.0, 1.0))
-    slots, assign = [], rasterize.assign_slots
-
-    def assign_and_count(*arguments):
-        assigned = assign(*arguments)
-        slots.append(assigned.band.num_slots)
-        return assigned
-
-    monkeypatch.setattr(rasterize, "assign_slots", assign_and_count)
-    params, entries = mi.traverse(scene), []
-    for sensor in make_sensors(dataset.train):
-        dr.enable_grad(params["integrator.means"])
-        params.update()
-        dr.backward(dr.mean(mi.render(scene, params, sensor=sensor, spp=1).array))
-        frame = scene.integrator().state.cache.kept["frames 0"].value[0][0]
-        entries.append(frame.bins.num_entries)
-    found = memory._bytes_at_start(dataset.train, gaussians, 0.2, 1.0)
-    assert found == pytest.approx((max(entries), max(slots)), rel=0.1)
 
 
 def test_photographs_count_as_they_are_kept():
@@ -147,11 +111,6 @@ def test_a_population_grows_to_its_cap_if_there_is_time(changes, expected):
     assert memory.max_num_gaussians(config, 1000) == expected
 
 
-# ----------------------------------------------------------------------------------------------
-# Refusals
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def available(monkeypatch):
     """Sets how much memory a fit may take."""
@@ -189,31 +148,22 @@ def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
     assert shared.gaussians == pytest.approx(alone.gaussians / 4, abs=1)
     assert (shared.splats, shared.pixels) == (alone.splats, alone.pixels)
     assert shared.required_bytes < alone.required_bytes / 1.5
-    for factor, fits in ((2.1, True), (1.9, False)):
-        available(factor * shared.required_bytes)
-        arguments = config, dataset, gaussians, TARGET_BYTES, comm
-        if fits:
-            memory.room_for_targets(*arguments)
-            continue
-        with pytest.raises(UserError, match=r"a process of the fit needs .* for 1/4 of 1,000,000"):
-            memory.room_for_targets(*arguments)
+    available(2.1 * shared.required_bytes)
+    memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, comm)
+    available(1.9 * shared.required_bytes)
+    with pytest.raises(UserError, match=r"a process of the fit needs .* for 1/4 of 1,000,000"):
+        memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, comm)
 
 
 @pytest.mark.slow
-def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available):
-    """The advised number fits, and a quarter more does not."""
+def test_advised_number_of_gaussians_fits_and_a_quarter_more_does_not(available):
     config, dataset = config_of(10_000, 10**6), dataset_of(400, 400, 20)
     available(GB)
-    with pytest.raises(UserError) as error:
+    with pytest.raises(UserError, match=r"^memory: the fit needs about 2\.") as error:
         room(config, dataset)
     message = str(error.value)
-    assert message.startswith("memory: the fit needs about 2.")
-    assert (
-        ", and may take 1 GB, nine tenths of the available memory; set densify.max_gaussians="
-        in message
-    )
-    assert "\n" not in message and "1,000,000 Gaussians" in message
-    fewer = int(message.partition("max_gaussians=")[2].split()[0])
+    assert ", and may take 1 GB, nine tenths of the available memory; set " in message
+    fewer = int(message.partition("densify.max_gaussians=")[2].split()[0])
     room(config_of(10_000, fewer), dataset)
     with pytest.raises(UserError):
         room(config_of(10_000, fewer * 5 // 4), dataset)
@@ -222,31 +172,20 @@ def test_a_fit_that_does_not_fit_is_refused_with_numbers_and_remedies(available)
 def test_smaller_images_are_advised_where_they_help(available):
     config, dataset = config_of(10_000, 10_000), dataset_of(5376, 3024, 4)
     available(3 * GB)
-    with pytest.raises(UserError, match=r"set data\.image_size=") as error:
+    with pytest.raises(UserError, match=r"memory; set data\.image_size=") as error:
         room(config, dataset)
     width = int(str(error.value).rpartition("image_size=")[2])
-    assert 500 < width < 4000 and "max_gaussians" not in str(error.value)
     peak = estimated(config, dataset, scale=width / 5376)
     assert 2 * GB < peak.required_bytes < 3 * GB
 
 
-def test_nothing_is_advised_where_nothing_helps(available):
-    available(100_000_000)
-    with pytest.raises(UserError, match=r"available memory; use fewer views and Gaussians$"):
-        room(config_of(1000, 1000), dataset_of(20, 20, 4))
-
-
-def test_a_trainer_checks_memory_before_it_allocates(available):
-    mi.set_variant("llvm_ad_rgb")
+def test_trainer_refuses_a_fit_that_no_advice_helps(available):
     config, dataset = config_of(1000, 1000), dataset_of(20, 20, 4)
     available(100_000_000)
-    with pytest.raises(UserError, match=r"^memory: the fit needs about "):
+    message = r"^memory: the fit needs about .* available memory; use fewer views and Gaussians$"
+    with pytest.raises(UserError, match=message):
         Trainer(config, dataset, initial_gaussians(config, dataset))
 
-
-# ----------------------------------------------------------------------------------------------
-# The peak itself
-# ----------------------------------------------------------------------------------------------
 
 MEASURED = """
 import sys
@@ -268,8 +207,8 @@ def write_photographs(folder, size, count):
     y, x = np.mgrid[:size, :size]
     frames = []
     for index, view in enumerate(dataset_of(size, size, count - 2).train):
-        waves = [127 + 100 * np.sin(x / (7 + c) + index) * np.cos(y / (9 + c)) for c in range(3)]
-        Image.fromarray(np.stack(waves, axis=2).astype(np.uint8)).save(folder / f"{index}.jpg")
+        wave = (127 + 100 * np.sin(x / 7 + index) * np.cos(y / 9)).astype(np.uint8)
+        Image.fromarray(wave).convert("RGB").save(folder / f"{index}.jpg")
         pose = between_opencv_and_opengl(view.camera_to_world)
         frames.append({"file_path": f"{index}.jpg", "transform_matrix": pose.tolist()})
     values = {"camera_angle_x": math.radians(40), "frames": frames}

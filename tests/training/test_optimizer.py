@@ -8,15 +8,14 @@ import pytest
 from drjit.llvm.ad import Float, TensorXf, TensorXf64, UInt32
 from drjit.opt import Adam
 from support.populations import rows_of
+from support.small_fits import kernel_hashes
 
-from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training import optimizer as optimizer_module
 from drgs.training.optimizer import (
     LARGE_WIDTH,
     make_optimizer,
 )
-from drgs.training.rates import ExponentialDecay
 
 RATES = {name: 0.01 * (k + 1) for k, name in enumerate(PARAMETER_NAMES)}
 
@@ -64,43 +63,45 @@ def snapshot(optimizer):
     return result
 
 
+def stepped(num=4, count=1):
+    """An optimizer after some steps."""
+    optimizer = make_optimizer(parameters(num), RATES)
+    for seed in range(count):
+        step(optimizer, seed, np.arange(num))
+    return optimizer
+
+
 def test_make_optimizer_sets_rates_and_leaves_out_empty_parameters():
-    optimizer = make_optimizer(parameters(5, sh_rows=0), RATES, epsilon=1e-12)
-    assert isinstance(optimizer, Adam)
-    assert optimizer.epsilon == 1e-12
+    optimizer = make_optimizer(parameters(5, sh_rows=0), RATES)
+    # Gradients of a mean over pixels are far below Adam's usual epsilon of 1e-8.
+    assert isinstance(optimizer, Adam) and optimizer.epsilon == 1e-15
     assert list(optimizer.keys()) == list(PARAMETER_NAMES[:-1])
     for name in PARAMETER_NAMES[:-1]:
         assert optimizer.learning_rate(name) == RATES[name]
-
-
-def adam_and_ours(num):
-    """Both optimizers with the same parameters, whose harmonics are large."""
-    values = parameters(num)
-    assert dr.width(values["shN"]) > LARGE_WIDTH > dr.width(values["quats"])
-    plain = Adam(lr=0.0, epsilon=1e-15)
-    for name, value in values.items():
-        plain[name] = value
-        plain.set_learning_rate({name: RATES[name]})
-    return plain, make_optimizer(values, RATES)
+    with pytest.raises(ValueError, match="no learning rate for parameter quats"):
+        make_optimizer(parameters(2), {"means": 1.0})
 
 
 @pytest.mark.slow
 def test_steps_are_those_of_adam_and_use_large_gradients_up():
-    num = 25_000
-    plain, ours = adam_and_ours(num)
+    values = parameters(25_000)
+    assert dr.width(values["shN"]) > LARGE_WIDTH > dr.width(values["quats"])
+    plain, ours = Adam(lr=0.0, epsilon=1e-15), make_optimizer(values, RATES)
+    for name, value in values.items():
+        plain[name] = value
+        plain.set_learning_rate({name: RATES[name]})
     for seed in range(2):
         former = dict(ours.items())
         for optimizer in (plain, ours):
-            step(optimizer, seed, np.arange(num) % 100)
+            step(optimizer, seed, np.arange(25_000) % 100)
     for key, state in snapshot(ours).items():
-        for array, other in zip(state, snapshot(plain)[key], strict=True):
-            np.testing.assert_array_equal(array, other)
+        np.testing.assert_array_equal(np.stack(state), np.stack(snapshot(plain)[key]))
     left = {key for key, value in former.items() if np.any(np.array(dr.grad(value)))}
     assert left == set(ours) - {"shN"}
 
 
 def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
-    """Also after they were assigned, and while somebody else holds them."""
+    """Also after they were assigned, and while another array refers to them."""
     num, key = 25_000, "shN"
     results = []
     for large in (LARGE_WIDTH, 1 << 40):
@@ -117,53 +118,7 @@ def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
         step(optimizer, 3, np.arange(num + 7) % 100)
         results.append(snapshot(optimizer))
     for key, arrays in results[0].items():
-        for array, other in zip(arrays, results[1][key], strict=True):
-            np.testing.assert_array_equal(array, other)
-
-
-def test_a_step_waits_for_nothing(monkeypatch):
-    """Once it has large moments, it asks for no memory of theirs again."""
-    optimizer = make_optimizer(parameters(25_000), RATES)
-    asked = []
-    original = optimizer_module.same_memory
-    monkeypatch.setattr(
-        optimizer_module, "same_memory", lambda array: asked.append(0) or original(array)
-    )
-    for seed in range(3):
-        step(optimizer, seed, np.arange(25_000) % 100)
-        assert len(asked) == 2
-
-
-def test_a_step_takes_two_blocks_of_harmonics_less_than_that_of_adam():
-    num = 25_000
-    peaks = []
-    for optimizer in adam_and_ours(num):
-        dr.sync_thread()
-        dr.flush_malloc_cache()
-        clear_memory_peak()
-        before = memory_peak()
-        step(optimizer, 0, np.arange(num) % 100)
-        dr.sync_thread()
-        peaks.append(memory_peak() - before)
-        del optimizer
-    block = 1 << 23  # bytes: Dr.Jit's blocks are powers of two
-    assert block / 2 < 4 * 45 * num < block
-    # Arrays of the other parameters are of other sizes, and come and go at other times.
-    assert peaks[0] - peaks[1] > 1.5 * block, peaks
-
-
-def test_tiny_gradients_move_parameters():
-    # A gradient of 1e-10 is far below Adam's default epsilon of 1e-8; with 1e-15 the first step
-    # is one learning rate.
-    optimizer = make_optimizer({"means": dr.zeros(TensorXf, (2, 3))}, {"means": 0.5})
-    dr.set_grad(optimizer["means"], dr.full(TensorXf, 1e-10, (2, 3)))
-    optimizer.step()
-    np.testing.assert_allclose(optimizer["means"].numpy(), -0.5, rtol=1e-5)
-
-
-def test_missing_rate_is_refused_by_name():
-    with pytest.raises(ValueError, match="no learning rate for parameter quats"):
-        make_optimizer(parameters(2), {"means": 1.0})
+        np.testing.assert_array_equal(np.stack(arrays), np.stack(results[1][key]))
 
 
 @pytest.mark.parametrize("tensor_type", [TensorXf, TensorXf64])
@@ -189,69 +144,52 @@ def test_surviving_rows_continue_bitwise(tensor_type):
             assert array[:5].tobytes() == original[[0, 3, 4, 7, 19]].tobytes(), key
 
 
-def test_appended_rows_have_their_values_and_zero_moments():
-    optimizer = make_optimizer(parameters(4), RATES)
-    step(optimizer, 0, np.arange(4))
-    before = snapshot(optimizer)
-    new = parameters(3, seed=5)
-    rows_of(optimizer).edit(UInt32(3, 1), new)
-    after = snapshot(optimizer)
-    assert rows_of(optimizer).num_rows == 5
-    for name in PARAMETER_NAMES:
-        value, m, v = after[name]
-        np.testing.assert_array_equal(value[:2], before[name][0][[3, 1]])
-        np.testing.assert_array_equal(m[:2], before[name][1][[3, 1]])
-        np.testing.assert_array_equal(v[:2], before[name][2][[3, 1]])
-        np.testing.assert_array_equal(value[2:], new[name].numpy().reshape(3, -1))
-        assert (m[:2] != 0).all()
-        assert (v[:2] != 0).all()
-        assert (m[2:] == 0).all()
-        assert (v[2:] == 0).all()
-        assert optimizer[name].shape == (5, *row_shapes()[name])
-
-
-def test_edit_keeps_step_counts_rates_order_and_gradients():
-    optimizer = make_optimizer(parameters(4), RATES)
-    step(optimizer, 0, np.arange(4))
-    step(optimizer, 1, np.arange(4))
+def test_edit_appends_rows_with_zero_moments_and_keeps_counts_rates_and_order():
+    optimizer = stepped(count=2)
     optimizer.set_learning_rate({"means": 0.125})
-    keys = list(optimizer.keys())
-    rows_of(optimizer).edit(UInt32(2), parameters(2))
-    assert list(optimizer.keys()) == keys
-    assert optimizer.learning_rate("means") == 0.125
-    assert optimizer.learning_rate("quats") == RATES["quats"]
+    before, new, rates = snapshot(optimizer), parameters(3, seed=5), RATES | {"means": 0.125}
+    rows_of(optimizer).edit(UInt32(3, 1), new)
+    assert list(optimizer.keys()) == list(PARAMETER_NAMES)
     for name in PARAMETER_NAMES:
-        value, promoted, _, (t, _, _, _) = optimizer.state[name]
-        assert t[0] == 2
-        assert promoted is False
-        assert dr.grad_enabled(value)
+        value, *moments = snapshot(optimizer)[name]
+        np.testing.assert_array_equal(value[:2], before[name][0][[3, 1]])
+        np.testing.assert_array_equal(value[2:], new[name].numpy().reshape(3, -1))
+        for moment, former in zip(moments, before[name][1:], strict=True):
+            np.testing.assert_array_equal(moment[:2], former[[3, 1]])
+            assert (moment[:2] != 0).all() and (moment[2:] == 0).all()
+        assert optimizer[name].shape == (5, *row_shapes()[name])
+        assert optimizer.learning_rate(name) == rates[name]
+        assert optimizer.state[name][3][0][0] == 2 and dr.grad_enabled(optimizer[name])
 
 
 def test_edit_without_appending_and_without_keeping():
-    optimizer = make_optimizer(parameters(4), RATES)
+    optimizer = stepped()
     expected = snapshot(optimizer)["shN"][0][[2, 0]]
     rows_of(optimizer).edit(UInt32(2, 0))
     np.testing.assert_array_equal(snapshot(optimizer)["shN"][0], expected)
-
     new = parameters(3, seed=1)
     rows_of(optimizer).edit(UInt32(), new)
     np.testing.assert_array_equal(optimizer["means"].numpy(), new["means"].numpy())
     step(optimizer, 0, np.arange(3))
 
 
-def test_edit_refuses_misaligned_rows():
-    optimizer = make_optimizer(parameters(4), RATES)
-    with pytest.raises(ValueError, match="row numbers below 4"):
-        rows_of(optimizer).edit(UInt32(0, 4))
-    with pytest.raises(ValueError, match="at least one row must remain"):
-        rows_of(optimizer).edit(UInt32())
-    incomplete = parameters(2)
-    del incomplete["quats"]
-    with pytest.raises(ValueError, match=r"rows of quats must have the shape \(2, 4\), got none"):
-        rows_of(optimizer).edit(UInt32(0), incomplete)
-    uneven = parameters(2) | {"sh0": parameters(3)["sh0"]}
-    with pytest.raises(ValueError, match=r"rows of means must have the shape \(3, 3\)"):
-        rows_of(optimizer).edit(UInt32(0), uneven)
+WITHOUT_QUATS = {name: value for name, value in parameters(2).items() if name != "quats"}
+
+REFUSED_EDITS = [
+    ([0, 4], None, "row numbers below 4"),
+    ([], None, "at least one row must remain"),
+    ([0], WITHOUT_QUATS, r"rows of quats must have the shape \(2, 4\), got none"),
+    (
+        *([0], parameters(2) | {"sh0": parameters(3)["sh0"]}),
+        r"rows of means must have the shape \(3, 3\)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("keep", "append", "message"), REFUSED_EDITS)
+def test_misaligned_rows_are_refused(keep, append, message):
+    with pytest.raises(ValueError, match=message):
+        rows_of(stepped()).edit(UInt32(keep), append)
 
 
 def test_later_edits_of_other_sizes_compile_no_kernel():
@@ -260,59 +198,26 @@ def test_later_edits_of_other_sizes_compile_no_kernel():
         # Memory of Dr.Jit's own: kernels that read numpy's also depend on its alignment.
         new = {name: value + 1 for name, value in parameters(added).items()}
         dr.eval(new)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            rows_of(optimizer).edit(dr.arange(UInt32, keep), new)
-            history = dr.kernel_history([dr.KernelType.JIT])
-        return {kernel["hash"] for kernel in history}
+        return kernel_hashes(lambda: rows_of(optimizer).edit(dr.arange(UInt32, keep), new))
 
     first = kernels(40, 30, 9)
-    assert len(first) > 0
-    assert kernels(70, 41, 22) == first
+    assert first and kernels(70, 41, 22) == first
 
 
-def test_taken_rows_are_detached_copies():
-    values = parameters(5)
-    optimizer = make_optimizer(values, RATES)
-    rows = rows_of(optimizer).take(UInt32(4, 4, 1))
-    for name in PARAMETER_NAMES:
-        assert rows[name].shape == (3, *row_shapes()[name])
-        np.testing.assert_array_equal(rows[name].numpy(), values[name].numpy()[[4, 4, 1]])
-        assert not dr.grad_enabled(rows[name])
-
-
-def test_replaced_values_keep_step_count_and_rate_but_not_moments():
-    optimizer = make_optimizer(parameters(4), RATES)
-    step(optimizer, 0, np.arange(4))
-    rows_of(optimizer).replace("logit_opacities", Float(1, 2, 3, 4))
-    value, _, rate, (t, m, v, _) = optimizer.state["logit_opacities"]
+@pytest.mark.parametrize("keeps_moments", [False, True], ids=["replace", "set_values"])
+def test_new_values_keep_step_count_and_rate(keeps_moments):
+    """``set_values`` keeps the moments as well."""
+    optimizer = stepped()
+    before, rows = snapshot(optimizer), rows_of(optimizer)
+    act = rows.set_values if keeps_moments else rows.replace
+    act("logit_opacities", Float(1, 2, 3, 4))
+    value, _, rate, (t, _, _, _) = optimizer.state["logit_opacities"]
     np.testing.assert_array_equal(value.numpy(), [1, 2, 3, 4])
-    assert rate == RATES["logit_opacities"]
-    assert t[0] == 1
-    assert not m.numpy().any()
-    assert not v.numpy().any()
-    assert dr.grad_enabled(value)
-    # The others keep theirs.
-    assert snapshot(optimizer)["means"][1].all()
+    assert rate == RATES["logit_opacities"] and t[0] == 1 and dr.grad_enabled(value)
+    after = snapshot(optimizer)
+    for k in (1, 2):
+        expected = before["logit_opacities"][k] * keeps_moments
+        np.testing.assert_array_equal(after["logit_opacities"][k], expected)
+        np.testing.assert_array_equal(after["means"][k], before["means"][k])
     with pytest.raises(ValueError, match=r"has shape \(4,\), the new values \(3,\)"):
-        rows_of(optimizer).replace("logit_opacities", Float(1, 2, 3))
-
-
-def test_decay_is_a_straight_line_in_the_logarithm():
-    rate = ExponentialDecay(1.6e-4, 1.6e-6, ((0, 30_000),))
-    assert rate(0) == pytest.approx(1.6e-4)
-    assert rate(15_000) == pytest.approx(1.6e-5)
-    assert rate(30_000) == rate(40_000) == pytest.approx(1.6e-6)
-    ratios = [rate(i + 1) / rate(i) for i in (0, 10_000, 29_999)]
-    np.testing.assert_allclose(ratios, 0.01 ** (1 / 30_000), rtol=1e-12)
-    with pytest.raises(ValueError, match="must be > 0"):
-        ExponentialDecay(1e-3, 0.0, ((0, 10),))
-
-
-def test_a_decay_that_is_revised_spreads_what_is_left():
-    """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
-    rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
-    once = ExponentialDecay(1.0, 1e-4, ((0, 100),))
-    assert [rate(i) for i in range(51)] == [once(i) for i in range(51)]
-    exponents = [math.log10(rate(i)) for i in (50, 75, 100, 150, 200)]
-    np.testing.assert_allclose(exponents, [-2, -2.5, -3, -4, -4], rtol=1e-12)
+        act("logit_opacities", Float(1, 2, 3))

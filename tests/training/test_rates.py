@@ -1,140 +1,72 @@
-"""Learning rates over a fit, and steps of several views."""
+"""Learning rates over a fit."""
 
-import drjit as dr
-import mitsuba as mi
+import math
+
 import numpy as np
 import pytest
 from support.trainers import make_trainer
 
-from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.config.schema import FitConfig
+from drgs.training.rates import ExponentialDecay, rates_over_time
+
+EXTENT = 2.5
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
+def rates_of(decay, decay_from=0.4):
+    optimizer = {"decay": decay, "decay_from": decay_from}
+    config = FitConfig(data={"path": "."}, iterations=50, optimizer=optimizer, coarse=[])
+    return config.optimizer, rates_over_time(config, EXTENT)
 
 
-FIXED_POPULATION = {"start": 1, "stop": 2}
-"""The population does not change."""
-
-
-def rates_of(trainer):
-    return {
-        name: float(np.array(trainer.optimizer.state[name][2]).ravel()[0])
-        for name in trainer.optimizer.state
-    }
-
-
-@pytest.mark.slow
 def test_rates_decay_to_a_fraction_after_a_share_of_the_fit():
-    trainer = make_trainer(optimizer={"decay": 0.1, "decay_from": 0.4}, densify=FIXED_POPULATION)
-    rates = []
-    for _ in range(50):
-        trainer.step()
-        rates.append(rates_of(trainer))
-    config = trainer.config.optimizer
+    config, rates = rates_of(0.1)
     for name, first in (("sh0", config.sh0_lr), ("log_scales", config.scales_lr)):
-        measured = np.array([rate[name] for rate in rates])
-        np.testing.assert_allclose(measured[:20], first, rtol=1e-6)
+        found = [rates(iteration)[name] for iteration in range(1, 51)]
+        np.testing.assert_allclose(found[:20], first, rtol=1e-12)
         # From iteration 20 to 50, in equal ratios.
-        expected = first * 10 ** (-np.arange(1, 31) / 30)
-        np.testing.assert_allclose(measured[20:], expected, rtol=1e-5)
-    means = np.array([rate["means"] for rate in rates])
-    np.testing.assert_allclose(
-        means, 3.2e-4 * trainer.extent * 100.0 ** (-np.arange(1, 51) / 50), rtol=1e-5
-    )
+        np.testing.assert_allclose(found[20:], first * 10 ** (-np.arange(1, 31) / 30), rtol=1e-12)
+    found = [rates(iteration)["means"] for iteration in range(1, 51)]
+    expected = config.means_lr * EXTENT * 100.0 ** (-np.arange(1, 51) / 50)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_rates_are_constant_without_a_decay():
-    trainer = make_trainer(densify=FIXED_POPULATION, optimizer={"decay": 1.0})
-    before = rates_of(trainer)
-    for _ in range(50):
-        trainer.step()
-    after = rates_of(trainer)
-    assert {k: v for k, v in after.items() if k != "means"} == {
-        k: v for k, v in before.items() if k != "means"
+    _, rates = rates_of(1.0)
+    first, last = rates(1), rates(50)
+    assert {k: v for k, v in first.items() if k != "means"} == {
+        k: v for k, v in last.items() if k != "means"
     }
 
 
-@pytest.mark.slow
 def test_revised_plan_keeps_past_rates():
-    changes = {"optimizer": {"decay": 0.1, "decay_from": 0.2}, "densify": FIXED_POPULATION}
+    changes = {"optimizer": {"decay": 0.1, "decay_from": 0.2}, "densify": {"start": 1, "stop": 2}}
     trainer = make_trainer(**changes)
-    past = []
-    for _ in range(30):
-        trainer.step()
-        past.append(rates_of(trainer))
-    trainer.reschedule(40, trainer.config.densify.stop)
-    replayed = make_trainer(**trainer.config.model_dump(mode="json"))
-    for expected in past:
-        replayed.step()
-        assert rates_of(replayed) == pytest.approx(expected, rel=1e-6)
+    trainer.iteration, before = 30, trainer.rates
+    trainer.reschedule(40, 2)
+    after = rates_over_time(trainer.config, trainer.extent)
+    for iteration in range(1, 31):
+        assert after(iteration) == pytest.approx(before(iteration), rel=1e-12)
     assert trainer.rates(40)["sh0"] == pytest.approx(0.1 * trainer.config.optimizer.sh0_lr)
+    trainer.iteration = 45
+    with pytest.raises(ValueError, match="cannot change from 2 to 44 after iteration 45"):
+        trainer.reschedule(50, 44)
 
 
-AVERAGED_VIEWS = {"views": 3, "views_from": 0.5, "decay": 1.0}
+def test_decay_is_a_straight_line_in_the_logarithm():
+    rate = ExponentialDecay(1.6e-4, 1.6e-6, ((0, 30_000),))
+    assert rate(0) == pytest.approx(1.6e-4)
+    assert rate(15_000) == pytest.approx(1.6e-5)
+    assert rate(30_000) == rate(40_000) == pytest.approx(1.6e-6)
+    ratios = [rate(i + 1) / rate(i) for i in (0, 10_000, 29_999)]
+    np.testing.assert_allclose(ratios, 0.01 ** (1 / 30_000), rtol=1e-12)
+    with pytest.raises(ValueError, match="must be > 0"):
+        ExponentialDecay(1e-3, 0.0, ((0, 10),))
 
 
-@pytest.mark.slow
-def test_step_of_several_views_uses_their_mean_gradient():
-    """Iterations 27, 28, 29 -> a step at 30: Adam by hand, from gradients of single views."""
-    trainer = make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION)
-    while trainer.iteration < 27:
-        trainer.step()
-    name = "log_scales"
-    before = np.array(dr.detach(trainer.optimizer[name]), np.float64)
-    _, _, rate, (t, m, v, _) = trainer.optimizer.state[name]
-    m, v = np.array(m, np.float64), np.array(v, np.float64)
-
-    gradients = []
-    for k in range(3):
-        alone = make_trainer(densify=FIXED_POPULATION)
-        alone.restore(trainer.state())
-        alone.iteration += k
-        parameters = alone.params[name]
-        steps = []
-        alone.optimizer.step = lambda p=parameters, s=steps: s.append(np.array(dr.grad(p)))
-        alone.step()
-        gradients.append(steps[0].ravel().astype(np.float64))
-    for _ in range(2):
-        trainer.step()
-        assert np.array_equal(np.array(dr.detach(trainer.optimizer[name])), before)
-    trainer.step()
-
-    g, t = np.mean(gradients, axis=0), int(np.array(t).ravel()[0]) + 1
-    m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
-    change = m / (1 - 0.9**t) / (np.sqrt(v / (1 - 0.999**t)) + 1e-15)
-    expected = before.ravel() - float(np.array(rate).ravel()[0]) * change
-    got = np.array(dr.detach(trainer.optimizer[name]), np.float64).ravel()
-    # Single precision of values of about 3, and of gradients that are summed in another order.
-    np.testing.assert_allclose(got, expected, atol=2e-6)
-    assert np.abs(got - before.ravel()).max() > 1e-3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stopped", [26, 27, 28, 29])
-def test_fit_resumed_within_a_step_continues_to_the_same_bytes(stopped):
-    uninterrupted, first = (
-        make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION) for _ in range(2)
-    )
-    for _ in range(stopped):
-        uninterrupted.step()
-        first.step()
-    second = make_trainer(optimizer=AVERAGED_VIEWS, densify=FIXED_POPULATION)
-    second.restore(first.state())
-    for _ in range(5):
-        uninterrupted.step()
-        second.step()
-    expected, got = uninterrupted.gaussians(), second.gaussians()
-    for name in PARAMETER_NAMES:
-        assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
-
-
-def test_views_are_averaged_only_after_the_last_density_change():
-    trainer = make_trainer(optimizer={"views": 4, "views_from": 0.2}, densify={"stop": 30})
-    counts = []
-    for iteration in range(1, 51):
-        trainer.iteration = iteration
-        counts.append(trainer.last_step.num_averaged)
-    assert counts == [1] * 30 + [4] * 20  # at 30, rows may change for the last time
+def test_a_decay_that_is_revised_spreads_what_is_left():
+    """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
+    rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
+    once = ExponentialDecay(1.0, 1e-4, ((0, 100),))
+    assert [rate(i) for i in range(51)] == [once(i) for i in range(51)]
+    exponents = [math.log10(rate(i)) for i in (50, 75, 100, 150, 200)]
+    np.testing.assert_allclose(exponents, [-2, -2.5, -3, -4, -4], rtol=1e-12)

@@ -10,12 +10,11 @@ from functools import cache
 import numpy as np
 import pytest
 from support import small_capture as capture
-from support.small_fits import double
+from support.small_fits import true_dataset
 
 import drgs
 from drgs.core.origin import MAX_SCENE_SIZES, WORLD
 from drgs.datasets import Dataset, load_dataset
-from drgs.reference import splatting as reference
 
 CASES = {
     "budget": {},
@@ -32,25 +31,6 @@ MIN_EQUAL_PSNR_DB = 40.0
 program is not in proportion to the scene."""
 
 
-@cache
-def photographed() -> Dataset:
-    """Blobs, with alpha and depth."""
-    blobs = double(capture.blobs())
-
-    def seen(view):
-        camera = reference.Camera(
-            view.camera_to_world[:3, :3].T, view.center, view.fx, view.fy, view.cx, view.cy,
-            view.width, view.height, 0.2,
-        )  # fmt: skip
-        rendered = reference.render(blobs, camera, np.ones(3))
-        alpha = rendered.alpha.astype(np.float32)
-        depth = np.where(alpha > 0.99, rendered.depth, 0).astype(np.float32)
-        return replace(view, image=rendered.image.astype(np.float32), alpha=alpha, depth=depth)
-
-    noise = capture.make_dataset(train=10, test=3)
-    return replace(noise, train=tuple(map(seen, noise.train)), test=tuple(map(seen, noise.test)))
-
-
 def scaled(unit: float) -> Dataset:
     """The dataset in a unit of length that is 1 / unit as long."""
 
@@ -59,10 +39,9 @@ def scaled(unit: float) -> Dataset:
         pose[:3, 3] *= unit
         return replace(view, camera_to_world=pose, depth=np.float32(unit) * view.depth)
 
-    dataset = photographed()
-    return replace(
-        dataset, train=tuple(map(moved, dataset.train)), test=tuple(map(moved, dataset.test))
-    )
+    dataset = true_dataset()
+    train, test = (tuple(map(moved, views)) for views in (dataset.train, dataset.test))
+    return replace(dataset, train=train, test=test)
 
 
 def images_and_result(case: str, dataset: Dataset):
@@ -80,7 +59,7 @@ def images_and_result(case: str, dataset: Dataset):
 
 @cache
 def fit_at_unit_scale(case: str):
-    return images_and_result(case, photographed())
+    return images_and_result(case, true_dataset())
 
 
 @pytest.mark.slow
@@ -96,14 +75,28 @@ def test_fit_is_invariant_to_units(case, unit):
     )
 
 
+def write_and_load(folder, dataset: Dataset) -> Dataset:
+    """Half transparent photographs in the NeRF-synthetic layout; then the true ones."""
+    capture.write_dataset(folder, dataset)
+    loaded = replace(load_dataset(folder), start_half_extent=None)  # which is about the origin
+    for name in ("train", "test"):
+        pairs = zip(getattr(loaded, name), getattr(dataset, name), strict=True)
+        views = tuple(replace(view, image=true.image, alpha=true.alpha) for view, true in pairs)
+        loaded = replace(loaded, **{name: views})
+    return loaded
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["budget", "refined cameras", "visual hull"])
 def test_fit_is_invariant_to_the_origin(case, tmp_path):
     """From files, whose cameras are in Earth-centred coordinates."""
     place = np.array([4.2e6, 1.7e5, -4.78e6])
-    dataset = photographed()
+    dataset = true_dataset()
     near = write_and_load(tmp_path / "near", dataset)
-    far = write_and_load(tmp_path / "far", moved_to(dataset, place))
+    train, test = (
+        tuple(view.with_offset(place) for view in views) for views in (dataset.train, dataset.test)
+    )
+    far = write_and_load(tmp_path / "far", replace(dataset, train=train, test=test))
     assert near.origin == WORLD
     assert np.abs(np.array(far.origin) - place).max() < 10 < MAX_SCENE_SIZES
     assert "far from the origin: coordinates are relative to (42" in far.description
@@ -115,26 +108,8 @@ def test_fit_is_invariant_to_the_origin(case, tmp_path):
     np.testing.assert_allclose(middle, np.median(gaussians.means, axis=0), atol=0.1)
 
 
-def moved_to(dataset: Dataset, place: np.ndarray) -> Dataset:
-    views = (tuple(v.with_offset(place) for v in views) for views in (dataset.train, dataset.test))
-    return replace(dataset, **dict(zip(("train", "test"), views, strict=True)))
-
-
-def write_and_load(folder, dataset: Dataset) -> Dataset:
-    """Half transparent photographs in the NeRF-synthetic layout; then the true ones."""
-    capture.write_dataset(folder, dataset)
-    loaded = replace(load_dataset(folder), start_half_extent=None)  # which is about the origin
-    for name in ("train", "test"):
-        true = getattr(photographed(), name)
-        views = zip(getattr(loaded, name), true, strict=True)
-        loaded = replace(
-            loaded, **{name: tuple(replace(v, image=t.image, alpha=t.alpha) for v, t in views)}
-        )
-    return loaded
-
-
 def test_extent_with_one_training_camera_uses_all_cameras():
-    dataset = photographed()
+    dataset = true_dataset()
     one = replace(dataset, train=dataset.train[:1])
     centers = np.stack([v.center for v in (*one.train, *one.test)])
     expected = 1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()

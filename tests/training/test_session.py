@@ -21,11 +21,6 @@ from drgs.training.losses import Loss
 from drgs.training.session import FitSession
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.slow
 def test_session_without_a_folder_writes_and_prints_nothing(tmp_path, capsys):
     config = load_config(write_project(tmp_path))
@@ -58,13 +53,16 @@ class Halves(DensityStrategy):
         return DensityReport(num_gaussians=len(kept))
 
 
-class Counted(TrainingEffect):
-    """Counts the views that it sees."""
+class Blue(TrainingEffect):
+    """Renderings are compared without red and green; counts the views that it sees."""
 
-    name, count = "counted", 0
+    name, count = "blue", 0
 
     def before_render(self, fit, view):
         self.count += 1
+
+    def adjust(self, image, view):
+        return image * type(image)(mi.Float([0.0, 0.0, 1.0]), (1, 1, 3))
 
 
 class Squares(Loss):
@@ -75,12 +73,17 @@ class Squares(Loss):
 
 
 @pytest.mark.slow
-def test_other_trainers_of_a_session_get_copies_of_its_objects(tmp_path):
+def test_objects_are_used_and_other_trainers_get_copies_of_them(tmp_path):
     """A rehearsal gets all of them; Gaussians for viewers, whose number stays, no strategy."""
-    config, effect = load_config(write_project(tmp_path)), Counted()
+    config, effect = load_config(write_project(tmp_path)), Blue()
     session = FitSession(config, strategy=Halves(), effects=[effect], loss=Squares())
     session.prepare()
     assert session.run() and effect.count == VALUES["iterations"]
+    view = session.trainer.views[-1]
+    image = dr.zeros(mi.TensorXf, (view.height, view.width, 3)) + 0.5
+    _, loss, _ = session.trainer.compare(image, view)
+    expected = np.square(np.array([0, 0, 0.5]) - np.array(view.target.image)).mean()
+    assert float(loss[0]) == pytest.approx(expected, rel=1e-5)
     dataset, start = session.dataset, session.trainer.gaussians()
     objects = session.strategy, session.effects, session.loss
     rehearsal, _ = rehearse(session.config, dataset, start, None, *objects)
@@ -88,7 +91,7 @@ def test_other_trainers_of_a_session_get_copies_of_its_objects(tmp_path):
     assert type(rehearsal.density) is Halves is not type(further.density)
     assert rehearsal.num_gaussians == start.num_gaussians // 2
     for trainer in (rehearsal, further):
-        assert type(trainer.loss) is Squares and type(trainer.effects[0]) is Counted
+        assert type(trainer.loss) is Squares and type(trainer.effects[0]) is Blue
         assert trainer.loss is not session.loss and trainer.effects[0] is not effect
     assert effect.count == VALUES["iterations"] < rehearsal.effects[0].count
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -11,11 +10,6 @@ from support import small_fits as fits
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training.steps import step_of, view_of
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def make_trainer(views_per_step, dataset=None, **changes):
@@ -91,37 +85,30 @@ def test_step_is_adam_on_the_mean_gradient_with_scaled_rates_and_decays():
             assert np.abs(got - expected).mean() < 1e-3 * np.abs(expected).mean(), name
 
 
-def test_report_is_the_mean_over_the_views():
-    trainer, alone = make_trainer(3), make_trainer(1)
-    losses, psnrs = [], []
+def test_report_is_the_mean_of_single_views_and_statistics_are_their_sum():
+    settings = {"densify__start": 1, "densify__stop": 100, "densify__every": 50}
+    trainer, dataset, reports, norms = make_trainer(3, **settings), fits.plain_dataset(), [], 0.0
     for index in (view_of(i, 6, 0, 3) for i in (1, 2, 3)):
-        fits_one = fits.make_trainer(
-            replace(fits.plain_dataset(), train=(fits.plain_dataset().train[index],))
-        )
-        report = fits_one.step()
-        losses.append(report.loss)
-        psnrs.append(report.psnr)
+        alone = make_trainer(1, replace(dataset, train=(dataset.train[index],)), **settings)
+        reports.append(alone.step())
+        norms = norms + alone.state()["density/gradient_norms"].astype(np.float64)
     report = trainer.step()
     # Single precision.
-    assert report.loss == pytest.approx(np.mean(losses), rel=1e-6)
-    assert report.psnr == pytest.approx(np.mean(psnrs), abs=1e-5)
-    assert len({alone.step().loss for _ in range(2)}) == 2
-
-
-def test_density_statistics_are_those_of_single_views():
-    """The same after a step of three views as of each of them alone, and not a third."""
-    settings = {"densify__start": 1, "densify__stop": 100, "densify__every": 50}
-    trainer = make_trainer(3, **settings)
-    norms = 0.0
-    for index in (view_of(i, 6, 0, 3) for i in (1, 2, 3)):
-        one = replace(fits.plain_dataset(), train=(fits.plain_dataset().train[index],))
-        alone = fits.make_trainer(one, **settings)
-        alone.step()
-        norms = norms + alone.state()["density/gradient_norms"].astype(np.float64)
-    trainer.step()
+    assert report.loss == pytest.approx(np.mean([each.loss for each in reports]), rel=1e-6)
+    assert report.psnr == pytest.approx(np.mean([each.psnr for each in reports]), abs=1e-5)
+    assert len({each.loss for each in reports}) == 3
     # Single precision: gradients that were divided by three, and multiplied again.
     np.testing.assert_allclose(trainer.state()["density/gradient_norms"], norms, rtol=1e-4)
     assert norms.max() > 0
+
+
+def test_image_size_changes_with_the_first_step_after_a_stage():
+    trainer = make_trainer(4, coarse=[{"until": 6, "factor": 2}])
+    steps = [trainer.plan(iteration) for iteration in (1, 5, 9, 13)]
+    whole = fits.plain_dataset().train[0].width
+    widths = [step.views[-1].view.width for step in steps]
+    assert widths == [whole // 2, whole // 2, whole, whole]
+    assert [step.begins_stage for step in steps] == [False, False, True, False]
 
 
 def test_density_change_due_within_a_step_follows_the_step():
@@ -134,52 +121,6 @@ def test_density_change_due_within_a_step_follows_the_step():
         if report.density is not None:
             changes.append(report.iteration)
     assert changes == [8, 12, 20]  # of iterations 6, 12, 18 and 20
-
-
-def test_image_size_changes_with_the_first_step_after_a_stage():
-    trainer = make_trainer(4, coarse=[{"until": 6, "factor": 2}])
-    widths, begun = [], []
-    for _ in range(4):
-        report = trainer.step()
-        widths.append(trainer.last_step.views[-1].view.width)
-        begun.append(trainer.last_step.begins_stage)
-        assert trainer.iteration == report.iteration
-    whole = fits.plain_dataset().train[0].width
-    assert widths == [whole // 2, whole // 2, whole, whole]
-    assert begun == [False, False, True, False]
-
-
-EFFECTS = {
-    "colors__lr": 0.02,
-    "cameras__optimise": True,
-    "cameras__focal_lr": 1e-3,
-    "model__smoothing": True,
-    "data__random_background": True,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {
-            "densify__strategy": strategy,
-            "densify__start": 2,
-            "densify__stop": 30,
-            "densify__every": 5,
-        }
-        for strategy in ("adc", "budget", "mcmc")
-    ]
-    + [EFFECTS, {"coarse": [{"until": 6, "factor": 2}], "optimizer__views": 8}],
-    ids=["adc", "budget", "mcmc", "effects", "coarse"],
-)
-def test_resumed_fit_continues_to_the_same_bytes(changes):
-    dataset = fits.true_dataset() if changes is EFFECTS else None
-
-    def make():
-        return make_trainer(4, dataset, iterations=40, **changes)
-
-    fits.assert_resumes_to_the_same_bytes(make, 3, 4)
 
 
 def test_effects_use_the_same_parameters_for_all_views_of_a_step():
@@ -213,6 +154,41 @@ def test_late_steps_consist_of_whole_steps():
         trainer.step()
         counts.append(trainer.last_step.num_averaged)
     assert counts == [6] * 6 and steps == [306, 312]
+
+
+def test_late_step_uses_the_mean_gradient_of_its_views():
+    late = {"optimizer__views": 3, "optimizer__views_from": 0.5, "iterations": 10}
+    trainer = make_trainer(1, **late, densify__start=1, densify__stop=2)
+    trainer.iteration, trainer.integrator.sh_degree = 6, 1
+    views = [trainer.plan(iteration).views[0].view for iteration in (7, 8, 9)]
+    gradients = [fits.gradients_of_loss(trainer, view) for view in views]
+    dr.set_grad(trainer.optimizer, 0)
+    found = []
+    trainer.optimizer.step = lambda: found.append(
+        {name: np.array(dr.grad(value)) for name, value in trainer.optimizer.items()}
+    )
+    fits.steps(trainer, 3)
+    (found,) = found
+    for name, values in found.items():
+        expected = np.mean([gradient[name] for gradient in gradients], axis=0)
+        # Sums in another order, in single precision.
+        np.testing.assert_allclose(values, expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("densify", "first"),
+    [
+        ({"stop": 30}, 31),
+        ({"stop": 14, "prune__to": 20, "prune__stop": 24}, 25),
+    ],
+)
+def test_views_are_averaged_only_after_the_last_density_change(densify, first):
+    densify = {f"densify__{name}": value for name, value in {"start": 2, **densify}.items()}
+    trainer = make_trainer(
+        1, iterations=50, optimizer__views=4, optimizer__views_from=0.2, **densify
+    )
+    counts = [trainer.plan(iteration).num_averaged for iteration in range(1, 51)]
+    assert counts == [1] * (first - 1) + [4] * (51 - first)
 
 
 def test_late_steps_must_be_a_multiple():

@@ -34,14 +34,6 @@ def test_mean_count_over_many_keys_is_the_weight():
     assert (np.abs(np.mean(drawn, axis=0) - shares) <= 6 * deviation + 1e-12).all()
 
 
-def test_equal_keys_give_equal_samples_and_other_keys_differ():
-    weights = np.random.default_rng(1).random(1000)
-    first = sample_in_proportion(weights, 100, [0, 5])
-    np.testing.assert_array_equal(sample_in_proportion(weights, 100, [0, 5]), first)
-    assert (sample_in_proportion(weights, 100, [0, 6]) != first).any()
-    assert (sample_in_proportion(weights, 100, [1, 5]) != first).any()
-
-
 def test_nan_weights_count_as_zero():
     weights = np.array([np.nan, 0.0, 1e-300, -1.0, np.nan])
     np.testing.assert_array_equal(sample_in_proportion(weights, 3, [0, 0]), [2, 2, 2])
@@ -91,15 +83,12 @@ def test_normals_are_independent_standard_normal_numbers(float_type):
 
 
 def test_normals_have_the_same_bits_with_any_number_of_threads():
-    def bytes_of(threads):
-        before = dr.thread_count()
+    threads, found = dr.thread_count(), set()
+    try:
+        for count in (1, 2):
+            dr.set_thread_count(count)
+            rows, key = dr.arange(UInt32, 10_000), dr.opaque(UInt32, 9)
+            found.add(np.array(normals(Float, rows, key, key)).tobytes())
+    finally:
         dr.set_thread_count(threads)
-        try:
-            drawn = normals(
-                Float, dr.arange(UInt32, 10_000), dr.opaque(UInt32, 9), dr.opaque(UInt32, 4)
-            )
-            return np.array(drawn).tobytes()
-        finally:
-            dr.set_thread_count(before)
-
-    assert bytes_of(1) == bytes_of(2) == bytes_of(1)
+    assert len(found) == 1

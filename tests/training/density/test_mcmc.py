@@ -1,6 +1,7 @@
 """Relocation, growth, noise and regularisers of the strategy ``mcmc``."""
 
 import math
+from functools import partial
 
 import drjit as dr
 import numpy as np
@@ -9,6 +10,7 @@ from drjit.llvm.ad import TensorXf64
 from scipy.integrate import quad
 from scipy.special import expit
 from support.populations import EXTENT, make, moments, rows_of, values
+from support.small_fits import kernel_hashes
 
 from drgs.config.density import DensifyConfig
 from drgs.core.errors import UserError
@@ -32,7 +34,6 @@ def act(optimizer, iteration=600, seed=0, **config):
     return strategy(**config).refine(rows_of(optimizer, seed), iteration)
 
 
-# ---- what copies look like
 @pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
 def test_copies_composite_to_the_original_opacity(opacity, count):
@@ -45,18 +46,6 @@ def test_copies_composite_to_the_original_opacity(opacity, count):
     assert factor * composited == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-9)
 
 
-def test_copies_beyond_the_maximum_count_as_the_maximum():
-    for numbers in correct_copies(np.array([0.7] * 2), np.array([1000, MAX_COPIES])):
-        assert numbers[0] == numbers[1]
-
-
-def test_opacity_of_one_has_finite_copies():
-    copies, factors = correct_copies(np.array([1.0]), np.array([2]))
-    assert 0.99 < copies[0] < 1
-    assert 0 < factors[0] < 1
-
-
-# ---- relocation
 def test_transparent_gaussians_become_copies_of_opaque_ones():
     optimizer = make([SIZE] * 6, [0.5, DEAD, 0.0051, DEAD, 0.6, DEAD], tensor_type=TensorXf64)
     before, kept_moments = values(optimizer), moments(optimizer, "quats")
@@ -90,23 +79,6 @@ def test_transparent_gaussians_become_copies_of_opaque_ones():
             assert not moment[len(untouched) :].any()
     for moment, former in zip(moments(optimizer, "quats"), kept_moments, strict=True):
         np.testing.assert_array_equal(moment[: len(untouched)], former[untouched])
-
-
-def test_relocation_nearly_preserves_the_image():
-    # Seen from far away, whatever the direction: a splat and its copies.
-    camera = reference.Camera(np.eye(3), np.array([0.0, 0, -4]), 40.0, 40.0, 12.0, 12.0, 24, 24)
-    optimizer = make([0.3, 0.3], [DEAD, 0.8], tensor_type=TensorXf64, seed=3)
-
-    def rendered():
-        arrays = values(optimizer)
-        gaussians = reference.Gaussians(**arrays | {"means": 0.1 * arrays["means"]})
-        return reference.render(gaussians, camera, np.ones(3)).image
-
-    before = rendered()
-    assert act(optimizer, growth=0.0).relocated == 1
-    # The same integral along lines through the centre; the profile itself is not Gaussian.
-    assert np.abs(before - 1).max() > 0.3
-    assert np.abs(rendered() - before).max() < 0.06 * np.abs(before - 1).max()
 
 
 def test_copies_are_sampled_from_the_covariance_of_their_original():
@@ -143,20 +115,6 @@ def test_nan_gaussians_are_relocated():
     assert np.isfinite(values(optimizer)["logit_opacities"]).all()
 
 
-# ---- growth
-def test_population_grows_by_a_fraction_up_to_its_cap():
-    optimizer = make([SIZE] * 100, 0.5)
-    sizes = [act(optimizer, 100 * i, gaussians=117).num_gaussians for i in range(6, 11)]
-    assert sizes == [105, 110, 115, 117, 117]
-
-
-def test_small_population_grows():
-    """5 % of 6 are less than one."""
-    optimizer = make([SIZE] * 6, 0.5)
-    sizes = [act(optimizer, 100 * i, gaussians=8).num_gaussians for i in range(6, 9)]
-    assert sizes == [7, 8, 8]
-
-
 def test_population_above_the_cap_loses_transparent_gaussians():
     optimizer = make([SIZE] * 10, [0.5] * 6 + [DEAD] * 4)
     report = act(optimizer, gaussians=8)
@@ -190,25 +148,6 @@ def test_random_populations_respect_both_caps(seed):
     assert strategy(**config).max_num_gaussians(num, 30_000) >= report.num_gaussians
 
 
-def test_equal_seeds_give_equal_bytes():
-    def population(seed, iteration):
-        optimizer = make([SIZE] * 40, [0.5] * 30 + [DEAD] * 10)
-        act(optimizer, iteration, seed)
-        return b"".join(value.tobytes() for value in values(optimizer).values())
-
-    first = population(3, 600)
-    assert population(3, 600) == first
-    assert population(4, 600) != first
-    assert population(3, 700) != first
-
-
-def test_refine_is_due_between_start_and_stop():
-    chain = strategy()
-    acting = [i for i in range(1, 20_000) if chain.is_due(i)]
-    assert acting == list(range(600, 15_000, 100))
-
-
-# ---- noise
 def test_noise_follows_the_covariance_of_transparent_gaussians():
     num, rate, seed, iteration = 4000, 1e-3, 7, 12
     optimizer = make(np.full(num, 0.3), 0.02, tensor_type=TensorXf64)
@@ -239,36 +178,12 @@ def test_opaque_gaussians_get_no_noise_and_moments_stay():
         np.testing.assert_array_equal(moment, expected)
 
 
-def test_noise_is_a_function_of_seed_and_iteration():
-    def means(seed, iteration):
-        optimizer = make([SIZE] * 50, 0.001)
-        strategy().perturb(rows_of(optimizer, seed), iteration, 1e-3)
-        return values(optimizer)["means"].tobytes()
-
-    assert means(0, 1) == means(0, 1)
-    assert means(0, 1) != means(0, 2)
-    assert means(0, 1) != means(1, 1)
-
-
 def test_perturbed_gaussians_of_any_size_stay_finite():
     optimizer = make([1e30, SIZE], 0.001)
     strategy().perturb(rows_of(optimizer), 1, 1e-3)
     assert np.isfinite(values(optimizer)["means"]).all()
 
 
-def test_noise_compiles_one_kernel():
-    optimizer = make([SIZE] * 5, 0.5)
-    chain, hashes = strategy(), []
-    for iteration in (1, 2, 3):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            chain.perturb(rows_of(optimizer), iteration, 1e-3 / iteration)
-            hashes.append({k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])})
-    assert hashes[0]
-    assert hashes[0] == hashes[1] == hashes[2]
-
-
-# ---- regularisers
 def test_penalties_are_mean_opacity_and_mean_scale():
     optimizer = make([0.1, 0.2, 0.4], [0.1, 0.5, 0.9], tensor_type=TensorXf64)
     parameters = dict(optimizer.items())
@@ -284,8 +199,48 @@ def test_penalties_are_mean_opacity_and_mean_scale():
     np.testing.assert_allclose(dr.grad(parameters["logit_opacities"]), slopes, rtol=1e-12)
     d_scales = np.array(dr.grad(parameters["log_scales"]))
     np.testing.assert_allclose(d_scales, 0.7 * scales / EXTENT / 9, rtol=1e-12)
-
-
-def test_penalties_without_weight_are_omitted():
-    parameters = dict(make([SIZE], 0.5).items())
     assert not list(strategy(opacity_weight=0.0, scale_weight=0.0).penalties(parameters, 3))
+
+
+def test_extreme_numbers_and_opacities_have_finite_copies():
+    for numbers in correct_copies(np.array([0.7] * 2), np.array([1000, MAX_COPIES])):
+        assert numbers[0] == numbers[1]
+    copies, factors = correct_copies(np.array([1.0]), np.array([2]))
+    assert 0.99 < copies[0] < 1 and 0 < factors[0] < 1
+
+
+@pytest.mark.parametrize(
+    ("num", "cap", "expected"),
+    # 5 % of 6 are less than one.
+    [(100, 117, [105, 110, 115, 117, 117]), (6, 8, [7, 8, 8])],
+)
+def test_population_grows_by_a_fraction_up_to_its_cap(num, cap, expected):
+    optimizer = make([SIZE] * num, 0.5)
+    iterations = [100 * i for i in range(6, 6 + len(expected))]
+    assert [act(optimizer, i, gaussians=cap).num_gaussians for i in iterations] == expected
+
+
+def relocated(seed, iteration):
+    optimizer = make([SIZE] * 40, [0.5] * 30 + [DEAD] * 10)
+    act(optimizer, iteration, seed)
+    return b"".join(value.tobytes() for value in values(optimizer).values())
+
+
+def perturbed(seed, iteration):
+    optimizer = make([SIZE] * 50, DEAD)
+    strategy().perturb(rows_of(optimizer, seed), iteration, 1e-3)
+    return values(optimizer)["means"].tobytes()
+
+
+@pytest.mark.parametrize("change", [relocated, perturbed])
+def test_changes_are_functions_of_seed_and_iteration(change):
+    assert change(3, 600) == change(3, 600)
+    assert len({change(3, 600), change(4, 600), change(3, 700)}) == 3
+
+
+def test_noise_compiles_one_kernel():
+    optimizer, chain, hashes = make([SIZE] * 5, 0.5), strategy(), set()
+    for iteration in (1, 2, 3):
+        arguments = rows_of(optimizer), iteration, 1e-3 / iteration
+        hashes |= kernel_hashes(partial(chain.perturb, *arguments))
+        assert len(hashes) == 1

@@ -6,35 +6,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.populations import make, rows_of
+from support.small_fits import everything_of, steps
 from support.trainers import make_trainer
 
 from drgs.config.density import DensifyConfig
-from drgs.config.extensions import GROWTH
 from drgs.config.schema import FitConfig
 from drgs.training import trainer as trainer_module
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
     Phases,
-    density_strategy,
 )
 from drgs.training.rates import revised_stops
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def trainer_with(monkeypatch, strategy, **changes):
     monkeypatch.setattr(trainer_module, "density_strategy", lambda *_: strategy)
     return make_trainer(**changes)
-
-
-# ----------------------------------------------------------------------------------------------
-# Calls by the trainer
-# ----------------------------------------------------------------------------------------------
 
 
 def red(image, photograph):
@@ -125,39 +113,14 @@ def test_learning_rates_are_scaled_in_the_given_iterations(monkeypatch):
     plain, quick = (fit.gaussians() for fit in fits)
     for name, factor in (("means", 2), ("sh0", 2), ("log_scales", 1)):
         start = getattr(before, name).astype(np.float64)
-        steps = [np.abs(getattr(g, name) - start).max() for g in (plain, quick)]
+        moves = [np.abs(getattr(g, name) - start).max() for g in (plain, quick)]
         # Values of order 1 in single precision, steps of 1.6e-4 and more.
-        assert steps[1] == pytest.approx(factor * steps[0], rel=2e-3), name
+        assert moves[1] == pytest.approx(factor * moves[0], rel=2e-3), name
     rates = []
     for fit in fits:
         fit.step()
         rates.append([entry[2] for entry in fit.optimizer.state.values()])
     assert rates[0] == rates[1]
-
-
-# ----------------------------------------------------------------------------------------------
-# Values without moments
-# ----------------------------------------------------------------------------------------------
-
-
-def test_setting_values_keeps_moments_and_step_count():
-    optimizer = make([0.1, 0.2, 0.3], 0.5)
-    before = {name: entry[1:] for name, entry in optimizer.state.items()}
-    rows = rows_of(optimizer)
-    means = rows.value("means") + 1
-    expected = rows.host("means") + 1
-    rows.set_values("means", means)
-    np.testing.assert_allclose(rows.host("means"), expected, rtol=1e-6)
-    assert dr.grad_enabled(optimizer["means"])
-    for name, entry in optimizer.state.items():
-        assert all(now is then for now, then in zip(entry[1:], before[name], strict=True)), name
-    with pytest.raises(ValueError, match=r"set_values\(\): means has shape \(3, 3\), the new valu"):
-        rows.set_values("means", rows.take(dr.llvm.ad.UInt(0))["means"])
-
-
-# ----------------------------------------------------------------------------------------------
-# Strategies that follow one another
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -226,19 +189,6 @@ def test_phases_act_as_one_strategy_and_restart_after_row_changes():
     assert [phase.seen for phase in again.phases] == [5, 6]
 
 
-# ----------------------------------------------------------------------------------------------
-# Configurations
-# ----------------------------------------------------------------------------------------------
-
-
-def test_every_configured_strategy_is_created():
-    made = set()
-    for name in GROWTH:
-        config = FitConfig(data={"path": "."}, densify={"strategy": name})
-        made.add(type(density_strategy(config)))
-    assert len(made) == len(GROWTH) == 3
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "densify",
@@ -258,11 +208,7 @@ def test_revised_plan_equals_the_same_plan_from_the_start(densify):
             revised.reschedule(45, {6: 36, 11: 16}[iteration])
     assert revised.num_gaussians > 40
     again = make_trainer(**revised.config.model_dump())
-    for _ in range(17):
-        again.step()
-    assert {name: v.tobytes() for name, v in again.state().items()} == {
-        name: v.tobytes() for name, v in revised.state().items()
-    }
+    assert everything_of(steps(again, 17)) == everything_of(revised)
 
 
 def test_earlier_stops_of_a_plan_are_kept_for_past_iterations():

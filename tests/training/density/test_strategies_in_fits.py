@@ -2,14 +2,15 @@
 
 import sys
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support import small_fits as fits
 from support.small_capture import blobs
 
+from drgs.config import extensions
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.training.density.strategy import density_strategy
 from drgs.training.trainer import Trainer
 
 MODULES = {"adc", "budget", "mcmc", "pruning"}
@@ -34,11 +35,6 @@ STRATEGIES = {
 }
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def many_blobs(count=48) -> Gaussians:
     """Return the start of a fit whose population changes: half of the blobs are transparent."""
     blob = blobs(count, seed=5)
@@ -59,16 +55,9 @@ def make_trainer(name, **changes):
     return fits.make_trainer(fits.plain_dataset(), many_blobs(), **values)
 
 
-def pauses():
-    """Return the cases that show most in one run; the others are slow."""
-    for name in STRATEGIES:
-        is_quick = name in ("mcmc and selection", "importance")
-        yield pytest.param(name, 16, marks=[] if is_quick else pytest.mark.slow)
-        yield pytest.param(name, 5, marks=pytest.mark.slow)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "pause"), list(pauses()))
+@pytest.mark.parametrize("pause", [5, 16])
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_fit_resumes_to_the_same_bytes_from_any_iteration(name, pause):
     whole = make_trainer(name)
     sizes = []
@@ -87,15 +76,6 @@ def test_fit_resumes_to_the_same_bytes_from_any_iteration(name, pause):
         assert max(sizes) <= 60
     if name != "mcmc":
         assert sizes[23:] == [20] * 4
-
-
-@pytest.mark.slow
-def test_mcmc_learns():
-    dataset = fits.plain_dataset()
-    trainer = make_trainer("mcmc", densify__stop=60, densify__every=20, iterations=80)
-    before = fits.test_psnr(trainer, dataset)
-    fits.steps(trainer, 80)
-    assert fits.test_psnr(trainer, dataset) > before + 2
 
 
 @pytest.mark.slow
@@ -121,9 +101,7 @@ def test_revised_plan_with_a_future_phase_equals_a_plan_from_the_start():
             revised.reschedule(24, 14)
     assert revised.config.densify.prune_window(24)[0] == 18
     again = fits.steps(replanned(revised), 24)
-    assert {k: v.tobytes() for k, v in again.state().items()} == {
-        k: v.tobytes() for k, v in revised.state().items()
-    }
+    assert fits.everything_of(again) == fits.everything_of(revised)
 
 
 @pytest.mark.slow
@@ -140,28 +118,11 @@ def replanned(trainer):
 
 
 def test_unused_strategies_are_not_imported(monkeypatch):
-    from drgs.config.extensions import STRATEGIES
-    from drgs.training.density.strategy import density_strategy
-
     names = {f"drgs.training.density.{module}" for module in MODULES}
-    for strategy, expected in (
-        ("adc", {"adc"}),
-        ("budget", {"budget"}),
-        ("mcmc", {"mcmc"}),
-    ):
+    for strategy in ("adc", "budget", "mcmc"):
         for name in names & set(sys.modules):
             monkeypatch.delitem(sys.modules, name)
-        monkeypatch.setattr(STRATEGIES, "_extensions", {})
+        monkeypatch.setattr(extensions.STRATEGIES, "_extensions", {})  # private: not registered yet
         density_strategy(FitConfig(data={"path": "."}, densify={"strategy": strategy}))
         imported = {name.rpartition(".")[2] for name in names & set(sys.modules)}
-        assert imported == expected
-
-
-@pytest.mark.slow
-def test_steps_of_several_views_begin_after_the_last_density_change():
-    trainer = make_trainer("selection", optimizer__views=5, optimizer__views_from=0.0)
-    views = []
-    for _ in range(27):
-        trainer.step()
-        views.append(trainer.last_step.num_averaged)
-    assert views == [1] * 24 + [5] * 3
+        assert imported == {strategy}

@@ -18,7 +18,7 @@ data: {{path: {data}, image_size: 50}}
 iterations: {iterations}
 init: {{num_points: 300}}
 model: {{antialiased: true}}
-optimizer: {{views_per_step: {views}}}
+optimizer: {{views_per_step: 4}}
 densify: {{budget: {{gaussians: 600}}}}
 output: {{report: false, save_renders: false, checkpoint_every: 20, history_every: 20}}
 """
@@ -28,10 +28,10 @@ output: {{report: false, save_renders: false, checkpoint_every: 20, history_ever
 def config(tmp_path):
     """Writes a configuration: config(iterations)."""
 
-    def write(iterations=60, views=4):
+    def write(iterations=60):
         path = tmp_path / "fit.yml"
         data = parallel_processes.REPOSITORY / "scenes" / "lego"
-        path.write_text(CONFIG.format(data=data, iterations=iterations, views=views))
+        path.write_text(CONFIG.format(data=data, iterations=iterations))
         return path
 
     return write
@@ -68,41 +68,42 @@ def test_distributed_fit_is_the_same(config, tmp_path):
     assert metrics["config"]["optimizer"]["views_per_step"] == 4
 
 
-@pytest.mark.slow
-def test_too_many_processes_are_reported_once(config, tmp_path):
-    status, _, errors = parallel_processes.run(
-        3, command(config(views=2), "--out", tmp_path / "out")
-    )
-    assert status == 2
-    assert errors.count("error: ") == 1
-    assert "optimizer.views_per_step must be at least the number of processes (3)" in errors
-    assert not (tmp_path / "out").exists()
+REFUSED = [
+    (3, ["--set", "optimizer.views_per_step=2"], "at least the number of processes (3)"),
+    (2, ["--set", "optimizer.views_per_step=101"], "at most the number of training views (100)"),
+    (2, ["--set", "densify.prune.to=1"], "2 processes cannot share 1 Gaussians"),
+    (2, ["--variant", "cuda_ad_rgb"], "--variant cuda_ad_rgb: not usable here"),
+    (2, ["--threads", "100000"], "--threads"),
+    (2, ["--view"], "--view: shows the fit of one process alone"),
+    (2, ["--set", "densify.budget.prune_opacity=0.999"], "every Gaussian would be pruned"),
+    (2, ["--nonsense"], "--nonsense"),
+]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--set", "optimizer.views_per_step=101"], "at most the number of training views (100)"),
-        (["--set", "densify.prune.to=1"], "2 processes cannot share 1 Gaussians"),
-        (["--variant", "cuda_ad_rgb"], "--variant cuda_ad_rgb: not usable here"),
-        (["--threads", "100000"], "--threads"),
-        (["--view"], "--view: shows the fit of one process alone"),
-        (["--set", "densify.budget.prune_opacity=0.999"], "every Gaussian would be pruned"),
-    ],
-)
-def test_unsupported_options_are_reported_once(config, tmp_path, words, message):
-    status, _, errors = parallel_processes.run(
-        2, command(config(), "--out", tmp_path / "out", *words)
-    )
+@pytest.mark.parametrize(("size", "words", "message"), REFUSED)
+def test_error_is_reported_once(config, tmp_path, size, words, message):
+    out = tmp_path / "out"
+    status, _, errors = parallel_processes.run(size, command(config(), "--out", out, *words))
     assert (status, errors.count("error: ")) == (2, 1), errors
     assert message in errors
 
 
+SCENES = parallel_processes.REPOSITORY / "scenes"
+
+SINGLE_PROCESS = [
+    ("export", SCENES / "shapes" / "knot.ply", "mpiexec: processes can share fit and render"),
+    ("render", SCENES / "hybrid.xml", "a scene of Mitsuba is rendered by one process"),
+]
+
+
 @pytest.mark.slow
-def test_wrong_command_line_is_reported_once(tmp_path):
-    status, _, errors = parallel_processes.run(2, command("nothing.yml", "--out", tmp_path / "out"))
-    assert status == 2 and errors.count("error: ") == 1
+@pytest.mark.parametrize(("name", "file", "message"), SINGLE_PROCESS)
+def test_single_process_command_is_refused_once(tmp_path, name, file, message):
+    words = ["-m", f"drgs.{name}", file, "--out", tmp_path / "a.spz"]
+    status, _, errors = parallel_processes.run(2, words)
+    assert (status, errors.count("error: ")) == (2, 1), errors
+    assert message in errors and not (tmp_path / "a.spz").exists()
 
 
 MISSING = "ModuleNotFoundError('No module named mpi4py', name='mpi4py')"
@@ -139,17 +140,6 @@ def test_unexpected_error_of_one_process_prints_one_traceback_and_ends_all(confi
     assert status == 1, errors
     assert errors.startswith("process 1: Traceback") and errors.count("Traceback") == 1
     assert errors.endswith("RuntimeError: a bug\n")
-
-
-@pytest.mark.slow
-def test_single_process_command_is_refused_once(tmp_path):
-    model = parallel_processes.REPOSITORY / "scenes" / "shapes" / "knot.ply"
-    words = ["-m", "drgs.export", model, "--out", tmp_path / "a.spz"]
-    status, _, errors = parallel_processes.run(2, words)
-    assert (status, errors.count("error: ")) == (2, 1), errors
-    assert "mpiexec: processes can share fit and render" in errors
-    assert not (tmp_path / "a.spz").exists()
-    assert parallel_processes.run(1, words)[0] == 0 and (tmp_path / "a.spz").exists()
 
 
 @pytest.mark.slow

@@ -1,14 +1,8 @@
 """However many processes share a fit, it is the same."""
 
-import mitsuba as mi
 import pytest
 from support import parallel_processes
 from support import small_fits as fits
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def settings(views_per_step=4, **changes):
@@ -16,85 +10,64 @@ def settings(views_per_step=4, **changes):
     return values | {key.replace("__", "."): value for key, value in changes.items()}
 
 
-def assert_the_same(changes, sizes, steps=8, data="plain"):
-    dataset = parallel_processes.DATASETS[data]()
-    alone = fits.Trainer(fits.config_of(**changes), dataset, fits.disturbed_blobs())
-    expected = parallel_processes.hashes_and_reports(alone, steps)
-    for size in sizes:
-        state, reports = parallel_processes.fitted(size, steps, changes, data)
-        assert reports == expected[1], size
-        assert state == expected[0], size
-
-
-DENSITY_SCHEDULE = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
-
-STRATEGIES = {
-    "adc": {**DENSITY_SCHEDULE, "densify__strategy": "adc", "densify__adc__grad_threshold": 1e-6},
-    "budget": {
-        **DENSITY_SCHEDULE,
-        "densify__strategy": "budget",
-        "densify__budget__gaussians": 60,
-        "densify__budget__error_every": 3,
-    },
-    "mcmc": {
-        **DENSITY_SCHEDULE,
-        "densify__strategy": "mcmc",
-        "densify__mcmc__gaussians": 60,
-        "densify__mcmc__min_opacity": 0.3,
-    },
-    "importance": {
-        "densify__start": 1,
-        "densify__stop": 2,
-        "densify__prune__to": 15,
-        "densify__prune__method": "importance",
-        "densify__prune__start": 4,
-        "densify__prune__stop": 24,
-        "densify__prune__every": 7,
-    },
-    "selection": {
-        "densify__start": 1,
-        "densify__stop": 2,
-        "densify__prune__to": 15,
-        "densify__prune__method": "selection",
-        "densify__prune__start": 4,
-        "densify__prune__stop": 24,
-        "densify__prune__every": 7,
-    },
+CHANGES = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
+PRUNING = {"to": 15, "start": 4, "stop": 24, "every": 7}
+PRUNED = {
+    "densify__start": 1,
+    "densify__stop": 2,
+    **{f"densify__prune__{name}": value for name, value in PRUNING.items()},
 }
-
+ADC = {**CHANGES, "densify__strategy": "adc", "densify__adc__grad_threshold": 1e-6}
+BUDGET = {"densify__budget__gaussians": 60, "densify__budget__error_every": 3}
+MCMC = {"densify__mcmc__gaussians": 60, "densify__mcmc__min_opacity": 0.3}
+REFINED = {
+    **ADC,
+    "cameras__optimise": True,
+    "cameras__start": 5,
+    "cameras__rotation_lr": 1e-3,
+    "cameras__focal_lr": 1e-3,
+    "cameras__principal_lr": 1e-3,
+}
 EFFECTS = {
     "data__random_background": True,
     "model__smoothing": True,
     "colors__lr": 0.02,
     "coarse": [{"until": 10, "factor": 2}],
 }
+LATE = {
+    "optimizer__views": 8,
+    "optimizer__views_from": 0.0,
+    "densify__start": 1,
+    "densify__stop": 2,
+}
+
+FITS = {
+    "adc": (settings(**ADC), [1, 2, 3, 4], "plain"),
+    "budget": (settings(**CHANGES, **BUDGET, densify__strategy="budget"), [1, 2, 3, 4], "plain"),
+    "mcmc": (settings(**CHANGES, **MCMC, densify__strategy="mcmc"), [1, 2, 3, 4], "plain"),
+    "importance": (settings(**PRUNED, densify__prune__method="importance"), [1, 2, 3, 4], "plain"),
+    "selection": (settings(**PRUNED, densify__prune__method="selection"), [1, 2, 3, 4], "plain"),
+    "six views": (settings(6, **ADC), [1, 2, 3], "plain"),
+    "effects": (settings(**EFFECTS), [1, 2, 3], "transparent"),
+    "late steps": (settings(**LATE), [2, 3], "plain"),
+    # Derivatives of a camera are summed over all processes in one place.
+    "refined cameras": (settings(**REFINED), [1, 2, 3, 4], "plain"),
+    "refined moving cameras": (settings(**REFINED), [1, 2, 4], "blurred"),
+    # A view that is blurred is projected at several times, and others once.
+    "partly moving cameras": (settings(**ADC), [2, 3], "blurred"),
+}
 
 
 @pytest.mark.slow
-def test_two_processes_grow_the_same_population_as_one():
-    assert_the_same(settings(**STRATEGIES["budget"]), [2])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("strategy", STRATEGIES)
-def test_every_strategy_gives_the_same_bytes_on_one_to_four_processes(strategy):
-    assert_the_same(settings(**STRATEGIES[strategy]), [1, 2, 3, 4])
-
-
-@pytest.mark.slow
-def test_six_views_per_step_give_the_same_bytes():
-    assert_the_same(settings(6, **STRATEGIES["adc"]), [1, 2, 3])
-
-
-@pytest.mark.slow
-def test_effects_of_views_give_the_same_bytes():
-    assert_the_same(settings(**EFFECTS), [1, 2, 3], data="transparent")
-
-
-@pytest.mark.slow
-def test_late_steps_of_more_views_give_the_same_bytes():
-    late = {"optimizer__views": 8, "optimizer__views_from": 0.0, "densify__stop": 2}
-    assert_the_same(settings(**late, densify__start=1), [2, 3])
+@pytest.mark.parametrize(("changes", "sizes", "data"), FITS.values(), ids=FITS)
+def test_any_number_of_processes_gives_the_same_bytes(changes, sizes, data):
+    dataset = parallel_processes.DATASETS[data]()
+    alone = fits.Trainer(fits.config_of(**changes), dataset, fits.disturbed_blobs())
+    expected = parallel_processes.hashes_and_reports(alone, 8)
+    for size in sizes:
+        state, reports = parallel_processes.fitted(size, 8, changes, data)
+        assert reports == expected[1], size
+        assert state == expected[0], size
 
 
 @pytest.mark.slow
@@ -103,31 +76,3 @@ def test_nonfinite_value_is_reported_by_all_processes():
     expected = parallel_processes.spoiled(alone, 17)
     assert "in row 17" in expected
     assert parallel_processes.state_text(3, 17) == expected
-
-
-REFINED = {
-    "cameras__optimise": True,
-    "cameras__start": 5,
-    "cameras__rotation_lr": 1e-3,
-    "cameras__focal_lr": 1e-3,
-    "cameras__principal_lr": 1e-3,
-    **STRATEGIES["adc"],
-}
-
-
-@pytest.mark.slow
-def test_refined_cameras_give_the_same_bytes():
-    """Derivatives of a camera are summed over all processes in one place."""
-    assert_the_same(settings(**REFINED), [3])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("data", ["plain", "blurred"])
-def test_refined_cameras_give_the_same_bytes_on_one_to_four_processes(data):
-    assert_the_same(settings(**REFINED), [1, 2, 4], data=data)
-
-
-@pytest.mark.slow
-def test_partly_moving_cameras_give_the_same_bytes():
-    """A view that is blurred is projected at several times, and others once."""
-    assert_the_same(settings(**STRATEGIES["adc"]), [2, 3], data="blurred")

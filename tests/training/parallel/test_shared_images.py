@@ -11,16 +11,6 @@ def rendered(size, out, *words):
     return parallel_processes.run(size, command)
 
 
-@pytest.mark.slow
-def test_mitsuba_scene_is_refused(tmp_path):
-    scene = parallel_processes.REPOSITORY / "scenes" / "hybrid.xml"
-    status, _, errors = parallel_processes.run(
-        2, ["-m", "drgs.render", scene, "--out", tmp_path / "a.png"]
-    )
-    assert status == 2 and errors.count("error: ") == 1
-    assert "a scene of Mitsuba is rendered by one process" in errors
-
-
 def files_of(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".json"}
 

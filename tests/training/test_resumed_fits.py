@@ -1,0 +1,129 @@
+"""Interrupted fits continue to the same bytes; later iterations compile no kernel."""
+
+from dataclasses import replace
+
+import pytest
+from support import small_fits as fits
+
+
+def plain():
+    return fits.plain_dataset()
+
+
+def transparent():
+    return fits.with_views(fits.true_dataset(), lambda view: replace(view, depth=None))
+
+
+def masked():
+    return fits.masked(fits.plain_dataset())
+
+
+def masked_with_depth():
+    """One view has no depth."""
+    dataset = fits.masked(fits.true_dataset())
+    return replace(dataset, train=(replace(dataset.train[0], depth=None), *dataset.train[1:]))
+
+
+ADC = {
+    "densify__start": 2,
+    "densify__stop": 60,
+    "densify__every": 4,
+    "densify__adc__grad_threshold": 1e-6,
+    "densify__adc__reset_every": 9,
+}
+
+LATE_STEPS = {
+    "iterations": 8,
+    "optimizer__views": 3,
+    "optimizer__views_from": 0.5,
+    "densify__start": 1,
+    "densify__stop": 2,
+}
+
+CAMERAS = {
+    "cameras__optimise": True,
+    "cameras__rotation_lr": 1e-3,
+    "cameras__translation_lr": 2e-3,
+    "cameras__focal_lr": 3e-3,
+    "cameras__principal_lr": 4e-3,
+}
+
+COLORS = {"colors__lr": 2e-3, "colors__identity_weight": 0.1}
+DEPTH = {"loss__depth_weight": 0.7}
+RANDOM = {"data__random_background": True}
+SMOOTHING = {"model__smoothing": True}
+COARSE = {"coarse": [{"until": 2, "factor": 4}, {"until": 5, "factor": 2}]}
+
+FOUR_VIEWS = {"optimizer__views_per_step": 4, "iterations": 40}
+CHANGES = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
+STRATEGIES = {
+    f"{name}, four views a step": (
+        *(plain, {**FOUR_VIEWS, **CHANGES, "densify__strategy": name}),
+        *(3, 4),
+    )
+    for name in ("adc", "budget", "mcmc")
+}
+
+SLOW_FITS = {
+    "reset and degree": (plain, {**ADC, "model__sh_increase_every": 8}, 7, 7),
+    "before a change, smoothing": (plain, {**ADC, **SMOOTHING}, 3, 8),
+    "at a change, smoothing": (plain, {**ADC, **SMOOTHING}, 4, 7),
+    "after a change, smoothing": (plain, {**ADC, **SMOOTHING}, 5, 6),
+    **{f"late step, {before}": (plain, LATE_STEPS, before, 5) for before in (4, 5, 6, 7)},
+    "cameras, coarse": (plain, {**CAMERAS, **COARSE}, 4, 5),
+    # The filter depends on where all cameras are, also on those not seen since.
+    "cameras, smoothing": (plain, {**CAMERAS, **SMOOTHING, **ADC}, 6, 5),
+    **STRATEGIES,
+    "effects, four views a step": (
+        *(transparent, {**FOUR_VIEWS, **CAMERAS, **COLORS, **RANDOM, **SMOOTHING}),
+        *(3, 4),
+    ),
+    "late steps of eight views": (plain, {**FOUR_VIEWS, **COARSE, "optimizer__views": 8}, 3, 4),
+}
+
+QUICK_FITS = {
+    "coarse": (plain, COARSE, 4, 4),
+    "colors": (plain, COLORS, 4, 5),
+    "depth and masks": (masked_with_depth, DEPTH, 4, 5),
+    "random background": (transparent, {**RANDOM, **COARSE}, 2, 4),
+}
+
+FITS = [
+    *(pytest.param(*case, id=name, marks=pytest.mark.slow) for name, case in SLOW_FITS.items()),
+    *(pytest.param(*case, id=name) for name, case in QUICK_FITS.items()),
+]
+
+
+@pytest.mark.parametrize(("dataset", "changes", "before", "after"), FITS)
+def test_interrupted_fit_continues_to_the_same_bytes(dataset, changes, before, after):
+    def make():
+        return fits.make_trainer(dataset(), **changes)
+
+    fits.assert_resumes_to_the_same_bytes(make, before, after)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "changes"),
+    [
+        (masked, {}),
+        (fits.true_dataset, DEPTH),
+        (transparent, RANDOM),
+        (plain, CAMERAS),
+        (plain, COLORS),
+        (plain, SMOOTHING),
+    ],
+    ids=["masks", "depth", "random background", "cameras", "colors", "smoothing"],
+)
+def test_no_kernel_is_compiled_after_all_views_were_seen(dataset, changes):
+    """Kernels by hash: what Dr.Jit's caches hold from other runs does not matter."""
+    trainer, seen = fits.make_trainer(dataset(), **changes), set()
+    for iteration in range(12):
+
+        def step():
+            trainer.step()
+            trainer.watch.check()
+
+        hashes = fits.kernel_hashes(step)
+        assert hashes
+        assert iteration < 7 or hashes <= seen, f"{len(hashes - seen)} at {iteration + 1}"
+        seen |= hashes
