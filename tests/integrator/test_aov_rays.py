@@ -110,13 +110,6 @@ def test_any_filter_and_sampler_may_be_used(srgb_primitives, rfilter, samples, s
     np.testing.assert_allclose(image[..., 6:8], alone[..., 4:], rtol=0, atol=TOLERANCE)
 
 
-def test_one_sample_is_at_the_pixel_centre_in_the_image_and_on_the_ray_in_aovs():
-    scene = Scene()
-    image = image_of(load(scene, AOV))
-    assert np.array_equal(image[..., :6], image_of(load(scene)))
-    assert np.abs(image[..., 6] - image[..., 4]).max() > 0.01
-
-
 def test_image_derivatives_are_the_same_without_aov():
     """With the same seed; aov hands on what is asked of the first channels."""
     scene = Scene()

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.helpers import assert_arrays_agree, clear
+from support.helpers import clear
 from support.views import VIEWS, Scene, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -96,13 +96,6 @@ def test_normals_and_features_are_composited_without_colour_conversion(view, srg
     assert [c.name for c in film.bitmap().struct_()] == [*"RGBA", *names]
 
 
-def test_aovs_leave_colors_unchanged():
-    scene = Scene()
-    np.testing.assert_array_equal(
-        image_of(with_features(scene))[..., :4], image_of(load(scene, ""))
-    )
-
-
 def test_a_flat_splat_shows_its_normal():
     """One that covers the film, tilted; whichever way its quaternion turns it."""
     scene = Scene()
@@ -125,21 +118,6 @@ def test_a_flat_splat_shows_its_normal():
         row, column = image.shape[0] // 2, image.shape[1] // 2
         *_, x, y, z, alpha = image[row, column]
         np.testing.assert_allclose(np.array([x, y, z]) / alpha, tilted, atol=1e-5)
-
-
-def test_a_feature_of_ones_is_alpha():
-    scene = Scene()
-    ones = mi.TensorXf(np.ones((scene.count, 1), np.float32))
-    image = image_of(load(scene, "f:feature_ones, a:alpha", feature_ones=ones))
-    np.testing.assert_allclose(image[..., 4], image[..., 5], atol=2e-6)
-
-
-def test_an_unused_feature_costs_nothing():
-    scene = Scene()
-    loaded = load(scene, "", feature_mine=mi.TensorXf(features_of(scene)))
-    mi.render(loaded)
-    (frame,) = loaded.integrator().state.cache.kept["frames 0"].value[0]
-    assert len(frame.planes()) == 4 and loaded.integrator().gaussians.features is None
 
 
 def test_gaussian_with_nonfinite_feature_is_not_drawn():
@@ -188,21 +166,6 @@ def test_gradients_equal_differences_of_the_reference():
             assert np.abs(terms).sum() > 0
 
 
-def test_gradients_of_features_are_compositing_weights():
-    """Row by row: they are linear."""
-    scene = clear(Scene())
-    rng = np.random.default_rng(6)
-    weights = rng.normal(0, 1, (*scene.weights().shape[:2], 12))
-    actual = gradients_of(with_features(scene), weights, ["feature_mine"])["feature_mine"]
-    expected = np.zeros((scene.count, 4))
-    for row in range(scene.count):
-        unit = np.zeros((scene.count, 1))
-        unit[row] = 1
-        share = composited(scene.gaussians, scene.camera, unit)[scene.view.window][..., 0]
-        expected[row] = np.einsum("hw,hwc->c", share, weights[..., 7:11])
-    assert_arrays_agree({"features": actual}, {"features": expected}, GRADIENTS)
-
-
 def test_forward_mode_is_the_transpose_of_the_gradients():
     scene = clear(Scene())
     rng = np.random.default_rng(7)
@@ -220,37 +183,6 @@ def test_forward_mode_is_the_transpose_of_the_gradients():
         total, size = total + terms.sum(), size + np.abs(terms).sum()
     tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
     assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
-
-
-@pytest.mark.slow
-def test_features_are_trained():
-    """Until they show what they are to show; the image stays."""
-    scene = clear(Scene())
-    target = image_of(with_features(scene))[..., 7:11].astype(np.float32)
-    zeros = mi.TensorXf(np.zeros((scene.count, 4), np.float32))
-    loaded = load(scene, "f:feature_mine", feature_mine=zeros)
-    params = mi.traverse(loaded)
-    key = "integrator.feature_mine"
-    optimizer = mi.ad.Adam(lr=0.1, params={key: params[key]})
-    losses = []
-    for _ in range(60):
-        params.update(optimizer)
-        shown = mi.render(loaded, params)[:, :, 4:]
-        loss = dr.mean(dr.square(shown - mi.TensorXf(target)), axis=None)
-        dr.backward(loss)
-        optimizer.step()
-        losses.append(float(loss.array[0]))
-    assert losses[-1] < 0.02 * losses[0]
-
-
-def test_several_samples_average_the_channels():
-    scene = Scene()
-    sensor = scene.view.sensor(samples=4)
-    image = image_of(with_features(scene, sensor=sensor), spp=4, seed=2)
-    ones = mi.TensorXf(np.ones((scene.count, 1), np.float32))
-    alpha = image_of(load(scene, "f:feature_ones", sensor, feature_ones=ones), spp=4, seed=2)
-    np.testing.assert_allclose(alpha[..., 4], alpha[..., 3], atol=2e-6)
-    assert np.abs(image[..., 4:] - image_of(with_features(scene))[..., 4:]).max() > 0.01
 
 
 # ----------------------------------------------------------------------------------------------

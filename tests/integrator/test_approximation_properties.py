@@ -46,13 +46,6 @@ def test_configuration_has_declared_properties(name):
     assert field.metadata == [getattr(annotated_types, k.title())(v) for k, v in limits.items()]
 
 
-def test_declared_properties_match_the_annotations():
-    assert list(DECLARED) == list(Approximations.__dataclass_fields__)
-    assert DECLARED["projection"].words == ("ewa", "unscented", "exact")
-    assert DECLARED["order_window"].kind is int and DECLARED["antialiased"].kind is bool
-    assert DECLARED["extent"].limits.finite == {"gt": 0, "le": 1e9}
-
-
 def test_unrounded_default_counts_as_default():
     """A configuration writes 0.99 for the float32 next to it."""
     written = ModelConfig(alpha_max=0.99, alpha_cut=1 / 255, extent=None, **VIEWER_RENDERING)

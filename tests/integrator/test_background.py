@@ -150,17 +150,6 @@ def test_each_sample_has_its_own_background_radiance(seed):
     assert (actual[..., 3] == 1).all()
 
 
-@pytest.mark.parametrize("camera", ["barrel"])
-def test_the_background_is_black_beyond_the_lens_model(camera):
-    camera = CAMERAS[camera]
-    sensor = camera.dictionary()
-    loaded = load(sensor, integrator_of(gaussians_in_front(camera)), sky=EMITTERS["constant"]())
-    image = image_of(loaded)
-    corner = PixelCenters.image(sensor, "constant")[0, 0, :3]
-    assert (corner == 0).all() and (image[0, 0, :3] == 0).all()
-    assert (image[12, 18, :3] > 0).all()
-
-
 def test_hide_emitters_keeps_the_background_color():
     scene = Scene()
     for hide, expected_alpha in ((True, None), (False, 1)):
@@ -182,13 +171,6 @@ def test_only_environment_emitters_are_visible():
     light = {"type": "point", "intensity": 10.0}
     image = image_of(load(sensor, integrator_of(scene.gaussians), light=light))
     assert np.array_equal(image, image_of(load(sensor, integrator_of(scene.gaussians))))
-
-
-def test_alpha_without_an_environment_is_that_of_the_splats():
-    scene, sensor = Scene(), Camera().dictionary()
-    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels()), "raw": True}
-    image = image_of(load(sensor, integrator_of(scene.gaussians, background=bitmap)))
-    np.testing.assert_array_equal(image[..., 3], splats_alone(sensor, scene.gaussians)[..., 3])
 
 
 # ----------------------------------------------------------------------------------------------
@@ -215,24 +197,6 @@ def test_a_background_texture_is_stretched_over_the_film_upright(view, srgb_prim
     if srgb_primitives:  # it is the last splat
         expected = to_linear(expected)
     np.testing.assert_allclose(image[..., :3], expected[..., :3], atol=2 * IMAGE)
-
-
-def test_a_background_texture_of_another_size_is_interpolated():
-    """Bilinearly, between the middles of texels, as numpy does it."""
-    values = texels(4, 5, seed=6)
-    sensor = Camera().dictionary()
-    background = rendered(values, filter_type="bilinear", wrap_mode="clamp")
-    nothing = {"logit_opacities": mi.Float(np.full(40, -20, np.float32))}
-    integrator = integrator_of(Scene().gaussians, background=background) | nothing
-    image = image_of(load(sensor, integrator))
-    height, width = image.shape[:2]
-    x = np.clip((np.arange(width) + 0.5) / width * 5 - 0.5, 0, 4)
-    y = np.clip((np.arange(height) + 0.5) / height * 4 - 0.5, 0, 3)
-    along = np.stack([[np.interp(x, range(5), row[:, c]) for row in values] for c in range(3)])
-    expected = np.stack(
-        [[np.interp(y, range(4), column) for column in plane.T] for plane in along], axis=-1
-    ).transpose(1, 0, 2)
-    np.testing.assert_allclose(image[..., :3], expected, atol=IMAGE)
 
 
 def test_an_environment_replaces_a_background_texture():

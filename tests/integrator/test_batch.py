@@ -63,20 +63,6 @@ def test_images_are_side_by_side(wall, pixel_format):
         assert differs.mean() <= (0.1 if wall else 0)
 
 
-def test_samples_cover_the_whole_film():
-    """A box filter averages them; each image's are a part of the film's. Half a percent
-    of noise with 256 of them is a percent with 64."""
-    center = image_of(load(batch()))
-    sampled = image_of(load(batch(samples=64)))
-    other = image_of(load(batch(samples=64)), seed=5)
-    assert np.abs(sampled - other).max() > 0
-    assert np.abs(sampled - other).mean() < 1e-2
-    alone = [image_of(load(view.sensor(samples=64))) for view in SENSORS]
-    difference = np.abs(sampled - np.concatenate(alone, axis=1))
-    assert difference.mean() < 1e-2
-    assert np.abs(sampled - center).mean() > difference.mean()
-
-
 def test_gradients_of_a_batch_are_sums_over_its_sensors():
     weights = weights_of()
 
@@ -143,29 +129,7 @@ def test_a_batch_may_contain_a_sensor_twice():
     assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
 
 
-def test_forward_mode_is_the_transpose_of_the_gradients():
-    weights, rng = weights_of(), np.random.default_rng(3)
-    loaded = load(batch())
-    params = mi.traverse(loaded)
-    value = params["integrator.means"]
-    dr.enable_grad(value)
-    dr.backward(dr.sum(mi.render(loaded, params) * mi.TensorXf(weights), axis=None))
-    direction = rng.normal(0, 1, value.shape).astype(np.float32)
-    terms = gradient(value) * direction
-    dr.clear_grad(value)
-    dr.set_grad(value, mi.TensorXf(direction))
-    tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-    total = np.sum(tangent * weights)
-    assert total == pytest.approx(terms.sum(), abs=GRADIENTS * np.abs(terms).sum())
-
-
 def test_a_crop_window_is_refused():
     loaded = load(batch(crop_offset_x=3, crop_width=20))
     with pytest.raises(ValueError, match="must not have a crop window"):
         loaded.integrator().render(loaded)
-
-
-def test_plan_describes_the_first_sensor():
-    loaded = load(batch())
-    plan = loaded.integrator().summary(loaded, loaded.sensors()[0])
-    assert plan.startswith("simulated:")

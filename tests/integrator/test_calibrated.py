@@ -30,7 +30,7 @@ from support.calibrated_sensors import (
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES, points_at
 from support.sensors import PIXELS
-from support.views import VIEWS, image_of, pose
+from support.views import VIEWS, image_of
 
 from drgs.reference import effects
 
@@ -222,90 +222,6 @@ def test_rays_are_differentiable_in_the_calibration(sensor, name):
 # ----------------------------------------------------------------------------------------------
 # Integrators
 # ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("integrator", ["path", "prb"])
-@pytest.mark.parametrize("view", [VIEWS[1], VIEWS[12]], ids=lambda view: view.name)
-def test_path_traced_images_equal_those_of_perspective(integrator, view):
-    """With the same samples: to rounding, and to pixels whose ray just misses or hits."""
-    camera = view.camera
-    focal, principal = (float(camera.fx),) * 2, (float(camera.cx), float(camera.cy))
-    center = (np.array(view.to_world) @ [0.2, 0.1, 5, 1])[:3]
-    images = []
-    for sensor in (Calibrated("", view=view, f=focal, c=principal).dictionary(), view.sensor()):
-        scene = {
-            "type": "scene",
-            "integrator": {"type": integrator},
-            "sensor": sensor,
-            "light": {"type": "constant"},
-            "shape": {"type": "sphere", "center": list(center), "radius": 1.5},
-        }
-        images.append(image_of(mi.load_dict(scene), spp=16, seed=1))
-    different = np.abs(images[0] - images[1]).max(axis=-1) > 1e-4
-    assert different.mean() < 0.01 and images[0].std() > 0.05
-
-
-@pytest.mark.parametrize(
-    "sensor", [OPENCV, FISHEYE, BARREL, WIDE_FISHEYE, MOVING[3], MOVING[5]], **by_name
-)
-def test_path_traced_sphere_is_where_the_reference_projects_it(sensor):
-    """A luminous sphere, seen by pixels whose rays are nearer to its centre than its radius."""
-    middle = sensor.corner + sensor.size / 2
-    middle_time = middle[1] / sensor.view.height
-    camera = sensor.camera_at(middle_time)
-    axis = points_at(sensor.lens, camera, middle[None] + 2.0, np.array([4.0]))[0]
-    center, radius = axis @ camera.rotation + camera.center, 4 * 5 / max(sensor.f)
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "path"},
-        "sensor": sensor.dictionary(),
-        "shape": {
-            "type": "sphere", "center": list(center), "radius": radius,
-            "emitter": {"type": "area", "radiance": 2.0},
-        },
-    }  # fmt: skip
-    image = image_of(mi.load_dict(scene), spp=64)[..., 0]
-    width, height = sensor.size
-    missed_by = np.full((height, width), np.inf)
-    for row in range(height):
-        place = sensor.corner + np.column_stack([np.arange(width), np.full(width, row)]) + 0.5
-        camera = sensor.camera_at(place[0, 1] / sensor.view.height)
-        points = points_at(sensor.lens, camera, place, np.ones(width))
-        rays = points @ camera.rotation / np.linalg.norm(points, axis=1, keepdims=True)
-        to_center = center - camera.center
-        along = rays @ to_center
-        nearest = np.linalg.norm(to_center - along[:, None] * rays, axis=1)
-        missed_by[row] = np.where(along > 0, nearest, np.inf) - radius
-    # A pixel reaches 0.7 px from its centre; 1 px where the lens shows less of the world.
-    pixel = 4 / min(sensor.f)
-    inside, outside = missed_by < -pixel, missed_by > pixel
-    assert inside.sum() > 10 and outside.sum() > 10
-    np.testing.assert_allclose(image[inside], 2.0, rtol=1e-5)
-    assert not image[outside].any()
-
-
-def test_moving_camera_blurs_a_path_traced_image():
-    """With a global shutter: a point is spread over the path that the reference says it takes."""
-    sensor = replace(PINHOLE, view=FILM, close=pose([0.3, -1.0, 0.5], 40, (0.7, -0.7, 1.1)))
-    center = (np.array(FILM.to_world) @ [0, 0, 4, 1])[:3]
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "path"},
-        "sensor": sensor.dictionary(),
-        "shape": {
-            "type": "sphere", "center": list(center), "radius": 0.15,
-            "emitter": {"type": "area", "radiance": 1.0},
-        },
-    }  # fmt: skip
-    image = image_of(mi.load_dict(scene), spp=1024)[..., 0]
-    y, x = np.mgrid[: FILM.height, : FILM.width] + 0.5
-    found = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
-    path = np.array([
-        film_of(center[None], sensor.camera_at(t), sensor.lens)[0] for t in np.linspace(0, 1, 65)
-    ])  # fmt: skip
-    assert np.linalg.norm(path[-1] - path[0]) > 2
-    # A thousand samples in each of some ten pixels.
-    np.testing.assert_allclose(found, path.mean(axis=0), atol=0.05)
 
 
 @pytest.mark.parametrize("sensor", [*STATIC_SENSORS, BARREL], **by_name)

@@ -15,9 +15,7 @@ from support.calibrated_sensors import (
     FISHEYE,
     OPENCV,
     PINHOLE,
-    STATIC_SENSORS,
     THIN_PRISM,
-    by_name,
     sampled_rays,
     splats_scene,
     transform,
@@ -26,7 +24,7 @@ from support.views import image_of, pose, splats_before
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import OpenCV, Pinhole
+from drgs.reference.effects import OpenCV
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -137,55 +135,6 @@ def test_zero_coefficients_can_be_optimised(sensor, names):
         assert abs(actual) > 2e-4 / step, name
 
 
-def test_an_opencv_lens_without_coefficients_is_a_pinhole():
-    (ray, weight, _), (expected, _, _) = (
-        sampled_rays(replace(OPENCV, lens=lens).load()) for lens in (OpenCV(), Pinhole())
-    )
-    assert (weight == 1).all()
-    np.testing.assert_allclose(np.array(ray.d), np.array(expected.d), rtol=0, atol=2e-7)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
-def test_gradients_of_an_image_reach_the_calibration(sensor):
-    """Against central differences in single precision; some slopes are clamped."""
-    gaussians = splats_before(FILM, 1, 40, 0)
-    # Nothing is cut: nothing jumps.
-    sensor = replace(sensor, view=FILM)
-    scene = splats_scene(sensor, gaussians, alpha_cut=0.0, transmittance_stop=0.0)
-    params = mi.traverse(scene)
-    weights = np.random.default_rng(1).normal(size=(29, 37, 4)).astype(np.float32)
-
-    def loss(key, value) -> float:
-        params[key] = value
-        params.update()
-        return float(np.sum(weights.astype(np.float64) * image_of(scene)))
-
-    for name, step in {
-        "fx": 0.02,
-        "fy": 0.02,
-        "cx": 0.02,
-        "cy": 0.02,
-        "k1": 1e-3,
-        "p1": 1e-3,
-    }.items():
-        keys = [key for key in params.keys() if key.split(".")[-1] == name]  # noqa: SIM118
-        if not keys:
-            continue
-        value = mi.Float(params[keys[0]])
-        expected = (loss(keys[0], value + step) - loss(keys[0], value - step)) / (2 * step)
-        params[keys[0]] = mi.Float(value)
-        dr.enable_grad(params[keys[0]])
-        params.update()
-        image = mi.render(scene, params)
-        dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
-        actual = float(dr.grad(params[keys[0]])[0])
-        params[keys[0]] = dr.detach(params[keys[0]])
-        # Error of the differences: 1e-6 of 4000 numbers of either sign, over the step, and its
-        # square.
-        assert actual == pytest.approx(expected, rel=2e-3, abs=1e-4 / step), name
-
-
 REFUSED = {
     "lens": (
         {"lens": "opencvv"},
@@ -281,44 +230,3 @@ def test_documented_defaults_are_used():
     assert (float(focal.fx[0]), float(focal.fy[0])) == (43.5, 43.5)
     assert (sensor.near_clip(), sensor.far_clip(), sensor.shutter_samples) == (0.01, 1e4, 8)
     assert not sensor.needs_aperture_sample()
-
-
-def test_sensor_has_a_readable_repr():
-    description = str(replace(OPENCV, lens=OpenCV(k1=0.125, p2=0.25)).load())
-    assert description.startswith("CalibratedSensor[\n  fx = [40], fy = [44],\n  cx = [24]")
-    assert "lens = RadialTangential, k1, p1, p2" in description
-    assert "HDRFilm" in description and "0.9" in description
-
-
-XML = """
-<scene version="3.0.0">
-    <sensor type="calibrated">
-        <float name="fx" value="40"/> <float name="fy" value="44"/>
-        <float name="cx" value="24"/> <float name="cy" value="22.5"/>
-        <string name="lens" value="opencv"/>
-        <float name="k1" value="-0.25"/> <float name="p2" value="0.015625"/>
-        <string name="shutter" value="rolling"/> <integer name="shutter_samples" value="3"/>
-        <transform name="to_world"> <matrix value="{open}"/> </transform>
-        <transform name="to_world_close"> <matrix value="{close}"/> </transform>
-        <film type="hdrfilm">
-            <integer name="width" value="53"/> <integer name="height" value="41"/>
-            <integer name="crop_offset_x" value="13"/> <integer name="crop_offset_y" value="7"/>
-            <integer name="crop_width" value="29"/> <integer name="crop_height" value="18"/>
-        </film>
-    </sensor>
-</scene>
-"""
-
-
-def test_sensor_from_xml_equals_sensor_from_a_dictionary():
-    sensor = replace(OPENCV, lens=OpenCV(k1=-0.25, p2=0.015625), close=CLOSE, shutter="rolling")
-    open, close = (
-        " ".join(repr(float(value)) for row in matrix for value in row)
-        for matrix in (sensor.view.to_world, CLOSE)
-    )
-    scene = mi.load_string(XML.format(open=open, close=close))
-    by_xml, by_dictionary = scene.sensors()[0], sensor.load()
-    assert by_xml.shutter_samples == 3
-    (ray, _, _), (expected, _, _) = map(sampled_rays, (by_xml, by_dictionary))
-    np.testing.assert_array_equal(np.array(ray.d), np.array(expected.d))
-    np.testing.assert_array_equal(np.array(ray.o), np.array(expected.o))

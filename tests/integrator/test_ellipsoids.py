@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
 import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
@@ -29,7 +28,6 @@ from support.ellipsoids import (
     write_model,
 )
 from support.helpers import assert_arrays_agree, clear, single
-from support.kernels import drain_kernels
 from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -193,21 +191,6 @@ def test_gradients_of_rotated_sh_match_unrotated_sh_with_a_rotated_camera(
     actual = gradients_held(moved, scene.weights())
     for name in ("sh_coeffs", "opacities"):
         assert_arrays_agree({name: actual[name]}, {name: expected[name]}, GRADIENTS)
-
-
-def test_rotation_change_needs_no_new_kernel(tmp_path):
-    path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
-    shape = {"type": "ellipsoids", "filename": path}
-
-    def kernels(degrees):
-        turn = {"shapes_to_world": mi.ScalarTransform4f().rotate([0, 0, 1], degrees)}
-        loaded = scene_with(turn, VIEWS[1], shape=shape)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(mi.render(loaded))
-            return drain_kernels()
-
-    assert kernels(20) == kernels(130)
 
 
 # ----------------------------------------------------------------------------------------------
