@@ -4,13 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.splats_checks import assert_images_agree, fresh_image, fresh_integrator
-from support.views import (
-    VIEWS,
-    Scene,
-    image_of,
-    pose,
-    tensors,
-)
+from support.views import VIEWS, Scene, image_of, pose, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 
@@ -34,7 +28,6 @@ def sensor_like(view, kind="calibrated", **changes) -> dict:
 
 
 BENT = {"lens": "opencv", "k1": -0.25, "p1": 0.01}
-
 
 BLURRED = {"aperture_radius": 0.1, "focus_distance": 2.0, "fov": VIEWS[1].fov}
 
@@ -92,15 +85,6 @@ def plan_of(sensor, **settings) -> str:
     integrator = fresh_integrator(scene, **settings)
     loaded = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **emitter})
     return loaded.integrator().summary(loaded, loaded.sensors()[0])
-
-
-def test_a_plan_of_a_plain_scene():
-    assert plan_of(VIEWS[1].sensor()) == (
-        "simulated:\n"
-        "  view dependence: spherical harmonics up to degree 1 (the Gaussians' coefficients)\n"
-        "  background: a constant colour (the integrator's background)\n"
-        "  not simulated: lens, depth of field, motion, antialiasing, surfaces"
-    )
 
 
 def test_plan_lists_the_setting_of_each_effect():
