@@ -173,16 +173,6 @@ def test_scene_may_contain_few_gaussians(count):
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
 
 
-def test_scene_parameters_are_copies_named_after_the_integrator():
-    gaussians = make_gaussians(make_view()).to(mi.TensorXf)
-    scene = make_scene(gaussians, ModelConfig(**VIEWER_RENDERING), BACKGROUND)
-    params = mi.traverse(scene)
-    before = np.array(gaussians.means)
-    params["integrator.means"] = dr.zeros(mi.TensorXf, gaussians.means.shape)
-    params.update()
-    assert np.array_equal(np.array(gaussians.means), before)
-
-
 def test_approximations_reach_the_integrator():
     """All of them; and the defaults of the configuration are those of the kernels."""
     values = {

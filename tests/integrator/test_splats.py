@@ -95,20 +95,16 @@ def test_a_background_may_be_given_as_any_rgb(background):
 
 def test_scene_parameters_are_copies_of_the_arguments():
     """Mitsuba assigns to parameters in place: two scenes of one dictionary would share them."""
-    scene = Scene()
-    values = tensors(scene.gaussians)
+    values = tensors(Scene().gaussians)
     before = {name: np.array(value) for name, value in values.items()}
-    loaded = [
-        mi.load_dict({"type": "scene", "integrator": scene.settings | values}) for _ in range(2)
-    ]
-    params = mi.traverse(loaded[0])
+    changed, other = (mi.load_dict({"type": "splats", **values}) for _ in range(2))
+    params = mi.traverse(changed)
     for name in PARAMETER_NAMES:
-        params[f"integrator.{name}"] = params[f"integrator.{name}"] * 0.5
+        params[name] = params[name] * 0.5
     params.update()
-    for name in PARAMETER_NAMES:
-        assert np.array_equal(np.array(values[name]), before[name]), name
-        other = np.array(getattr(loaded[1].integrator().gaussians, name))
-        assert np.array_equal(other, before[name]), name
+    for name, expected in before.items():
+        np.testing.assert_array_equal(values[name], expected, err_msg=name)
+        np.testing.assert_array_equal(getattr(other.gaussians, name), expected, err_msg=name)
 
 
 SWITCHING_PROGRAM = """

@@ -7,17 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import NEAR_THRESHOLD, clear
-from support.splats_checks import (
-    ALL_PARAMETERS,
-    GRADIENTS,
-    STEP,
-    XYZ,
-    assert_gradients_agree,
-    assert_images_agree,
-    both_color_spaces,
-    random_directions,
-    with_tangents,
-)
+from support.splats_checks import ALL_PARAMETERS, XYZ, assert_gradients_agree, assert_images_agree
 from support.views import VIEWS, Scene, View, gradient, gradients_of, image_of, pose, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -190,33 +180,3 @@ def test_parameters_may_be_resized(count):
     assert_images_agree(image_of(loaded), resized.image())
     weights = resized.weights()
     assert_gradients_agree(gradients_of(loaded, weights), resized.gradients(weights))
-
-
-def moved(scene, directions, step) -> np.ndarray:
-    """The reference's image (H, W, 4) of the scene, moved along the directions."""
-    values = dict(vars(scene.gaussians))
-    background = np.array(scene.background)
-    for name, direction in directions.items():
-        if name == "background":
-            background = background + step * direction
-        else:
-            values[name] = values[name] + step * direction
-    rendered = reference.render(
-        reference.Gaussians(**values), scene.camera, np.zeros(3), scene.rendered_degree,
-        scene.antialiased,
-    )  # fmt: skip
-    return replace(scene, background=tuple(background)).image(rendered)
-
-
-@pytest.mark.parametrize(
-    "names", [*((name,) for name in ALL_PARAMETERS), ALL_PARAMETERS], ids="+".join
-)
-@both_color_spaces
-def test_forward_mode_equals_central_differences(names, srgb_primitives):
-    scene = clear(Scene(VIEWS[12], srgb_primitives=srgb_primitives))
-    directions = random_directions(scene, names)
-    loaded = scene.load()
-    params = with_tangents(loaded, directions)
-    actual = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-    expected = (moved(scene, directions, STEP) - moved(scene, directions, -STEP)) / (2 * STEP)
-    assert_images_agree(actual, expected, GRADIENTS)

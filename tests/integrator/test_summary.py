@@ -302,9 +302,7 @@ print(json.dumps(found))
 def test_each_effect_imports_its_own_modules(run_python, tmp_path):
     """In this order, what comes later knows what came before."""
     program = IMPORTS.format(
-        tests=TESTS,
-        modules=[f"drgs.{name}" for name in MODULES],
-        ply=str(tmp_path / "blobs.ply"),
+        tests=TESTS, modules=[f"drgs.{name}" for name in MODULES], ply=str(tmp_path / "blobs.ply")
     )
     result = run_python(program)
     assert result.returncode == 0, result.stderr
@@ -313,18 +311,12 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "nothing": [],
         "smoothing": ["drgs.effects.smoothing", "drgs.training.effects.smoothing"],
         "masks": ["drgs.training.effects.masks"],
-        "colors": [
-            "drgs.training.effects.colors",
-            "drgs.training.effects.view_parameters",
-        ],
+        "colors": ["drgs.training.effects.colors", "drgs.training.effects.view_parameters"],
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
         "perspective": [],
         "environment": [],
-        "distorted": [
-            "drgs.cameras.distortion",
-            "drgs.cameras.radial_tangential",
-        ],
+        "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
         "thin lens": ["drgs.effects.defocus"],
         "orthographic": ["drgs.cameras.orthographic"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],

@@ -1,6 +1,5 @@
 """Code that tests of the ``splats`` integrator share: settings, tolerances, files and scenes."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -43,36 +42,8 @@ def write_gaussians(path, gaussians):
 
 # Rec. 709 primaries and white point D65 (Mitsuba's color.h).
 XYZ = np.array(
-    [
-        [0.412453, 0.357580, 0.180423],
-        [0.212671, 0.715160, 0.072169],
-        [0.019334, 0.119193, 0.950227],
-    ]
+    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
-
-
-# The reference's difference quotient is off by STEP^2 / 6 times the third derivative and by
-# 1e-16 / STEP: 1e-8 of the largest value. What is left is the kernels' single precision.
-STEP = 1e-7
-
-
-def with_tangents(loaded, directions):
-    """Parameters of a scene with gradients enabled and set to ``directions``."""
-    params = mi.traverse(loaded)
-    for name, direction in directions.items():
-        parameter = params[f"integrator.{name}"]
-        dr.enable_grad(parameter)
-        dr.set_grad(parameter, type(parameter)(direction.astype(np.float32)))
-    return params
-
-
-def random_directions(scene, names):
-    rng = np.random.default_rng(7)
-    values = vars(scene.gaussians) | {"background": np.array(scene.background)}
-    return {
-        name: rng.normal(0, 1, values[name].shape).astype(np.float32).astype(np.float64)
-        for name in names
-    }
 
 
 def fresh_integrator(scene, **settings):
