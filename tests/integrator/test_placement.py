@@ -164,7 +164,7 @@ STEP = 1e-6
 
 
 def central_difference(loss, step):
-    """Of sum(weights * image), along a change of the matrix."""
+    """Return the derivative of a loss along a change of the matrix."""
     return (loss(STEP * step) - loss(-STEP * step)) / (2 * STEP)
 
 
