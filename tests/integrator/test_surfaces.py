@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.splats_checks import XYZ
 from support.views import VIEWS, Scene, gradient, image_of, tensors
 from support.wall_scenes import (
     IMAGE,
@@ -96,6 +97,25 @@ def test_image_without_splats_is_the_nested_image():
         assert difference.max() < 0.125 + 0.1
 
 
+def test_each_sample_of_a_pixel_has_its_own_depth():
+    """The mean over the samples, of a wall whose edge crosses pixels."""
+    scene, count = apart(SCENE), 256
+    sensor, wall = scene.view.sensor(samples=count), Wall(half=0.5)
+    smooth = image_of(load(scene, sensor, wall=wall))
+    center = image_of(load(scene, wall=wall, nested_spp=count))
+    blurred = image_of(load(scene, sensor, wall=None)) - image_of(load(scene, wall=None))
+    # Both see the same, but for what the splats change within a pixel and for the sampling noise.
+    assert np.abs(smooth - center - blurred).mean() < 0.01
+    assert np.abs(smooth - center).max() < 0.5
+
+
+def test_film_that_converts_colours_shows_the_same_image():
+    scene = replace(apart(SCENE), srgb_primitives=True)
+    image = image_of(load(scene, scene.view.sensor("xyz"), sky=True))
+    expected_image = rgba(scene, sky=SKY)[..., :3] @ XYZ.T
+    np.testing.assert_allclose(image, expected_image, rtol=0, atol=IMAGE * image.max())
+
+
 def test_depth_alpha_and_normal_include_surfaces_and_splats():
     scene = apart(SCENE)
     image = image_of(load(scene, aovs="z:depth, a:alpha, n:normal"))
@@ -105,7 +125,10 @@ def test_depth_alpha_and_normal_include_surfaces_and_splats():
     np.testing.assert_allclose(image[..., 5], planes["alpha"], rtol=0, atol=IMAGE)
     # The normals of splats are 0 where they are all transparent, and the wall's is added.
     bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
-    normals = image_of(load(scene, aovs="n:normal", **bare))[..., 4:]
+    bare["feature_x"] = mi.TensorXf(np.ones((scene.count, 1), np.float32))
+    image = image_of(load(scene, aovs="n:normal, f:feature_x", **bare))
+    normals, feature = image[..., 4:7], image[..., 7]
+    np.testing.assert_allclose(feature, 0, atol=IMAGE)
     normal = scene.camera.rotation.T @ WALL.axes()[2]
     np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=IMAGE)
 
