@@ -17,10 +17,7 @@ WIDTH, HEIGHT = 200, 150
 
 MEGABYTE = 1 << 20
 SCENE = Scene(count=2000)
-KINDS = {
-    "splats": {},
-    "surfaces": {"floor": {"type": "rectangle"}, "sky": {"type": "constant"}},
-}
+KINDS = {"splats": {}, "surfaces": {"floor": {"type": "rectangle"}, "sky": {"type": "constant"}}}
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -62,11 +62,6 @@ def make_gaussians(view, count=40, degree=2, seed=0):
     return Gaussians(**{n: getattr(g, n).astype(np.float32) for n in PARAMETER_NAMES})
 
 
-# ----------------------------------------------------------------------------------------------
-# Sensors
-# ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("samples", [None, 3])
 def test_sensor_of_a_moving_view_has_the_configured_shutter_samples(samples):
     """The configuration sets their number; the default is the sensor's own."""
@@ -78,23 +73,6 @@ def test_sensor_of_a_moving_view_has_the_configured_shutter_samples(samples):
     assert sensor.shutter_samples == expected
     state = read_sensor(sensor, 0.0)
     assert len(cameras_in_time(camera_from_sensor(state))) == expected
-
-
-@pytest.mark.parametrize(
-    "view",
-    [make_view(), make_view(23, 37, cx=8.0, cy=20.0), make_view(64, 64, 80, 80, 32, 32)],
-    ids=["wide", "tall", "centred"],
-)
-def test_sensor_has_the_camera_of_its_view(view):
-    (sensor,) = make_sensors([view])
-    camera = camera_of(sensor)
-    actual = numbers(camera)
-    # Mitsuba keeps to_world, the angle and the offsets in float32.
-    assert actual["rotation"] == pytest.approx(view.camera_to_world[:3, :3].T, abs=1e-7)
-    assert actual["center"] == pytest.approx(view.center, rel=1e-7)
-    assert actual["focal"] == pytest.approx([view.fx, view.fy], rel=1e-6)
-    assert actual["principal"] == pytest.approx([view.cx, view.cy], abs=1e-5)
-    assert (camera.width, camera.height) == (view.width, view.height)
 
 
 def test_sensor_rays_match_the_view():
@@ -148,11 +126,6 @@ def test_nearly_square_pixels_move_by_less_than_the_tolerance():
     assert 0.002 < np.abs(shift).max() < SQUARE_PIXEL_TOLERANCE
 
 
-# ----------------------------------------------------------------------------------------------
-# Scene
-# ----------------------------------------------------------------------------------------------
-
-
 def expected_image(gaussians, view, near, antialiased):
     parameters = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
     rendered = reference.render(
@@ -187,28 +160,6 @@ def test_derivatives_work_between_images_of_an_unfinished_iterator():
     assert dr.grad(x) == 4
 
 
-def test_settings_of_the_model_change_the_image():
-    """Or the test above would show nothing."""
-    view = make_view()
-    gaussians = make_gaussians(view)
-    images = [
-        expected_image(gaussians, view, near, antialiased)
-        for antialiased, near in ((False, 0.01), (True, 0.01), (False, 0.25))
-    ]
-    assert all(np.abs(images[0] - other).max() > 0.05 for other in images[1:])
-
-
-def test_a_scene_takes_gaussians_from_host_or_device():
-    view = make_view()
-    gaussians = make_gaussians(view)
-    sensor = make_sensors([view])[0]
-    images = [
-        image_of(make_scene(g, ModelConfig(**VIEWER_RENDERING), BACKGROUND), sensor=sensor)
-        for g in (gaussians, gaussians.to(mi.TensorXf))
-    ]
-    assert np.array_equal(*images)
-
-
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 16])
 def test_scene_may_contain_few_gaussians(count):
     """Mitsuba turns three numbers into a colour, four or sixteen could be a matrix."""
@@ -220,23 +171,6 @@ def test_scene_may_contain_few_gaussians(count):
     image = image_of(scene, sensor=make_sensors([view])[0])
     expected = expected_image(few, view, 0.01, False)
     assert_arrays_agree({"image": image}, {"image": expected}, 1e-5)
-
-
-def test_scene_parameters_are_copies_named_after_the_integrator():
-    gaussians = make_gaussians(make_view()).to(mi.TensorXf)
-    scene = make_scene(gaussians, ModelConfig(**VIEWER_RENDERING), BACKGROUND)
-    params = mi.traverse(scene)
-    before = np.array(gaussians.means)
-    params["integrator.means"] = dr.zeros(mi.TensorXf, gaussians.means.shape)
-    params.update()
-    assert np.array_equal(np.array(gaussians.means), before)
-
-
-def test_sensors_of_views_render_without_a_warning(capfd):
-    view = make_view()
-    scene = make_scene(make_gaussians(view), ModelConfig(**VIEWER_RENDERING), BACKGROUND)
-    mi.render(scene, sensor=make_sensors([view])[0])
-    assert "splats" not in "".join(capfd.readouterr())
 
 
 def test_approximations_reach_the_integrator():

@@ -4,6 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.lit_scenes import camera
+from support.lit_scenes import scene_of as lit_scene
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import PluginError, UnsupportedError
@@ -17,35 +19,20 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def discs(means, degree=1):
-    """Thin, faint and grey, in the plane of x and y, with some harmonics."""
+def scene_of(means, shadows, **objects):
+    """Discs that are thin, faint and grey, in the plane of x and y, with some harmonics."""
     n, rng = len(means), np.random.default_rng(0)
-    return {
-        "means": means,
-        "quats": np.tile([1.0, 0, 0, 0], (n, 1)),
-        "log_scales": np.tile(np.log([0.02, 0.02, 0.0005]), (n, 1)),
-        "logit_opacities": np.full(n, np.log(0.01 / 0.99)),
-        "sh0": np.full((n, 1, 3), 0.1),
-        "shN": rng.normal(0, 0.1, (n, (degree + 1) ** 2 - 1, 3)),
-    }
-
-
-def scene_of(values, shadows, **objects):
-    T = mi.ScalarTransform4f
-    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in values.items()}
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "splats", "shadows": shadows, **tensors},
-            "sensor": {
-                "type": "perspective",
-                "to_world": T().look_at([0, -2, 1], [0, 0, 0], [0, 0, 1]),
-                "film": film,
-            },
-            **objects,
-        }
+    splats = splatting.Gaussians(
+        means=np.asarray(means),
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        log_scales=np.tile(np.log([0.02, 0.02, 0.0005]), (n, 1)),
+        logit_opacities=np.full(n, np.log(0.01 / 0.99)),
+        sh0=np.full((n, 1, 3), 0.1),
+        shN=rng.normal(0, 0.1, (n, 3, 3)),
     )
+    sensor = camera([0, -2, 1], [0, 0, 0], size=8, up=(0, 0, 1))
+    settings = {"light": None, "nested": None, "spp": 1, "shadows": shadows}
+    return lit_scene(splats, **settings, sensor=sensor, **objects)
 
 
 def disc(height, radius):
@@ -71,12 +58,11 @@ SKY = {"type": "constant"}
 @pytest.mark.parametrize(("height", "radius"), [(1.0, 1.0), (0.5, 0.2), (2.0, 6.0)])
 def test_disc_blocks_its_solid_angle_of_the_sky(height, radius, monkeypatch):
     """1 - sin^2 of half the angle under which it is seen (Lambert)."""
-    monkeypatch.setattr(
-        shadows, "EMITTER_SAMPLES", 512
-    )  # the quotient of few is biased by a hundredth
+    # The quotient of few samples is biased by a hundredth.
+    monkeypatch.setattr(shadows, "EMITTER_SAMPLES", 512)
     means = np.random.default_rng(1).normal(0, 0.01, (150, 3)) * [1, 1, 0.01]
     factor, higher = factors(
-        scene_of(discs(means), "lid", lid=disc(height, radius), sky=SKY, floor=disc(-0.05, 50.0))
+        scene_of(means, "lid", lid=disc(height, radius), sky=SKY, floor=disc(-0.05, 50.0))
     )
     expected = height**2 / (height**2 + radius**2)
     assert np.mean(factor**GAMMA) == pytest.approx(expected, abs=0.01)
@@ -94,7 +80,7 @@ def test_object_before_a_lamp_casts_a_shadow(pane):
     objects = {"lid": disc(2.0, 0.5), "lamp": lamp, "floor": disc(-0.05, 50.0)}
     if pane is not None:
         objects["pane"] = disc(pane, 50.0) | {"bsdf": {"type": "null"}}
-    factor, _ = factors(scene_of(discs(means), "lid", **objects))
+    factor, _ = factors(scene_of(means, "lid", **objects))
     inside = np.abs(x) < 0.98
     np.testing.assert_allclose(factor[inside], 0, atol=1e-6)
     np.testing.assert_array_equal(factor[np.abs(x) > 1.02], 1)
@@ -102,20 +88,14 @@ def test_object_before_a_lamp_casts_a_shadow(pane):
 
 def test_unlisted_objects_cast_no_shadow():
     means = np.zeros((10, 3))
-    objects = {
-        "lid": disc(1.0, 1.0),
-        "other": disc(3.0, 0.1),
-        "sky": SKY,
-        "floor": disc(-0.05, 50.0),
-    }
-    factor, _ = factors(scene_of(discs(means), "other", **objects))
+    objects = {"lid": disc(1.0, 1.0), "sky": SKY, "floor": disc(-0.05, 50.0)}
+    objects["other"] = disc(3.0, 0.1)
+    factor, _ = factors(scene_of(means, "other", **objects))
     np.testing.assert_array_equal(factor, 1)  # it is behind the lid
 
 
 def test_shadows_are_cached_until_the_scene_changes():
-    scene = scene_of(
-        discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY, floor=disc(-0.05, 50.0)
-    )
+    scene = scene_of(np.zeros((4, 3)), "lid", lid=disc(1.0, 1.0), sky=SKY, floor=disc(-0.05, 50.0))
     mi.render(scene)
     first = scene.integrator().state.cache.shaded
     mi.render(scene)
@@ -128,10 +108,10 @@ def test_shadows_are_cached_until_the_scene_changes():
 
 
 def test_unknown_shapes_and_derivatives_are_refused():
-    scene = scene_of(discs(np.zeros((4, 3))), "lit", lid=disc(1.0, 1.0), sky=SKY)
+    scene = scene_of(np.zeros((4, 3)), "lit", lid=disc(1.0, 1.0), sky=SKY)
     with pytest.raises(PluginError, match="ids of the scene's shapes, got 'lit'; there are lid"):
         scene.integrator().render(scene)
-    scene = scene_of(discs(np.zeros((4, 3))), "lid", lid=disc(1.0, 1.0), sky=SKY)
+    scene = scene_of(np.zeros((4, 3)), "lid", lid=disc(1.0, 1.0), sky=SKY)
     params = mi.traverse(scene)
     dr.enable_grad(params["integrator.sh0"])
     params.update()

@@ -17,18 +17,10 @@ from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
-from drgs.datasets.fingerprint import fingerprint_of
 from drgs.datasets.types import CameraMotion
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.integrator.summary import (
-    SimulatedEffect,
-    format_effects,
-    summary_of_sensors,
-    summary_of_views,
-)
-from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
 from drgs.training.effects.base import integrator_settings, training_effects
-from drgs.training.loop import History
 from drgs.training.summary import summary_of_fit
 
 MODULES = (
@@ -56,50 +48,19 @@ def config_of(**changes):
     return with_changes(FitConfig(data={"path": "."}, model=VIEWER_RENDERING), values)
 
 
-# ----------------------------------------------------------------------------------------------
-# Plans
-# ----------------------------------------------------------------------------------------------
-
-
-def test_plan_has_a_line_per_effect_and_one_for_unused_ones():
-    effects = [
-        SimulatedEffect("a", "much", "x.y"),
-        SimulatedEffect("b", None),
-        SimulatedEffect("c", "some", "z"),
-        SimulatedEffect("d", None),
-    ]
-    assert (
-        format_effects(effects)
-        == "simulated:\n  a: much (x.y)\n  c: some (z)\n  not simulated: b, d"
-    )
-    assert format_effects(effects[:1]) == "simulated:\n  a: much (x.y)"
-    ignored = [
-        *effects,
-        SimulatedEffect("e", None, "z", ignored=True),
-        SimulatedEffect("f", "a part", "z", True),
-    ]
-    assert format_effects(ignored[4:]) == (
-        "simulated:\n  f: a part (z)\n  not simulated: e (ignored), f (ignored)"
-    )
-
-
 def test_the_plan_of_a_plain_fit():
     config = config_of(data__background="white")
-    assert format_effects(summary_of_fit(config, fits.plain_dataset())) == (
+    plan = format_effects(summary_of_fit(config, fits.plain_dataset()))
+    assert plan == (
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 3 (model.sh_degree: 3)\n"
         "  background: white (data.background)\n"
         "  not simulated: lens distortion, motion, antialiasing, exposure and white balance, "
         "masks, depth, camera refinement"
     )
-
-
-def test_the_plan_of_a_fit_by_default_is_antialiased():
-    config = config_of(model__antialiased=True, model__low_pass=0.1, data__background="white")
     default = FitConfig(data={"path": ".", "background": "white"})
-    plan = format_effects(summary_of_fit(default, fits.plain_dataset()))
-    assert plan == format_effects(summary_of_fit(config, fits.plain_dataset()))
-    assert "antialiasing: opacities compensated for the low-pass filter" in plan
+    by_default = format_effects(summary_of_fit(default, fits.plain_dataset()))
+    assert "antialiasing: opacities compensated for the low-pass filter" in by_default
 
 
 def rich_dataset():
@@ -141,35 +102,27 @@ def test_plan_of_a_fit_lists_the_setting_of_each_effect():
     )
 
 
-@pytest.mark.parametrize(
-    ("changes", "name", "expected"),
-    [
-        ({"loss__depth_weight": 0.0}, "depth", None),
-        ({"data__background": "black"}, "background", ("black", "data.background")),
-        (
-            {"cameras__optimise": True, "cameras__principal_lr": 1e-4},
-            "camera refinement",
-            ("poses, principal point", "cameras.optimise"),
-        ),
-        (
-            {
-                "cameras__optimise": True, "cameras__rotation_lr": 0.0,
-                "cameras__translation_lr": 0.0,
-            },
-            "camera refinement",
-            ("nothing: all rates are 0", "cameras.optimise"),
-        ),
-        (
-            {"model__antialiased": True},
-            "antialiasing",
-            ("opacities compensated for the low-pass filter", "model.antialiased"),
-        ),
-        ({"model__smoothing": True}, "antialiasing", ("3D smoothing filter", "model.smoothing")),
-    ],
-)  # fmt: skip
+SETTINGS = [
+    ({"loss__depth_weight": 0.0}, "depth", (None, "the dataset's depth, in 6 views")),
+    ({"data__background": "black"}, "background", ("black", "data.background")),
+    (
+        {"cameras__optimise": True, "cameras__principal_lr": 1e-4},
+        "camera refinement",
+        ("poses, principal point", "cameras.optimise"),
+    ),
+    (
+        {"cameras__optimise": True, "cameras__rotation_lr": 0.0, "cameras__translation_lr": 0.0},
+        "camera refinement",
+        ("nothing: all rates are 0", "cameras.optimise"),
+    ),
+    ({"model__smoothing": True}, "antialiasing", ("3D smoothing filter", "model.smoothing")),
+]
+
+
+@pytest.mark.parametrize(("changes", "name", "expected"), SETTINGS)
 def test_the_plan_follows_the_configuration(changes, name, expected):
     (effect,) = [e for e in summary_of_fit(config_of(**changes), rich_dataset()) if e.name == name]
-    assert (None if effect.what is None else (effect.what, effect.why)) == expected
+    assert (effect.what, effect.why) == expected
 
 
 def test_plan_of_a_fit_lists_ignored_data():
@@ -205,21 +158,15 @@ def test_plan_of_views_covers_all_views():
 
 
 def test_plan_of_views_lists_ignored_effects():
-    integrator = rich_scene(ignore="distortion, motion, defocus, smoothing")
-    assert format_effects(summary_of_views(integrator.state, rich_dataset().train)).splitlines()[
-        -1
-    ] == (
-        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, "
-        "smoothing filter (ignored)"
-    )
-    assert format_effects(
-        summary_of_views(integrator.state, fits.plain_dataset().train)
-    ).splitlines()[-1] == (
-        "  not simulated: lens distortion, motion, antialiasing, smoothing filter (ignored)"
-    )
+    state = rich_scene(ignore="distortion, motion, defocus, smoothing").state
+    for views, ignored in ((rich_dataset().train, " (ignored)"), (fits.plain_dataset().train, "")):
+        assert format_effects(summary_of_views(state, views)).splitlines()[-1] == (
+            f"  not simulated: lens distortion{ignored}, motion{ignored}, antialiasing, "
+            "smoothing filter (ignored)"
+        )
 
 
-def cameras_of_sensors():
+def test_plan_of_sensors_covers_all_sensors():
     """A pinhole; one that is bent and moves; a thin lens; an orthographic one."""
     to_world = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
     close = {"to_world_close": VIEWS[0].sensor()["to_world"]}
@@ -230,62 +177,26 @@ def cameras_of_sensors():
         {"type": "thinlens", **to_world, "fov": 40.0, **thin},
         {"type": "orthographic", **to_world},
     ]
-    return [camera_from_sensor(read_sensor(mi.load_dict(sensor), 0.01)) for sensor in sensors]
+    cameras = [camera_from_sensor(read_sensor(mi.load_dict(s), 0.01)) for s in sensors]
 
+    def lines(integrator, **surfaces):
+        plan = summary_of_sensors(integrator.state, cameras, None, **surfaces)
+        return format_effects(plan).splitlines()[3:]
 
-def test_plan_of_sensors_covers_all_sensors():
-    cameras = cameras_of_sensors()
-    assert format_effects(summary_of_sensors(rich_scene().state, cameras, None)).splitlines()[
-        3:
-    ] == [
+    assert lines(rich_scene()) == [
         "  lens: Orthographic and RadialTangential (k1) (2 of 4 sensors)",
         "  depth of field: a thin lens (1 of 4 sensors)",
         "  motion: blurred (1 of 4 sensors)",
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
         "  not simulated: surfaces",
     ]
-    ignoring = rich_scene(ignore="distortion, motion, defocus")
-    assert format_effects(summary_of_sensors(ignoring.state, cameras, None)).splitlines()[3:] == [
+    assert lines(rich_scene(ignore="distortion, motion, defocus"), num_surfaces=2) == [
         "  lens: Orthographic (1 of 4 sensors)",
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)",
-        "  not simulated: lens (ignored), depth of field (ignored), motion (ignored), surfaces",
+        "  surfaces: a nested integrator's image, between the splats (2 of the scene's shapes)",
+        "  not simulated: lens (ignored), depth of field (ignored), motion (ignored), "
+        "light between splats and surfaces",
     ]
-    plan = summary_of_sensors(rich_scene().state, cameras[:1], None, num_surfaces=2)
-    line = "  surfaces: a nested integrator's image, between the splats (2 of the scene's shapes)"
-    assert line in format_effects(plan).splitlines()
-    assert format_effects(summary_of_sensors(ignoring.state, cameras[:1], None)).splitlines()[
-        -1
-    ] == ("  not simulated: lens, depth of field, motion, surfaces")
-
-
-def test_plan_of_a_fit_matches_its_effects():
-    """Both are made of the same configuration and dataset; neither knows of the other."""
-    names = {
-        "background": "background",
-        "colors": "exposure and white balance",
-        "masks": "masks",
-        "depth": "depth",
-        "cameras": "camera refinement",
-        "smoothing": "antialiasing",
-    }
-    for changes, dataset in (
-        ({}, fits.plain_dataset()),
-        ({}, rich_dataset()),
-        ({"loss__depth_weight": 0.0, "colors__lr": 0.1}, rich_dataset()),
-        ({"cameras__optimise": True}, fits.plain_dataset()),
-        (EVERYTHING, rich_dataset()),
-    ):
-        config = config_of(**changes)
-        planned = {e.name for e in summary_of_fit(config, dataset) if e.what is not None}
-        taking_part = {names[e.name] for e in training_effects(config, dataset)}
-        of_the_integrator = {"view dependence", "lens distortion", "motion", "background"}
-        assert planned - of_the_integrator == taking_part - of_the_integrator
-        assert ("background" in taking_part) == config.data.random_background
-
-
-# ----------------------------------------------------------------------------------------------
-# Effects of a fit
-# ----------------------------------------------------------------------------------------------
 
 
 def test_plain_fit_has_no_effects():
@@ -302,9 +213,6 @@ def test_plain_fit_has_no_effects():
     [
         ({}, ["depth", "masks"]),
         ({"colors__lr": 0.1}, ["depth", "colors", "masks"]),
-        ({"data__random_background": True}, ["depth", "background", "masks"]),
-        ({"cameras__optimise": True}, ["depth", "masks", "cameras"]),
-        ({"model__smoothing": True}, ["depth", "masks", "smoothing"]),
         (EVERYTHING, ["depth", "colors", "background", "masks", "smoothing", "cameras"]),
     ],
 )
@@ -328,115 +236,13 @@ def test_all_effects_work_in_one_fit():
     fits.assert_resumes_to_the_same_bytes(lambda: fits.make_trainer(dataset, **changes), 3, 4)
 
 
-def test_checkpoint_contains_the_state_of_effects(tmp_path):
-    changes = {key: value for key, value in EVERYTHING.items() if key != "model__antialiased"}
-    dataset = fits.with_views(fits.true_dataset(), lambda v: replace(v, depth=None))
-    trainer = fits.steps(fits.make_trainer(dataset, **changes), 3)
-    saved = Checkpoint(trainer.state(), *History().arrays(), 0.0, fingerprint_of(dataset))
-    save_checkpoint(tmp_path, trainer.config, saved)
-    resumed = fits.make_trainer(dataset, **changes)
-    resumed.restore(load_checkpoint(tmp_path, trainer.config).trainer)
-    expected, got = (fits.everything_of(fits.steps(t, 2)) for t in (trainer, resumed))
-    assert expected == got
-    assert {"colors/matrices.m", "cameras/turns.value", "smoothing/filter"} <= expected.keys()
-
-
-# ----------------------------------------------------------------------------------------------
-# No trace of what is not called for
-# ----------------------------------------------------------------------------------------------
-
-PLAIN = """
-import importlib.abc, json, sys
-sys.path.insert(0, {tests!r})
-
-class Blocked(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path=None, target=None):
-        if name in {blocked!r}:
-            raise AssertionError(name + " is not there")
-
-sys.meta_path.insert(0, Blocked())
-import drgs, drjit as dr, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-import numpy as np
-from drgs.bench import scenes
-from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.scene import make_scene, make_sensors
-
-def kernels(action):
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        action()
-        dr.sync_thread()
-        history = dr.kernel_history([dr.KernelType.JIT])
-    return [[kernel["hash"], kernel["operation_count"]] for kernel in history]
-
-bench = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
-trainer = scenes.trainer_of(bench, {changes!r})
-found = {{"first step": kernels(trainer.step), "later step": kernels(trainer.step)}}
-
-scene = make_scene(bench.gaussians, trainer.config.model, (0.2, 0.4, 0.6))
-(sensor,) = make_sensors([scenes.view_of(bench)])
-params = mi.traverse(scene)
-for name in PARAMETER_NAMES:
-    dr.enable_grad(params["integrator." + name])
-ones = dr.ones(mi.TensorXf, (48, 48, 3))
-dr.eval(ones)
-
-def backward():
-    dr.backward(dr.sum(mi.render(scene, params, sensor=sensor, spp=1) * ones, axis=None))
-    dr.eval([dr.grad(params["integrator." + name]) for name in PARAMETER_NAMES])
-
-found["render and backward"] = kernels(backward)
-found["imported"] = sorted(set(sys.modules) & set({modules!r}))
-print(json.dumps(found))
-"""
-
-
-def run_in_new_process(run_python, blocked=(), **changes) -> dict:
-    """Raises RuntimeError with the process's last line of error."""
-    modules = [f"drgs.{name}" for name in MODULES]
-    program = PLAIN.format(
-        tests=TESTS,
-        blocked=[f"drgs.{name}" for name in blocked],
-        changes={key.replace("__", "."): value for key, value in changes.items()},
-        modules=modules,
-    )
-    result = run_python(program)
-    if result.returncode != 0:
-        raise RuntimeError(result.stderr.strip().splitlines()[-1])
-    return json.loads(result.stdout)
-
-
-@pytest.mark.slow
-def test_kernels_are_the_same_without_effect_modules(run_python):
-    """Hashes and operations of an image with its derivatives, and of a fit's iterations."""
-    whole = run_in_new_process(run_python)
-    reduced = run_in_new_process(run_python, blocked=MODULES)
-    assert whole == reduced
-    assert whole["imported"] == []
-    assert all(len(kernels) > 30 for name, kernels in whole.items() if name != "imported")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("changes", "module"),
-    [
-        ({"colors__lr": 1e-3}, "training.effects.colors"),
-        ({"cameras__optimise": True}, "training.effects.cameras"),
-        ({"model__smoothing": True}, "training.effects.smoothing"),
-    ],
-)
-def test_missing_module_fails_only_when_its_effect_is_used(run_python, changes, module):
-    with pytest.raises(RuntimeError, match=f"drgs.{module} is not there"):
-        run_in_new_process(run_python, blocked=[module], **changes)
-
-
 IMPORTS = """
 import json, sys
 sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
 from dataclasses import replace
+from drgs.bench import scenes
 from drgs.training.effects.base import training_effects
 from drgs.training.summary import summary_of_fit
 from support import small_capture as capture
@@ -450,7 +256,9 @@ ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
 def dataset(**extras):
     return replace(plain, train=tuple(replace(view, **extras) for view in plain.train))
 
-found, known = {{}}, set()
+bench = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
+scenes.trainer_of(bench, {{}}).step()
+found, known = {{"a plain fit": sorted(set(sys.modules) & set({modules!r}))}}, set()
 for name, extras, changes in (
     ("nothing", {{}}, {{}}),
     ("smoothing", {{}}, {{"model.smoothing": True}}),
@@ -476,6 +284,7 @@ for name, scene in (
     ("environment", {{"sensor": sensor(type="perspective"), "sky": {{"type": "constant"}}}}),
     ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}),
     ("thin lens", {{"sensor": sensor(type="thinlens", aperture_radius=0.1, focus_distance=2.0)}}),
+    ("orthographic", {{"sensor": sensor(type="orthographic")}}),
     ("surface", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
     ("light", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
 ):
@@ -493,39 +302,26 @@ print(json.dumps(found))
 def test_each_effect_imports_its_own_modules(run_python, tmp_path):
     """In this order, what comes later knows what came before."""
     program = IMPORTS.format(
-        tests=TESTS,
-        modules=[f"drgs.{name}" for name in MODULES],
-        ply=str(tmp_path / "blobs.ply"),
+        tests=TESTS, modules=[f"drgs.{name}" for name in MODULES], ply=str(tmp_path / "blobs.ply")
     )
     result = run_python(program)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout) == {
+        "a plain fit": [],
         "nothing": [],
         "smoothing": ["drgs.effects.smoothing", "drgs.training.effects.smoothing"],
         "masks": ["drgs.training.effects.masks"],
-        "colors": [
-            "drgs.training.effects.colors",
-            "drgs.training.effects.view_parameters",
-        ],
+        "colors": ["drgs.training.effects.colors", "drgs.training.effects.view_parameters"],
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
         "perspective": [],
         "environment": [],
-        "distorted": [
-            "drgs.cameras.distortion",
-            "drgs.cameras.radial_tangential",
-        ],
+        "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
         "thin lens": ["drgs.effects.defocus"],
+        "orthographic": ["drgs.cameras.orthographic"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
         "light": ["drgs.integrator.splat_transport", "drgs.light.grid", "drgs.light.walk"],
     }
-
-
-def test_plain_plugin_has_no_effect_parameters():
-    params = mi.traverse(mi.load_dict({"type": "splats", **tensors(Scene().gaussians)}))
-    names = ["means", "quats", "log_scales", "logit_opacities", "sh0", "shN"]
-    names += ["to_world", "background"]
-    assert list(params.keys()) == names
 
 
 def test_plain_sensor_has_no_effect_parameters():

@@ -9,18 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import bitwise
-from support.views import (
-    gradient,
-    gradients_of,
-    image_of,
-    tensors,
-)
+from support.views import gradient, gradients_of, image_of
 from support.wall_scenes import GRADIENTS, IMAGE, SCENE, Wall, apart, blob, expected, load, rgba
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.reference import splatting as reference
 
 STEP = 1e-6
 
@@ -30,23 +24,14 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-# ----------------------------------------------------------------------------------------------
-# Derivatives
-# ----------------------------------------------------------------------------------------------
-
-
 RADIANCE_KEY = "wall.emitter.radiance.value"
-
-
-def weights_of(scene, seed=1) -> np.ndarray:
-    return scene.weights(seed)
 
 
 @pytest.mark.parametrize("srgb_primitives", [False, True])
 def test_gradients_equal_differences_of_the_reference(srgb_primitives):
     """Along a random direction of each parameter; the wall stays."""
     scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
-    weights = weights_of(scene)
+    weights = scene.weights()
     actual = gradients_of(load(scene), weights, PARAMETER_NAMES)
     rng = np.random.default_rng(5)
     for name in PARAMETER_NAMES:
@@ -65,7 +50,7 @@ def test_gradients_equal_differences_of_the_reference(srgb_primitives):
 
 def test_gradient_of_wall_radiance_is_its_transmittance():
     scene = replace(apart(SCENE), srgb_primitives=True)
-    weights = weights_of(scene)
+    weights = scene.weights()
     loaded = load(scene)
     params = mi.traverse(loaded)
     dr.enable_grad(params[RADIANCE_KEY])
@@ -82,7 +67,7 @@ def test_gradient_of_wall_radiance_is_its_transmittance():
 def test_forward_mode_is_the_transpose_of_the_gradients(srgb_primitives):
     """Parameters: the splats, the wall's colour, and the environment past its edges."""
     scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
-    weights = weights_of(scene)
+    weights = scene.weights()
     keys = [f"integrator.{name}" for name in PARAMETER_NAMES]
     keys += [RADIANCE_KEY, "sky.radiance.value"]
     wall = Wall(half=0.5)
@@ -114,76 +99,53 @@ def test_forward_mode_is_the_transpose_of_the_gradients(srgb_primitives):
     assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
 
 
-SENSORS = {
-    "perspective": (
-        {"type": "perspective"},
-        ["to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"],
-    ),
+PERSPECTIVE = {"type": "perspective"}
+OF_CAMERAS = {
+    "perspective": (PERSPECTIVE, ("to_world", "x_fov", "principal_point_offset_x"), {}),
     "thinlens": (
         {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0},
-        ["to_world", "aperture_radius", "focus_distance"],
+        ("to_world", "aperture_radius", "focus_distance"),
+        {},
     ),
-    "orthographic": ({"type": "orthographic"}, ["to_world"]),
+    "orthographic": ({"type": "orthographic"}, ("to_world",), {}),
     "calibrated": (
         {"type": "calibrated", "fx": 8.0, "lens": "opencv", "k1": 0.01},
-        ["to_world", "fx", "cx", "k1"],
+        ("to_world", "fx", "cx", "k1"),
+        {},
     ),
     "batch": (
-        {
-            "type": "batch",
-            "left": {"type": "perspective"},
-            "right": {"type": "perspective", "fov": 50},
-        },
-        ["left.to_world", "right.x_fov"],
+        {"type": "batch", "left": PERSPECTIVE, "right": {"type": "perspective", "fov": 50}},
+        ("left.to_world", "right.x_fov"),
+        {},
     ),
+    "prb": (PERSPECTIVE, ("to_world",), {"nested": {"type": "prb"}}),
+    "splatpath": (PERSPECTIVE, ("to_world",), {"nested": {"type": "splatpath"}}),
+    "rays": (PERSPECTIVE, ("to_world",), {"light": "rays"}),
+    "probe": (PERSPECTIVE, ("to_world",), {"light": "probe", "probes": "wall"}),
 }
-"""With parameters that can be differentiated where there are no surfaces."""
-
-NESTED = {
-    "the default": {},
-    "path": {"nested": {"type": "path"}},
-    "prb": {"nested": {"type": "prb"}},
-    "splatpath": {"nested": {"type": "splatpath"}},
-    "rays": {"light": "rays"},
-    "probe": {"light": "probe", "probes": "wall"},
-}
+"""Sensors, parameters that have derivatives without surfaces, and settings."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["backward", "forward"])
-@pytest.mark.parametrize("nested", NESTED)
-def test_camera_derivatives_with_surfaces_are_refused_by_name(nested, mode):
-    check_refused("perspective", ["to_world"], NESTED[nested], mode)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", SENSORS)
-def test_camera_derivatives_with_surfaces_are_refused_for_every_sensor(kind):
-    check_refused(kind, SENSORS[kind][1], {}, "backward")
-
-
-def check_refused(kind, keys, settings, mode):
+@pytest.mark.parametrize("derivative", [dr.backward, dr.forward_to])
+@pytest.mark.parametrize("name", OF_CAMERAS)
+def test_camera_derivatives_with_surfaces_are_refused_by_name(name, derivative):
+    sensor, keys, settings = OF_CAMERAS[name]
     film = {"type": "hdrfilm", "width": 8, "height": 4, "rfilter": {"type": "box"}}
     loaded = load(SCENE, wall=Wall(), **settings)
     for key in keys:
-        sensor = mi.load_dict({**SENSORS[kind][0], "film": film, "id": "eye"})
-        params = mi.traverse(sensor)
+        eye = mi.load_dict({**sensor, "film": film, "id": "eye"})
+        params = mi.traverse(eye)
         dr.enable_grad(params[key])
-        image = mi.render(loaded, params, sensor=sensor)
-        derivative = dr.backward if mode == "backward" else dr.forward_to
+        image = mi.render(loaded, params, sensor=eye)
         with pytest.raises(UnsupportedError, match=rf"^splats: eye\.{key} is not differentiated"):
             derivative(image)
 
 
 def test_gradients_are_the_same_to_the_last_bit():
     scene = apart(SCENE)
-    runs = [gradients_of(load(scene), weights_of(scene), PARAMETER_NAMES) for _ in range(2)]
+    runs = [gradients_of(load(scene), scene.weights(), PARAMETER_NAMES) for _ in range(2)]
     assert bitwise(list(runs[0].values())) == bitwise(list(runs[1].values()))
-
-
-# ----------------------------------------------------------------------------------------------
-# Runs of the nested integrator
-# ----------------------------------------------------------------------------------------------
 
 
 def counting():
@@ -230,27 +192,19 @@ def test_unreferenced_scene_is_freed(use, with_shapes):
     assert integrator() is None
 
 
-def test_nested_samples_are_independent_of_the_splats():
-    """Whatever the nested integrator writes into the sensor's sampler."""
-    scene, weights = apart(SCENE), weights_of(SCENE)
-    loaded = load(scene, nested_spp=16)
-    images = [image_of(loaded) for _ in range(2)]
-    np.testing.assert_array_equal(*images)
-    gradients = [gradients_of(loaded, weights, ["means"])["means"] for _ in range(2)]
-    np.testing.assert_array_equal(gradients[1], 2 * gradients[0])  # they are accumulated
-    assert loaded.sensors()[0].sampler().sample_count() == 1
-
-
-@pytest.mark.parametrize("mode", ["backward", "forward"])
-def test_surface_derivatives_keep_the_sample_count(mode):
-    loaded = load(apart(SCENE), nested_spp=16)
+@pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
+def test_nested_samples_are_independent_of_the_splats(spp):
+    """Whatever the nested integrator and its derivatives write into the sensor's sampler."""
+    loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
+    first = image_of(loaded, spp=spp, seed=3)
+    loaded.integrator().state.cache.forget("frames")
+    np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
     params = mi.traverse(loaded)
-    dr.enable_grad(params[RADIANCE_KEY])
-    dr.set_grad(params[RADIANCE_KEY], 1)
-    image = mi.render(loaded, params)
-    derivative = dr.backward if mode == "backward" else dr.forward_to
-    derivative(image)
-    assert loaded.sensors()[0].sampler().sample_count() == 1
+    for derivative in (dr.backward, dr.forward_to):
+        dr.enable_grad(params[RADIANCE_KEY])
+        dr.set_grad(params[RADIANCE_KEY], 1)
+        derivative(mi.render(loaded, params))
+        assert loaded.sensors()[0].sampler().sample_count() == 1
 
 
 def test_nested_integrator_can_be_set():
@@ -262,19 +216,9 @@ def test_nested_integrator_can_be_set():
     assert "nested = " in str(scene.integrator())
 
 
-@pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
-def test_nested_integrator_keeps_its_own_sample_count(spp):
-    """Mitsuba's integrators leave their count with the sampler: the next image is the same."""
-    loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
-    first = image_of(loaded, spp=spp, seed=3)
-    assert loaded.sensors()[0].sampler().sample_count() == 1
-    loaded.integrator().state.cache.forget("frames")
-    np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
-
-
 def test_gradients_match_the_image_for_any_nested_samples():
     """Splats at the centres of pixels, before a wall that covers the film and has no noise."""
-    scene, weights = apart(SCENE), weights_of(SCENE)
+    scene, weights = apart(SCENE), SCENE.weights()
     alone = gradients_of(load(scene), weights, ["means"])["means"]
     with_more = gradients_of(load(scene, nested_spp=16), weights, ["means"])["means"]
     np.testing.assert_allclose(with_more, alone, rtol=0, atol=GRADIENTS * np.abs(alone).max())
@@ -292,7 +236,7 @@ def test_moved_wall_is_rendered_at_its_new_place():
 
 
 def test_rendering_another_image_keeps_gradients():
-    scene, weights = apart(SCENE), weights_of(SCENE)
+    scene, weights = apart(SCENE), SCENE.weights()
     loaded = load(scene)
     expected = gradients_of(loaded, weights, ["means"])["means"]
     loaded, other = load(scene), load(scene, wall=Wall(z=2.9))
@@ -302,22 +246,3 @@ def test_rendering_another_image_keeps_gradients():
     mi.render(other, integrator=loaded.integrator())
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
     np.testing.assert_array_equal(gradient(params["integrator.means"]), expected)
-
-
-def test_gaussians_of_shapes_are_not_surfaces():
-    """They equal the integrator's own, and the nested image does not show them."""
-    scene = apart(SCENE)
-    center = scene.camera.rotation.T @ [0, 0, 1.5] + scene.camera.center
-    one = {
-        "means": center,
-        "quats": [1, 0, 0, 0],
-        "log_scales": np.log([0.3] * 3),
-        "logit_opacities": np.log(3),
-        "sh0": np.ones((1, 3)),
-        "shN": np.zeros((3, 3)),
-    }
-    together = {n: np.concatenate([v, [one[n]]]) for n, v in vars(scene.gaussians).items()}
-    image = image_of(load(scene, shapes={"blob": blob(center)}))
-    expected = image_of(load(scene, **tensors(reference.Gaussians(**together))))
-    np.testing.assert_allclose(image, expected, atol=IMAGE * expected.max())
-    assert np.abs(image - image_of(load(scene))).max() > 0.1

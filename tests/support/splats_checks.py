@@ -1,8 +1,5 @@
 """Code that tests of the ``splats`` integrator share: settings, tolerances, files and scenes."""
 
-from dataclasses import replace
-
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -10,55 +7,16 @@ import pytest
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from support.helpers import assert_arrays_agree
-from support.views import (
-    VIEWS,
-    Scene,
-    image_of,
-    tensors,
-)
+from support.views import image_of, tensors
 
 # Relative to the largest value of an array, in single precision: test_rendering derives 2e-5 and
 # 2e-4 for films up to twice this size. Converting to linear radiance multiplies relative errors by
 # at most 2.4. Measured 1e-6 and 1e-5.
 IMAGE = 1e-5
 
-
 GRADIENTS = 1e-4
 
-
 ALL_PARAMETERS = (*PARAMETER_NAMES, "background")
-
-
-SETTINGS = (
-    Scene(),
-    Scene(degree=3),
-    Scene(degree=0),
-    Scene(degree=3, sh_degree=1),
-    Scene(degree=2, sh_degree=0),
-    Scene(antialiased=True),
-    Scene(near=0.25),
-    Scene(replace(VIEWS[1], near_clip=0.25)),
-    Scene(srgb_primitives=True),
-    Scene(srgb_primitives=True, antialiased=True, degree=2, near=0.25),
-)
-
-
-SETTING_NAMES = (
-    "degree 1",
-    "degree 3",
-    "degree 0",
-    "degree 1 of 3",
-    "degree 0 of 2",
-    "antialiased",
-    "near",
-    "near clip of the sensor",
-    "linear radiance",
-    "linear radiance, antialiased, near",
-)
-
-
-all_settings = pytest.mark.parametrize("scene", SETTINGS, ids=SETTING_NAMES)
-
 
 both_color_spaces = pytest.mark.parametrize(
     "srgb_primitives", [False, True], ids=["display space", "linear radiance"]
@@ -84,36 +42,8 @@ def write_gaussians(path, gaussians):
 
 # Rec. 709 primaries and white point D65 (Mitsuba's color.h).
 XYZ = np.array(
-    [
-        [0.412453, 0.357580, 0.180423],
-        [0.212671, 0.715160, 0.072169],
-        [0.019334, 0.119193, 0.950227],
-    ]
+    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
-
-
-# The reference's difference quotient is off by STEP^2 / 6 times the third derivative and by
-# 1e-16 / STEP: 1e-8 of the largest value. What is left is the kernels' single precision.
-STEP = 1e-7
-
-
-def with_tangents(loaded, directions):
-    """Parameters of a scene with gradients enabled and set to ``directions``."""
-    params = mi.traverse(loaded)
-    for name, direction in directions.items():
-        parameter = params[f"integrator.{name}"]
-        dr.enable_grad(parameter)
-        dr.set_grad(parameter, type(parameter)(direction.astype(np.float32)))
-    return params
-
-
-def random_directions(scene, names):
-    rng = np.random.default_rng(7)
-    values = vars(scene.gaussians) | {"background": np.array(scene.background)}
-    return {
-        name: rng.normal(0, 1, values[name].shape).astype(np.float32).astype(np.float64)
-        for name in names
-    }
 
 
 def fresh_integrator(scene, **settings):

@@ -1,4 +1,4 @@
-"""doc"""
+"""Isolated splats, and their images by ``volprim_rf_basic``, by drgs and by closed forms."""
 
 from __future__ import annotations
 
@@ -18,10 +18,8 @@ from support.views import View, image_of, pose, tensors
 FILM = 64
 """Width and height of the film, px."""
 
-
 WIDTH = 7.0
 """Standard deviation of an ordinary splat on the film, px: the film shows 4.5 to each side."""
-
 
 DISTANCE = 8.0
 """From the camera to the nearest splat, scene units. volprim goes on 1e-4 behind the point where
@@ -29,33 +27,21 @@ a ray entered a splat's shell. Where single precision is coarser than that (at a
 or the shell narrow as seen from the camera, such a point may lie before the shell, and the splat
 is then counted twice."""
 
-
 REACH = 6.0
 """volprim's shells are at least so many standard deviations wide: at their rim, where a grazing
 ray may count a splat twice, alpha is at most exp(-6^2 / 2) = 1.5e-8 and less than UNIT."""
 
-
 UNIT = 2.0**-24
 """Half a unit in the last place of single precision, relative."""
-
 
 ROUNDING = 16 * UNIT
 """Relative. Each side takes a mean or a ray through about 8 operations (offset, rotation,
 division, focal length, principal point, distance in the splat's axes), each rounded by UNIT."""
 
-
 STRAIGHT = pose([0, 0, 1], 0)
-
-
 TURNED = pose([0.3, -1.0, 0.5], 40, (0.4, -0.7, 1.1))
-
-
 ROUND = ((WIDTH, WIDTH, WIDTH),)
-
-
 LONG = ((1.2 * WIDTH, 0.6 * WIDTH, 0.3 * WIDTH),)
-
-
 OFF_AXIS = (0.4, -0.3)
 
 
@@ -113,7 +99,6 @@ TWO = Splats(
     opacities=(0.8, 0.95),
 )
 
-
 THREE = Splats(
     slope=OFF_AXIS,
     sizes=LONG + ROUND + LONG,
@@ -121,7 +106,6 @@ THREE = Splats(
     distances=(4.0, 1.0, 2.0),
     opacities=(0.9, 0.5, 0.7),
 )
-
 
 SCENES = {
     "round, on the axis": Splats(to_world=STRAIGHT),
@@ -224,10 +208,6 @@ def opacities_of(gaussians) -> np.ndarray:
 class Footprints:
     """N splats on the film, and the two models of their alphas and colours."""
 
-    angles: np.ndarray  # (N, H, W) |d|
-    distances: np.ndarray  # (N, H, W) rho
-    coupling: np.ndarray  # (N, 1, 1) |kappa|
-    depth: np.ndarray  # (N, 1, 1) w
     alpha_by_mean: np.ndarray  # (N, H, W)
     alpha_by_ray: np.ndarray  # (N, H, W)
     color_by_mean: np.ndarray  # (N, 1, 1, 3)
@@ -277,10 +257,6 @@ def footprints(gaussians, camera, covariance) -> Footprints:
 
     rays = np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=-1) @ camera.rotation
     return Footprints(
-        angles=np.linalg.norm(offsets, axis=-1),
-        distances=rho,
-        coupling=np.sqrt(_mahalanobis((at_mean @ relative)[..., 2], by_mean))[:, None, None],
-        depth=relative[:, 2, 2, None, None],
         alpha_by_mean=alpha,
         alpha_by_ray=alpha_by_ray,
         color_by_mean=reference.sh_colors(gaussians, camera, gaussians.sh_degree)[:, None, None],
@@ -308,32 +284,6 @@ def _colors_along(gaussians, rays) -> np.ndarray:
     return np.maximum(np.einsum("hwk,nkc->nhwc", basis, coefficients) + 0.5, 0)
 
 
-def bound(gaussians, camera, covariance, excess=0.0) -> np.ndarray:
-    """(H, W, 3): how far the images may be apart.
-
-    covariance: (N, 3, 3) world, volprim's. excess: drgs's variances on the film are larger than
-    the projections of ``covariance`` by at most this factor, less 1.
-    """
-    on_film = footprints(gaussians, camera, covariance)
-    rho, alpha = on_film.distances, on_film.alpha_by_mean
-
-    # D lies between 1 - nearer and 1 + farther.
-    nearer = np.minimum(2 * rho * on_film.coupling, 1)
-    farther = 2 * rho * on_film.coupling + rho**2 * on_film.depth
-    with np.errstate(divide="ignore"):
-        d_alpha = alpha * np.maximum(
-            np.expm1(rho**2 / 2 * farther / (1 + farther)),
-            -np.expm1(-(rho**2) / 2 * nearer / (1 - nearer)),
-        )
-    # drgs's exponent lies between rho^2 / 2 and rho^2 / 2 / (1 + excess).
-    d_alpha += alpha * np.expm1(rho**2 / 2 * excess)
-    # Below the cut drgs draws nothing.
-    d_alpha += np.where((alpha < ALPHA_CUT) | on_film.near_cut, alpha, 0)
-
-    d_colors = color_slopes(gaussians)[:, None, None] * on_film.angles[..., None]
-    return propagated(on_film, d_alpha + on_film.alpha_rounding, d_colors + on_film.color_rounding)
-
-
 def propagated(on_film, d_alpha, d_colors) -> np.ndarray:
     """(H, W, 3): what errors of alphas (N, H, W) and colours (N, H, W, 3) make of an image.
 
@@ -343,16 +293,6 @@ def propagated(on_film, d_alpha, d_colors) -> np.ndarray:
     colors = np.maximum(on_film.color_by_mean, on_film.color_by_ray) + d_colors
     weights = np.maximum(on_film.alpha_by_mean, on_film.alpha_by_ray) + d_alpha
     return (d_alpha[..., None] * colors.max(axis=0) + weights[..., None] * d_colors).sum(axis=0)
-
-
-def color_slopes(gaussians) -> np.ndarray:
-    """(N, 3): by how much the colours may change per radian."""
-    slopes = np.zeros((len(gaussians.means), 3))
-    for degree in range(1, gaussians.sh_degree + 1):
-        band = gaussians.shN[:, degree**2 - 1 : (degree + 1) ** 2 - 1]
-        gradient = np.sqrt(degree * (degree + 1) * (2 * degree + 1) / (8 * np.pi))
-        slopes += np.linalg.norm(band, axis=1) * gradient
-    return slopes
 
 
 def assert_within(difference, allowed) -> None:

@@ -16,12 +16,9 @@ from support.views import VIEWS, Scene, decode, tensors
 # Conversions to display space multiply errors of dark pixels by up to 13.
 IMAGE, GRADIENTS = 2e-5, 1e-4
 
-
 RADIANCE = np.array([0.25, 0.5, 1.5])
 
-
 SKY = np.array([0.75, 0.125, 0.5])
-
 
 SCENE = Scene(VIEWS[1])
 
