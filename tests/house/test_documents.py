@@ -5,19 +5,17 @@ import importlib.util
 import io
 import re
 import shlex
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import REPOSITORY
-from support.small_capture import make_dataset, write_dataset
-from support.views import Scene
 
 from drgs.bench import __main__ as bench
 from drgs.config.load import known_keys
 from drgs.config.schema import FitConfig
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 PAGES = (
     "README.md",
@@ -204,50 +202,24 @@ def test_documents_show_every_command():
 # Programs
 # ----------------------------------------------------------------------------------------------
 
-PAGES_WITH_PROGRAMS = tuple(page for page in PAGES if fenced(page, "python"))
-
-SMALL_FIT = """
-data: {path: lego}
-init: {num_points: 300, half_extent: 1.0}
-densify: {start: 2, stop: 3, strategy: adc, adc: {white_background_reset: null}}
-iterations: 4
-"""
-
-
-def python_of(page) -> str:
-    """Its programs; without those that need PyTorch, where that is not installed."""
-    programs = fenced(page, "python")
-    if importlib.util.find_spec("torch") is None:
-        programs = [program for program in programs if "import torch" not in program]
-    return "\n".join(programs)
-
-
-@pytest.fixture
-def folder(tmp_path) -> Path:
-    """A folder with small files that the pages' programs read, under the pages' names."""
-    path = tmp_path / "out" / "lego" / "point_cloud.ply"
-    path.parent.mkdir(parents=True)
-    gaussians = Scene(count=20, degree=3).gaussians
-    columns = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    Gaussians(**columns).save(path)
-    write_dataset(tmp_path / "scenes" / "lego", make_dataset(train=3, test=1))
-    (tmp_path / "scenes" / "lego_mini.yml").write_text(SMALL_FIT)
-    return tmp_path
-
 
 @pytest.mark.slow
-def test_programs_in_the_documents_run(folder, run_python):
-    """Each page's one after the other, as if they were pasted, then its scenes in XML."""
-    program = []
-    for page in PAGES_WITH_PROGRAMS:
-        name = f"page_{Path(page).stem}"
-        (folder / f"{name}.py").write_text(python_of(page))
-        program.append(f"exec(compile(open('{name}.py').read(), {page!r}, 'exec'), {{}})")
-        program.append(f"print('ran', {page!r})")
-        for k, xml in enumerate(fenced(page, "xml")):
-            (folder / f"{name}_{k}.xml").write_text(xml)
-            program.append("import mitsuba as mi")
-            program.append(f"assert mi.render(mi.load_file('{name}_{k}.xml')).shape")
-    result = run_python("\n".join(program), cwd=folder, PYTHONPATH=str(REPOSITORY))
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.count("ran ") >= len(PAGES_WITH_PROGRAMS) == 4, result.stdout
+def test_programs_in_the_documents_run():
+    """By sybil: see ``support.pages``."""
+    command = [
+        "-q",
+        "-p",
+        "support.pages",
+        "-n0",
+        "-m",
+        "",
+        "-p",
+        "no:cacheprovider",
+        "README.md",
+        "docs",
+    ]
+    result = subprocess.run(
+        [sys.executable, "-m", "pytest", *command], cwd=REPOSITORY, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stdout
+    assert int(re.search(r"(\d+) passed", result.stdout)[1]) >= 28

@@ -25,10 +25,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from support.openexr import read_exr
 
 import drgs  # noqa: F401  (registers the plugins)
+from conftest import REPOSITORY
 from drgs.core.arrays import from_host
 
 REFERENCES = REPOSITORY / "tests" / "references"

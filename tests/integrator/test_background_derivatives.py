@@ -1,6 +1,5 @@
 """Derivatives of what is behind splats, and of the splats before it."""
 
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
