@@ -62,6 +62,11 @@ def test_callback_receives_each_iteration_and_may_end_the_fit(folder):
     assert result.trainer.iteration == 5
 
 
+def test_folder_is_fitted_with_the_settings_of_its_data(folder):
+    config = drgs.train("data", callback=lambda report: True).trainer.config
+    assert config.data.path == folder / "data" and config.iterations == 4500
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [

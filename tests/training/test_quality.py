@@ -31,6 +31,7 @@ def test_a_fit_is_measured_ten_times_or_every_hundred_iterations(iterations, eve
 
 
 def test_few_evenly_spaced_views_are_measured():
+    assert list(quality.measured_views(range(1))) == [0]
     assert list(quality.measured_views(range(8))) == list(range(8))
     assert list(quality.measured_views(range(25))) == [0, 3, 7, 10, 14, 17, 21, 24]
 

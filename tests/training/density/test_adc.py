@@ -124,7 +124,7 @@ def test_thresholds_compare_like_in_the_reference():
 
 def test_just_added_rows_are_not_pruned_in_the_same_step():
     # Half the size of the scene divided by 1.6 is still far above the limit of 0.1 x extent.
-    optimizer = make([2.0, SMALL], 0.5)
+    optimizer = make([2.0, SMALL], 0.5, sh_rows=0)
     report = run(optimizer, [HIGH, 0], iteration=LATE)
     assert report == DensityReport(num_added=1, split=1, num_gaussians=3)
     # In the next step they are old.
