@@ -205,21 +205,13 @@ def test_documents_show_every_command():
 
 @pytest.mark.slow
 def test_programs_in_the_documents_run():
-    """By sybil: see ``support.pages``."""
-    command = [
-        "-q",
-        "-p",
-        "support.pages",
-        "-n0",
-        "-m",
-        "",
-        "-p",
-        "no:cacheprovider",
-        "README.md",
-        "docs",
-    ]
+    """Run by sybil: see ``support.pages``."""
+    options = ["-q", "-n0", "-m", "", "-psupport.pages", "-pno:cacheprovider"]
     result = subprocess.run(
-        [sys.executable, "-m", "pytest", *command], cwd=REPOSITORY, capture_output=True, text=True
+        [sys.executable, "-m", "pytest", *options, "README.md", "docs"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
     )
     assert result.returncode == 0, result.stdout
     assert int(re.search(r"(\d+) passed", result.stdout)[1]) >= 28

@@ -69,4 +69,4 @@ def test_folders_mirror_the_packages():
     folders = {path.name for path in TESTS.iterdir() if path.is_dir() and any(path.glob("*.py"))}
     assert folders <= packages | OTHER_FOLDERS
     names = {path.name for path in TESTS.glob("test_*.py")}
-    assert names == {"test_gradients.py", "test_laws.py"}
+    assert names == {"test_gradients.py", "test_laws.py", "test_mutants.py"}
