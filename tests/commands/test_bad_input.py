@@ -162,6 +162,11 @@ WRONG_INPUTS = [
         "r_1.png: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's mode CMYK",
     ),
     (bent_lens_and_exact_projection, "of view r_1 (opencv: k1), got exact; or set data.ignore_"),
+    (settings(model={"near": 3.0}), "model.near must be less than half of the distance from the"),
+    (
+        settings(init={"num_points": 9, "half_extent": 1e-5}),
+        "init.half_extent: the start box",
+    ),
     (without(POINTS), "points.ply: cannot read"),
     (folder_in_place_of(POINTS), "points.ply: cannot read"),
     (cut(POINTS), "points.ply: not a valid PLY file: element vertex must have the 5 rows"),
@@ -181,7 +186,8 @@ WRONG_INPUTS = [
 @pytest.mark.parametrize(("damage", "message"), WRONG_INPUTS, ids=[m for _, m in WRONG_INPUTS])
 def test_wrong_input_ends_with_status_2_and_one_line(scene, damage, message):
     damage(scene)
-    assert str(scene) in assert_fit_refused(scene / "a.yml", folder=scene, message=message)
+    line = assert_fit_refused(scene / "a.yml", folder=scene, message=message)
+    assert str(scene) in line or line.startswith(("error: model.near ", "error: init.half_extent"))
 
 
 @pytest.mark.parametrize(("weight", "first"), [(0.2, "there is no image"), (0, "points.ply")])
