@@ -147,7 +147,7 @@ def test_kernels_do_not_depend_on_the_numbers_of_a_lens(lens, other):
 @pytest.mark.parametrize(
     "lenses",
     [
-        [effects.Pinhole(), OpenCV(), LENSES["radial"], LENSES["rational"]],
+        [effects.Pinhole(), LENSES["radial"], LENSES["rational"]],
         [LENSES["plain fisheye"], LENSES["fisheye"], WITHOUT_PRISM, LENSES["thin prism"]],
     ],
     ids=["slopes", "angles"],
