@@ -4,7 +4,7 @@ It imports nothing of this package but ``reference``, and is to be read after it
 replaces one stage of ``reference.render``, or is the mean of many of its images::
 
     Lens, ThinLens     project, sh_colors     where splats lie, how large, seen along what
-    render_lens_samples, render_motion_blur, render_rolling_shutter     many images
+    render_motion_blur, render_rolling_shutter                          many images
     smoothing_filter   the scales and opacities that everything starts from
 
 The Jacobian of a lens is a difference quotient of its ``film_points``: no derivative is written
@@ -629,25 +629,6 @@ def render(
         sh_colors(gaussians, camera, lens, degree), splats.depths, splats.visible,
         background, camera.width, camera.height, threshold_width, splats.cuts,
     )  # fmt: skip
-
-
-def render_lens_samples(
-    gaussians: Gaussians,
-    camera: Camera,
-    defocus: ThinLens,
-    num_samples: int,
-    background: ArrayLike = (0.0, 0.0, 0.0),
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image (H, W, 3), display space, and alpha (H, W) of a camera with an aperture.
-
-    They are means over ``lens_cameras``, and what defocus in ``project`` approximates.
-    """
-    images = [
-        reference.render(gaussians, lens_camera, background)
-        for lens_camera in lens_cameras(camera, defocus, num_samples)
-    ]
-    mean = _mean_image(images)
-    return mean.image, mean.alpha
 
 
 def lens_cameras(camera: Camera, defocus: ThinLens, num_samples: int) -> list[Camera]:

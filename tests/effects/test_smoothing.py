@@ -112,6 +112,8 @@ def test_baked_gaussians_give_the_same_image(precision):
         replace(as_numpy(case.gaussians), smoothing=smoothing.astype(np.float32))
     )
     assert plain.smoothing is None and plain.log_scales.dtype == np.float32
+    again = bake_smoothing(plain)  # which has no filter
+    np.testing.assert_array_equal(again.log_scales, plain.log_scales)
     camera = device_camera(case.camera, precision)
     frame = render_composed(plain.to(precision.TensorXf), camera, case.pipeline)
     by_reference = reference.Gaussians(**{n: getattr(plain, n) for n in PARAMETER_NAMES})
