@@ -96,30 +96,6 @@ def test_normals_and_features_are_composited_without_colour_conversion(view, srg
     assert [c.name for c in film.bitmap().struct_()] == [*"RGBA", *names]
 
 
-def test_a_flat_splat_shows_its_normal():
-    """One that covers the film, tilted; whichever way its quaternion turns it."""
-    scene = Scene()
-    camera = scene.camera
-    tilted = camera.rotation.T @ np.array([0.6, 0.0, -0.8])  # towards the camera
-    for sign in (1, -1):
-        axis = np.cross([0, 0, 1], sign * tilted)
-        quat = np.array([1 + sign * tilted[2], *axis])
-        one = reference.Gaussians(
-            means=[camera.center + 2 * camera.rotation[2]],
-            quats=[quat],
-            log_scales=np.log([[5.0, 4.0, 0.01]]),
-            logit_opacities=[3.0],
-            sh0=np.zeros((1, 1, 3)),
-            shN=np.zeros((1, 0, 3)),
-        )
-        integrator = {"type": "splats", "aovs": "n:normal, a:alpha", **tensors(one)}
-        loaded = mi.load_dict({"type": "scene", "integrator": integrator})
-        image = image_of(loaded, sensor=mi.load_dict(scene.view.sensor()))
-        row, column = image.shape[0] // 2, image.shape[1] // 2
-        *_, x, y, z, alpha = image[row, column]
-        np.testing.assert_allclose(np.array([x, y, z]) / alpha, tilted, atol=1e-5)
-
-
 def test_gaussian_with_nonfinite_feature_is_not_drawn():
     """Neither a pixel nor another row is affected, as with other parameters."""
     scene = clear(Scene())

@@ -1,7 +1,6 @@
-"""The ``calibrated`` sensor: its rays, and what ``splats`` and other integrators see through it.
+"""The ``calibrated`` sensor: its rays, and what ``splats`` sees through it.
 
-Rays are compared with Mitsuba's own sensors, and projected again by the float64 reference. Also
-here: cameras of Mitsuba's ``thinlens`` and ``orthographic``, against the rays of these sensors.
+Rays are compared with Mitsuba's own sensors, and projected again by the float64 reference.
 """
 
 from __future__ import annotations
@@ -34,40 +33,32 @@ from support.views import VIEWS, image_of
 
 from drgs.reference import effects
 
+MOVING = [replace(s, close=CLOSE) for s in (PINHOLE, OPENCV, FISHEYE)]
+ROLLING = [replace(s, shutter="rolling") for s in MOVING]
+
 
 @pytest.fixture(scope="module", autouse=True)
 def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-# ----------------------------------------------------------------------------------------------
-# Sensors
-# ----------------------------------------------------------------------------------------------
+def assert_rays_project_to_samples(rays, sensor, times) -> None:
+    """Compare samples with points on rays, projected by the reference's camera at each time."""
+    ray, weight, sample = rays
+    assert (weight == 1).all()
+    distances = np.random.default_rng(4).uniform(1, 8, dr.width(ray.o))
+    world = np.array(ray(mi.Float(distances))).T.astype(np.float64)
+    expected = sample * sensor.size + sensor.corner
+    for point, place, time in zip(world, expected, np.broadcast_to(times, 200), strict=True):
+        camera = sensor.camera_at(time)
+        points = (point[None] - camera.center) @ camera.rotation.T
+        assert sensor.lens.is_seen(camera, points).all()
+        assert np.abs(sensor.lens.film_points(camera, points) - place).max() < PIXELS
 
 
-MOVING = [
-    replace(s, name=f"{s.name}, {shutter}", close=CLOSE, shutter=shutter)
-    for s in (PINHOLE, OPENCV, FISHEYE)
-    for shutter in ("global", "rolling")
-]
-
-
-def points_along(ray, seed=4) -> np.ndarray:
-    """(N, 3) float64, one on each ray."""
-    distances = np.random.default_rng(seed).uniform(1, 8, dr.width(ray.o))
-    return np.array(ray(mi.Float(distances))).T.astype(np.float64)
-
-
-def film_of(world, camera, lens) -> np.ndarray:
-    """(N, 2), px, of world points, by the reference."""
-    points = (world - camera.center) @ camera.rotation.T
-    assert lens.is_seen(camera, points).all()
-    return lens.film_points(camera, points)
-
-
-# ----------------------------------------------------------------------------------------------
-# Rays
-# ----------------------------------------------------------------------------------------------
+def row_times(sensor, sample) -> np.ndarray:
+    """Of rows of the whole film, not of the crop window."""
+    return (sample[:, 1] * sensor.size[1] + sensor.corner[1]) / sensor.view.height
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
@@ -88,46 +79,38 @@ def test_pinhole_rays_match_perspective(view):
 
 @pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
 def test_points_on_rays_project_to_their_pixels(sensor):
-    ray, weight, sample = sampled_rays(sensor.load())
-    assert (weight == 1).all()
-    film = film_of(points_along(ray), sensor.camera, sensor.lens)
-    assert np.abs(film - (sample * sensor.size + sensor.corner)).max() < PIXELS
+    assert_rays_project_to_samples(sampled_rays(sensor.load()), sensor, 0)
 
 
-@pytest.mark.parametrize("sensor", [s for s in MOVING if s.shutter == "global"], **by_name)
+@pytest.mark.parametrize("sensor", MOVING, **by_name)
 @pytest.mark.parametrize("time", [0.0, 0.375, 1.0])
 def test_global_shutter_uses_the_pose_at_the_ray_time(sensor, time):
-    ray, _, sample = sampled_rays(sensor.load(), time)
-    film = film_of(points_along(ray), sensor.camera_at(time), sensor.lens)
-    assert np.abs(film - (sample * sensor.size + sensor.corner)).max() < PIXELS
-    np.testing.assert_array_equal(np.array(ray.time), time)
+    rays = sampled_rays(sensor.load(), time)
+    assert_rays_project_to_samples(rays, sensor, time)
+    np.testing.assert_array_equal(np.array(rays[0].time), time)
 
 
-@pytest.mark.parametrize("sensor", [s for s in MOVING if s.shutter == "rolling"], **by_name)
+@pytest.mark.parametrize("sensor", ROLLING, **by_name)
 def test_rolling_shutter_uses_the_pose_at_the_row_time(sensor):
-    """Rows of the whole film, not of the crop window; whatever the ray's time."""
-    ray, _, sample = sampled_rays(sensor.load(), time=0.75)
-    expected = sample * sensor.size + sensor.corner
-    for point, place in zip(points_along(ray), expected, strict=True):
-        camera = sensor.camera_at(place[1] / sensor.view.height)
-        assert np.abs(film_of(point[None], camera, sensor.lens) - place).max() < PIXELS
+    """Whatever the ray's time."""
+    rays = sampled_rays(sensor.load(), time=0.75)
+    assert_rays_project_to_samples(rays, sensor, row_times(sensor, rays[2]))
 
 
-def test_ray_times_are_within_the_exposure():
-    """A moving camera is open from 0 to 1 by default, as in Mitsuba's integrators."""
-    sensor = replace(PINHOLE, close=CLOSE)
-    loaded = sensor.load()
+@pytest.mark.parametrize(
+    ("close", "time", "expected"), [(4.0, 2.5, 0.25), (2.0, 2.0, 0)], ids=["late", "instant"]
+)
+def test_ray_times_are_within_the_exposure(close, time, expected):
+    loaded = MOVING[0].load(shutter_open=2.0, shutter_close=close)
+    rays = sampled_rays(loaded, time=time)
+    assert_rays_project_to_samples(rays, MOVING[0], expected)
+    assert (np.array(rays[0].time) == time).all()
+
+
+def test_moving_camera_is_open_from_0_to_1_by_default():
+    loaded = MOVING[0].load()
     assert (loaded.shutter_open(), loaded.shutter_open_time()) == (0, 1)
     assert PINHOLE.load().shutter_open_time() == 0
-    late = sensor.load(shutter_open=2.0, shutter_close=4.0)
-    ray, _, sample = sampled_rays(late, time=2.5)
-    film = film_of(points_along(ray), sensor.camera_at(0.25), sensor.lens)
-    assert np.abs(film - (sample * sensor.size + sensor.corner)).max() < PIXELS
-    assert (np.array(ray.time) == 2.5).all()
-    instant = sensor.load(shutter_open=2.0, shutter_close=2.0)
-    ray, _, sample = sampled_rays(instant, time=2.0)
-    film = film_of(points_along(ray), sensor.camera_at(0), sensor.lens)
-    assert np.abs(film - (sample * sensor.size + sensor.corner)).max() < PIXELS
 
 
 # Its image is a circle of a radius of 16 px.
@@ -149,7 +132,7 @@ def test_rays_outside_the_lens_have_zero_weight(sensor):
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, MOVING[3], BARREL], **by_name)
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, ROLLING[1], BARREL], **by_name)
 def test_ray_differentials_are_rays_of_neighbouring_pixels(sensor):
     loaded = sensor.load()
     sample = np.random.default_rng(0).uniform(0.1, 0.8, (2, 50)).astype(np.float32)
@@ -166,22 +149,18 @@ def test_ray_differentials_are_rays_of_neighbouring_pixels(sensor):
         # The sample is one rounding away.
         np.testing.assert_allclose(np.array(d), np.array(beside.d), rtol=0, atol=1e-6)
         np.testing.assert_allclose(np.array(o), np.array(beside.o), rtol=0, atol=1e-6)
-        turned = np.linalg.norm(np.array(d) - np.array(plain.d), axis=0)
-        shown = np.broadcast_to(np.array(weight)[0] == 1, turned.shape)
-        assert turned[shown].min() > 0.3 / 44
 
 
-@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, MOVING[3]], **by_name)
+@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, ROLLING[1]], **by_name)
 def test_rays_end_at_the_far_plane(sensor):
     """From depth ``near_clip`` to ``far_clip``: z, with a fisheye the distance."""
     near_view = replace(sensor.view, near_clip=0.5)
     loaded = replace(sensor, view=near_view).load(far_clip=8.0)
-    assert (loaded.near_clip(), loaded.far_clip()) == (0.5, 8.0)
     ray, _, sample = sampled_rays(loaded)
     for world, depth in ((ray.o, 0.5), (ray(ray.maxt), 8.0)):
-        for place, y in zip(np.array(world).T.astype(np.float64), sample[:, 1], strict=True):
-            row = (y * sensor.size[1] + sensor.corner[1]) / sensor.view.height
-            camera = sensor.camera_at(row)
+        places = np.array(world).T.astype(np.float64)
+        for place, time in zip(places, row_times(sensor, sample), strict=True):
+            camera = sensor.camera_at(time)
             point = (place - camera.center) @ camera.rotation.T
             assert sensor.lens.depths(camera, point[None])[0] == pytest.approx(depth, rel=2e-6)
 
@@ -199,29 +178,21 @@ def test_rays_are_differentiable_in_the_calibration(sensor, name):
     value = float(params[name][0])
     sample = mi.Point2f(np.random.default_rng(0).uniform(size=(2, 20)).astype(np.float32))
 
-    def directions() -> mi.Vector3f:
+    def directions(value) -> mi.Vector3f:
+        params[name] = value
+        params.update()
         return loaded.sample_ray(0.0, 0.5, sample, mi.Point2f(0.5))[0].d
 
-    found = []
     step = 2.0**-6 if name in ("fx", "cy") else 2.0**-10
-    for sign in (1, -1):
-        params[name] = mi.Float(value + sign * step)
-        params.update()
-        found.append(np.array(directions()).astype(np.float64))
-    expected = (found[0] - found[1]) / (2 * step)
-    params[name] = mi.Float(value)
-    dr.enable_grad(params[name])
-    params.update()
-    d = directions()
-    dr.forward(params[name], flags=dr.ADFlag.ClearEdges)
+    after, before = (np.array(directions(mi.Float(value + s)), float) for s in (step, -step))
+    expected = (after - before) / (2 * step)
+    attached = mi.Float(value)
+    dr.enable_grad(attached)
+    d = directions(attached)
+    dr.forward(attached, flags=dr.ADFlag.ClearEdges)
     # Differences: 1e-7 / step of rounding, step^2 times a third derivative.
     size = np.abs(expected).max()
     np.testing.assert_allclose(np.array(dr.grad(d)), expected, rtol=0, atol=3e-3 * size)
-
-
-# ----------------------------------------------------------------------------------------------
-# Integrators
-# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sensor", [*STATIC_SENSORS, BARREL], **by_name)

@@ -36,14 +36,8 @@ OTHER_POSE = pose([1, 2, 3], 30, (0.5, -0.6, 1.0))
 
 
 CHANGES = {
-    "to_world": (transform, OTHER_POSE),
-    "fx": (mi_float := lambda value: mi.Float(value), 33.0),
-    "fy": (mi_float, 33.0),
-    "cx": (mi_float, 19.0),
-    "cy": (mi_float, 19.0),
-    "k1": (mi_float, -0.125),
-    "p1": (mi_float, -0.03125),
-    "to_world_close": (transform, OTHER_POSE),
+    **{"to_world": OTHER_POSE, "to_world_close": OTHER_POSE},
+    **{"fx": 33.0, "fy": 33.0, "cx": 19.0, "cy": 19.0, "k1": -0.125, "p1": -0.03125},
 }
 
 
@@ -52,9 +46,9 @@ MOVING_SENSOR = replace(OPENCV, close=CLOSE, shutter="rolling")
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_changed_parameter_takes_effect(name):
-    convert, value = CHANGES[name]
-    given = transform(value) if name.startswith("to_world") else value
-    expected = MOVING_SENSOR.load(**{name: given})
+    value = CHANGES[name]
+    is_pose = name.startswith("to_world")
+    expected = MOVING_SENSOR.load(**{name: transform(value) if is_pose else value})
     gaussians = splats_before(MOVING_SENSOR.view, 1, 40, 0)
     scene = splats_scene(MOVING_SENSOR, gaussians)
     before = image_of(scene)
@@ -62,7 +56,7 @@ def test_changed_parameter_takes_effect(name):
     params = mi.traverse(scene)
     own = [key for key in params.keys() if not key.startswith("integrator.")]  # noqa: SIM118
     key = next(key for key in own if key.split(".")[-1] == name)
-    params[key] = convert(value)
+    params[key] = transform(value) if is_pose else mi.Float(value)
     params.update()
     (ray, weight, _), (other, other_weight, _) = map(sampled_rays, (sensor, expected))
     np.testing.assert_allclose(np.array(ray.d), np.array(other.d), rtol=0, atol=1e-6)
@@ -135,90 +129,46 @@ def test_zero_coefficients_can_be_optimised(sensor, names):
         assert abs(actual) > 2e-4 / step, name
 
 
-REFUSED = {
-    "lens": (
+LENS_NAMES = (
+    "there are pinhole, opencv, fisheye, thin_prism_fisheye (others come with installed packages "
+    'that have an entry point of the group "drgs")'
+)
+
+REFUSED = [
+    (
         {"lens": "opencvv"},
-        'PluginError: calibrated: lens: no lens is called "opencvv"; did you mean opencv?; '
-        "there are pinhole, opencv, fisheye, thin_prism_fisheye (others come with installed "
-        'packages that have an entry point of the group "drgs")',
+        f'lens: no lens is called "opencvv"; did you mean opencv?; {LENS_NAMES}',
     ),
-    "lens that is no name": (
-        {"lens": 3},
-        'PluginError: calibrated: lens: no lens is called "3"; there are pinhole, opencv, '
-        "fisheye, thin_prism_fisheye (others come with installed packages that have an entry "
-        'point of the group "drgs")',
-    ),
-    "coefficient of another lens": (
-        {"lens": "fisheye", "k5": 0.1},
-        "PluginError: calibrated: lens 'fisheye' has the coefficients k1, k2, k3, k4, got k5",
-    ),
-    "coefficient of a pinhole": (
-        {"k1": 0.1},
-        "PluginError: calibrated: lens 'pinhole' has no coefficients, got k1",
-    ),
-    "focal length": (
-        {"fx": "long"},
-        "PluginTypeError: calibrated: fx must be a positive number, got 'long'",
-    ),
-    "truth": ({"cx": True}, "PluginTypeError: calibrated: cx must be a finite number, got True"),
-    "no focal length": (
-        {"fy": 0.0},
-        "PluginError: calibrated: fy must be a positive number, got 0.0",
-    ),
-    "coefficient": (
-        {"lens": "opencv", "k1": "a"},
-        "PluginTypeError: calibrated: k1 must be a finite number, got 'a'",
-    ),
-    "infinite": ({"cy": np.inf}, "PluginError: calibrated: cy must be a finite number, got inf"),
-    "near": (
-        {"near_clip": -1.0},
-        "PluginError: calibrated: near_clip must be a positive number, got -1.0",
-    ),
-    "far": (
-        {"far_clip": 0.005},
-        "PluginError: calibrated: far_clip must be larger than near_clip, 0.01, got 0.005",
-    ),
-    "shutter": (
-        {"shutter": "leaf"},
-        "PluginError: calibrated: shutter must be one of global, rolling, got 'leaf'",
-    ),
-    "no samples": (
-        {"shutter_samples": 0},
-        "PluginError: calibrated: shutter_samples must be an integer from 1 to 1000, got 0",
-    ),
-    "too many samples": (
-        {"shutter_samples": 1001},
-        "PluginError: calibrated: shutter_samples must be an integer from 1 to 1000, got 1001",
-    ),
-    "part of a sample": (
-        {"shutter_samples": 2.5},
-        "PluginTypeError: calibrated: shutter_samples must be an integer from 1 to 1000, got 2.5",
-    ),
-    "large coefficient": (
+    ({"lens": 3}, f'lens: no lens is called "3"; {LENS_NAMES}'),
+    ({"lens": "fisheye", "k5": 0.1}, "lens 'fisheye' has the coefficients k1, k2, k3, k4, got k5"),
+    ({"k1": 0.1}, "lens 'pinhole' has no coefficients, got k1"),
+    ({"fx": "long"}, "fx must be a positive number, got 'long'"),
+    ({"cx": True}, "cx must be a finite number, got True"),
+    ({"fy": 0.0}, "fy must be a positive number, got 0.0"),
+    ({"cy": np.inf}, "cy must be a finite number, got inf"),
+    ({"lens": "opencv", "k1": "a"}, "k1 must be a finite number, got 'a'"),
+    ({"near_clip": -1.0}, "near_clip must be a positive number, got -1.0"),
+    ({"far_clip": 0.005}, "far_clip must be larger than near_clip, 0.01, got 0.005"),
+    ({"shutter": "leaf"}, "shutter must be one of global, rolling, got 'leaf'"),
+    ({"shutter_samples": 0}, "shutter_samples must be an integer from 1 to 1000, got 0"),
+    ({"shutter_samples": 1001}, "shutter_samples must be an integer from 1 to 1000, got 1001"),
+    ({"shutter_samples": 2.5}, "shutter_samples must be an integer from 1 to 1000, got 2.5"),
+    (
         {"lens": "fisheye", "k2": 1e7},
-        "PluginError: calibrated: k2 must be a coefficient of at most 1e+06 in size, got 1e+07; "
-        "calibrate the camera again",
+        "k2 must be a coefficient of at most 1e+06 in size, got 1e+07; calibrate the camera again",
     ),
-    "pose": (
-        {"to_world_close": 3.0},
-        "PluginTypeError: calibrated: to_world_close must be a transform, got float",
-    ),
-}
+    ({"to_world_close": 3.0}, "to_world_close must be a transform, got float"),
+    ({"shutter_sample": 3}, "there is no parameter shutter_sample; did you mean shutter_samples?"),
+]
 
 
-@pytest.mark.parametrize(("values", "message"), REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize(("values", "message"), REFUSED, ids=str)
 def test_wrong_values_are_refused(values, message):
     with pytest.raises(RuntimeError) as caught:
         mi.load_dict({"type": "calibrated", **values})
-    assert str(caught.value).strip().splitlines()[-1].removeprefix("drgs.core.errors.") == message
-
-
-def test_an_unknown_property_is_refused():
-    message = (
-        r"PluginError: calibrated: there is no parameter shutter_sample; did you mean shutter_s"
-    )
-    with pytest.raises(RuntimeError, match=message):
-        mi.load_dict({"type": "calibrated", "shutter_sample": 3})
+    kind, _, found = str(caught.value).strip().splitlines()[-1].partition(": calibrated: ")
+    assert kind.endswith(("PluginError", "PluginTypeError"))
+    assert found.startswith(message)
 
 
 def test_documented_defaults_are_used():

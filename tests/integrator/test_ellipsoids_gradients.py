@@ -27,7 +27,7 @@ from support.kernels import float_reductions
 from support.views import image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.integrator import gathering as shapes_module
+from drgs.integrator import gathering
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
@@ -42,10 +42,17 @@ def variant():
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("srgb_primitives", [False, True])
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_gradients_match_the_reference(degree, srgb_primitives):
-    scene = clear(EllipsoidsCase(degree=degree, srgb_primitives=srgb_primitives))
+@pytest.mark.parametrize(
+    "scene",
+    [
+        *(EllipsoidsCase(degree=degree) for degree in (0, 1, 3)),
+        EllipsoidsCase(degree=3, srgb_primitives=True),
+        EllipsoidsCase(kind="ellipsoidsmesh"),
+    ],
+    ids=["degree 0", "degree 1", "degree 3", "linear", "mesh"],
+)
+def test_gradients_match_the_reference(scene):
+    scene = clear(scene)
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
 
@@ -116,16 +123,13 @@ def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
 
 def test_backward_passes_give_the_same_bytes_without_float_atomics():
     scene = Merged()
-    first = gradients_held(scene.load(), scene.weights(), "first")
-    again = {}
-    loaded = scene.load(shapes_to_world=transform())
 
-    def turned():
-        again.update(gradients_held(loaded, scene.weights(), "first"))
+    def backward():
+        return gradients_held(scene.load(), scene.weights(), "first")
 
-    found, count = float_reductions(turned)
+    found, count = float_reductions(backward)
     assert not found and count > 5
-    again = gradients_held(scene.load(), scene.weights(), "first")
+    first, again = backward(), backward()
     assert all(first[name].tobytes() == again[name].tobytes() for name in SHAPE_ATTRIBUTES)
 
 
@@ -136,21 +140,21 @@ def test_backward_passes_give_the_same_bytes_without_float_atomics():
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Two lists: a growing one for each frame that is rendered, and for each conversion."""
-    frames, conversions = [], []
-    render, convert = rendering.render, shapes_module.Conversion.gaussians
+    """Names of what is called: for each frame that is rendered, and for each conversion."""
+    calls = []
 
-    def counting_render(*arguments):
-        frames.append(arguments)
-        return render(*arguments)
+    def count(owner, name):
+        function = getattr(owner, name)
 
-    def counting_convert(self):
-        conversions.append(self)
-        return convert(self)
+        def counting(*arguments):
+            calls.append(name)
+            return function(*arguments)
 
-    monkeypatch.setattr(rendering, "render", counting_render)
-    monkeypatch.setattr(shapes_module.Conversion, "gaussians", counting_convert)
-    return frames, conversions
+        monkeypatch.setattr(owner, name, counting)
+
+    count(rendering, "render")
+    count(gathering.Conversion, "gaussians")
+    return calls
 
 
 def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
@@ -158,32 +162,24 @@ def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
     loaded = scene.load()
     gradients_held(loaded, scene.weights())
     image_of(loaded)
-    assert [len(calls) for calls in counted] == [1, 2]
+    assert sorted(counted) == ["gaussians", "gaussians", "render"]
 
 
-@pytest.mark.parametrize("name", SHAPE_ATTRIBUTES)
+@pytest.mark.parametrize("name", [*SHAPE_ATTRIBUTES, "all, and the number of rows"])
 def test_a_changed_parameter_is_rendered_again(name, counted):
     scene = EllipsoidsCase()
     loaded = scene.load()
     before = image_of(loaded)
+    others = EllipsoidsCase(count=60, seed=9).held
+    held = scene.held | {name: scene.held[name] * 0.75} if name in scene.held else others
     params = mi.traverse(loaded)
-    params[f"shape.{name}"] = params[f"shape.{name}"] * 0.75
+    for key in SHAPE_ATTRIBUTES if held is others else [name]:
+        params[f"shape.{key}"] = mi.Float(held[key].ravel().astype(np.float32))
     params.update()
     after = image_of(loaded)
-    assert [len(calls) for calls in counted] == [2, 2] and np.abs(after - before).max() > 0.01
-    halved = scene.held | {name: scene.held[name] * 0.75}
-    np.testing.assert_array_equal(after, image_of(scene.load(shape=shape_of(halved))))
-
-
-def test_gaussians_of_a_shape_may_be_replaced(counted):
-    scene, other = EllipsoidsCase(), EllipsoidsCase(count=60, seed=9)
-    loaded = scene.load()
-    image_of(loaded)
-    params = mi.traverse(loaded)
-    for name, values in other.held.items():
-        params[f"shape.{name}"] = mi.Float(values.ravel().astype(np.float32))
-    params.update()
-    np.testing.assert_array_equal(image_of(loaded), image_of(other.load()))
+    assert sorted(counted) == ["gaussians"] * 2 + ["render"] * 2
+    assert np.abs(after - before).max() > 0.01
+    np.testing.assert_array_equal(after, image_of(scene.load(shape=shape_of(held))))
 
 
 def test_changed_integrator_parameter_is_rendered_again():
@@ -194,8 +190,7 @@ def test_changed_integrator_parameter_is_rendered_again():
     params["integrator.means"] = params["integrator.means"] + 0.25
     params.update()
     moved = replace(scene.own, means=single(scene.own.means + 0.25))
-    expected = image_of(scene.load(**tensors(moved)))
-    np.testing.assert_array_equal(image_of(loaded), expected)
+    np.testing.assert_array_equal(image_of(loaded), image_of(scene.load(**tensors(moved))))
 
 
 def test_integrator_renders_the_shapes_of_the_current_scene():

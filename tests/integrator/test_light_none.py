@@ -17,8 +17,12 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 MODULES = (
     "drgs.integrator.splat_transport",
     "drgs.integrator.shadows",
+    "drgs.integrator.gathering",
+    "drgs.gaussians.similarity",
+    "drgs.gaussians.rotation",
 )
-"""Modules used only for light between splats and surfaces, like all of ``PACKAGE``."""
+"""Modules used only for light between splats and surfaces, like all of ``PACKAGE``, and for
+Gaussians of shapes or with a ``to_world``."""
 
 PACKAGE = ["drgs", "light"]
 
