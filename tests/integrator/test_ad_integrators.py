@@ -25,10 +25,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from support.openexr import read_exr
 
 import drgs  # noqa: F401  (registers the plugins)
-from conftest import REPOSITORY
 from drgs.core.arrays import from_host
 
 REFERENCES = REPOSITORY / "tests" / "references"
@@ -435,7 +435,7 @@ def test_images_equal_the_stored_ones(name):
 @pytest.mark.slow
 @all_parameters
 def test_derivatives_equal_differences(parameter):
-    """Of the image in forward mode; of a weighted sum, no terms of which cancel, in reverse."""
+    """Differentiate the image forward; in reverse, a weighted sum without terms that cancel."""
     expected, thresholds = differences(parameter), parameter.thresholds
     with attached(parameter) as (theta, image):
         dr.set_grad(theta, 1.0)
