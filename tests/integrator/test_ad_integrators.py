@@ -435,7 +435,7 @@ def test_images_equal_the_stored_ones(name):
 @pytest.mark.slow
 @all_parameters
 def test_derivatives_equal_differences(parameter):
-    """Of the image in forward mode; of a weighted sum, no terms of which cancel, in reverse."""
+    """Forward mode for the image, reverse mode for a weighted sum whose terms do not cancel."""
     expected, thresholds = differences(parameter), parameter.thresholds
     with attached(parameter) as (theta, image):
         dr.set_grad(theta, 1.0)
