@@ -435,7 +435,7 @@ def test_images_equal_the_stored_ones(name):
 @pytest.mark.slow
 @all_parameters
 def test_derivatives_equal_differences(parameter):
-    """Differentiate the image forward; in reverse, a weighted sum without terms that cancel."""
+    """Forward mode for the image, reverse mode for a weighted sum whose terms do not cancel."""
     expected, thresholds = differences(parameter), parameter.thresholds
     with attached(parameter) as (theta, image):
         dr.set_grad(theta, 1.0)

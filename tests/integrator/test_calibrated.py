@@ -57,7 +57,7 @@ def assert_rays_project_to_samples(rays, sensor, times) -> None:
 
 
 def row_times(sensor, sample) -> np.ndarray:
-    """Of rows of the whole film, not of the crop window."""
+    """Return times of rows of the whole film, not of the crop window."""
     return (sample[:, 1] * sensor.size[1] + sensor.corner[1]) / sensor.view.height
 
 
