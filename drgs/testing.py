@@ -157,7 +157,8 @@ class Case:
         if self.smoothing is not None:
             gaussians = replace(gaussians, smoothing=np.full(self.count, self.smoothing))
         gaussians = gaussians.to(TensorXf)
-        return replace(gaussians, logit_opacities=from_host(Float, gaussians.logit_opacities))
+        logits = from_host(Float, np.array(gaussians.logit_opacities))
+        return replace(gaussians, logit_opacities=logits)
 
     def planes(self, values: Values, Float: type = llvm.Float64) -> np.ndarray:
         """Return the planes (5, H * W) of the kernels' image."""
@@ -273,7 +274,7 @@ def camera_gradients_equal_differences(case: Case) -> None:
     weights = _weights(case)
     gaussians, frames = case.frames(case.values)
     for frame in frames:
-        d_planes = [llvm.Float64(plane) for plane in weights]
+        d_planes = [cast("Any", llvm.Float64(plane)) for plane in weights]
         found = rendering.frames_adjoint(gaussians, [frame], [d_planes], of_camera=True).camera
         gradient = _arrays(found or []).ravel()
         direction = single(np.random.default_rng(3).normal(size=len(gradient)))
@@ -289,7 +290,7 @@ def camera_gradients_equal_differences(case: Case) -> None:
         terms = direction * gradient
         error = abs(terms.sum() - expected) / np.abs(terms).sum()
         assert error <= case.gradient_tolerance, f"{case.name}: camera is off by {error:.1e}"
-        tangents = [llvm.Float64(number) for number in direction]
+        tangents = [cast("Any", llvm.Float64(each)) for each in direction]
         still = case._gaussians({n: 0 * v for n, v in case.values.items()}, llvm.Float64)
         planes = rendering.frames_tangent(gaussians, [frame], still, tangents)[0]
         forward = np.sum(weights * _arrays(planes))

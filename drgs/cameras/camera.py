@@ -203,7 +203,7 @@ def _map(value: Any, function: Callable[[Float], Float]) -> Any:
         return replace(value, **changes)
     if isinstance(value, tuple):
         return tuple(_map(item, function) for item in value)
-    if not dr.is_array_v(value):
+    if isinstance(value, type) or not dr.is_array_v(value):
         return value
     if dr.depth_v(value) == 1:
         return function(value)
