@@ -605,7 +605,7 @@ def sh_colors(
     """
     degree = gaussians.sh_degree if degree is None else degree
     directions = lens.view_directions(camera, gaussians.means)
-    return np.maximum(reference._unclamped_colors(gaussians, directions, degree), 0.0)
+    return np.maximum(reference.unclamped_colors(gaussians, directions, degree), 0.0)
 
 
 def render(

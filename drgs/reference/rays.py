@@ -262,7 +262,7 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
     gaussians = _rows(gaussians, camera_z >= camera.near)
     degree = gaussians.sh_degree if model.sh_degree is None else model.sh_degree
 
-    affine = reference._local_affine(gaussians, camera)
+    affine = reference.local_affine(gaussians, camera)
     z = affine.means[:, 2]
     slopes = affine.means[:, :2] / z[:, None] if model.projection == "exact" else affine.ratios
     axes2d = _film_axes(affine, camera, slopes)
@@ -301,14 +301,14 @@ def _film_positions(points: np.ndarray, camera: Camera) -> np.ndarray:
     return focal * points[..., :2] / points[..., 2:] + principal
 
 
-def _film_axes(affine: reference._LocalAffine, camera: Camera, slopes: np.ndarray) -> np.ndarray:
+def _film_axes(affine: reference.LocalAffine, camera: Camera, slopes: np.ndarray) -> np.ndarray:
     """Return M = F A0 V / m_z (N, 2, 3), px, S = V V^T, where A0 has the given slopes (N, 2)."""
     along_film = affine.axes[:, :2] - slopes[:, :, None] * affine.axes[:, 2:]
     return along_film * [[camera.fx], [camera.fy]] / affine.means[:, 2, None, None]
 
 
 def _unscented_transform(
-    affine: reference._LocalAffine, camera: Camera, means2d: np.ndarray
+    affine: reference.LocalAffine, camera: Camera, means2d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean (N, 2), px, and M (N, 2, 7), px, with covariance M M^T, of sigma points.
 
@@ -346,7 +346,7 @@ def _low_passed_covariances(
     return axes2d @ np.swapaxes(axes2d, 1, 2) + low_pass * np.eye(2), dets, areas
 
 
-def _whitened_rays(affine: reference._LocalAffine, camera: Camera, low_pass: float) -> np.ndarray:
+def _whitened_rays(affine: reference.LocalAffine, camera: Camera, low_pass: float) -> np.ndarray:
     """Return (N, 3, 3), columns B e_x / fx, B e_y / fy and B m / m_z, with B^T B = S'^-1.
 
     The ray through the pixel at ``mean2d + d`` is whitened to B r = (B m / m_z) + B (F^-1 d, 0).

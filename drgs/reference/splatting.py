@@ -274,7 +274,7 @@ def sh_colors(gaussians: Gaussians, camera: Camera, degree: int) -> np.ndarray:
     centre to the mean (3DGS rasterizer). ``degree`` may be lower than what is stored.
     """
     directions, _ = _view_directions(gaussians, camera)
-    return np.maximum(_unclamped_colors(gaussians, directions, degree), 0.0)
+    return np.maximum(unclamped_colors(gaussians, directions, degree), 0.0)
 
 
 def _view_directions(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -282,7 +282,8 @@ def _view_directions(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, 
     return _normalize(gaussians.means - camera.center, fallback=(0.0, 0.0, 1.0))
 
 
-def _unclamped_colors(gaussians: Gaussians, directions: np.ndarray, degree: int) -> np.ndarray:
+def unclamped_colors(gaussians: Gaussians, directions: np.ndarray, degree: int) -> np.ndarray:
+    """Return colours (N, 3) before they are clamped at zero; directions: (N, 3) unit, world."""
     basis = sh_basis(directions, degree)
     return np.einsum("nk,nkc->nc", basis, _sh_coefficients(gaussians, degree)) + 0.5
 
@@ -300,7 +301,7 @@ def _sh_coefficients(gaussians: Gaussians, degree: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _LocalAffine:
+class LocalAffine:
     """The affine approximation of the projection at each mean, with its intermediate results.
 
     Rows behind the near plane have their camera mean replaced by (0, 0, 1), so that no division
@@ -318,7 +319,7 @@ class _LocalAffine:
     axes2d: np.ndarray  # (N, 2, 3) M = J V, px
 
 
-def _local_affine(gaussians: Gaussians, camera: Camera) -> _LocalAffine:
+def local_affine(gaussians: Gaussians, camera: Camera) -> LocalAffine:
     """Linearise the projection at each mean (EWA, section 4; 3DGS, equation 5).
 
     M = J W R(q) diag(s), with W the camera's rotation and J the Jacobian of
@@ -349,7 +350,7 @@ def _local_affine(gaussians: Gaussians, camera: Camera) -> _LocalAffine:
     rotations = quat_to_rotation(gaussians.quats)
     scales = np.exp(gaussians.log_scales)
     axes = camera.rotation @ rotations * scales[:, None, :]
-    return _LocalAffine(
+    return LocalAffine(
         in_front=in_front,
         means=camera_means,
         ratios=ratios,
@@ -370,7 +371,7 @@ def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     ``antialiased`` multiplies each opacity by sqrt(det(M M^T) / det(cov2d)), which undoes the
     brightening that the low-pass causes (Mip-Splatting, section 4.2).
     """
-    affine = _local_affine(gaussians, camera)
+    affine = local_affine(gaussians, camera)
     x, y, z = affine.means.T
     cov2d, dets, areas = _low_passed_covariances(affine.axes2d)
     opacities = sigmoid(gaussians.logit_opacities)
@@ -468,7 +469,7 @@ def _pixel_boxes(
     ]
 
 
-def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
+def depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """Return the indices of the visible splats, nearest first, ties by index."""
     indices = np.flatnonzero(visible)
     return indices[np.argsort(depths[indices], kind="stable")]
@@ -501,14 +502,14 @@ def composite(
     which an alpha, evaluated before the pixel is finished, is that close to the cut or (before
     clamping) to the clamp, or the transmittance behind a splat is that close to the stop.
     """
-    rendered, _ = _composite_and_stops(
+    rendered, _ = composite_and_stops(
         means2d, conics, opacities, colors, depths, visible, background, width, height,
         threshold_width, cuts,
     )  # fmt: skip
     return rendered
 
 
-def _composite_and_stops(
+def composite_and_stops(
     means2d: np.ndarray,
     conics: np.ndarray,
     opacities: np.ndarray,
@@ -525,7 +526,7 @@ def _composite_and_stops(
     means2d, conics, opacities, colors, depths, background = _as_float64(
         means2d, conics, opacities, colors, depths, background
     )
-    order = _depth_order(depths, visible)
+    order = depth_order(depths, visible)
     cuts = np.broadcast_to(ALPHA_CUT if cuts is None else cuts, depths.shape)
     smallest = cuts[order] * (1 - threshold_width)
     boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], smallest, width, height)
@@ -634,11 +635,11 @@ def composite_gradients(
     d_alpha, d_depth = _as_float64(
         zeros if d_alpha is None else d_alpha, zeros if d_depth is None else d_depth
     )
-    rendered, stops = _composite_and_stops(
+    rendered, stops = composite_and_stops(
         means2d, conics, opacities, colors, depths, visible, background, width, height,
         THRESHOLD_WIDTH,
     )  # fmt: skip
-    order = _depth_order(depths, visible)
+    order = depth_order(depths, visible)
     boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], ALPHA_CUT, width, height)
 
     n = len(means2d)
@@ -708,7 +709,7 @@ def project_gradients(
 
     Not differentiated: the camera.
     """
-    affine = _local_affine(gaussians, camera)
+    affine = local_affine(gaussians, camera)
     splats = project(gaussians, camera, antialiased)
     opacities = sigmoid(gaussians.logit_opacities)
 
@@ -756,7 +757,7 @@ def _area_gradients(axes2d: np.ndarray) -> np.ndarray:
 
 
 def _camera_mean_gradients(
-    affine: _LocalAffine, camera: Camera, d_means2d: np.ndarray, d_jacobians: np.ndarray
+    affine: LocalAffine, camera: Camera, d_means2d: np.ndarray, d_jacobians: np.ndarray
 ) -> np.ndarray:
     """Return the gradients (N, 3) with respect to the camera-space mean (x, y, z).
 
@@ -812,7 +813,7 @@ def sh_colors_gradients(
     """
     directions, distances = _view_directions(gaussians, camera)
     coefficients = _sh_coefficients(gaussians, degree)
-    d_colors = np.where(_unclamped_colors(gaussians, directions, degree) >= 0, d_colors, 0.0)
+    d_colors = np.where(unclamped_colors(gaussians, directions, degree) >= 0, d_colors, 0.0)
 
     d_coefficients = np.einsum("nk,nc->nkc", sh_basis(directions, degree), d_colors)
     d_sh = np.zeros((len(gaussians.means), 1 + gaussians.shN.shape[1], 3))

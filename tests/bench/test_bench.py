@@ -49,7 +49,7 @@ def test_useful_pairs_match_the_reference():
     )  # fmt: skip
     work = timing.count_work(frame)
     splats = reference.project(case.gaussians, case.camera)
-    order = reference._depth_order(splats.depths, splats.visible)
+    order = reference.depth_order(splats.depths, splats.visible)
     y, x = np.mgrid[: case.height, : case.width] + 0.5
     transmittance, finished, useful = np.ones(x.shape), np.zeros(x.shape, bool), 0
     for i in order:

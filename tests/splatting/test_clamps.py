@@ -180,7 +180,7 @@ def test_a_clamped_slope_is_a_constant_in_the_covariance_only(precision, factor)
     gaussians = wide_splat(factor * limit)
     numbers = [("means", (0, 0)), ("means", (0, 2)), ("log_scales", (0, 0))]
     assert_slopes(gaussians, precision, at_pixel(16 if factor > 0 else 0, 6), *numbers)
-    affine = reference._local_affine(gaussians, CAMERA)
+    affine = reference.local_affine(gaussians, CAMERA)
     assert affine.unclamped[0, 0] == (abs(factor) < 1)
 
 

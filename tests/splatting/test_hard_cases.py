@@ -70,7 +70,7 @@ def test_error_bounds_are_tight():
 def test_bound_distinguishes_textbook_from_stable_formulas():
     """The conic by xx yy - xy^2 in float32 loses needles: the bound tells the two apart."""
     case = FAMILIES["needles of ratio 1e6"]
-    affine = reference._local_affine(case.gaussians, case.camera)
+    affine = reference.local_affine(case.gaussians, case.camera)
     M = affine.axes2d.astype(np.float32)
     low_pass = np.float32(0.3) * np.eye(2, dtype=np.float32)
     cov2d = M @ np.swapaxes(M, 1, 2) + low_pass

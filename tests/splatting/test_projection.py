@@ -172,7 +172,7 @@ def test_gradients_equal_the_reference(precision, case):
 def test_scenes_clamp_slopes_on_every_side_and_keep_visible_splats():
     case = CASES[0]
     splats = reference.project(case.gaussians, case.camera)
-    affine = reference._local_affine(case.gaussians, case.camera)
+    affine = reference.local_affine(case.gaussians, case.camera)
     slopes = affine.means[:, :2] / affine.means[:, 2:]
     low, high = affine.ratios > slopes, affine.ratios < slopes
     assert (low & splats.visible[:, None]).any(axis=0).all()

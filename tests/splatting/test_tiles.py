@@ -212,7 +212,7 @@ def test_entries_are_sorted_by_tile_then_depth(precision, case):
     depths = rows(binned.splats.depths)
     expected = np.argsort(np.where(visible, depths, np.inf), kind="stable")
     np.testing.assert_array_equal(binned.order, expected)
-    reference_order = reference._depth_order(
+    reference_order = reference.depth_order(
         reference.project(case.gaussians, case.camera).depths, visible
     )
     np.testing.assert_array_equal(binned.order[: visible.sum()], reference_order)

@@ -109,7 +109,7 @@ class FlatScene:
 
     def num_stopped(self) -> int:
         """Pixels that are finished before the last splat that reaches them."""
-        _, stops = reference._composite_and_stops(
+        _, stops = reference.composite_and_stops(
             **self.reference_arguments(), threshold_width=NEAR_THRESHOLD
         )
         return int((stops < self.visible.sum()).sum())

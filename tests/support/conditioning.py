@@ -47,7 +47,7 @@ def noise(case: Case, cotangents: Cotangents, samples: int = SAMPLES) -> Noise:
     images, gradients = [], []
     base = _results(case.gaussians, case.camera, case, cotangents)
     splats = reference.project(case.gaussians, case.camera, case.antialiased)
-    order = reference._depth_order(splats.depths, splats.visible)
+    order = reference.depth_order(splats.depths, splats.visible)
     for sample in range(samples):
         rng = np.random.default_rng([sample, 17])
         gaussians, camera = rounded_inputs(rng, case.gaussians, case.camera)
@@ -126,8 +126,8 @@ def _rounded_stages(rng, order):
     gradient's functions do: noise is a function of the call's place, not of the call.
     """
     seed = int(rng.integers(2**62))
-    original_affine, original_sigmoid = reference._local_affine, reference.sigmoid
-    original_colors = reference._unclamped_colors
+    original_affine, original_sigmoid = reference.local_affine, reference.sigmoid
+    original_colors = reference.unclamped_colors
 
     def affine(gaussians, camera):
         result = original_affine(gaussians, camera)
@@ -147,9 +147,9 @@ def _rounded_stages(rng, order):
         return result + U / share[:, None] * own.uniform(-1, 1, result.shape)
 
     with (
-        mock.patch.object(reference, "_local_affine", affine),
+        mock.patch.object(reference, "local_affine", affine),
         mock.patch.object(reference, "sigmoid", sigmoid),
-        mock.patch.object(reference, "_unclamped_colors", colors),
-        mock.patch.object(reference, "_depth_order", lambda depths, visible: order),
+        mock.patch.object(reference, "unclamped_colors", colors),
+        mock.patch.object(reference, "depth_order", lambda depths, visible: order),
     ):
         yield

@@ -76,7 +76,7 @@ def assume_decided(case) -> None:
     size = np.array([camera.width, camera.height])
     outside = np.abs(film - size / 2) - (0.5 + reference.FRUSTUM_MARGIN / 2) * size
     directions, _ = reference._view_directions(gaussians, camera)
-    colors = reference._unclamped_colors(gaussians, directions, case.rendered_degree)
+    colors = reference.unclamped_colors(gaussians, directions, case.rendered_degree)
     for distances, margin in (
         (z - camera.near, 1e-5),
         (np.diff(np.sort(z)), 1e-5),
