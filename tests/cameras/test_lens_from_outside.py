@@ -8,10 +8,10 @@ import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from examples.unified_camera import UnifiedCamera
 from support.datasets import view_at
 
-from conftest import REPOSITORY
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import LENSES, Lens, Pinhole
 from drgs.core.errors import UserError

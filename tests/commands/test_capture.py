@@ -16,11 +16,11 @@ import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from support.commands import assert_ends_well, assert_refused
 from support.folders import contents, visible
 from support.render_command import write_scene
 
-from conftest import REPOSITORY
 from drgs.capture import __main__ as capture
 from drgs.capture import camera_placement, dataset, path_tracing
 from drgs.capture.path_tracing import CaptureSettings, lit_part

@@ -13,13 +13,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
+from conftest import REPOSITORY
 from support.fit_command import assert_fits
 from support.folders import visible
 from support.small_capture import write_dataset
 from support.small_fits import plain_dataset
 from support.viewer_rendering import VIEWER_RENDERING
 
-from conftest import REPOSITORY
 from drgs.cli.execution import execution_settings
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset

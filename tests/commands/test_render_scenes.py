@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from support.folders import visible
 from support.openexr import read_exr
 from support.render_command import (
@@ -24,7 +25,6 @@ from support.small_capture import (
 )
 from support.small_capture import view as small_view
 
-from conftest import REPOSITORY
 from drgs.io.images import write_exr
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from pydantic import BaseModel, ValidationError
 from support.small_fits import make_trainer, plain_dataset
 
-from conftest import REPOSITORY
 from drgs.config.approximations import Approximations
 from drgs.config.changes import with_iterations
 from drgs.config.load import PATH_KEYS, dump_config, known_keys, load_config

@@ -5,9 +5,9 @@ import re
 import annotated_types
 import mitsuba as mi
 import pytest
+from conftest import REPOSITORY
 from support.viewer_rendering import VIEWER_RENDERING
 
-from conftest import REPOSITORY
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig

@@ -18,10 +18,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from support.lit_scenes import camera, gaussians
 
 import drgs  # noqa: F401  (registers the plugins)
-from conftest import REPOSITORY
 from drgs.core.errors import UnsupportedError
 
 ROUTES = {

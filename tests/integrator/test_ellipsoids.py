@@ -11,6 +11,7 @@ import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from support.ellipsoids import (
     GRADIENTS,
     IMAGE,
@@ -30,7 +31,6 @@ from support.helpers import assert_arrays_agree, clear, single
 from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
-from conftest import REPOSITORY
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 KINDS = ("ellipsoids", "ellipsoidsmesh")

@@ -6,12 +6,12 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import TESTS
 from support import small_fits as fits
 from support.viewer_rendering import VIEWER_RENDERING
 from support.views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
-from conftest import TESTS
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential

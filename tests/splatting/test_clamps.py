@@ -1,8 +1,7 @@
 """Effect of each limit of the image model on the gradient: decided in ``constants.py``.
 
-One splat (or a few), float64 and float32. Each test moves a parameter from one side of a limit to
-the other: on the limited side the gradient is exactly what the constant's docstring says, on the
-other it is the slope of the float64 reference (central differences).
+One splat (or a few), float64 and float32. Gradients beyond a limit are exactly zero; on its other
+side, and on both sides of the slope's clamp, they are the slopes of the float64 reference.
 """
 
 from dataclasses import replace
@@ -22,6 +21,7 @@ from support.helpers import (
 )
 
 from drgs.core import constants
+from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
 CAMERA = reference.Camera(
@@ -31,6 +31,9 @@ CAMERA = reference.Camera(
 
 TOLERANCE = {FLOAT64: 1e-7, FLOAT32: 2e-5}
 """Relative: central differences of 1e-6 in float64; some hundred roundings in float32."""
+
+CENTER = (8, 6)
+"""The pixel whose centre is the splat's mean."""
 
 
 def splat(**changes) -> reference.Gaussians:
@@ -47,19 +50,37 @@ def splat(**changes) -> reference.Gaussians:
     return reference.Gaussians(**{name: single(value) for name, value in fields.items()})
 
 
-def joined(*parts) -> reference.Gaussians:
+def of_opacity(opacity) -> reference.Gaussians:
+    return splat(logit_opacities=[np.log(opacity / (1 - opacity))])
+
+
+def of_color(color) -> reference.Gaussians:
+    return splat(sh0=np.full((1, 1, 3), (color - 0.5) / reference.C_00))
+
+
+def of_size(*sizes) -> reference.Gaussians:
+    return splat(log_scales=np.log([sizes]))
+
+
+def at_depth(z) -> reference.Gaussians:
+    gaussians = of_size(0.02, 0.02, 0.02)
+    gaussians.means[0, 2] = z
+    return gaussians
+
+
+def layers(*logits) -> reference.Gaussians:
+    depths = np.linspace(1, 2, len(logits))
+    parts = [
+        splat(means=[[0.0, 0.0, z]], logit_opacities=[logit])
+        for z, logit in zip(depths, logits, strict=True)
+    ]
     columns = zip(*(vars(part).values() for part in parts), strict=True)
     return reference.Gaussians(*map(np.concatenate, columns))
 
 
 def case_of(gaussians) -> Case:
-    degree = gaussians.sh_degree
     # The reference's background is behind every image: the loss sees transmittance too.
-    return Case("clamp", 17, 13, degree, recipe=lambda *_: (gaussians, CAMERA))
-
-
-def gradients_of(gaussians, precision, cotangents) -> dict[str, np.ndarray]:
-    return kernel_gradients(case_of(gaussians), precision, cotangents)
+    return Case("clamp", 17, 13, 0, recipe=lambda *_: (gaussians, CAMERA))
 
 
 def at_pixel(x, y) -> Cotangents:
@@ -69,84 +90,91 @@ def at_pixel(x, y) -> Cotangents:
     return Cotangents(image, alpha, depth)
 
 
-def slope(gaussians, cotangents, name, index, step=1e-6) -> float:
+def gradients_of(gaussians, precision, pixel=CENTER) -> dict[str, np.ndarray]:
+    return kernel_gradients(case_of(gaussians), precision, at_pixel(*pixel))
+
+
+def slope(gaussians, pixel, name, index, step=1e-6) -> float:
     """Central difference of the loss by the reference with respect to one number."""
+    cotangents, background = at_pixel(*pixel), case_of(gaussians).background
 
     def loss(sign):
         values = getattr(gaussians, name).copy()
         values[index] += sign * step
-        rendered = reference.render(
-            replace(gaussians, **{name: values}), CAMERA, case_of(gaussians).background
-        )
-        return (
-            np.sum(cotangents.d_image * rendered.image)
-            + np.sum(cotangents.d_alpha * rendered.alpha)
-            + np.sum(cotangents.d_depth * rendered.depth)
-        )
+        rendered = reference.render(replace(gaussians, **{name: values}), CAMERA, background)
+        image = np.sum(cotangents.d_image * rendered.image)
+        return image + np.sum(cotangents.d_depth * rendered.depth)
 
     return (loss(1) - loss(-1)) / (2 * step)
 
 
-def assert_slopes(gaussians, precision, cotangents, *numbers, nonzero=True):
-    """Gradients of (name, index) are the reference's slopes."""
-    gradients = gradients_of(gaussians, precision, cotangents)
+LOGIT, RED, DEPTH, SIZE = (
+    ("logit_opacities", 0), ("sh0", (0, 0, 0)), ("means", (0, 2)), ("log_scales", (0, 0))
+)  # fmt: skip
+ALL = PARAMETER_NAMES[:5]
+NEAREST = np.nextafter(np.float32(0.25), np.float32(0))
+
+LIMITS = {
+    "alpha just below its clamp": (of_opacity(0.985), (), [LOGIT, RED]),
+    "alpha clamped": (of_opacity(0.9975), ("logit_opacities", "log_scales", "quats"), [RED, DEPTH]),
+    "alpha above its cut": (of_opacity(1.01 * constants.ALPHA_CUT), (), [LOGIT, RED]),
+    "alpha below its cut": (of_opacity(0.99 * constants.ALPHA_CUT), ALL, []),
+    "a colour above 0": (of_color(0.01), (), [LOGIT, RED]),
+    "a negative colour": (of_color(-0.01), ("sh0",), [LOGIT]),
+    "at the near plane": (at_depth(0.25), (), [RED]),
+    "nearer than the near plane": (at_depth(NEAREST), ALL, []),
+    "two layers above the stop": (layers(1, 8, 0), (), [("sh0", (2, 0, 0)), ("means", (2, 2))]),
+}
+"""A scene, parameters whose gradients are zero, and numbers whose gradients are slopes."""
+
+
+@both_precisions
+@pytest.mark.parametrize("name", LIMITS)
+def test_gradients_beyond_a_limit_are_zero(precision, name):
+    gaussians, without, numbers = LIMITS[name]
+    gradients = gradients_of(gaussians, precision)
+    assert [name for name in without if gradients[name].any()] == []
+    assert_slopes(gaussians, gradients, precision, CENTER, numbers)
+
+
+def assert_slopes(gaussians, gradients, precision, pixel, numbers):
     for name, index in numbers:
-        expected = slope(gaussians, cotangents, name, index)
-        assert (abs(expected) > 1e-4) == nonzero, (name, expected)
+        expected = slope(gaussians, pixel, name, index)
+        assert abs(expected) > 1e-4, name
         error = abs(gradients[name][index] - expected)
         assert error <= TOLERANCE[precision] * max(1.0, abs(expected)), name
 
 
-CENTER = at_pixel(8, 6)
-"""The pixel whose centre is the splat's mean."""
-
-
-# Alpha's upper clamp
+@both_precisions
+def test_splats_behind_the_stop_have_no_gradient(precision):
+    """Two clamped splats leave just less than the stop: the second and all behind have none."""
+    gradients = gradients_of(layers(8, 8, 0), precision)
+    for name in ("sh0", "means"):
+        assert gradients[name][0].any() and not gradients[name][1:].any()
 
 
 @both_precisions
-def test_clamped_alpha_has_no_derivative_but_its_colour_has(precision):
-    gaussians = splat(logit_opacities=[6.0])
-    gradients = gradients_of(gaussians, precision, CENTER)
-    for name in ("logit_opacities", "log_scales", "quats"):
-        assert not gradients[name].any(), name
-    # The mean still moves the depth: 0.125 times the weight.
-    expected = [0, 0, 0.125 * constants.ALPHA_MAX]
-    np.testing.assert_allclose(gradients["means"][0], expected, rtol=1e-6, atol=0)
-    assert_slopes(gaussians, precision, CENTER, ("sh0", (0, 0, 0)), ("means", (0, 2)))
+@pytest.mark.parametrize("factor", [0.98, 1.02, -0.98, -1.02])
+def test_a_clamped_slope_is_a_constant_in_the_covariance_only(precision, factor):
+    """On either side of the clamp all slopes are those of the reference: beyond it the covariance
+    depends on z but not on x, while the position on the film depends on both."""
+    slope_x = factor * (1 + constants.TAN_CLAMP) * (CAMERA.width / 2) / CAMERA.fx
+    z, size = 2.0, 2 * (abs(slope_x) - 0.3)  # reaches the film
+    sizes = np.log([[size, 0.5 * size, 0.7 * size]])
+    gaussians = splat(means=[[slope_x * z, 0.1, z]], log_scales=sizes)
+    pixel = 16 if factor > 0 else 0, 6
+    gradients = gradients_of(gaussians, precision, pixel)
+    assert_slopes(gaussians, gradients, precision, pixel, [("means", (0, 0)), DEPTH, SIZE])
 
 
 @both_precisions
-def test_an_alpha_just_below_the_clamp_has_its_slope(precision):
-    gaussians = splat(logit_opacities=[np.log(0.985 / 0.015)])
-    assert_slopes(gaussians, precision, CENTER, ("logit_opacities", 0), ("sh0", (0, 0, 1)))
-
-
-# Alpha's cut
-
-
-@both_precisions
-@pytest.mark.parametrize(("factor", "is_seen"), [(1.01, True), (0.99, False)])
-def test_an_alpha_below_the_cut_has_no_gradient_at_all(precision, factor, is_seen):
-    opacity = factor * constants.ALPHA_CUT
-    gaussians = splat(logit_opacities=[np.log(opacity / (1 - opacity))])
-    numbers = [("logit_opacities", 0), ("sh0", (0, 0, 0)), ("means", (0, 2))]
-    if is_seen:
-        assert_slopes(gaussians, precision, CENTER, *numbers[:2])
-    else:
-        gradients = gradients_of(gaussians, precision, CENTER)
-        for name, _ in numbers:
-            assert not gradients[name].any(), name
-
-
-@both_precisions
-def test_pixel_outside_the_ellipse_has_no_gradient(precision):
-    gaussians = splat(log_scales=np.log([[0.02, 0.02, 0.02]]))
-    assert not gradients_of(gaussians, precision, at_pixel(14, 6))["means"].any()
-    assert gradients_of(gaussians, precision, at_pixel(9, 6))["means"].any()
-
-
-# The exponent, which needs no clamp
+def test_a_colour_of_zero_keeps_its_gradient(precision):
+    """The weight of the pixel, opacity 0.5, times the basis function."""
+    basis = float(precision.dtype(reference.C_00))  # the sum is exactly 0 in both precisions
+    gaussians = splat()
+    gaussians.sh0[:] = -0.5 / basis
+    expected = 0.5 * reference.C_00 * np.array([1.0, 0.5, 0.25])
+    np.testing.assert_allclose(gradients_of(gaussians, precision)["sh0"][0, 0], expected, rtol=1e-6)
 
 
 @both_precisions
@@ -158,6 +186,7 @@ def test_exponents_far_below_underflow_are_zero_not_garbage(precision):
     rows_of_the_needle = np.abs(np.arange(13) + 0.5 - CAMERA.cy) < 3
     assert (rendered["alpha"][rows_of_the_needle] > 0).any()
     assert (rendered["transmittance"][~rows_of_the_needle] == 1).all()
+<<<<<<< HEAD
     assert not gradients_of(gaussians, precision, at_pixel(8, 0))["means"].any()
 
 
@@ -243,15 +272,17 @@ def test_splats_behind_the_stop_have_no_gradient(precision):
 
 
 # The low-pass
+=======
+    assert not gradients_of(gaussians, precision, (8, 0))["means"].any()
+>>>>>>> t43-spl
 
 
 @both_precisions
 def test_subpixel_splat_has_position_gradients_but_no_scale_gradients(precision):
     """The low-pass is added, not clamped: the gradient of the size fades with the size squared."""
-    off_center = at_pixel(9, 6)
 
     def gradients(size):
-        return gradients_of(splat(log_scales=np.log([[size] * 3])), precision, off_center)
+        return gradients_of(of_size(size, size, size), precision, (9, 6))
 
     slopes = [np.abs(gradients(size)["log_scales"]).sum() for size in (0.02, 0.01, 0.005)]
     assert slopes[0] / slopes[1] == pytest.approx(4, rel=0.3)

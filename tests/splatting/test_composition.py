@@ -3,13 +3,10 @@
 Kernels are compared between fresh processes of one test run: nothing is stored.
 """
 
-import json
-
 import drjit as dr
 import drjit.llvm.ad as llvm
 import mitsuba as mi
 import pytest
-from conftest import TESTS
 from support.helpers import (
     Case,
     Cotangents,
@@ -29,92 +26,6 @@ from drgs.splatting.projection import compensated_opacity
 # ----------------------------------------------------------------------------------------------
 # Kernel history
 # ----------------------------------------------------------------------------------------------
-
-
-PROGRAM = """
-import json, sys
-import drjit as dr
-sys.path.insert(0, {tests!r})
-from drgs.gaussians import sh
-from drgs.splatting import projection, rendering
-from support.kernels import kernels_of_a_frame
-
-{before}
-pipeline = rendering.Pipeline({degree}, {rule}, {features})
-print(json.dumps(kernels_of_a_frame(pipeline)))
-"""
-
-
-FORBIDDEN = """
-class Forbidden:
-    def __init__(self, name):
-        self.__dict__["name"] = name
-
-    def refuse(self, *args):
-        raise AssertionError(self.__dict__["name"] + " was used")
-
-    __call__ = __getattr__ = __getitem__ = __iter__ = __len__ = __neg__ = refuse
-    __add__ = __radd__ = __mul__ = __rmul__ = __sub__ = __rsub__ = __float__ = refuse
-
-for module, name in [{names}]:
-    setattr(module, name, Forbidden(name))
-"""
-
-
-UNUSED_AT_DEGREE_1 = """
-    (projection, "compensated_opacity"), (rendering, "depth_feature"), (sh, "C2"), (sh, "C3"),
-"""
-
-
-UNUSED_AT_DEGREE_0 = UNUSED_AT_DEGREE_1 + '(sh, "C1"),'
-
-
-def kernels_in_a_new_process(run_python, degree, rule, features, forbidden=None):
-    """Raises RuntimeError with the process's last line of error."""
-    program = PROGRAM.format(
-        tests=TESTS,
-        before=FORBIDDEN.replace("{names}", forbidden) if forbidden else "",
-        degree=degree,
-        rule=rule,
-        features=features,
-    )
-    result = run_python(program)
-    if result.returncode != 0:
-        raise RuntimeError(result.stderr.strip().splitlines()[-1])
-    return json.loads(result.stdout)
-
-
-PLAIN = {"rule": "projection.plain_opacity", "features": "(rendering.color_features,)"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("degree", "forbidden"),
-    [(0, UNUSED_AT_DEGREE_0), (1, UNUSED_AT_DEGREE_1)],
-    ids=["degree 0", "degree 1"],
-)
-def test_kernels_are_the_same_without_unused_modules(run_python, degree, forbidden):
-    whole = kernels_in_a_new_process(run_python, degree, **PLAIN)
-    reduced = kernels_in_a_new_process(run_python, degree, **PLAIN, forbidden=forbidden)
-    assert whole == reduced
-    assert all(len(kernels) >= 3 for kernels in whole.values())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("degree", "change", "used"),
-    [
-        (2, {}, "C2 was used"),
-        (1, {"rule": "projection.compensated_opacity"}, "compensated_opacity was used"),
-        (1, {"features": "(rendering.color_features, rendering.depth_feature)"}, "depth_feature"),
-    ],
-    ids=["degree 2", "compensation", "depth"],
-)
-def test_missing_module_fails_only_when_its_feature_is_used(run_python, degree, change, used):
-    with pytest.raises(RuntimeError, match=used):
-        kernels_in_a_new_process(
-            run_python, degree, **{**PLAIN, **change}, forbidden=UNUSED_AT_DEGREE_1
-        )
 
 
 @pytest.fixture(scope="module")
@@ -181,23 +92,6 @@ def test_search_finds_every_kind_of_float_scatter_add(float_type, mode):
     assert found
     atomic = any("atomicrmw fadd" in text for text in found)
     assert atomic == (mode in ("Direct", "Local"))
-
-
-def test_search_finds_gather_derivatives_but_no_integer_scatter():
-    def differentiated_gather():
-        source = dr.opaque(llvm.Float, 1.0, 100)
-        dr.enable_grad(source)
-        dr.backward(dr.gather(llvm.Float, source, dr.arange(llvm.UInt32, 1000) % 7))
-        dr.eval(dr.grad(source))
-
-    def integers():
-        target = dr.zeros(llvm.UInt32, 100)
-        dr.scatter_add(target, dr.arange(llvm.UInt32, 1000), dr.arange(llvm.UInt32, 1000) % 7)
-        dr.eval(target)
-
-    assert float_reductions(differentiated_gather)[0]
-    found, count = float_reductions(integers)
-    assert not found and count > 0
 
 
 @both_precisions

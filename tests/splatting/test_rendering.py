@@ -1,6 +1,5 @@
 """Features, attached parameters, visibility and weights of whole images."""
 
-from dataclasses import replace
 from functools import cache
 
 import drjit as dr
@@ -17,7 +16,6 @@ from support.helpers import (
     device_camera,
     device_gaussians,
     frame_adjoint,
-    image_planes,
     plane_cotangents,
     reference_gradients,
     render,
@@ -130,40 +128,6 @@ def test_splats_overlapping_the_film_are_visible(precision):
     touched = expected_gradients(case)["means2d"].any(axis=1)
     assert visible[touched].all()
     assert not rows(gradients.means2d)[~visible].any()
-
-
-@both_precisions
-def test_image_without_visible_splats_is_background(precision):
-    case = Case("hidden", 20, 13, 1, count=5)
-    hidden = replace(case.gaussians, logit_opacities=np.full(5, -8.0))
-    gaussians = device_gaussians(hidden, precision)
-    frame = rendering.render(gaussians, device_camera(case.camera, precision), case.pipeline)
-    rendered = image_planes(frame, case)
-    np.testing.assert_array_equal(rendered["image"], np.broadcast_to(case.background, (13, 20, 3)))
-    assert not rendered["depth"].any() and not rendered["alpha"].any()
-    gradients = frame_adjoint(
-        gaussians, frame, *plane_cotangents(case, Cotangents.random(case), precision)
-    )
-    for name in PARAMETER_NAMES:
-        values = np.array(getattr(gradients.parameters, name))
-        assert values.shape == getattr(hidden, name).shape and not values.any(), name
-    assert not np.array(gradients.visible).any()
-
-
-@both_precisions
-@pytest.mark.parametrize("logit", [-np.inf, -900.0, -120.0])
-def test_an_opacity_that_underflows_to_zero_has_no_gradient(precision, logit):
-    case = clear(CASE)
-    logits = case.gaussians.logit_opacities.copy()
-    row = int(np.argmax(np.abs(expected_gradients(case)["logit_opacities"])))
-    logits[row] = logit
-    gaussians = device_gaussians(replace(case.gaussians, logit_opacities=logits), precision)
-    frame = rendering.render(gaussians, device_camera(case.camera, precision), case.pipeline)
-    cotangents = plane_cotangents(case, Cotangents.random(case), precision)
-    gradients = frame_adjoint(gaussians, frame, *cotangents)
-    for name in PARAMETER_NAMES:
-        values = np.array(getattr(gradients.parameters, name))
-        assert np.isfinite(values).all() and not values[row].any(), name
 
 
 @pytest.mark.parametrize("sh_direction", ["mean", "pixel"])

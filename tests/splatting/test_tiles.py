@@ -88,39 +88,9 @@ def quadratic_form(factor, dx, dy) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("size", "columns", "rows_"), [((1, 1), 1, 1), ((16, 17), 1, 2), ((37, 29), 3, 2)]
-)
-def test_tiles_cover_the_film(size, columns, rows_):
-    grid = TileGrid(*size)
-    assert (grid.columns, grid.rows, grid.num_tiles) == (columns, rows_, columns * rows_)
-
-
 # ----------------------------------------------------------------------------------------------
 # Which pairs
 # ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@both_precisions
-@all_cases
-def test_entries_cover_every_pair_that_the_reference_accepts(precision, case):
-    binned = bin_case(case, precision)
-    grid = binned.bins.grid
-    table = binned.mask_table()
-    splats = reference.project(case.gaussians, case.camera, case.antialiased)
-    y, x = np.mgrid[: case.height, : case.width]
-    tile, micro = tile_and_micro(x, y, grid)
-    pairs = 0
-    for i in np.flatnonzero(splats.visible):
-        d = np.stack([x + 0.5, y + 0.5], axis=-1) - splats.means2d[i]
-        power = np.einsum("hwi,ij,hwj->hw", d, splats.conics[i], d)
-        accepted = splats.opacities[i] * np.exp(-0.5 * power) >= reference.ALPHA_CUT
-        found = table[i, tile] >> micro & 1
-        assert found[accepted].all(), f"splat {i} is missing at {np.argwhere(accepted & ~found)}"
-        pairs += accepted.sum()
-    assert pairs > 0
-    assert not table[~splats.visible].any()
 
 
 @both_precisions
@@ -171,33 +141,6 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
     assert undecided <= 2 + 1e-2 * total, "the margin decides too much"
 
 
-@both_precisions
-@all_cases
-def test_number_of_entries_matches_the_boxes(precision, case):
-    """Each visible splat's bounding box, in whole tiles: two computations of the same box."""
-    binned = bin_case(case, precision)
-    splats = reference.project(case.gaussians, case.camera, case.antialiased)
-    variances = np.diagonal(splats.cov2d, axis1=1, axis2=2)
-    size = np.array([case.width, case.height])
-    with np.errstate(invalid="ignore"):
-        reach = 2 * np.log(splats.opacities / reference.ALPHA_CUT)
-
-        def count(margin):
-            radius = np.sqrt((reach + margin)[:, None] * variances) + margin / 100
-            first = np.maximum(np.ceil(splats.means2d - radius - 0.5), 0)
-            last = np.minimum(np.floor(splats.means2d + radius - 0.5), size - 1)
-            tiles_per_axis = last // TILE - first // TILE + 1
-            hit = splats.visible & (first <= last).all(axis=1)
-            return np.where(hit, tiles_per_axis.prod(axis=1), 0)
-
-        fewest, most = count(0), count(2 * binned.bins.grid.cull_margin)
-    runs = np.zeros(len(fewest), dtype=np.int64)
-    runs[binned.order] = np.diff(binned.first_entry)
-    assert (fewest <= runs).all() and (runs <= most).all()
-    assert runs.sum() == binned.count == binned.first_entry[-1]
-    assert (fewest == most).mean() > 0.9
-
-
 # ----------------------------------------------------------------------------------------------
 # In which order
 # ----------------------------------------------------------------------------------------------
@@ -237,16 +180,6 @@ def test_tile_start_and_sources_and_padding(precision, case):
     # An entry's source lies in the run of its rank.
     run = np.searchsorted(binned.first_entry, binned.source[:count], side="right") - 1
     np.testing.assert_array_equal(run, binned.ranks[:count])
-
-
-@both_precisions
-@all_cases
-def test_words_are_transposed_masks(precision, case):
-    binned = bin_case(case, precision)
-    bits = binned.masks[:, None] >> np.arange(MICROS) & 1
-    groups = bits.reshape(-1, WORD, MICROS)
-    expected = (groups << np.arange(WORD)[None, :, None]).sum(axis=1)
-    np.testing.assert_array_equal(binned.words.reshape(-1, MICROS), expected)
 
 
 def test_random_bits_are_transposed():
@@ -374,12 +307,6 @@ def test_a_needle_touches_only_what_its_ellipse_touches():
     # 1.8 px to either side of the diagonal: it and its two neighbours.
     diagonal = film // MICRO
     assert diagonal <= micro_tiles <= 3 * diagonal
-
-
-def test_packing_preserves_the_largest_numbers():
-    numbers = [(1 << 26) - 1, 5, 0], [(1 << 22) - 1, 1 << 16, 0], [(1 << 16) - 1, 0, 9]
-    packed = tiles._pack(*(dr.llvm.ad.UInt32(column) for column in numbers))
-    assert [np.array(v).tolist() for v in tiles._unpack(*packed)] == [*numbers]
 
 
 def test_more_splats_than_ranks_are_refused(monkeypatch):

@@ -7,9 +7,9 @@ from functools import cache
 from operator import attrgetter
 
 import pytest
+from conftest import REPOSITORY, SHARED_DATA
 from support.photographs import moved
 
-from conftest import REPOSITORY, SHARED_DATA
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
