@@ -21,13 +21,14 @@ from drgs.config.load import config_from
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UnsupportedError
 from drgs.core.registry import ExtensionError, reporting_extensions
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import ProjectionModel, ewa
-from drgs.splatting.rendering import CenterOrder, frames_adjoint, frames_tangent, render
+from drgs.splatting.rendering import CenterOrder, render
+from drgs.testing import Case, adjoint_is_transpose, gradients_equal_differences
 from drgs.training.summary import summary_of_fit
 
 K = np.array([[30.0, 0, 14], [0, 33, 11], [0, 0, 1]])
-WIDTH, HEIGHT, STEP = 28, 22, 1e-6
+WIDTH, HEIGHT = 28, 22
 UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0, "low_pass": 0.5}
 COMPACT = FALLOFFS._extensions.pop("compact")  # not there in other tests
 
@@ -94,28 +95,12 @@ def test_image_matches_the_equation():
     assert np.abs(np.array(found) - planes_of(values())).max() > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["center", "pixel"])
-def test_gradients_match_differences_of_the_image(order):
-    """Against central differences, and the tangent against the adjoint."""
-    rng, arrays = np.random.default_rng(4), values()
-    weights = rng.normal(size=(4, WIDTH * HEIGHT))
-    chosen = {"falloff": "compact", "order": order}
-    gaussians, pipeline = gaussians_of(arrays), pipeline_of(Approximations(**UNCUT, **chosen), 0)
-    frame = render(gaussians, CAMERA, pipeline)
-    found = frames_adjoint(gaussians, [frame], [[llvm.Float64(w) for w in weights]]).parameters
-    direction = {name: rng.normal(size=array.shape) for name, array in arrays.items()}
-    along = sum(
-        (np.array(getattr(found, name)).reshape(direction[name].shape) * direction[name]).sum()
-        for name in PARAMETER_NAMES
-    )
-    tangent = frames_tangent(gaussians, [frame], gaussians_of(direction))[0]
-    assert (weights * [np.array(plane) for plane in tangent]).sum() == pytest.approx(along)
-
-    def loss(step):
-        moved = {name: array + step * direction[name] for name, array in arrays.items()}
-        return (weights * planes_of(moved, **chosen)).sum()
-
-    assert (loss(STEP) - loss(-STEP)) / (2 * STEP) == pytest.approx(along, rel=1e-5)
+@pytest.mark.parametrize("law", [gradients_equal_differences, adjoint_is_transpose])
+def test_laws_of_gradients_hold(law, order):
+    approximations = {"falloff": "compact", "order": order, **UNCUT}
+    law(Case("compact", approximations=approximations, degree=0, count=12))
 
 
 def test_falloff_is_found_by_name_in_plugin_and_configuration():

@@ -1,136 +1,84 @@
 """Several samples per pixel: kernels against the reference, films against the definition."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.approximation_checks import (
-    GRADIENTS,
-    MARKED,
-    PLANES,
-    STEP,
-    Problem,
-    _planes,
-    direction,
-)
 from support.backgrounds import CLOSE, EMITTERS, rendered, texels
-from support.helpers import (
-    FLOAT32,
-    FLOAT64,
-    assert_arrays_agree,
-    both_precisions,
-    device_camera,
-    device_gaussians,
-    single,
-)
+from support.cases import CASES, MODEL_FIELDS, planes_of, reference_camera
+from support.helpers import FLOAT64, NEAR_THRESHOLD, single
 from support.views import VIEWS, Scene, image_of, tensors
 from support.wall_scenes import Wall
 from support.wall_scenes import load as load_wall
 
 import drgs  # noqa: F401  (registers the plugin)
+from drgs.core.arrays import from_host
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.film import PIXELS_PER_PASS, SAMPLES_PER_KERNEL, DrawnSamples, SamplePoints
+from drgs.integrator.film import PIXELS_PER_PASS, DrawnSamples, SamplePoints
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
+from drgs.testing import Case, laws_of
 
 # ----------------------------------------------------------------------------------------------
 # Kernels
 # ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Sampled(Problem):
-    """An approximation, seen at one random point of each pixel."""
+@dataclass(frozen=True, eq=False)
+class Sampled(Case):
+    """A case that is seen at one random point of each pixel."""
 
     @property
     def points(self) -> np.ndarray:
         """(H, W, 2) in [0, 1), exact in single precision."""
-        camera = self.inputs[1]
-        rng = np.random.default_rng(9)
-        return rng.integers(0, 256, (camera.height, camera.width, 2)) / 256
+        return np.random.default_rng(9).integers(0, 256, (self.height, self.width, 2)) / 256
 
-    @property
-    def positions(self) -> np.ndarray:
-        """(H, W, 2) px, film."""
-        camera = self.inputs[1]
-        corners = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-        return corners + self.points
-
-    def rendered(self, threshold_width) -> reference.RenderedImage:
-        return reference_rays.render(
-            *self.inputs, (0, 0, 0), self.model, None, self.positions, threshold_width
+    def frames(self, values, Float=FLOAT64.Float):
+        gaussians, (frame,) = super().frames(values, Float)
+        points = SamplePoints(
+            *(from_host(Float, p.ravel()) for p in np.moveaxis(self.points, -1, 0))
         )
-
-    def reference_planes(self, gaussians) -> np.ndarray:
-        return _planes(
-            reference_rays.render(
-                gaussians, self.inputs[1], (0, 0, 0), self.model, None, self.positions
-            )
-        )
-
-    @property
-    def pipeline(self) -> rendering.Pipeline:
-        raise AssertionError("depends on the precision")
-
-    def render(self, precision):
-        pipeline = Problem.pipeline.fget(self)
-        points = SamplePoints(*(precision.array(p) for p in np.moveaxis(self.points, -1, 0)))
-        model = replace(pipeline.model, positions=points)
-        gaussians = device_gaussians(self.inputs[0], precision)
-        camera = device_camera(self.inputs[1], precision)
-        return gaussians, rendering.render(gaussians, camera, replace(pipeline, model=model))
+        model = replace(frame.pipeline.model, positions=points)
+        pipeline = replace(frame.pipeline, model=model)
+        return gaussians, [rendering.render(gaussians, frame.camera, pipeline)]
 
 
-CASES = [Sampled("wide low-pass", "random"), Sampled("all three", "close")]
-
-all_cases = pytest.mark.parametrize("problem", CASES, ids=lambda p: f"{p.name}, {p.scene}")
-
-
-@both_precisions
-@all_cases
-def test_image_at_points_equals_the_reference(precision, problem):
-    rendered = problem.rendered(MARKED[precision])
-    kept = ~rendered.near_threshold
-    assert kept.mean() > 0.9
-    actual = problem.kernel_planes(precision)
-    assert_arrays_agree(
-        {"planes": actual[kept]}, {"planes": _planes(rendered)[kept]}, PLANES[precision]
-    )
-    centers = Problem(problem.name, problem.scene).kernel_planes(precision)
-    assert np.abs(actual - centers).max() > 0.01
+def by_rays_at_points(case, values):
+    corners = np.stack(np.meshgrid(np.arange(case.width), np.arange(case.height)), axis=-1)
+    given = {k: v for k, v in case.approximations.items() if k in MODEL_FIELDS}
+    model = reference_rays.ImageModel(**given, sh_degree=case.degree)
+    rendered = reference_rays.render(
+        reference.Gaussians(**values), reference_camera(case), model=model,
+        positions=corners + case.points, threshold_width=NEAR_THRESHOLD,
+    )  # fmt: skip
+    planes, marked = planes_of(rendered)
+    return planes if model.order == "center" else planes[:4], marked
 
 
-@all_cases
-def test_gradients_at_points_equal_central_differences_of_the_reference(problem):
-    weights = problem.weights(seed=1)
-    gradients = problem.kernel_gradients(FLOAT64, weights)
-    for parameter in PARAMETER_NAMES:
-        d = direction(problem, parameter, seed=2)
-        moved = [
-            problem.reference_planes(
-                reference.Gaussians(
-                    **{
-                        n: getattr(problem.inputs[0], n) + sign * STEP * getattr(d, n)
-                        for n in PARAMETER_NAMES
-                    }
-                )
-            )
-            for sign in (1, -1)
-        ]
-        expected = np.sum(weights * (moved[0] - moved[1])) / (2 * STEP)
-        terms = getattr(d, parameter) * gradients[parameter]
-        assert abs(terms.sum() - expected) < 1e-6 * np.abs(terms).sum(), parameter
+def sampled(name) -> Sampled:
+    case = next(case for case in CASES if case.name == name)
+    given = {field.name: getattr(case, field.name) for field in fields(Case)}
+    return Sampled(**{**given, "reference": by_rays_at_points})
 
 
-@all_cases
-def test_single_precision_gradients_at_points_equal_double_precision(problem):
-    weights = problem.weights(seed=5)
-    expected = problem.kernel_gradients(FLOAT64, weights)
-    assert_arrays_agree(problem.kernel_gradients(FLOAT32, weights), expected, GRADIENTS[FLOAT32])
+SAMPLED = {"wide low-pass, pinhole": [], "all three, close": pytest.mark.slow}
+
+
+@pytest.mark.parametrize(
+    ("case", "law"),
+    [
+        pytest.param(case, law, id=f"{name}-{law.__name__}", marks=marks)
+        for name, marks in SAMPLED.items()
+        for case in [sampled(name)]
+        for law in laws_of(case)
+    ],
+)
+def test_law_holds_at_points(case, law):
+    law(case)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -302,27 +250,6 @@ def test_no_samples_outside_the_film():
     np.testing.assert_allclose(*images, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("action", ["develop", "adjoint"])
-def test_kernels_with_a_filter_do_not_grow_with_samples(action):
-    """Compilers take longer than proportionally to a kernel's length."""
-    sensor = SCENE.load(rfilter="gaussian").sensors()[0]
-    width, height = sensor.film().crop_size()
-
-    def longest_kernel(samples) -> int:
-        exposure = DrawnSamples(sensor, 0, samples, {})
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            if action == "develop":
-                sizes = [dr.width(points.x) for points in exposure.positions]
-                dr.eval(exposure.develop([[dr.opaque(mi.Float, 1, n)] * 4 for n in sizes]))
-            else:
-                dr.eval(exposure.adjoint(dr.full(mi.TensorXf, 1, (height, width, 4))))
-            kernels = dr.kernel_history([dr.KernelType.JIT])
-        return max(kernel["operation_count"] for kernel in kernels)
-
-    assert longest_kernel(6) < 1.2 * longest_kernel(2)
-
-
 def test_a_box_filter_gives_the_same_bytes_in_every_run():
     results = []
     for _ in range(2):
@@ -476,19 +403,6 @@ def test_a_pass_of_a_large_film_has_one_sample():
     at_once = PIXELS_PER_PASS // (SMALL_SCENE.view.width * SMALL_SCENE.view.height)
     passes = DrawnSamples(small, 0, 2 * at_once + 1, {}).positions
     assert [p.samples for p in passes] == [at_once, at_once, 1]
-
-
-def test_samples_of_a_small_film_share_kernels():
-    """But for their sums over samples, of 16 at a time."""
-
-    def launches(samples) -> int:
-        loaded = scene_with()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            loaded.integrator().render(loaded, spp=samples)
-            return len(dr.kernel_history([dr.KernelType.JIT]))
-
-    launches(2)
-    assert launches(64) <= launches(2) + 64 // SAMPLES_PER_KERNEL
 
 
 def test_weights_are_means_over_the_samples_of_all_passes(monkeypatch):

@@ -20,10 +20,10 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.approximation_checks import MARKED, PLANES
 from support.helpers import (
     FLOAT32,
     FLOAT64,
+    NEAR_THRESHOLD,
     assert_arrays_agree,
     both_precisions,
     rows,
@@ -44,6 +44,12 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.reference import light as reference_light
 from drgs.reference import rays as reference_rays
 from drgs.splatting.cutoffs import Cutoffs
+
+# Tolerances of images, relative to the largest value: see ``image_tolerance`` in drgs.testing.
+PLANES = {FLOAT64: 1e-12, FLOAT32: 2e-5}
+
+MARKED = {FLOAT64: 1e-9, FLOAT32: NEAR_THRESHOLD}
+"""Relative distance from a decision within which a pixel is left out."""
 
 RAY_APPROXIMATIONS = {
     "projection": "exact",

@@ -71,26 +71,10 @@ def bin_case(case, precision) -> Binned:
     return Binned(case, splats, bin_splats(splats, TileGrid(case.width, case.height)))
 
 
-def tile_and_micro(x, y, grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tile of each pixel and the micro-tile in it, both counted in rows."""
-    tile = (y // TILE) * grid.columns + x // TILE
-    return tile, (y % TILE // MICRO) * GRID + x % TILE // MICRO
-
-
 def quadratic_form(factor, dx, dy) -> np.ndarray:
     """|U d|^2 with U = [[p, r], [0, s]], base e: twice the negative exponent."""
     p, r, s = factor
     return (p * dx + r * dy) ** 2 + (s * dy) ** 2
-
-
-# ----------------------------------------------------------------------------------------------
-# The grid
-# ----------------------------------------------------------------------------------------------
-
-
-# ----------------------------------------------------------------------------------------------
-# Which pairs
-# ----------------------------------------------------------------------------------------------
 
 
 @both_precisions
@@ -141,11 +125,6 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
     assert undecided <= 2 + 1e-2 * total, "the margin decides too much"
 
 
-# ----------------------------------------------------------------------------------------------
-# In which order
-# ----------------------------------------------------------------------------------------------
-
-
 @both_precisions
 @all_cases
 def test_entries_are_sorted_by_tile_then_depth(precision, case):
@@ -190,11 +169,6 @@ def test_random_bits_are_transposed():
     np.testing.assert_array_equal(np.array(words).reshape(-1, MICROS), expected)
 
 
-# ----------------------------------------------------------------------------------------------
-# Corner cases, given as splats on the film
-# ----------------------------------------------------------------------------------------------
-
-
 def round_splats(precision, means2d, sigma=1.0, depths=None, opacities=0.5, visible=True):
     """Isotropic splats of ``sigma`` px."""
     means2d = np.asarray(means2d, dtype=float).reshape(-1, 2)
@@ -211,50 +185,46 @@ def round_splats(precision, means2d, sigma=1.0, depths=None, opacities=0.5, visi
     )
 
 
-@both_precisions
-@pytest.mark.parametrize(
-    "mean", [(-30, 10), (10, 60), (1e30, 10), (-1e30, -1e30), (10, 3e9), (66.62, 10)]
-)
-def test_a_splat_off_the_film_has_no_entry(precision, mean):
-    bins = bin_splats(round_splats(precision, mean), TileGrid(64, 48))
-    assert bins.num_entries == 0
-    assert not np.array(bins.masks).any() and not np.array(bins.tile_start).any()
-    assert not np.array(bins.words).any()
+WHOLE = np.full(63 * 19, 0xFFFF)
+RADIUS = 3.11
+"""px; that of an opacity of 0.5 is sqrt(2 ln(0.5 * 255)) = 3.114."""
+
+CORNERS = {
+    "left of the film": ((64, 48), {"means2d": (-30, 10)}, [], []),
+    "below the film": ((64, 48), {"means2d": (10, 60)}, [], []),
+    "far right of the film": ((64, 48), {"means2d": (1e30, 10)}, [], []),
+    "far left above the film": ((64, 48), {"means2d": (-1e30, -1e30)}, [], []),
+    "far below the film": ((64, 48), {"means2d": (10, 3e9)}, [], []),
+    "a little too far right": ((64, 48), {"means2d": (63.5 + 3.12, 10)}, [], []),
+    "as far as the cut": ((64, 48), {"means2d": (63.5 + RADIUS, 10)}, [3], [1 << (2 * GRID + 3)]),
+    "invisible": ((64, 48), {"means2d": np.full((40, 2), 20.0), "visible": False}, [], []),
+    "the corner of four tiles": (
+        *((40, 40), {"means2d": (16, 16)}),
+        *([0, 1, 3, 4], [1 << 15, 1 << 12, 1 << 3, 1 << 0]),
+    ),
+    **{
+        f"a giant of {sigma:.0e} px": (
+            *((1000, 300), {"means2d": (90, 40), "sigma": sigma, "opacities": 0.99}),
+            *(np.arange(63 * 19), WHOLE),
+        )
+        for sigma in (1e3, 1e6)
+    },
+}
+"""Film, round splats, and the tiles and masks of their entries."""
 
 
 @both_precisions
-def test_a_splat_reaches_as_far_as_the_cut(precision):
-    """Radius sqrt(2 ln(0.5 * 255)) = 3.114 px; the last pixel's centre is at 63.5."""
-    bins = bin_splats(round_splats(precision, (63.5 + 3.11, 10)), TileGrid(64, 48))
-    assert bins.num_entries == 1 and np.array(bins.tiles)[0] == 3
-    assert np.array(bins.masks)[0] == 1 << (2 * GRID + 3)
-
-
-@both_precisions
-def test_invisible_splats_have_no_entries(precision):
-    splats = round_splats(precision, np.full((40, 2), 20.0), visible=False)
-    bins = bin_splats(splats, TileGrid(64, 48))
-    assert bins.num_entries == 0 and not np.array(bins.first_entry).any()
-
-
-@both_precisions
-def test_one_splat_in_the_corner_of_four_tiles(precision):
-    # Radius sqrt(2 ln(0.5 * 255)) = 3.1 px around the corner (16, 16): one micro-tile of each tile.
-    bins = bin_splats(round_splats(precision, (16, 16)), TileGrid(40, 40))
-    assert bins.num_entries == 4
-    np.testing.assert_array_equal(np.array(bins.tiles)[:4], [0, 1, 3, 4])
-    np.testing.assert_array_equal(np.array(bins.masks)[:4], [1 << 15, 1 << 12, 1 << 3, 1 << 0])
-    np.testing.assert_array_equal(np.array(bins.tile_start), [0, 1, 2, 2, 3, 4, 4, 4, 4, 4])
-
-
-@both_precisions
-@pytest.mark.parametrize("sigma", [1000.0, 1e6])
-def test_a_giant_splat_touches_everything(precision, sigma):
-    grid = TileGrid(1000, 300)
-    bins = bin_splats(round_splats(precision, (90, 40), sigma, opacities=0.99), grid)
-    assert bins.num_entries == grid.num_tiles == 63 * 19
-    np.testing.assert_array_equal(np.array(bins.tiles)[: grid.num_tiles], np.arange(63 * 19))
-    assert (np.array(bins.masks)[: grid.num_tiles] == 0xFFFF).all()
+@pytest.mark.parametrize("name", CORNERS)
+def test_round_splats_have_entries_in_the_tiles_they_touch(precision, name):
+    film, splats, expected_tiles, expected_masks = CORNERS[name]
+    bins, count = (
+        bin_splats(round_splats(precision, **splats), TileGrid(*film)),
+        len(expected_tiles),
+    )
+    assert bins.num_entries == count
+    np.testing.assert_array_equal(np.array(bins.tiles)[:count], expected_tiles)
+    np.testing.assert_array_equal(np.array(bins.masks)[:count], expected_masks)
+    assert not np.array(bins.masks)[count:].any() and np.array(bins.tile_start)[-1] == count
 
 
 @both_precisions

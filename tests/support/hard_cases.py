@@ -439,14 +439,10 @@ def offset_by(rng, width, height, degree, count, distance):
     return gaussians, camera
 
 
-@family("coordinates offset by 1e4", count=30)
-def offset_1e4(rng, width, height, degree, count):
-    return offset_by(rng, width, height, degree, count, 1e4)
-
-
-@family("coordinates offset by 1e6", count=30)
-def offset_1e6(rng, width, height, degree, count):
-    return offset_by(rng, width, height, degree, count, 1e6)
+for distance in ("1e4", "1e6"):
+    family(f"coordinates offset by {distance}", count=30)(
+        partial(offset_by, distance=float(distance))
+    )
 
 
 @cache
