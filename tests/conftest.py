@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import imageio.v3 as iio
+import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
@@ -36,6 +37,12 @@ def _shared(*parts):
     if not folder.is_dir():
         pytest.skip(f"the shared data folder {'/'.join(parts)} is not here")
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    """Select the variant of nearly all tests."""
+    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture

@@ -61,11 +61,6 @@ QUICK = {
 """Cases of the default tests; those of combinations are slow tests."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def is_quick(case) -> bool:
     return case.name in QUICK
 

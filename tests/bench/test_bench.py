@@ -156,11 +156,6 @@ def test_existing_output_is_refused_before_measuring(name, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [f"{name}.csv"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture
 def small(monkeypatch):
     """32 px, 150 Gaussians, one round."""

@@ -12,11 +12,6 @@ from support.views import VIEWS, View, pose
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
 def test_points_on_sensor_rays_project_to_their_pixels(view):
     sensor = mi.load_dict(view.sensor())

@@ -10,12 +10,6 @@ from drgs.capture.camera_placement import settings_for, views_around, views_of
 from drgs.capture.path_tracing import CaptureCamera, CaptureSettings, lit_part
 from drgs.core.errors import UserError
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 TWO_SIDED = {"type": "twosided", "bsdf": {"type": "diffuse"}}
 
 ROOM = {"type": "cube", "bsdf": TWO_SIDED}

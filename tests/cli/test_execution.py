@@ -21,11 +21,6 @@ from drgs.training.trainer import Trainer
 DEBUG = dr.JitFlag.Debug
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture(autouse=True)
 def settings_are_restored():
     before = dr.flag(DEBUG), dr.thread_count(), sys.gettrace(), sys.stderr

@@ -13,7 +13,6 @@ from dataclasses import replace
 from itertools import product
 
 import imageio.v3 as iio
-import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -70,11 +69,6 @@ SMALL = ["--views", 6, "--test-views", 3, "--size", 20, 20, "--spp", 16, "--poin
 
 DISTANCE = RADIUS * math.sqrt(3) / math.sin(path_tracing.NERF_SYNTHETIC_FOV / 2)
 """Without --distance the bounding box's sphere touches the edges of the image."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def write(folder, name, text):

@@ -20,11 +20,6 @@ FILES = 7
 """The settings, three images, points, two transforms files."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
     path = tmp_path_factory.mktemp("scene") / "ball.xml"

@@ -2,7 +2,6 @@ import math
 import os
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -316,11 +315,6 @@ def test_last_opacity_reset_of_a_short_run_is_long_before_its_end(name):
         adc = config.densify.adc
         resets = range(adc.reset_every, config.densify.stop, adc.reset_every)
         assert config.iterations - max([*resets, adc.white_background_reset]) >= 1200
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def numbers_of(key, model):

@@ -34,11 +34,6 @@ from drgs.splatting.projection import load_rows
 FILTER = {FLOAT64: 1e-14, FLOAT32: 2e-6}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def filter_of(count, seed=0) -> np.ndarray:
     """Standard deviations (N,) from far below to far above the Gaussians' own."""
     return single(10 ** np.random.default_rng([seed, count]).uniform(-4, 0, count))

@@ -36,11 +36,6 @@ WIDTH, HEIGHT = 48, 32
 SEED = 3
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def tensor(values) -> mi.TensorXf:
     """Aligned as Dr.Jit's own memory is: other memory is read by other kernels."""
     values = np.asarray(values, np.float32)

@@ -19,11 +19,6 @@ TOLERANCE = 3e-5
 OWN_AOVS = "t:depth, a:alpha"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @dataclass(frozen=True)
 class SensorView(View):
     """The view through a sensor of another type; its lens need not see the same part."""

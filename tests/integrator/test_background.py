@@ -21,12 +21,6 @@ from support.views import VIEWS, Scene, decode, image_of, tensors, to_linear
 
 import drgs  # noqa: F401  (registers the plugins)
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 # ----------------------------------------------------------------------------------------------
 # Scenes
 # ----------------------------------------------------------------------------------------------

@@ -21,12 +21,6 @@ import drgs  # noqa: F401  (registers the plugins)
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 # ----------------------------------------------------------------------------------------------
 # Through an aperture
 # ----------------------------------------------------------------------------------------------

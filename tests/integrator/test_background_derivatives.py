@@ -24,11 +24,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def tensor(values):
     values = np.asarray(values)
     return mi.TensorXf(from_host(mi.Float, values), values.shape)

@@ -17,11 +17,6 @@ SENSORS = (VIEWS[1], VIEWS[2], VIEWS[10])
 GRADIENTS = 1e-4
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def load(sensor, wall=False, **others):
     scene = clear(SCENE)
     objects = {"integrator": scene.settings | tensors(scene.gaussians) | others, "sensor": sensor}

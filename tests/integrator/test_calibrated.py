@@ -37,11 +37,6 @@ MOVING = [replace(s, close=CLOSE) for s in (PINHOLE, OPENCV, FISHEYE)]
 ROLLING = [replace(s, shutter="rolling") for s in MOVING]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def assert_rays_project_to_samples(rays, sensor, times) -> None:
     """Compare samples with points on rays, projected by the reference's camera at each time."""
     ray, weight, sample = rays

@@ -26,12 +26,6 @@ from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.reference.effects import OpenCV
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 OTHER_POSE = pose([1, 2, 3], 30, (0.5, -0.6, 1.0))
 
 

@@ -377,11 +377,6 @@ TABLE = read_table((REPOSITORY / "docs" / "mitsuba.md").read_text())
 CELLS = [(row, route) for row, of_row in TABLE.items() for route, cell in of_row.items() if cell]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("row, route", CELLS)
 def test_cells_equal_the_measured_errors(row, route):

@@ -26,11 +26,6 @@ ROUNDING = 3e-6
 """Error of coverages: products of up to 100 transmittances in single precision, and their means."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @dataclass(frozen=True)
 class Fog:
     """Balls of one opacity around the origin."""

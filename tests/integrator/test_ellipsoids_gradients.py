@@ -31,12 +31,6 @@ from drgs.integrator import gathering
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 # ----------------------------------------------------------------------------------------------
 # Gradients
 # ----------------------------------------------------------------------------------------------

@@ -25,12 +25,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.core.errors import UnsupportedError
 from drgs.integrator import checks
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 # ----------------------------------------------------------------------------------------------
 # Numbers at the border
 # ----------------------------------------------------------------------------------------------
@@ -234,7 +228,9 @@ WRONG_PROPERTIES = [
 ]
 
 
-@pytest.mark.parametrize(("make", "message"), WRONG_PROPERTIES, ids=lambda value: str(value)[:30])
+@pytest.mark.parametrize(
+    ("make", "message"), WRONG_PROPERTIES, ids=[message[:30] for _, message in WRONG_PROPERTIES]
+)
 def test_wrong_properties_are_refused(make, message):
     with pytest.raises(RuntimeError) as caught:
         mi.load_dict({"type": "splats", **make()})

@@ -23,11 +23,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.parametrize(
     "scene",
     [*MERGED, Merged(sh_degree=1)],

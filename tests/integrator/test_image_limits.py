@@ -15,11 +15,6 @@ from drgs.integrator.checks import MAX_SAMPLES
 SCENE = Scene(VIEWS[1], count=8)  # 37 x 23 px
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def load(sensor=None, **settings):
     integrator = SCENE.settings | tensors(SCENE.gaussians) | settings
     sensor = sensor or SCENE.view.sensor()

@@ -14,11 +14,6 @@ ROUNDING = 4e-4
 """Mitsuba moves rays that go on from a surface by 1e-4: so much is the shift of what they see."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 PANES = {
     "null": {"type": "null"},
     "mask": {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}},

@@ -27,11 +27,6 @@ Gaussians of shapes or with a ``to_world``."""
 PACKAGE = ["drgs", "light"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 SCENE = Scene(degree=3, srgb_primitives=True)
 
 

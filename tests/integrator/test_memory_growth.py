@@ -20,11 +20,6 @@ SCENE = Scene(count=2000)
 KINDS = {"splats": {}, "surfaces": {"floor": {"type": "rectangle"}, "sky": {"type": "constant"}}}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def load(kind):
     size = {"width": WIDTH, "height": HEIGHT}
     sensors = {f"sensor_{k}": VIEWS[k].sensor(**size) for k in range(3)}

@@ -10,11 +10,6 @@ from support.views import VIEWS, Scene
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture(scope="module")
 def ply(tmp_path_factory):
     """A file of the Gaussians of a scene."""

@@ -10,11 +10,6 @@ from support.sensors import PIXELS, camera_of, numbers, points_on_rays, project
 from support.views import View
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.parametrize("crop", [None, WINDOW])
 @pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
 def test_points_on_thin_lens_rays_project_to_their_pixels(crop, to_world):

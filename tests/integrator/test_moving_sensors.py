@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.calibrated_sensors import (
@@ -23,12 +22,6 @@ from support.views import gradients_of, image_of
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
 
 SAMPLES = 3
 SENSORS = [

@@ -17,11 +17,6 @@ MODELS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def load(objects, own=None, **others) -> mi.Scene:
     integrator = SCENE.settings | (tensors(own) if own else {})
     integrator |= {name: {"type": "splats"} | settings for name, settings in objects.items()}

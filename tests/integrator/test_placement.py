@@ -27,11 +27,6 @@ MATRIX = single(MATRIX)
 KEY = "integrator.to_world"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def moved_by(matrix, gaussians) -> reference.Gaussians:
     """Gaussians moved in double precision."""
     place = Similarity.from_matrix(matrix, "the test's matrix")

@@ -30,11 +30,6 @@ from drgs.reference import splatting as reference
 BACKGROUND = (0.875, 0.375, 0.1875)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def make_view(width=37, height=23, fx=30.0, fy=30.0, cx=20.5, cy=9.25, name="view"):
     """An oblique camera with an off-centre principal point."""
     camera_to_world = np.array(pose([0.3, -1.0, 0.5], 40, (0.4, -0.7, 1.1)))

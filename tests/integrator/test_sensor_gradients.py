@@ -28,11 +28,6 @@ IMAGE, VALUE = 1e-4, 2e-5
 STEP = 1e-6
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 AXIS, DIRECTION = np.array([0.6, -0.48, 0.64]), np.array([0.28, 0.96, 0.3])
 
 BACKGROUND = np.array([0.875, 0.375, 0.03125])

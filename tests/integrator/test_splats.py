@@ -13,11 +13,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_file_and_tensors_give_the_same_image(degree, tmp_path):
     scene = Scene(degree=degree)

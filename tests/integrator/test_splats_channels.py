@@ -16,11 +16,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def with_channels(scene, aovs="z:depth, a:alpha", sensor=None):
     """The scene with an integrator that puts out more than colours."""
     integrator = scene.settings | tensors(scene.gaussians) | {"aovs": aovs}

@@ -15,11 +15,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.sensors import read_sensor
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @cache
 def valid():
     return tensors(Scene(count=8).gaussians)

@@ -15,12 +15,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 DIGEST = """
 import hashlib
 import drgs, drjit as dr, mitsuba as mi

@@ -16,12 +16,6 @@ from drgs.integrator import film as exposure
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 SETTINGS = {
     "degree 1": Scene(),
     "degree 3": Scene(degree=3),

@@ -8,12 +8,6 @@ from support.views import VIEWS, Scene, image_of, pose, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 CLOSE = pose([0.3, -1.0, 0.5], 48, (0.5, -0.6, 1.0))
 
 

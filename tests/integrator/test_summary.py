@@ -37,11 +37,6 @@ MODULES = (
 """Modules used only by effects."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def config_of(**changes):
     """The default of everything but of filters; ``__`` is written for the dot."""
     values = {key.replace("__", "."): value for key, value in changes.items()}

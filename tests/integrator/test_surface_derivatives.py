@@ -19,11 +19,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 STEP = 1e-6
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 RADIANCE_KEY = "wall.emitter.radiance.value"
 
 

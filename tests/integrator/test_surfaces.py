@@ -28,11 +28,6 @@ import drgs  # noqa: F401  (registers the plugins)
 CROPPED = Scene(VIEWS[12])
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.parametrize("scene", [SCENE, CROPPED], ids=lambda scene: scene.view.name)
 @pytest.mark.parametrize("srgb_primitives", [False, True])
 @pytest.mark.parametrize("sky", [None, SKY], ids=["constant background", "sky"])

@@ -12,11 +12,6 @@ from support.views import VIEWS, Scene, image_of, tensors
 import drgs  # noqa: F401  (registers the plugin)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def run_in_two_threads(work):
     """Return ``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
     results = [None, None]

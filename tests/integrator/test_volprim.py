@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.volprim import (
@@ -43,11 +42,6 @@ from support.volprim import (
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.core.constants import ALPHA_CUT
 from drgs.reference import splatting as reference
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def check_difference(splats, change=None, covariance_of=widened):

@@ -62,11 +62,6 @@ RAY_APPROXIMATIONS = {
 VOLPRIM_CUTOFFS = Cutoffs(alpha_max=0.9999, alpha_cut=0.0, transmittance_stop=0.0)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def rays_of(camera) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions (H W, 3) through the middles of pixels, row by row."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5

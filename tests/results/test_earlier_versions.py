@@ -25,11 +25,6 @@ ROUNDING = 1e-4
 """Relative: instructions of other processors round differently, and 30 iterations follow."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture
 def fitted(tmp_path):
     """The folder of the stopped fit, beside its data."""

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import RADIUS, blobs, decibels, pose_around
@@ -31,11 +30,6 @@ WHITE = (1.0, 1.0, 1.0)
 EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, RADIUS)
 REQUEST = FrameRequest(EYE, 48, 32)
 BEST = {"projection": "exact", **MOST_ACCURATE}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import threading
 import time
 from types import SimpleNamespace
 
-import mitsuba as mi
 import pytest
 
 pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
@@ -30,11 +29,6 @@ STOPPING = ("Pause", "End and write results")
 """Buttons that any client may press."""
 
 NAN, INF = float("nan"), float("inf")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import warnings
 from types import SimpleNamespace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -24,11 +23,6 @@ from drgs.viewer.server import free_port, is_same_origin, run_server, url
 from drgs.viewer.training_viewer import TrainingPage
 
 FITTED = Approximations(low_pass=0.1, antialiased=True, extent=3.5)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import time
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.small_capture import HEIGHT, WIDTH, pose_around
@@ -39,11 +38,6 @@ EVERYTHING = {
     "densify__every": 2,
 }
 """Settings of a fit with effects, density control and a growing SH degree."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 class Screen:
