@@ -1,4 +1,4 @@
-"""What approximations do that is no law of images: windows, faint splats, kernels, messages."""
+"""Approximations beyond the laws of images: windows, faint splats, kernels, messages."""
 
 import json
 import math
