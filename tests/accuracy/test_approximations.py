@@ -1,4 +1,4 @@
-"""Approximations beyond the laws of images: windows, faint splats, kernels, messages."""
+"""Windows, faint splats, kernels and messages of approximations, beyond the laws of images."""
 
 import json
 import math
