@@ -140,6 +140,7 @@ class FarFirst(CenterOrder):
 @pytest.fixture
 def others(monkeypatch):
     for registry in (PROJECTIONS, ORDERS):
+        # Registries forget nothing: the names are there for one test only.
         monkeypatch.setattr(registry, "_extensions", dict(registry._extensions))
     PROJECTIONS.register("twofold")(Twofold)
     ORDERS.register("far_first")(FarFirst)
@@ -166,6 +167,7 @@ def test_an_order_is_found_by_name(others):
 
 
 def test_errors_of_an_approximation_contain_its_name(monkeypatch):
+    # Registries forget nothing: the name is there for this test only.
     monkeypatch.setattr(PROJECTIONS, "_extensions", dict(PROJECTIONS._extensions))
 
     @PROJECTIONS.register("broken")

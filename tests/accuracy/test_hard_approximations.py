@@ -120,6 +120,7 @@ def rounded_axes(seed):
     Equal numbers are rounded equally wherever they are computed again. A derivative does not know
     of the rounding.
     """
+    # The sigma points are a stage within the projection, which nothing else needs to name.
     film_axes, sigma_offsets = projection.film_axes, unscented._sigma_offsets
 
     def moved(rng, x):

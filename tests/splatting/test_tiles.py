@@ -280,7 +280,7 @@ def test_a_needle_touches_only_what_its_ellipse_touches():
 
 
 def test_more_splats_than_ranks_are_refused(monkeypatch):
-    monkeypatch.setattr(tiles, "_RANK_BITS", 2)
+    monkeypatch.setattr(tiles, "_RANK_BITS", 2)  # 2^26 splats would need gigabytes
     splats = round_splats(FLOAT32, np.full((5, 2), 8.0))
     with pytest.raises(UserError, match="at most 4 Gaussians"):
         bin_splats(splats, TileGrid(16, 16))
