@@ -1,4 +1,4 @@
-"""The pages are true: links, paths, names, commands, options, and programs."""
+"""The pages are true: paths, names, commands, options, and programs."""
 
 import contextlib
 import importlib.util
@@ -71,28 +71,8 @@ def test_readme_links_to_every_page():
 
 
 # ----------------------------------------------------------------------------------------------
-# Links, paths and names
+# Paths and names
 # ----------------------------------------------------------------------------------------------
-
-
-def anchors(path) -> set[str]:
-    """Return the anchors of headings, as code hosts make them."""
-    headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
-    return {
-        re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
-    }
-
-
-@each_page
-def test_links_have_targets(page):
-    path = REPOSITORY / page
-    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
-        if "://" in target:
-            continue
-        name, _, anchor = target.partition("#")
-        linked = path.parent / name if name else path
-        assert linked.exists(), target
-        assert not anchor or anchor in anchors(linked), target
 
 
 FOLDERS = ("drgs", "plugins", "scenes", "tests", "docs")

@@ -1,4 +1,4 @@
-"""Sphinx builds the pages without a warning."""
+"""Sphinx builds the pages, and finds the targets of the links of all pages, without a warning."""
 
 import subprocess
 import sys
@@ -8,17 +8,27 @@ from conftest import REPOSITORY
 
 pytestmark = pytest.mark.slow
 
+# Pages outside of docs/ are read too: their links, and the links to them.
+ALL_PAGES = {
+    "include_patterns": "*.md,docs/*.md,scenes/studies/*.md",
+    "root_doc": "README",
+    "suppress_warnings": "toc.not_included,myst.header,ref.python",
+}
 
-def test_sphinx_builds_the_pages_without_a_warning(tmp_path):
+
+@pytest.mark.parametrize("folder, settings", [("docs", {}), (".", ALL_PAGES)])
+def test_sphinx_builds_the_pages_without_a_warning(folder, settings, tmp_path):
     for module in ("sphinx", "myst_parser", "furo"):
         pytest.importorskip(module)
-    command = ["-W", "--keep-going", "-b", "html", "-d", str(tmp_path / "trees")]
+    command = ["-W", "--keep-going", "-b", "html", "-c", "docs", "-d", str(tmp_path / "trees")]
+    command += [f"-D{name}={value}" for name, value in settings.items()]
     result = subprocess.run(
-        [sys.executable, "-m", "sphinx", *command, "docs", str(tmp_path / "html")],
+        [sys.executable, "-m", "sphinx", *command, folder, str(tmp_path / "html")],
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
     )
     assert result.returncode == 0, result.stderr
     for page in (REPOSITORY / "docs").glob("*.md"):
-        assert (tmp_path / "html" / f"{page.stem}.html").exists(), page
+        built = tmp_path / "html" / page.relative_to(REPOSITORY / folder)
+        assert built.with_suffix(".html").exists(), page
