@@ -55,10 +55,6 @@ def test_unknown_name_is_refused():
         _ = drgs.fitt
 
 
-# ----------------------------------------------------------------------------------------------
-# Modules and functions share no name
-# ----------------------------------------------------------------------------------------------
-
 FILES = sorted((REPOSITORY / "drgs").rglob("*.py"))
 
 
@@ -69,22 +65,13 @@ def names_around(file):
     return {*parts, *beside} - {"__init__", "__main__"}
 
 
-def shared_names(source, modules):
-    """Public functions and classes of a module that are called like one of ``modules``."""
-    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
-    defined = {node.name for node in ast.parse(source).body if isinstance(node, kinds)}
-    return defined & modules
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(REPOSITORY)))
 def test_no_name_equals_its_module_or_package(file):
-    assert not shared_names(file.read_text(), names_around(file))
+    """Public functions and classes."""
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    defined = {node.name for node in ast.parse(file.read_text()).body if isinstance(node, kinds)}
+    assert not defined & names_around(file)
 
 
 def test_public_names_differ_from_module_names():
     assert not PUBLIC & {path.stem for path in (REPOSITORY / "drgs").iterdir()}
-
-
-def test_a_shared_name_is_found():
-    assert shared_names("def exact(): ...\n\nclass Other: ...", {"exact", "other"}) == {"exact"}

@@ -29,10 +29,6 @@ def test_undocumented_functions_are_used_in_one_module_only():
     assert {name for name, uses in found.items() if uses} == {"drgs/core/private.py"}
 
 
-def test_use_of_an_undocumented_function_is_found():
-    assert undocumented("def f(x):\n    return dr.detail.collect_indices(x)") == ["dr.detail"]
-
-
 def test_bucket_order_is_stable_within_blocks():
     keys = np.random.default_rng(0).integers(0, 8, 100)
     order = private.bucket_order(UInt32(keys), 64, 8)
