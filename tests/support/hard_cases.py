@@ -102,347 +102,261 @@ def on_film(rng, camera, count, margin=0.0) -> np.ndarray:
 FAMILIES = {}
 
 
-def family(name, width=37, height=29, degree=1, count=16, **settings):
-    """Register recipe(rng, width, height, degree, count) -> (Gaussians, camera) as a case."""
+def family(
+    name, width=37, height=29, degree=1, count=16, turned=True, backdrop=True, principal=(),
+    **settings,
+):  # fmt: skip
+    """Register recipe(rng, camera, degree, count) -> Gaussians as a case.
+
+    turned: the camera is; otherwise it looks along z from the origin. backdrop: ordinary Gaussians
+    are added. principal: changes of the camera.
+    """
 
     def register(recipe):
-        def seeded(seed, *arguments):
-            return recipe(np.random.default_rng(seed), *arguments)
+        def scene(seed, *_):
+            rng = np.random.default_rng(seed)
+            camera = camera_for(width, height, rng if turned else None, **dict(principal))
+            hard = recipe(rng, camera, degree, count)
+            return with_backdrop(rng, camera, hard) if backdrop else hard, camera
 
-        FAMILIES[name] = Case(name, width, height, degree, count=count, recipe=seeded, **settings)
+        FAMILIES[name] = Case(name, width, height, degree, count=count, recipe=scene, **settings)
         return recipe
 
     return register
 
 
-@family("means at, just before, just behind and far behind the near plane")
-def near_plane(rng, width, height, degree, count):
-    # An axis-aligned camera at the origin: z is the mean's own third coordinate, not rounded.
-    camera = camera_for(width, height)
+@family("means at, just before, just behind and far behind the near plane", turned=False)
+def near_plane(rng, camera, degree, count):
+    # The camera is not turned: z is the mean's own third coordinate, not rounded.
     near = np.float32(camera.near)
     above, below = np.nextafter(near, np.float32(1)), np.nextafter(near, np.float32(0))
     z = np.array([near, above, below, 0.99 * near, 0.5 * near, 1.01 * near])
     z = np.append(z, [1e-20, 0.0, -1e-20, -near, -1.0, -1e6])
-    hard = splats(
-        rng, camera, on_film(rng, camera, len(z)), z, 0.01, rng.normal(0, 1, len(z)), degree
-    )
+    film, logits = on_film(rng, camera, len(z)), rng.normal(0, 1, len(z))
+    hard = splats(rng, camera, film, z, 0.01, logits, degree)
     hard.means[6:, :2] = single(rng.normal(0, 0.1, (len(z) - 6, 2)))
-    return with_backdrop(rng, camera, hard), camera
+    return hard
 
 
 @family("means at the camera centre")
-def camera_center(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    hard = splats(
-        rng,
-        camera,
-        on_film(rng, camera, 4),
-        1.0,
-        [[1e-3] * 3, [0.1] * 3, [10] * 3, [1e4] * 3],
-        2.0,
-        degree,
-    )
+def camera_center(rng, camera, degree, count):
+    scales = np.array([1e-3, 0.1, 10, 1e4])[:, None]
+    hard = splats(rng, camera, on_film(rng, camera, 4), 1.0, scales, 2.0, degree)
     hard.means[:] = camera.center
     hard.means[1] += 1e-7
-    return with_backdrop(rng, camera, hard), camera
+    return hard
 
 
 @family("far outside the frustum, reaching it")
-def far_outside(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    size = np.array([width, height])
+def far_outside(rng, camera, degree, count):
+    size = np.array([camera.width, camera.height])
     beyond = np.array(
         [[-0.4, 0.5], [1.5, 0.4], [0.3, -1.5], [0.6, 2.5], [-2, -2], [4, 3], [9, 0.5], [-20, 8]]
     )
-    distance = np.abs(beyond - np.clip(beyond, 0, 1)).max(axis=1) * max(width, height)
+    distance = np.abs(beyond - np.clip(beyond, 0, 1)).max(axis=1) * max(size)
     z = rng.uniform(1, 4, len(beyond))
     sizes = distance[:, None] * rng.uniform(0.4, 0.8, (len(beyond), 3))
-    hard = splats(rng, camera, beyond * size, z, sizes * z[:, None] / camera.fx, 1.0, degree)
-    return with_backdrop(rng, camera, hard), camera
+    return splats(rng, camera, beyond * size, z, sizes * z[:, None] / camera.fx, 1.0, degree)
 
 
 @family("89 degrees off axis", threshold_width=1e-3)
-def off_axis(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
+def off_axis(rng, camera, degree, count):
     angle = np.deg2rad([60, 75, 85, 89, 89, 89.9])
     turn = rng.uniform(0, 2 * np.pi, len(angle))
     slopes = np.tan(angle)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
     film = slopes * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     z = np.linspace(0.5, 0.6, len(angle))
     sizes = np.linalg.norm(film, axis=1) / 2.5
-    hard = splats(rng, camera, film, z, (sizes * z)[:, None] / camera.fx, 0.5, degree)
-    return with_backdrop(rng, camera, hard), camera
+    return splats(rng, camera, film, z, (sizes * z)[:, None] / camera.fx, 0.5, degree)
 
 
 @family("needles of ratio 1e6", count=40)
-def needles(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    z = rng.uniform(1, 4, count)
-    long = 10.0 ** rng.uniform(-1, 1, count)
-    scales = long[:, None] * [1, 1e-6, 1e-6]
-    hard = splats(
-        rng, camera, on_film(rng, camera, count, 0.3), z, scales, rng.normal(1, 1, count), degree
-    )
-    return with_backdrop(rng, camera, hard), camera
+def needles(rng, camera, degree, count):
+    z, length = rng.uniform(1, 4, count), 10.0 ** rng.uniform(-1, 1, count)
+    film, logits = on_film(rng, camera, count, 0.3), rng.normal(1, 1, count)
+    return splats(rng, camera, film, z, length[:, None] * [1, 1e-6, 1e-6], logits, degree)
 
 
-@family("needles along the line of sight", count=10)
-def needles_end_on(rng, width, height, degree, count):
-    camera = camera_for(width, height)
+@family("needles along the line of sight", count=10, turned=False)
+def needles_end_on(rng, camera, degree, count):
     film = on_film(rng, camera, count)
     film[0] = [camera.cx, camera.cy]
-    hard = splats(rng, camera, film, 2.0, [1e-6, 1e-6, 1.0], 1.0, degree, quats=[1, 0, 0, 0])
-    return with_backdrop(rng, camera, hard), camera
+    return splats(rng, camera, film, 2.0, [1e-6, 1e-6, 1.0], 1.0, degree, quats=[1, 0, 0, 0])
 
 
 @family("disks of ratio 1e6", count=20)
-def disks(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    z = rng.uniform(1, 4, count)
-    size = 10.0 ** rng.uniform(-2, 0, count)
-    hard = splats(
-        rng,
-        camera,
-        on_film(rng, camera, count),
-        z,
-        size[:, None] * [1, 1, 1e-6],
-        rng.normal(1, 1, count),
-        degree,
-    )
-    return with_backdrop(rng, camera, hard), camera
+def disks(rng, camera, degree, count):
+    z, size = rng.uniform(1, 4, count), 10.0 ** rng.uniform(-2, 0, count)
+    film, logits = on_film(rng, camera, count), rng.normal(1, 1, count)
+    return splats(rng, camera, film, z, size[:, None] * [1, 1, 1e-6], logits, degree)
 
 
-@family("disks edge-on and face-on", count=20)
-def disks_aligned(rng, width, height, degree, count):
-    camera = camera_for(width, height)
+@family("disks edge-on and face-on", count=20, turned=False)
+def disks_aligned(rng, camera, degree, count):
     film = on_film(rng, camera, count)
-    quats = np.where(
-        np.arange(count)[:, None] % 2, [np.sqrt(0.5), np.sqrt(0.5), 0, 0], [1, 0, 0, 0]
-    )
-    hard = splats(rng, camera, film, 2.0, [0.3, 0.3, 1e-6], 0.5, degree, quats=quats)
-    return with_backdrop(rng, camera, hard), camera
+    edge_on = np.arange(count)[:, None] % 2
+    quats = np.where(edge_on, [np.sqrt(0.5), np.sqrt(0.5), 0, 0], [1, 0, 0, 0])
+    return splats(rng, camera, film, 2.0, [0.3, 0.3, 1e-6], 0.5, degree, quats=quats)
 
 
-def points_of(rng, width, height, degree, count, scale):
-    camera = camera_for(width, height, rng)
+def points(rng, camera, degree, count, scale):
     film = on_film(rng, camera, count)
     film[: count // 4] = np.floor(film[: count // 4]) + 0.5
     film[count // 4 : count // 2] = np.floor(film[count // 4 : count // 2])
-    hard = splats(
-        rng, camera, film, rng.uniform(1, 4, count), scale, rng.normal(1, 1, count), degree
-    )
-    return with_backdrop(rng, camera, hard), camera
+    z, logits = rng.uniform(1, 4, count), rng.normal(1, 1, count)
+    return splats(rng, camera, film, z, scale, logits, degree)
 
 
 for size, name, antialiased_name in [
     (1e-8, "points of scale 1e-8", "points of scale 1e-8, antialiased"),
     (1e-25, "scales of 1e-25, whose determinant underflows", "scales of 1e-25, antialiased"),
 ]:
-    family(name, count=24)(partial(points_of, scale=size))
-    family(antialiased_name, count=24, antialiased=True)(partial(points_of, scale=size))
+    family(name, count=24)(partial(points, scale=size))
+    family(antialiased_name, count=24, antialiased=True)(partial(points, scale=size))
 
 
 family("a needle whose minor axis underflows", count=12, antialiased=True)(
-    partial(points_of, scale=[1e-2, 1e-22, 1e-22])
+    partial(points, scale=[1e-2, 1e-22, 1e-22])
 )
 
 
 @family("sub-pixel splats, antialiased", count=30, antialiased=True)
 @family("sub-pixel splats", count=30)
-def sub_pixel(rng, width, height, degree, count):
-    return points_of(rng, width, height, degree, count, 10.0 ** rng.uniform(-3.5, -1.5, (count, 3)))
+def sub_pixel(rng, camera, degree, count):
+    return points(rng, camera, degree, count, 10.0 ** rng.uniform(-3.5, -1.5, (count, 3)))
 
 
-def giants_of(rng, width, height, degree, count, scale):
-    camera = camera_for(width, height, rng)
-    film = on_film(rng, camera, count, 0.5)
-    z = 10.0 ** rng.uniform(-0.5, 1, count)
-    hard = splats(rng, camera, film, z, scale, rng.normal(-2, 1, count), degree)
-    return with_backdrop(rng, camera, hard), camera
+def giants(rng, camera, degree, count, scale):
+    film, z = on_film(rng, camera, count, 0.5), 10.0 ** rng.uniform(-0.5, 1, count)
+    return splats(rng, camera, film, z, scale, rng.normal(-2, 1, count), degree)
 
 
 for size, name, antialiased_name in [
     (1e4, "giants: scales of 1e4 around the camera", "giants, antialiased"),
     (1e10, "giants of 1e10, whose determinant overflows", "giants of 1e10, antialiased"),
 ]:
-    family(name, count=8)(partial(giants_of, scale=size))
-    family(antialiased_name, count=8, antialiased=True)(partial(giants_of, scale=size))
+    family(name, count=8)(partial(giants, scale=size))
+    family(antialiased_name, count=8, antialiased=True)(partial(giants, scale=size))
 
 
 @family("giants that are needles, far away", count=8)
-def giants_far(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    hard = splats(
-        rng,
-        camera,
-        on_film(rng, camera, count),
-        rng.uniform(1e4, 2e4, count),
-        [1e4, 1e2, 1e1],
-        rng.normal(-1, 1, count),
-        degree,
-    )
-    return with_backdrop(rng, camera, hard), camera
+def giants_far(rng, camera, degree, count):
+    film, z = on_film(rng, camera, count), rng.uniform(1e4, 2e4, count)
+    return splats(rng, camera, film, z, [1e4, 1e2, 1e1], rng.normal(-1, 1, count), degree)
 
 
 @family("opacity logits of +-40 and more", count=24)
-def logits(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
+def logits(rng, camera, degree, count):
     values = np.resize([40.0, -40.0, 100.0, -100.0, 20.0, -5.0, 0.0, 1e4, -1e4], count)
-    z = rng.uniform(1, 4, count)
-    sizes = rng.uniform(0.02, 0.1, (count, 3)) * width
-    hard = splats(
-        rng, camera, on_film(rng, camera, count), z, sizes * z[:, None] / camera.fx, values, degree
-    )
-    return with_backdrop(rng, camera, hard), camera
+    z, sizes = rng.uniform(1, 4, count), rng.uniform(0.02, 0.1, (count, 3)) * camera.width
+    film = on_film(rng, camera, count)
+    return splats(rng, camera, film, z, sizes * z[:, None] / camera.fx, values, degree)
 
 
-def stack_of(rng, width, height, degree, count, logits, spread=0.3, sizes=(0.4, 0.9)):
-    camera = camera_for(width, height, rng)
-    film = [0.5 * width, 0.5 * height] + rng.normal(0, spread, (count, 2)) * width
+def stack(rng, camera, degree, count, logits, spread=0.3, sizes=(0.4, 0.9)):
+    size = np.array([camera.width, camera.height])
+    film = 0.5 * size + rng.normal(0, spread, (count, 2)) * camera.width
     z = np.sort(rng.uniform(1, 4, count))
-    sizes = rng.uniform(*sizes, (count, 3)) * width
-    return splats(rng, camera, film, z, sizes * z[:, None] / camera.fx, logits, degree), camera
+    sizes = rng.uniform(*sizes, (count, 3)) * camera.width
+    return splats(rng, camera, film, z, sizes * z[:, None] / camera.fx, logits, degree)
 
 
-@family("hundreds of near-opaque layers", 13, 11, count=300)
-def opaque_stack(rng, width, height, degree, count):
-    return stack_of(rng, width, height, degree, count, rng.uniform(2, 8, count))
+@family("hundreds of near-opaque layers", 13, 11, count=300, backdrop=False)
+def opaque_stack(rng, camera, degree, count):
+    return stack(rng, camera, degree, count, rng.uniform(2, 8, count))
 
 
-@family("hundreds of half-transparent layers, transmittance 1e-30", 13, 11, count=400)
-def transmittance_stack(rng, width, height, degree, count):
-    return stack_of(rng, width, height, degree, count, rng.normal(-1.7, 0.3, count))
+@family(
+    *("hundreds of half-transparent layers, transmittance 1e-30", 13, 11), count=400, backdrop=False
+)
+def transmittance_stack(rng, camera, degree, count):
+    return stack(rng, camera, degree, count, rng.normal(-1.7, 0.3, count))
 
 
-@family("thousands of layers just above the cut", 7, 6, degree=0, count=2500)
-def above_the_cut(rng, width, height, degree, count):
+@family("thousands of layers just above the cut", 7, 6, 0, count=2500, backdrop=False)
+def above_the_cut(rng, camera, degree, count):
     logit = np.log(1.02 / (255 - 1.02))
-    return stack_of(rng, width, height, degree, count, logit, 0.05, (8, 12))
+    return stack(rng, camera, degree, count, logit, 0.05, (8, 12))
 
 
-@family("thousands of layers just above and below the cut", 7, 6, degree=0, count=3000)
-def around_the_cut(rng, width, height, degree, count):
+@family("thousands of layers just above and below the cut", 7, 6, 0, count=3000, backdrop=False)
+def around_the_cut(rng, camera, degree, count):
     alpha = np.where(rng.random(count) < 0.5, 1.01, 0.99) / 255
-    return stack_of(rng, width, height, degree, count, np.log(alpha / (1 - alpha)), 0.01, (40, 60))
+    logits = np.log(alpha / (1 - alpha))
+    return stack(rng, camera, degree, count, logits, 0.01, (40, 60))
 
 
-@family("equal depths", count=60)
-def equal_depths(rng, width, height, degree, count):
-    camera = camera_for(width, height)
-    hard = splats(
-        rng,
-        camera,
-        on_film(rng, camera, count),
-        2.0,
-        rng.uniform(0.03, 0.15, (count, 3)),
-        rng.normal(1, 1, count),
-        degree,
-    )
-    return hard, camera
+def at_depths(rng, camera, degree, z, count):
+    film, sizes = on_film(rng, camera, count), rng.uniform(0.03, 0.15, (count, 3))
+    return splats(rng, camera, film, z, sizes, rng.normal(1, 1, count), degree)
 
 
-@family("depths that differ in the last bit", count=60)
-def last_bit_depths(rng, width, height, degree, count):
-    camera = camera_for(width, height)
+@family("equal depths", count=60, turned=False, backdrop=False)
+def equal_depths(rng, camera, degree, count):
+    return at_depths(rng, camera, degree, 2.0, count)
+
+
+@family("depths that differ in the last bit", count=60, turned=False, backdrop=False)
+def last_bit_depths(rng, camera, degree, count):
     z = 2.0 + rng.permutation(count) * np.spacing(np.float32(2.0)).astype(float)
-    hard = splats(
-        rng,
-        camera,
-        on_film(rng, camera, count),
-        z,
-        rng.uniform(0.03, 0.15, (count, 3)),
-        rng.normal(1, 1, count),
-        degree,
-    )
-    return hard, camera
+    return at_depths(rng, camera, degree, z, count)
 
 
 @family("quaternions of norm 0, 1e-20, 1e20 and negated", count=30)
-def quaternions(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    z = rng.uniform(1, 4, count)
-    sizes = rng.uniform(0.02, 0.15, (count, 3)) * width
+def quaternions(rng, camera, degree, count):
+    z, sizes = rng.uniform(1, 4, count), rng.uniform(0.02, 0.15, (count, 3)) * camera.width
     quats = rng.normal(0, 1, (count, 4))
     quats *= np.resize([0, 1e-20, 1e20, -1, 1e-30, 1e30], count)[:, None]
     quats[-3:] = [[1, 0, 0, 0], [0, -1, 0, 0], [1e-20, 1e20, 0, 1]]
-    hard = splats(
-        rng,
-        camera,
-        on_film(rng, camera, count),
-        z,
-        sizes * z[:, None] / camera.fx,
-        1.0,
-        degree,
-        quats,
-    )
-    return with_backdrop(rng, camera, hard), camera
+    film = on_film(rng, camera, count)
+    return splats(rng, camera, film, z, sizes * z[:, None] / camera.fx, 1.0, degree, quats)
 
 
-@family("SH that drive colour negative", degree=3, count=40)
-def negative_colors(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    z = rng.uniform(1, 4, count)
-    sizes = rng.uniform(0.03, 0.1, (count, 3)) * width
-    hard = splats(
-        rng,
-        camera,
-        on_film(rng, camera, count),
-        z,
-        sizes * z[:, None] / camera.fx,
-        1.0,
-        degree,
-        sh_size=1.0,
-    )
+@family("SH that drive colour negative", degree=3, count=40, backdrop=False)
+def negative_colors(rng, camera, degree, count):
+    z, sizes = rng.uniform(1, 4, count), rng.uniform(0.03, 0.1, (count, 3)) * camera.width
+    scales, film = sizes * z[:, None] / camera.fx, on_film(rng, camera, count)
+    hard = splats(rng, camera, film, z, scales, 1.0, degree, sh_size=1.0)
     hard.sh0[:] = single(rng.normal(-1.5, 2, hard.sh0.shape))
-    return hard, camera
+    return hard
 
 
-def ordinary(rng, width, height, degree, count, **changes):
-    camera = camera_for(width, height, rng, **changes)
+def ordinary(rng, camera, degree, count):
     none = splats(rng, camera, np.zeros((0, 2)), 1.0, 1.0, 0.0, degree)
-    return with_backdrop(rng, camera, none, count), camera
+    return with_backdrop(rng, camera, none, count)
 
 
-for size in [(1, 1), (1, 40), (40, 1), (2, 17), (17, 33), (16, 16), (3, 5)]:
-    family(f"a film of {size[0]}x{size[1]}", *size, count=30)(ordinary)
+for name, options in {
+    **{
+        f"a film of {width}x{height}": {"width": width, "height": height, "count": 30}
+        for width, height in [(1, 1), (1, 40), (40, 1), (2, 17), (17, 33), (16, 16), (3, 5)]
+    },
+    "a principal point on the film's corner": {"count": 30, "principal": {"cx": 0.0, "cy": 29.0}},
+    "a principal point outside the film": {"count": 30, "principal": {"cx": -111.0, "cy": 72.5}},
+    "one Gaussian": {"count": 1},
+}.items():
+    family(name, backdrop=False, **options)(ordinary)
 
 
-@family("a principal point on the film's corner", count=30)
-def corner_principal(rng, width, height, degree, count):
-    return ordinary(rng, width, height, degree, count, cx=0.0, cy=float(height))
+@family("no visible Gaussian", count=0, backdrop=False)
+def none_visible(rng, camera, degree, count):
+    film, z = [[5, 5], [9, 9], [1e4, 1e4]], np.array([-1.0, -5.0, 2.0])
+    return splats(rng, camera, film, z, 0.01, 1.0, degree)
 
 
-@family("a principal point outside the film", count=30)
-def outside_principal(rng, width, height, degree, count):
-    return ordinary(rng, width, height, degree, count, cx=-3.0 * width, cy=2.5 * height)
-
-
-@family("no visible Gaussian", count=0)
-def none_visible(rng, width, height, degree, count):
-    camera = camera_for(width, height, rng)
-    z = np.array([-1.0, -5.0, 2.0])
-    hard = splats(rng, camera, [[5, 5], [9, 9], [1e4, 1e4]], z, 0.01, 1.0, degree)
-    return hard, camera
-
-
-@family("one Gaussian", count=1)
-def one(rng, width, height, degree, count):
-    return ordinary(rng, width, height, degree, count)
-
-
-def offset_by(rng, width, height, degree, count, distance):
+def offset_by(seed, width, height, degree, count, distance):
     """The scene and the camera together; means are rounded there, then given exactly."""
-    gaussians, camera = ordinary(rng, width, height, degree, count)
+    rng = np.random.default_rng(seed)
+    camera = camera_for(width, height, rng)
+    gaussians = ordinary(rng, camera, degree, count)
     shift = distance * np.array([1.0, -0.7, 0.4])
-    camera = replace(camera, center=single(camera.center + shift))
     gaussians.means[:] = single(gaussians.means + shift)
-    return gaussians, camera
+    return gaussians, replace(camera, center=single(camera.center + shift))
 
 
 for distance in ("1e4", "1e6"):
-    family(f"coordinates offset by {distance}", count=30)(
-        partial(offset_by, distance=float(distance))
-    )
+    name, recipe = f"coordinates offset by {distance}", partial(offset_by, distance=float(distance))
+    FAMILIES[name] = Case(name, 37, 29, 1, count=30, recipe=recipe)
 
 
 @cache
