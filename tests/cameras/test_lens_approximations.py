@@ -20,7 +20,6 @@ from support.lens_scenes import (
     covariances,
     every_lens,
     gaussians_at_points,
-    kernel_lens,
     lens_camera,
     planes_of,
     points_at,
@@ -35,7 +34,6 @@ from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.reference.effects import Orthographic
 from drgs.splatting import rendering
-from drgs.testing import Case, gradients_equal_differences
 
 
 def unscented_scene(name, size) -> tuple[reference.Gaussians, reference.Camera]:
@@ -77,7 +75,6 @@ def test_unscented_splats_have_the_mean_and_covariance_of_projected_samples(name
 
 
 PIXEL_COLORS = {"sh_direction": "pixel"}
-UNSCENTED = {"projection": "unscented", "sh_direction": "pixel"}
 
 
 def direction_of_pixels(case) -> np.ndarray:
@@ -196,23 +193,3 @@ def needles(case, rng):
     sizes = rng.uniform(0.3, 4.0, (case.count, 3))
     logits = rng.uniform(-1.5, 0.5, case.count)
     return gaussians_at_points(case, rng, camera, points, sizes, logits), camera
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "approximations"),
-    [
-        ("rational", UNSCENTED | {"order": "pixel", "order_window": 2}),
-        ("barrel", PIXEL_COLORS),
-        ("fisheye", UNSCENTED),
-        ("fisheye", {"order": "pixel", "order_window": 2}),
-        ("orthographic", UNSCENTED),
-        ("orthographic", {"order": "pixel", "order_window": 2}),
-    ],
-    ids=lambda value: value if isinstance(value, str) else ", ".join(value),
-)
-def test_gradients_equal_differences(name, approximations):
-    lens = kernel_lens(LENSES[name])
-    focal = 26.0 if name in ("rational", "barrel") else 10.0
-    case = Case(name, lens=lens, approximations=approximations, count=20, focal=focal)
-    gradients_equal_differences(case)

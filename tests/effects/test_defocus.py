@@ -30,7 +30,6 @@ from drgs.reference import splatting as reference
 from drgs.reference.effects import ThinLens
 from drgs.splatting import rendering
 from drgs.splatting.projection import compensated_opacity, ewa, load_rows, plain_opacity, project
-from drgs.testing import Case, laws_of
 
 # Blurred by up to 3 px: f a |1 / focus - 1 / z| with f = 26 px and z from 1 to 4.
 DEFOCUS = ThinLens(0.21875, 2.0)
@@ -186,24 +185,6 @@ def test_splats_invisible_in_focus_stay_invisible_when_defocused(precision):
         np.testing.assert_array_equal(np.array(splats.visible), visible)
         np.testing.assert_array_equal(expected.visible, visible)
         assert rows(splats.opacities).max() < reference.ALPHA_CUT
-
-
-CASES = [
-    Case(
-        ", ".join(approximations), approximations=approximations, aperture=(0.21875, 2.0), count=20
-    )
-    for approximations in (
-        {"projection": "unscented"},
-        {"projection": "exact", "antialiased": True, "order": "pixel", "order_window": 2},
-    )
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_laws_hold_with_other_approximations(case):
-    for law in laws_of(case):
-        law(case)
 
 
 def test_small_exact_splats_are_blurred_like_affine_ones():

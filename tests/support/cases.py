@@ -231,22 +231,6 @@ def with_lens(name, effect, reference_of, **options) -> Case:
     return Case(f"{effect}, {name}", reference=found, **options)
 
 
-EFFECTS = {
-    "no effect": (by_effects, {}),
-    "antialiased": (by_effects, {"approximations": {"antialiased": True}}),
-    "thin lens": (by_effects, {"aperture": (0.0625, 2.0)}),
-    "smoothing": (by_effects, {"smoothing": 0.0625}),
-    "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
-    "rolling shutter": (None, {"shutter": shutter(RollingShutter)}),
-}
-
-NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
-HOLES = {
-    ("thin lens", "orthographic"): "parallel rays meet in no aperture",
-    **{("thin lens", name): NO_SENSOR for name in ("plain fisheye", "fisheye", "thin prism")},
-}
-"""Cells of the matrix without a case, and the reason."""
-
 APPROXIMATIONS = {
     "exact": {"projection": "exact"},
     "unscented": {"projection": "unscented"},
@@ -272,6 +256,26 @@ APPROXIMATIONS = {
     "exact, antialiased": {"projection": "exact", "antialiased": True},
     "unscented, antialiased": {"projection": "unscented", "antialiased": True},
 }  # fmt: skip
+
+OF_LENSES = ("unscented", "pixel order", "pixel colours")
+"""Approximations that render with all lenses."""
+
+EFFECTS = {
+    "no effect": (by_effects, {}),
+    "antialiased": (by_effects, {"approximations": {"antialiased": True}}),
+    "thin lens": (by_effects, {"aperture": (0.0625, 2.0)}),
+    "smoothing": (by_effects, {"smoothing": 0.0625}),
+    "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
+    "rolling shutter": (None, {"shutter": shutter(RollingShutter)}),
+    **{name: (None, {"approximations": APPROXIMATIONS[name]}) for name in OF_LENSES},
+}
+
+NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
+HOLES = {
+    ("thin lens", "orthographic"): "parallel rays meet in no aperture",
+    **{("thin lens", name): NO_SENSOR for name in ("plain fisheye", "fisheye", "thin prism")},
+}
+"""Cells of the matrix without a case, and the reason."""
 
 SCENES = {
     "edges": Case("", scene=edges, degree=3, seed=1),
@@ -334,6 +338,10 @@ CASES = [
         for name, options in APPROXIMATIONS.items()
         for scene in ("close", "needles")
         if name not in OF_SCENES and (name, scene) not in SCENE_HOLES
+    ),
+    *(
+        Case(f"thin lens, {name}", approximations=APPROXIMATIONS[name], **EFFECTS["thin lens"][1])
+        for name in ("unscented", "exact, antialiased", "exact, pixel order")
     ),
 ]
 

@@ -25,8 +25,6 @@ from support.helpers import (
     Precision,
     device_camera,
     device_gaussians,
-    frame_adjoint,
-    plane_cotangents,
     render_composed,
     rows,
     single,
@@ -311,13 +309,6 @@ IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 
 def case_of(name, **others) -> LensCase:
     return LensCase(name, 37, 29, 1, lens=LENSES[name], **others)
-
-
-def kernel_gradients(case, precision, cotangents, pipeline=None) -> dict[str, np.ndarray]:
-    gaussians, frame = case.render(precision, pipeline)
-    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
-    gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
-    return {n: np.array(getattr(gradients.parameters, n)) for n in PARAMETER_NAMES}
 
 
 def splats_of(gaussians, camera, lens, precision, shape=ewa, low_pass=0.3, degree=0):
