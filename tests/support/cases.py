@@ -260,6 +260,9 @@ APPROXIMATIONS = {
 OF_LENSES = ("unscented", "pixel order", "pixel colours")
 """Approximations that render with all lenses."""
 
+STEP = {"step": 1e-7}
+"""Of differences without a reference, which marks the pixels whose order changes within a step."""
+
 EFFECTS = {
     "no effect": (by_effects, {}),
     "antialiased": (by_effects, {"approximations": {"antialiased": True}}),
@@ -267,7 +270,7 @@ EFFECTS = {
     "smoothing": (by_effects, {"smoothing": 0.0625}),
     "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
     "rolling shutter": (None, {"shutter": shutter(RollingShutter)}),
-    **{name: (None, {"approximations": APPROXIMATIONS[name]}) for name in OF_LENSES},
+    **{name: (None, {"approximations": APPROXIMATIONS[name], **STEP}) for name in OF_LENSES},
 }
 
 NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
@@ -340,7 +343,12 @@ CASES = [
         if name not in OF_SCENES and (name, scene) not in SCENE_HOLES
     ),
     *(
-        Case(f"thin lens, {name}", approximations=APPROXIMATIONS[name], **EFFECTS["thin lens"][1])
+        Case(
+            f"thin lens, {name}",
+            approximations=APPROXIMATIONS[name],
+            aperture=(0.0625, 2.0),
+            **STEP,
+        )
         for name in ("unscented", "exact, antialiased", "exact, pixel order")
     ),
 ]
