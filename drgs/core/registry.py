@@ -182,6 +182,18 @@ def all_extensions() -> list[Extension]:
 
 
 @contextmanager
+def temporary_registrations() -> Iterator[None]:
+    """Undo at the end what is registered within the block: for tests of extensions."""
+    before = [(registry, dict(registry._extensions)) for registry in _registries]
+    try:
+        yield
+    finally:
+        for registry, extensions in before:
+            registry._extensions.clear()
+            registry._extensions.update(extensions)
+
+
+@contextmanager
 def reporting_extensions() -> Iterator[None]:
     """Within the block, report errors that come from an installed extension with its name.
 

@@ -183,6 +183,13 @@ def test_documents_show_every_command():
 # ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("example", sorted((REPOSITORY / "tests" / "examples").glob("*.py")))
+def test_documents_contain_the_examples_of_extensions(example):
+    program = example.read_text()
+    assert f"```python\n{program}```" in text_of("docs/developing.md")
+    assert 20 <= len(program.splitlines()) <= 60
+
+
 @pytest.mark.slow
 def test_programs_in_the_documents_run():
     """Run by sybil: see ``support.pages``."""

@@ -6,11 +6,10 @@ import ast
 import importlib
 import inspect
 from collections.abc import Iterable
-from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
-from drgs.core import registry
+from drgs.core.registry import temporary_registrations
 from support.mutants import (
     _COMPARISONS,
     _HAND_OVERS,
@@ -19,16 +18,6 @@ from support.mutants import (
     Site,
     Switchboard,
 )
-
-
-@contextmanager
-def registered_classes_kept():
-    """Undo registrations of the block, such as those of a copied module."""
-    before = [(each, dict(each._extensions)) for each in registry._registries]
-    yield
-    for each, extensions in before:
-        each._extensions.clear()
-        each._extensions.update(extensions)
 
 
 class Instrumented:
@@ -62,7 +51,7 @@ class Instrumented:
                 _Instrumenter(switchboard.sites, label, node, package, is_derivative)
         ast.fix_missing_locations(tree)
         self.namespace["__switchboard__"] = switchboard
-        with registered_classes_kept():
+        with temporary_registrations():
             exec(compile(tree, "sample" if is_source else module.__file__, "exec"), self.namespace)
         self.namespace.update(names)
 
