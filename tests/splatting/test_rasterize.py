@@ -5,7 +5,7 @@ import math
 import drjit as dr
 import numpy as np
 import pytest
-from support.cases import by_effects, gaussians_at, stacked
+from support.cases import by_effects, splats_at, stacked
 from support.helpers import FLOAT32, both_precisions
 
 from drgs.splatting import footprint, reduction
@@ -21,7 +21,7 @@ def faint_layers(case):
     rng, n = np.random.default_rng(case.seed), case.count
     film = case.width / 2 + rng.normal(0, 0.5, (n, 2))
     logits = rng.uniform(-4.5, -2.75, n)
-    return gaussians_at(case, rng, film, np.linspace(2, 3, n), rng.uniform(7, 11, (n, 3)), logits)
+    return splats_at(case, rng, film, np.linspace(2, 3, n), rng.uniform(7, 11, (n, 3)), logits)
 
 
 @pytest.mark.parametrize("count", [31, 32, 33, 65])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import drjit as dr
 import drjit.llvm.ad as llvm
@@ -98,7 +98,7 @@ def _random_camera(rng, width, height) -> reference.Camera:
     )
 
 
-def _gaussians(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussians:
+def gaussians_on_film(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussians:
     """Gaussians at film positions (N, 2) px and depths z (N,), of ``sizes`` (N, 3) px."""
     slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     points = np.column_stack([slopes * z[:, None], z])
@@ -113,48 +113,46 @@ def _gaussians(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussia
     )
 
 
-def random_scene(
-    seed, width, height, degree, count
-) -> tuple[reference.Gaussians, reference.Camera]:
+def scattered(rng, camera, degree, count) -> reference.Gaussians:
     """Splats of a fraction of a pixel to a fifth of the film, on and around the film.
 
     The first eight: behind the camera; nearer than the near plane; too transparent; four large
     ones so far beyond each side of the film that the Jacobian's slope is clamped; and one whose
     parameters are those of a fresh Gaussian: a logit and colours of exactly zero, unrotated, round.
     """
-    rng = np.random.default_rng(seed)
-    camera = _random_camera(rng, width, height)
-    size = np.array([width, height])
+    size = np.array([camera.width, camera.height])
     film = rng.uniform(-0.15, 1.15, (count, 2)) * size
     z = rng.uniform(1.0, 4.0, count)
-    sizes = np.minimum(rng.lognormal(np.log(1.5), 0.9, (count, 3)), 0.2 * max(width, height) + 1)
+    sizes = np.minimum(rng.lognormal(np.log(1.5), 0.9, (count, 3)), 0.2 * max(size) + 1)
     logits = rng.normal(0.5, 1.7, count)
     if count >= 8:
         z[:2] = [-1.0, 0.1]
-        logits[2] = -6.0
         film[3:7] = size * np.array([[-0.6, 0.5], [1.6, 0.4], [0.3, -0.6], [0.6, 1.6]])
-        sizes[3:7] = 0.3 * max(width, height)
-        logits[3:7] = 2.0
-        film[7], sizes[7], logits[7] = 0.4 * size, 2.0, 0.0
-    gaussians = _gaussians(rng, camera, film, z, sizes, logits, degree)
+        film[7], sizes[3:7], sizes[7] = 0.4 * size, 0.3 * max(size), 2.0
+        logits[2:8] = -6, 2, 2, 2, 2, 0
+    gaussians = gaussians_on_film(rng, camera, film, z, sizes, logits, degree)
     if count >= 8:
-        gaussians.quats[7] = [1, 0, 0, 0]
-        gaussians.sh0[7] = 0
-    return gaussians, camera
+        gaussians.quats[7], gaussians.sh0[7] = [1, 0, 0, 0], 0
+    return gaussians
 
 
-def stacked_scene(
-    seed, width, height, degree, count
-) -> tuple[reference.Gaussians, reference.Camera]:
+def stacked(rng, camera, degree, count) -> reference.Gaussians:
     """Large, mostly opaque splats behind each other: pixels stop, and alphas are clamped."""
+    size = np.array([camera.width, camera.height])
+    film, z = rng.uniform(0.2, 0.8, (count, 2)) * size, rng.uniform(1.0, 4.0, count)
+    sizes, logits = rng.uniform(0.15, 0.5, (count, 3)), rng.uniform(0.0, 4.0, count)
+    logits[::4] = 7.0
+    return gaussians_on_film(rng, camera, film, z, sizes * max(size), logits, degree)
+
+
+def scene_of(make, seed, width, height, degree, count):
+    """The Gaussians that a function of the above makes, and a random camera before them."""
     rng = np.random.default_rng(seed)
     camera = _random_camera(rng, width, height)
-    film = rng.uniform(0.2, 0.8, (count, 2)) * [width, height]
-    z = rng.uniform(1.0, 4.0, count)
-    sizes = rng.uniform(0.15, 0.5, (count, 3)) * max(width, height)
-    logits = rng.uniform(0.0, 4.0, count)
-    logits[::4] = 7.0
-    return _gaussians(rng, camera, film, z, sizes, logits, degree), camera
+    return make(rng, camera, degree, count), camera
+
+
+random_scene, stacked_scene = partial(scene_of, scattered), partial(scene_of, stacked)
 
 
 @dataclass(frozen=True)

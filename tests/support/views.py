@@ -11,7 +11,7 @@ import numpy as np
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from support.helpers import NEAR_THRESHOLD, single
+from support.helpers import NEAR_THRESHOLD, gaussians_on_film, single
 
 # ----------------------------------------------------------------------------------------------
 # Sensors
@@ -149,16 +149,7 @@ def splats_before(view: View, degree: int, count: int, seed: int) -> reference.G
     logits = rng.normal(0.5, 1.5, count)
     z[:2], logits[2] = [-1.0, 0.15], -6.0
     film[1], sizes[1:4:2], logits[1] = origin + size * [0.41, 0.43], [[3.0], [8.0]], 1.0
-    slopes = (film - [camera.cx, camera.cy]) / camera.fx
-    points = np.column_stack([slopes * z[:, None], z])
-    return reference.Gaussians(
-        means=single(points @ camera.rotation + camera.center),
-        quats=single(rng.normal(0, 1, (count, 4)) * rng.uniform(0.2, 5.0, (count, 1))),
-        log_scales=single(np.log(sizes * np.abs(z)[:, None] / camera.fx)),
-        logit_opacities=single(logits),
-        sh0=single(rng.normal(0, 1.0, (count, 1, 3))),
-        shN=single(rng.normal(0, 0.3, (count, (degree + 1) ** 2 - 1, 3))),
-    )
+    return gaussians_on_film(rng, camera, film, z, sizes, logits, degree)
 
 
 def tensors(gaussians) -> dict:
