@@ -6,8 +6,8 @@ import struct
 import numpy as np
 import pytest
 from conftest import SHARED_DATA
+from support.attacks.mutations import mutate_bytes
 from support.colmap_models import PARAMETERS, WRITERS, some_model, write_binary, write_text
-from support.formats import damaged
 
 from drgs.core.errors import UserError
 from drgs.io.colmap import MODELS, ColmapCamera, read_model, read_points3d
@@ -199,8 +199,8 @@ def test_damaged_files_are_read_or_refused_with_file_and_place(tmp_path, model, 
     refused = 0
     for path in paths:
         content = path.read_bytes()
-        for data in damaged(content, MUTATIONS // len(paths)):
-            path.write_bytes(data)
+        for seed in range(MUTATIONS // len(paths)):
+            path.write_bytes(mutate_bytes(np.random.default_rng(seed), content))
             try:
                 read_points3d(read_model(tmp_path).points_file)
             except UserError as error:

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.formats import PRECISION, assert_within, damaged, gaussians_within_ranges, matched
+from support.attacks.mutations import mutate_bytes
+from support.formats import PRECISION, assert_within, gaussians_within_ranges, matched, refusal
 
 from drgs.core import memory
 from drgs.core.errors import UserError
@@ -19,11 +20,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
 
 MUTATIONS = 300  # of each format
 
-each_format = pytest.mark.parametrize("each", readable_formats(), ids=lambda each: each.name)
+FORMATS = readable_formats()
+each_format = pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
 checked = pytest.mark.parametrize(
-    "each",
-    [f for f in readable_formats() if not f.value.allows_nonfinite],
-    ids=lambda each: each.name,
+    "each", [f for f in FORMATS if not f.value.allows_nonfinite], ids=lambda each: each.name
 )
 
 
@@ -91,16 +91,6 @@ def test_compressed_file_is_recognised_without_its_suffix(tmp_path):
     assert_within(PRECISION["compressed-ply"], expected, found)
 
 
-def test_compressed_elements_after_lists_are_refused(tmp_path):
-    """The end of a list is unknown; harmonics behind it are not taken for none."""
-    content = gaussians_within_ranges(5).to_bytes("compressed-ply")
-    lists = b"element foo 1\nproperty list uchar int bar\nelement sh"
-    path = tmp_path / "a.ply"
-    path.write_bytes(content.replace(b"element sh", lists, 1))
-    with pytest.raises(UserError, match=r"a\.ply: element sh must .* no lists, and come before"):
-        Gaussians.load(path)
-
-
 @pytest.mark.slow
 @checked
 @pytest.mark.filterwarnings("ignore:.*(infinite logits|extensions of a vendor)")
@@ -109,8 +99,8 @@ def test_damaged_files_are_read_or_refused_by_file(tmp_path, each):
     path = tmp_path / f"a{each.value.suffix}"
     content = gaussians_within_ranges(40, degree=1).to_bytes(each.name)
     refused = 0
-    for data in damaged(content, MUTATIONS):
-        path.write_bytes(data)
+    for seed in range(MUTATIONS):
+        path.write_bytes(mutate_bytes(np.random.default_rng(seed), content))
         try:
             found = Gaussians.load(path)
         except UserError as error:
@@ -128,8 +118,7 @@ def test_truncated_file_is_refused_at_any_length(tmp_path, each):
     content = gaussians_within_ranges(1, degree=1).to_bytes(each.name)
     for end in range(0, len(content), max(1, len(content) // 200)):
         path.write_bytes(content[:end])
-        with pytest.raises(UserError, match=re.escape(str(path))):
-            Gaussians.load(path)
+        assert refusal(path)
 
 
 @pytest.mark.parametrize("names", [("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r",)])
@@ -141,8 +130,7 @@ def test_bounds_of_a_compressed_file_give_finite_numbers_or_are_refused(tmp_path
         rows["chunk"][f"min_{name}"], rows["chunk"][f"max_{name}"] = -3e38, 3e38
     path.write_bytes(encode_elements(rows))
     if names == ("r",):
-        with pytest.raises(UserError, match=r"numbers must be finite: sh0 of Gaussian 0 is "):
-            Gaussians.load(path)
+        assert refusal(path).startswith("numbers must be finite: sh0 of Gaussian 0 is ")
     else:
         read = Gaussians.load(path)
         assert np.isfinite(read.means).all() and np.isfinite(read.log_scales).all()
