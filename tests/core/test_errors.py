@@ -3,16 +3,8 @@ import sys
 import pytest
 
 from drgs.cli.ending import exit_on_user_error
-from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.errors import UserError
 from drgs.core.llvm import LLVMVersionError
-
-
-def test_did_you_mean_names_the_nearest_candidate():
-    assert did_you_mean("evry", ["start", "every"]) == "; did you mean every?"
-    found = did_you_mean("every", ["model.near", "densify.every"])  # in another section
-    assert found == "; did you mean densify.every?"
-    assert did_you_mean("xyzzy", ["start", "every"]) == ""
-
 
 REPORTED = [
     (UserError("a.yml: wrong"), "error: a.yml: wrong\n"),
@@ -66,8 +58,3 @@ def test_closed_output_pipe_ends_a_command_quietly(run_python):
     )
     result = run_python(program)
     assert (result.returncode, result.stderr) == (141, "")
-
-
-def test_foreign_messages_are_put_on_one_line():
-    assert one_line("a\n  b\tc") == "a b c"
-    assert one_line("x" * 10, limit=9) == "xxxxxx..."

@@ -10,7 +10,6 @@ from drgs.core.llvm import (
     LLVMVersionError,
     ensure_usable_llvm,
     installed_libraries,
-    loaded_version,
     select_newest_llvm,
     version_from_name,
 )
@@ -61,17 +60,13 @@ def test_unversioned_link_has_the_version_of_its_target(tmp_path):
     assert version_from_name(tmp_path / "libLLVM.so") == (21, 1)
 
 
-def test_libraries_are_listed_newest_first_without_dangling_links(machine):
-    folder = machine("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM.so.100.1")
-    (folder / "libLLVM.so.200.1").symlink_to("nowhere")
-    assert [version for version, _ in installed_libraries()] == [(100, 1), (19, 1), (15,), (9,)]
-
-
 def test_the_newest_library_is_selected_even_if_it_is_a_link(machine):
-    folder = machine("libLLVM-15.so.1", "libLLVM.so.17.0", "target")
-    (folder / "libLLVM.so.22.1").symlink_to("target")
+    folder = machine("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "target")
+    for name, target in (("libLLVM.so.100.1", "target"), ("libLLVM.so.200.1", "nowhere")):
+        (folder / name).symlink_to(target)
+    assert [version for version, _ in installed_libraries()] == [(100, 1), (19, 1), (15,), (9,)]
     select_newest_llvm()
-    assert os.environ[llvm.PATH_VARIABLE] == str(folder / "libLLVM.so.22.1")
+    assert os.environ[llvm.PATH_VARIABLE] == str(folder / "libLLVM.so.100.1")
 
 
 def test_nothing_is_selected_where_the_choice_is_made(machine, monkeypatch):
@@ -130,12 +125,6 @@ def test_unusable_libraries_are_refused(machine, monkeypatch, version, names, mo
     assert message.format(folder) in str(error.value)
 
 
-def test_the_version_in_use_is_known():
-    version = loaded_version()
-    assert version is not None, "the test suite needs libLLVM: apt-get install libllvm19"
-    assert version[0] >= llvm.MINIMUM_VERSION
-
-
 SET_VARIANT = """
 import drgs, mitsuba as mi
 try:
@@ -160,9 +149,3 @@ def test_an_old_library_is_refused_when_an_llvm_variant_is_chosen(run_python, ma
     assert refusal.startswith("drgs: libLLVM 17 or newer is needed (19 is tested), found ")
     assert f"found {major}" in refusal or found[0] in refusal
     assert (variant, fallback) == ("None", "scalar_rgb")
-
-
-@pytest.mark.slow
-def test_a_usable_library_passes(run_python):
-    result = run_python('import drgs, mitsuba as mi; mi.set_variant("llvm_ad_rgb"); print("ok")')
-    assert (result.returncode, result.stdout) == (0, "ok\n"), result.stderr

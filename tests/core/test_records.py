@@ -29,44 +29,27 @@ def refusal(function, *arguments, **options):
     return line
 
 
-def test_existing_file_is_foreign(tmp_path):
-    write(tmp_path, a="mine", b="mine")
-    message = refusal(record(tmp_path).claim, ["a", "b", "c"])
-    assert message.startswith(f"{tmp_path}: holds a, b, which this command would replace")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
-
-
-def test_claimed_file_may_be_rewritten_until_sealed(tmp_path):
+def test_claimed_files_may_be_rewritten_until_they_are_sealed(tmp_path):
     """Also by another process, when the first was killed."""
-    record(tmp_path).claim(["a"])
+    record(tmp_path).claim("ab")
     write(tmp_path, a="half")
-    record(tmp_path).claim(["a", "b"])
-    write(tmp_path, a="whole", b="whole")
-    record(tmp_path).seal()
-    record(tmp_path).claim(["a", "b"])
-
-
-def test_file_changed_after_sealing_is_foreign(tmp_path):
     record(tmp_path).claim("abc")
     write(tmp_path, a="ours", b="ours")
     record(tmp_path).seal()
+    assert not record(tmp_path).foreign_files("abc")
     write(tmp_path, b="theirs", c="theirs")  # c did not exist when the record was sealed
-    assert "holds b, c, which this command would replace" in refusal(record(tmp_path).claim, "abc")
-    assert not record(tmp_path).foreign_files(["a", "d"])
+    message = f"{tmp_path}: holds b, c, which this command would replace"
+    assert refusal(record(tmp_path).claim, "abc").startswith(message)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".drgs-render.json", *"abc"]
 
 
-def test_symlink_or_folder_in_place_of_a_file_is_foreign(tmp_path):
-    record(tmp_path).claim(["a", "b"])
-    write(tmp_path, photograph="mine")
+def test_links_folders_and_files_of_other_commands_are_foreign(tmp_path):
+    record(tmp_path).claim("ab")
+    record(tmp_path, "fit").claim("c")
+    write(tmp_path, photograph="mine", c="of a fit")
     (tmp_path / "a").symlink_to(tmp_path / "photograph")
     (tmp_path / "b").mkdir()
-    assert record(tmp_path).foreign_files(["a", "b"]) == ["a", "b"]
-
-
-def test_files_of_another_command_are_foreign(tmp_path):
-    record(tmp_path, "fit").claim(["a"])
-    write(tmp_path, a="of a fit")
-    assert record(tmp_path).foreign_files(["a"]) == ["a"]
+    assert record(tmp_path).foreign_files("abcd") == ["a", "b", "c"]
 
 
 def test_files_of_a_version_without_records_are_claimed_once(tmp_path):

@@ -28,13 +28,9 @@ PROGRAM = """def scene():
 """
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture
 def sky(tmp_path):
+    mi.set_variant("llvm_ad_rgb")
     pixels = np.random.default_rng(0).random((4, 8, 3), np.float32)
     write_exr(tmp_path / "sky.exr", mi.Bitmap(pixels))
     (tmp_path / "scene.xml").write_text(SKY)
@@ -64,25 +60,8 @@ def test_a_sampler_without_samples_is_refused(sky, sampler):
     message = rf"^{sky}: the sampler '{sampler}' must have a sample_count of at least 1, got 0$"
     with pytest.raises(UserError, match=message):
         load_scene_file(sky, sampler=sampler, count="0")
+    with pytest.raises(UserError, match=r"y: the sampler 'multijitter' must have a sample_c"):
+        load_scene(sky.with_name("scene.py"))
     # Parameters may be named like options of Mitsuba's parser.
     scene = load_scene_file(sky, sampler=sampler, count="4", filename="3")
     assert "max_depth = 3" in str(scene)
-
-
-def test_python_scene_with_a_sampler_without_samples_is_refused(sky):
-    with pytest.raises(UserError, match=r"y: the sampler 'multijitter' must have a sample_c"):
-        load_scene(sky.with_name("scene.py"))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.xml", b"\xa9", "a.xml: not a valid scene: it holds bytes that are not UTF-8"),
-        ("\udcff.xml", b"", "Mitsuba takes names in UTF-8 only"),
-    ],
-)
-def test_files_that_are_not_utf_8_are_refused(tmp_path, name, content, message):
-    (tmp_path / name).write_bytes(b'<scene version="3.0.0"><%s/></scene>' % content)
-    with pytest.raises(UserError) as error:
-        load_scene_file(tmp_path / name)
-    assert message in str(error.value)
