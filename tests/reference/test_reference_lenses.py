@@ -1,4 +1,7 @@
-"""Lenses of the float64 reference: where points lie, how large splats are."""
+"""Lenses of the float64 reference: what they show, and where points lie.
+
+The laws and the tests of cameras compare depths, directions and splats with those of the kernels.
+"""
 
 from __future__ import annotations
 
@@ -8,55 +11,21 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support.reference_lenses import (
-    FISHEYE,
-    THIN_PRISM,
-    camera_at_origin,
-    gaussians_at,
-    whitened_samples,
-)
-from support.reference_scenes import (
-    small_camera,
-    small_scene,
-)
+from support.reference_lenses import FISHEYE, THIN_PRISM, camera_at_origin, gaussians_at
 
 from drgs.reference import effects
-from drgs.reference import splatting as reference
 from drgs.reference.effects import Fisheye, OpenCV, Orthographic, Pinhole, ThinPrismFisheye
 
 # Coefficients of sizes that cameras have, exact in binary.
 BARREL = OpenCV(k1=-0.25, k2=0.0625, p1=0.0078125, p2=-0.015625, k3=0.03125)
-
-
 RATIONAL = replace(BARREL, k4=0.125, k5=-0.0625, k6=0.015625)
-
-
 PINCUSHION = OpenCV(k1=0.125, k2=0.03125)
-
-
 LENSES = [Pinhole(), BARREL, RATIONAL, PINCUSHION, Fisheye(), FISHEYE, THIN_PRISM, Orthographic()]
-
-
-every_lens = pytest.mark.parametrize("lens", LENSES, ids=str)
-
-
-def points_within(lens, camera, count=200, seed=3) -> np.ndarray:
-    """(count, 3) random points in camera axes that the lens sees, at distances 0.5 to 4."""
-    rng = np.random.default_rng(seed)
-    angles = rng.uniform(0, 2.7 if isinstance(lens, Fisheye) else 0.75, count)
-    azimuths, distances = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 4, count)
-    sines = np.sin(angles)
-    directions = [sines * np.cos(azimuths), sines * np.sin(azimuths), np.cos(angles)]
-    points = distances[:, None] * np.stack(directions, axis=-1)
-    assert lens.is_seen(camera, points).all()
-    return points
-
 
 # cv2.projectPoints and cv2.fisheye.projectPoints of opencv-python 5.0.0 and Camera.img_from_cam of
 # pycolmap 4.2.1, of the points (0, 0, 1), (0.5, -0.25, 2), (-1.5, 1, 2), (0.75, 1.5, 1.25), with
 # RATIONAL, FISHEYE and THIN_PRISM.
 KNOWN_POINTS = np.array([[0, 0, 1], [0.5, -0.25, 2], [-1.5, 1, 2], [0.75, 1.5, 1.25]])
-
 
 KNOWN_FILM = {
     RATIONAL: [
@@ -86,20 +55,49 @@ def test_film_points_match_opencv_and_colmap(lens):
     np.testing.assert_allclose(actual, KNOWN_FILM[lens], rtol=1e-13)
 
 
-def radial(lens, r) -> float:
-    """R -> r q(r) of an OpenCV lens."""
+@pytest.mark.parametrize("degrees", [1e-6, 30, 90, 120, 170])
+def test_plain_fisheye_is_proportional_to_the_angle(degrees):
+    camera, theta = camera_at_origin(fy=230.0), math.radians(degrees)
+    point = 3.0 * np.array([[math.sin(theta) * 0.6, math.sin(theta) * -0.8, math.cos(theta)]])
+    assert Fisheye().is_seen(camera, point).all()
+    expected = 230 * theta * np.array([[0.6, -0.8]]) + [140, 95]
+    np.testing.assert_allclose(Fisheye().film_points(camera, point), expected, rtol=1e-13)
+
+
+def limit_of(lens) -> float:
+    """The slope, or angle, up to which a lens is made."""
+    return lens.valid_radius if isinstance(lens, OpenCV) else lens.valid_angle
+
+
+def radial(lens, r):
+    """The distorted slopes, or angles, of some from the axis, without tangential terms."""
     u = r * r
     numerator = 1 + lens.k1 * u + lens.k2 * u**2 + lens.k3 * u**3
+    if isinstance(lens, Fisheye):
+        return r * (numerator + lens.k4 * u**4)
     return r * numerator / (1 + lens.k4 * u + lens.k5 * u**2 + lens.k6 * u**3)
 
 
-def test_valid_radius_of_one_coefficient_matches_the_closed_form():
-    # d/dr (r + k1 r^3) = 1 + 3 k1 r^2; 1 + k4 r^2 has its zero before the derivative has one.
-    assert OpenCV(k1=-0.3).valid_radius == pytest.approx(math.sqrt(1 / 0.9), rel=1e-12)
-    assert OpenCV(k1=0.3).valid_radius == math.inf
-    assert OpenCV(k4=-0.25).valid_radius == pytest.approx(2.0, rel=1e-12)
-    # d/dr r / (1 + k4 r^2) vanishes where 1 = k4 r^2.
-    assert OpenCV(k4=0.25).valid_radius == pytest.approx(2.0, rel=1e-12)
+@pytest.mark.parametrize(
+    ("lens", "limit"),
+    [
+        # d/dr (r + k1 r^3) = 1 + 3 k1 r^2; 1 + k4 r^2 has its zero before the derivative has one.
+        (OpenCV(k1=-0.3), math.sqrt(1 / 0.9)),
+        (OpenCV(k1=0.3), math.inf),
+        (OpenCV(k4=-0.25), 2.0),
+        # d/dr r / (1 + k4 r^2) vanishes where 1 = k4 r^2.
+        (OpenCV(k4=0.25), 2.0),
+        (Fisheye(), 0.95 * math.pi),
+        (Fisheye(k1=0.1), 0.95 * math.pi),
+        (Fisheye(k1=-0.3), math.sqrt(1 / 0.9)),
+    ],
+)
+def test_limit_of_one_coefficient_matches_the_closed_form(lens, limit):
+    assert limit_of(lens) == pytest.approx(limit, rel=1e-12)
+    if isinstance(lens, Fisheye):
+        angles = np.array([limit - 1e-9, limit + 1e-9, math.pi])
+        points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
+        assert lens.is_seen(camera_at_origin(), points).tolist() == [True, False, False]
 
 
 def test_valid_radius_of_a_touching_derivative_is_where_it_touches():
@@ -110,36 +108,35 @@ def test_valid_radius_of_a_touching_derivative_is_where_it_touches():
         assert lens.valid_radius == pytest.approx(math.sqrt(c), rel=1e-7)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_valid_radius_is_where_the_distorted_radius_first_turns(seed):
-    rng = np.random.default_rng(seed)
-    lens = OpenCV(*rng.normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03]))
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Fisheye(0.05, -0.04, 0.01, -0.002),
+        *(
+            OpenCV(*np.random.default_rng(seed).normal(0, [0.3, 0.1, 0.03, 0.3, 0.1, 0.03]))
+            for seed in range(8)
+        ),
+    ],
+    ids=str,
+)
+def test_limit_is_where_the_distorted_radius_first_turns(lens):
     radii = np.linspace(0, 5, 500_001)
-    values = radial(lens, radii)
-    turns = np.flatnonzero(np.diff(values) <= 0)  # a pole jumps down from +inf to -inf
-    first = radii[turns[0]] if len(turns) else math.inf
-    assert first < 5 or len(turns) == 0
-    if first < math.inf:
-        assert abs(lens.valid_radius - first) <= 2 * radii[1]
+    turns = np.flatnonzero(np.diff(radial(lens, radii)) <= 0)  # a pole jumps from +inf to -inf
+    if len(turns):
+        assert abs(limit_of(lens) - radii[turns[0]]) <= 2 * radii[1]
     else:
-        assert lens.valid_radius > 5
+        assert limit_of(lens) > 5
 
 
+TANGENTIAL = OpenCV(k1=-0.3, p1=0.18, p2=-0.24)
 TILTED = ThinPrismFisheye(-0.1, p1=0.06, p2=-0.08, sx1=0.1, sy1=0.05)
-
-
-def limit_of(lens) -> float:
-    """The largest slope, or angle, that a lens is made for, at most 10."""
-    return min(lens.valid_radius if isinstance(lens, OpenCV) else lens.valid_angle, 10.0)
 
 
 def places_within(lens, parts, count) -> np.ndarray:
     """(parts, count, 2) slopes or angles in all directions, at parts of the limit."""
-    azimuths, radii = np.meshgrid(np.linspace(0, 2 * np.pi, count), limit_of(lens) * parts)
+    limit = min(limit_of(lens), 10.0)
+    azimuths, radii = np.meshgrid(np.linspace(0, 2 * np.pi, count), limit * parts)
     return radii[..., None] * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
-
-
-TANGENTIAL = OpenCV(k1=-0.3, p1=0.18, p2=-0.24)
 
 
 @pytest.mark.parametrize("lens", [BARREL, RATIONAL, TANGENTIAL, TILTED, THIN_PRISM], ids=str)
@@ -171,7 +168,8 @@ def test_lenses_have_no_fold_within_their_limit(kind, sizes):
         ended += limit_of(lens) < 0.99 * limit_of(plain)
         if seed % 2 == 0:
             lens = kind(**{name: getattr(lens, name) for name in tilt if hasattr(lens, name)})
-        places, h = places_within(lens, parts, 720), 1e-6 * limit_of(lens)
+        limit = min(limit_of(lens), 10.0)
+        places, h = places_within(lens, parts, 720), 1e-6 * limit
         columns = [
             (lens.distort(places + step) - lens.distort(places - step)) / h
             for step in h * np.eye(2) / 2
@@ -179,101 +177,11 @@ def test_lenses_have_no_fold_within_their_limit(kind, sizes):
         quotients = np.stack(columns, axis=-1)
         symmetric = (quotients + np.swapaxes(quotients, -1, -2)) / 2
         found = np.linalg.eigvalsh(symmetric)[..., 0].min(axis=1)
-        least = lens.least_eigenvalue(limit_of(lens) * parts)
+        least = lens.least_eigenvalue(limit * parts)
         # Rounding of quotients, over h; half a degree between directions.
         assert (found > least - 1e-9).all() and (least > 0).all(), lens
         assert seed % 2 or np.abs(found - least).max() < 1e-4, lens
     assert ended > 20
-
-
-@pytest.mark.parametrize("degrees", [1e-6, 30, 90, 120, 170])
-def test_plain_fisheye_is_proportional_to_the_angle(degrees):
-    camera, theta = camera_at_origin(fy=230.0), math.radians(degrees)
-    point = 3.0 * np.array([[math.sin(theta) * 0.6, math.sin(theta) * -0.8, math.cos(theta)]])
-    assert Fisheye().is_seen(camera, point).all()
-    expected = 230 * theta * np.array([[0.6, -0.8]]) + [140, 95]
-    np.testing.assert_allclose(Fisheye().film_points(camera, point), expected, rtol=1e-13)
-
-
-def test_fisheye_is_valid_up_to_its_first_turn_or_almost_all_around():
-    assert Fisheye().valid_angle == 0.95 * math.pi
-    assert Fisheye(k1=0.1).valid_angle == 0.95 * math.pi
-    # d/dtheta (theta + k1 theta^3) = 1 + 3 k1 theta^2
-    assert Fisheye(k1=-0.3).valid_angle == pytest.approx(math.sqrt(1 / 0.9), rel=1e-12)
-    theta = np.linspace(0, np.pi, 1_000_001)
-    lens = Fisheye(0.05, -0.04, 0.01, -0.002)
-    powers = theta ** np.array([[1], [3], [5], [7], [9]])
-    turn = theta[np.argmax(np.diff(np.array([1, lens.k1, lens.k2, lens.k3, lens.k4]) @ powers) < 0)]
-    assert 0 < turn < 2.5 and abs(lens.valid_angle - turn) < 1e-5
-
-    camera = camera_at_origin()
-    for lens, limit in [(Fisheye(), 0.95 * math.pi), (Fisheye(k1=-0.3), math.sqrt(1 / 0.9))]:
-        angles = np.array([limit - 1e-9, limit + 1e-9, math.pi])
-        points = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
-        np.testing.assert_array_equal(lens.is_seen(camera, points), [True, False, False])
-
-
-def test_depth_is_distance_for_a_fisheye_and_z_otherwise():
-    camera = camera_at_origin(near=0.5)
-    points = np.array([[0.6, 0, 0.1], [0.3, 0, 0.1], [0.0, 0.4, 0.5], [0.7, 0, -0.1], [0, 0, 0]])
-    assert list(Fisheye().is_seen(camera, points)) == [True, False, True, True, False]
-    np.testing.assert_allclose(Fisheye().depths(camera, points)[2], math.sqrt(0.41), rtol=1e-15)
-    for lens in (Pinhole(), OpenCV(), Orthographic()):
-        assert list(lens.is_seen(camera, points)) == [False, False, True, False, False]
-        np.testing.assert_array_equal(lens.depths(camera, points), points[:, 2])
-
-
-@pytest.mark.parametrize("lens", [FISHEYE, Orthographic()], ids=str)
-def test_view_directions_end_at_the_means_unless_rays_are_parallel(lens):
-    gaussians, camera = small_scene()
-    directions = lens.view_directions(camera, gaussians.means)
-    for mean, direction in zip(gaussians.means, directions, strict=True):
-        expected = mean - camera.center
-        if isinstance(lens, Orthographic):
-            expected = np.linalg.inv(camera.rotation) @ [0, 0, 1]
-        np.testing.assert_allclose(direction, expected / np.linalg.norm(expected), atol=1e-14)
-
-
-@pytest.mark.parametrize(("lens", "antialiased"), [(Pinhole(), True), (OpenCV(), False)])
-def test_pinhole_splats_match_the_reference(lens, antialiased):
-    """Row 9's slopes are clamped in J, row 10 is behind the camera, row 11 is too faint."""
-    gaussians, camera = small_scene()
-    expected = reference.project(gaussians, camera, antialiased)
-    actual = effects.project(gaussians, camera, lens, antialiased)
-    np.testing.assert_array_equal(actual.visible, expected.visible)
-    assert list(np.flatnonzero(~actual.visible)) == [10, 11]
-    for field in ("means2d", "cov2d", "conics", "opacities"):
-        # J by differences is off by 1e-13 of itself. Measured: 1e-13.
-        np.testing.assert_allclose(
-            getattr(actual, field)[:10], getattr(expected, field)[:10], rtol=1e-10, atol=1e-11
-        )
-    np.testing.assert_allclose(actual.depths, expected.depths, atol=1e-14)
-
-
-@every_lens
-def test_covariances_match_projected_samples(lens):
-    """A Gaussian of 1e-5 of its distance leaves samples whose covariance is J's sandwich."""
-    camera = replace(small_camera(), width=400, height=400, cx=210.0, cy=190.0, fx=220.0, fy=260.0)
-    points = points_within(lens, camera, count=8)
-    rng = np.random.default_rng(1)
-    scales = 1e-5 * np.linalg.norm(points, axis=1)[:, None] * rng.uniform(0.3, 1.0, (8, 3))
-    gaussians = gaussians_at(points @ camera.rotation + camera.center, scales)
-    gaussians = replace(gaussians, quats=rng.normal(0, 1, (8, 4)))
-    splats = effects.project(gaussians, camera, lens, low_pass=0.0)
-    assert splats.visible.all()
-
-    turns = reference.quat_to_rotation(gaussians.quats)
-    for n in range(8):
-        offsets = whitened_samples(5000) * scales[n] @ turns[n].T
-        world = gaussians.means[n] + offsets
-        film = lens.film_points(camera, (world - camera.center) @ camera.rotation.T)
-        # The Gaussian is 1e-5 of its distance, and so is the quadratic part of the linear one,
-        # times the samples' third moments, 0.03. Measured: 1.1e-6.
-        expected = np.cov(film.T, bias=True)
-        np.testing.assert_allclose(
-            splats.cov2d[n], expected, rtol=0, atol=1e-5 * np.abs(expected).max()
-        )
-        np.testing.assert_allclose(splats.conics[n] @ splats.cov2d[n], np.eye(2), atol=1e-8)
 
 
 def test_a_singular_splat_is_not_visible():
@@ -282,12 +190,11 @@ def test_a_singular_splat_is_not_visible():
     assert not splats.visible.any() and np.isfinite(splats.conics).all()
 
 
-@every_lens
+@pytest.mark.parametrize("lens", LENSES, ids=str)
 def test_invisible_splats_have_finite_values(lens):
     means = np.array([[0, 0, 0], [0, 0, -1], [1, 2, 0], [3, 0, 0.011], [0, 0, 2.0], [1e3, 0, 1]])
-    gaussians, camera = gaussians_at(means), camera_at_origin()
     with np.errstate(all="raise"):
-        splats = effects.project(gaussians, camera, lens, defocus=None)
+        splats = effects.project(gaussians_at(means), camera_at_origin(), lens, defocus=None)
     for field in fields(splats):
         assert np.isfinite(getattr(splats, field.name)).all(), field.name
     assert splats.visible[4] and not splats.visible[0]
