@@ -41,7 +41,7 @@ def test_basis_equals_the_reference_and_legendre_functions(precision, degree):
     # Angles assume an exact unit vector: normalise again, which moves the basis by 1e-7 times
     # its degree and a factor below 3.
     units = points / np.linalg.norm(points, axis=1, keepdims=True)
-    legendre = np.array([legendre_sh_basis(unit, degree) for unit in units])
+    legendre = np.array([legendre_sh_basis(tuple(unit), degree) for unit in units])
     np.testing.assert_allclose(actual, legendre, rtol=0, atol=tolerance(precision) + 1e-6)
 
 

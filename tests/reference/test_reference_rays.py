@@ -8,23 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.reference_loops import (
-    UNCUT,
-    assert_images_agree,
-    naive_image,
-    only,
-)
-from support.reference_scenes import (
-    BACKGROUND,
-    PARAMETERS,
-    small_camera,
-    small_scene,
-)
+from support.reference_loops import UNCUT, assert_images_agree, naive_image
+from support.reference_scenes import BACKGROUND, only, small_scene, with_invisible
 
 from drgs.reference import rays
 from drgs.reference import splatting as reference
 from drgs.reference.rays import ImageModel
-from drgs.reference.splatting import Gaussians
 
 # The loop inverts covariances of condition 25 and takes differences of squared distances from the
 # camera, up to 40^2: rho^2 is off by up to 1e-16 * 25 * 40^2 = 4e-12. Measured: 8e-14.
@@ -99,19 +88,11 @@ def test_region_is_the_crop_of_the_whole(model):
     gaussians, camera = small_scene()
     positions = rays.pixel_centers(camera) + 0.2
     whole = rays.render(gaussians, camera, BACKGROUND, model, positions=positions)
-    regions = [
-        (slice(3, 17), slice(5, 9)),
-        (slice(None), slice(-4, None)),
-        (slice(7, 8), slice(0, 1)),
-        (slice(5, 5), slice(None)),
-    ]
-    for region in regions:
+    for region in (np.s_[3:17, 5:9], np.s_[:, -4:], np.s_[7:8, 0:1], np.s_[5:5, :]):
         part = rays.render(gaussians, camera, BACKGROUND, model, region, positions)
-        for name in ("image", "alpha", "depth", "transmittance", "near_threshold"):
+        for name, values in vars(whole).items():
             # Products of other batches of rows may be rounded differently.
-            np.testing.assert_allclose(
-                getattr(part, name), getattr(whole, name)[region], rtol=0, atol=1e-14
-            )
+            np.testing.assert_allclose(getattr(part, name), values[region], rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow
@@ -143,23 +124,8 @@ def test_shifted_positions_are_a_shifted_principal_point(model):
 @pytest.mark.parametrize("low_pass", [0.0, 0.3])
 @pytest.mark.parametrize("projection", ["ewa", "unscented", "exact"])
 def test_culled_and_degenerate_gaussians_raise_no_warning_and_change_nothing(projection, low_pass):
-    """Behind the camera, on its plane, transparent; and in front: points without extent."""
     gaussians, camera = small_scene()
-    points = np.array([[0, 0, -1], [1e3, 0, 0], [0, 0, 0], [0.1, 0, 2], [0.1, 0, 2]])
-    strange = Gaussians(
-        means=points @ camera.rotation + camera.center,
-        quats=np.zeros((5, 4)),
-        log_scales=np.repeat([80.0, 1.0, -np.inf, 0.0, -np.inf], 3).reshape(5, 3),
-        logit_opacities=[9.0, 9.0, 9.0, -1e3, 9.0 if low_pass == 0 else -1e3],
-        sh0=np.ones((5, 1, 3)),
-        shN=np.ones((5, 15, 3)),
-    )
-    both = Gaussians(
-        **{
-            name: np.concatenate([getattr(gaussians, name), getattr(strange, name)])
-            for name in PARAMETERS
-        }
-    )
+    both = with_invisible(gaussians, camera, point_logit=9.0 if low_pass == 0 else -1e3)
     model = ImageModel(projection, "pixel", low_pass=low_pass)
     with warnings.catch_warnings(), np.errstate(divide="raise", over="raise", invalid="raise"):
         warnings.simplefilter("error")
@@ -170,10 +136,9 @@ def test_culled_and_degenerate_gaussians_raise_no_warning_and_change_nothing(pro
 
 
 def test_image_without_gaussians_is_background():
-    camera = small_camera()
-    empty = only(small_scene()[0], [])
+    gaussians, camera = small_scene()
     for model in PROJECTIONS:
-        rendered = rays.render(empty, camera, BACKGROUND, model)
+        rendered = rays.render(only(gaussians, []), camera, BACKGROUND, model)
         np.testing.assert_array_equal(rendered.image, np.broadcast_to(BACKGROUND, (20, 24, 3)))
 
 

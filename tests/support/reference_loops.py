@@ -7,13 +7,7 @@ import math
 import numpy as np
 
 from drgs.reference.rays import ImageModel
-from drgs.reference.splatting import Camera, Gaussians
-from support.reference_scenes import (
-    BACKGROUND,
-    PARAMETERS,
-    legendre_sh_basis,
-    rotation_about,
-)
+from support.reference_scenes import BACKGROUND, legendre_sh_basis, rotation_about
 
 UNCUT = ImageModel(alpha_max=1.0, alpha_cut=0.0, transmittance_stop=0.0)
 """No decisions: every splat touches every pixel."""
@@ -131,18 +125,14 @@ def naive_splat(gaussians, camera, n, model):
     return at
 
 
-def naive_basis(gaussians, camera, model, position=None, n=None) -> np.ndarray:
-    """(K,) harmonics in the direction of a pixel's ray, or of the mean of Gaussian n."""
-    if model.sh_direction == "mean":
-        direction = gaussians.means[n] - camera.center
-    else:
+def naive_color(gaussians, camera, model, n, position) -> np.ndarray:
+    """(3,) the colour of Gaussian n in the direction of its mean, or of a pixel's ray."""
+    direction = gaussians.means[n] - camera.center
+    if model.sh_direction == "pixel":
         ray = [(position[0] - camera.cx) / camera.fx, (position[1] - camera.cy) / camera.fy, 1]
         direction = camera.rotation.T @ ray
     degree = gaussians.sh_degree if model.sh_degree is None else model.sh_degree
-    return legendre_sh_basis(direction / np.linalg.norm(direction), degree)
-
-
-def naive_color(gaussians, n, basis) -> np.ndarray:
+    basis = legendre_sh_basis(tuple(direction / np.linalg.norm(direction)), degree)
     coefficients = np.concatenate([gaussians.sh0[n], gaussians.shN[n]])[: len(basis)]
     return np.maximum(basis @ coefficients + 0.5, 0)
 
@@ -154,14 +144,9 @@ def naive_image(gaussians, camera, model) -> dict[str, np.ndarray]:
         "depth": np.zeros(shape),
         "transmittance": np.ones(shape),
     }
-    indices = range(len(gaussians.means))
-    splats = [naive_splat(gaussians, camera, n, model) for n in indices]
-    if model.sh_direction == "mean":
-        bases = [naive_basis(gaussians, camera, model, n=n) for n in indices]
+    splats = [naive_splat(gaussians, camera, n, model) for n in range(len(gaussians.means))]
     for row, column in np.ndindex(shape):
         position = np.array([column + 0.5, row + 0.5])
-        if model.sh_direction == "pixel":
-            bases = [naive_basis(gaussians, camera, model, position)] * len(indices)
         hits = [(splat(position), n) for n, splat in enumerate(splats) if splat]
         hits = sorted((hit[1], n, hit[0], hit[2]) for hit, n in hits if hit)
         transmittance, last = 1.0, -math.inf
@@ -173,7 +158,7 @@ def naive_image(gaussians, camera, model) -> dict[str, np.ndarray]:
             behind = transmittance * (1 - alpha)
             if (behind if model.stop == "before" else transmittance) < model.transmittance_stop:
                 break
-            color = naive_color(gaussians, n, bases[n])
+            color = naive_color(gaussians, camera, model, n, position)
             rendered["image"][row, column] += transmittance * alpha * color
             rendered["depth"][row, column] += transmittance * alpha * depth
             transmittance *= 1 - alpha
@@ -186,34 +171,3 @@ def assert_images_agree(rendered, expected, atol) -> None:
     for name in ("image", "depth", "transmittance"):
         wanted = expected[name] if isinstance(expected, dict) else getattr(expected, name)
         np.testing.assert_allclose(getattr(rendered, name), wanted, rtol=0, atol=atol, err_msg=name)
-
-
-def straight_camera(size=9, focal=20.0, near=0.01) -> Camera:
-    return Camera(np.eye(3), np.zeros(3), focal, focal, size / 2, size / 2, size, size, near)
-
-
-def scene_of(means, log_scales, quats=None, opacity=0.5, colors=None) -> Gaussians:
-    """Gaussians of one opacity, whose colours (N, 3) do not depend on direction."""
-    n = len(means)
-    opacities = np.broadcast_to(opacity, n)
-    colors = np.ones((n, 3)) if colors is None else np.asarray(colors)
-    return Gaussians(
-        means=means,
-        quats=np.tile([1.0, 0, 0, 0], (n, 1)) if quats is None else quats,
-        log_scales=np.broadcast_to(log_scales, (n, 3)),
-        logit_opacities=np.log(opacities / (1 - opacities)),
-        sh0=((colors - 0.5) * math.sqrt(4 * math.pi))[:, None],
-        shN=np.zeros((n, 0, 3)),
-    )
-
-
-def only(gaussians, kept) -> Gaussians:
-    return Gaussians(**{name: getattr(gaussians, name)[kept] for name in PARAMETERS})
-
-
-def pixel_rays(camera) -> np.ndarray:
-    """(H, W, 3) rays through the pixels' centres, camera axes, z = 1."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    x, y = np.meshgrid(x, y)
-    return np.stack([x, y, np.ones_like(x)], axis=-1)

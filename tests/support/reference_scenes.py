@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -66,6 +67,31 @@ def small_scene() -> tuple[Gaussians, Camera]:
     return gaussians, camera
 
 
+def only(gaussians, kept) -> Gaussians:
+    return Gaussians(**{name: getattr(gaussians, name)[kept] for name in PARAMETERS})
+
+
+def with_invisible(gaussians, camera, point_logit=-1e3) -> Gaussians:
+    """Seven more Gaussians at the end, which no image shows.
+
+    At the camera's centre, behind it (one of them huge), nearer than the near plane, on the
+    camera's plane, transparent; and a point without extent, of the given logit.
+    """
+    points = [[0, 0, 0], [0, 0, -1], [0, 1e30, -1e30], [0, 0, 0.0099], [1e3, 0, 0]]
+    points += [[0.1, 0, 2]] * 2
+    sizes = np.array([0.0, 80, 0, -2.3, -np.inf, 0, -np.inf])
+    strange = {
+        "means": np.array(points) @ camera.rotation + camera.center,
+        "quats": np.zeros((7, 4)),
+        "log_scales": np.repeat(sizes, 3).reshape(7, 3),
+        "logit_opacities": [*[1e3] * 5, -1e3, point_logit],
+        "sh0": np.ones((7, 1, 3)),
+        "shN": np.ones((7, 15, 3)),
+    }
+    names = PARAMETERS
+    return Gaussians(**{n: np.concatenate([getattr(gaussians, n), strange[n]]) for n in names})
+
+
 BACKGROUND = np.array([0.9, 0.4, 0.2])
 
 
@@ -109,7 +135,8 @@ def numeric_gradients(outputs, weights, parameters) -> dict[str, np.ndarray]:
     return gradients
 
 
-def legendre_sh_basis(direction, degree) -> np.ndarray:
+@lru_cache
+def legendre_sh_basis(direction: tuple, degree: int) -> np.ndarray:
     """(K,) from associated Legendre functions, with the Condon-Shortley phase, and angles."""
     x, y, z = direction
     azimuth, sine = math.atan2(y, x), math.hypot(x, y)
