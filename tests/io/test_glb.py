@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.datasets import set_value
-from support.formats import gaussians_within_ranges
+from support.formats import gaussians_within_ranges, refusal
 
-from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.glb import Glb
 
@@ -55,12 +54,9 @@ def parts(gaussians):
     return split(gaussians.to_bytes("glb"))
 
 
-def refusal(path, document, binary):
+def refused(path, document, binary):
     path.write_bytes(joined(document, binary))
-    with pytest.raises(UserError) as error:
-        Glb().read(path)
-    assert "\n" not in str(error.value)
-    return str(error.value).removeprefix(f"{path}: ")
+    return refusal(path, Glb().read)
 
 
 def test_a_file_follows_the_extensions_specification(gaussians, parts):
@@ -123,10 +119,8 @@ def test_foreign_extras_are_ignored(tmp_path, parts, extras):
 def test_damaged_drgs_extras_are_refused(tmp_path, parts, extras):
     document, binary = parts
     document["meshes"][0]["primitives"][0]["extras"] = {"drgs": extras}
-    refused = refusal(tmp_path / "a.glb", document, binary)
-    expected = "must be an object of names and values of one word, got "
-    assert refused.startswith(f"{WHERE}.extras.drgs: {expected}")
-    assert len(refused) < 300
+    expected = f"{WHERE}.extras.drgs: must be an object of names and values of one word, got "
+    assert refused(tmp_path / "a.glb", document, binary).startswith(expected)
 
 
 def test_interleaved_and_quantised_numbers_are_read(tmp_path, gaussians, parts):
@@ -186,7 +180,7 @@ SCALED = {"children": [0], "scale": [2, 2, 2]}
 def test_invalid_document_is_refused(tmp_path, parts, path, value, message):
     document, binary = parts
     set_value(document, path, value)
-    assert refusal(tmp_path / "a.glb", document, binary).startswith(message)
+    assert refused(tmp_path / "a.glb", document, binary).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +196,7 @@ def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute,
     start, there = numbers(document, binary, f"{NAME}:{attribute}")
     at = start + 5 * 4 * there.shape[1]
     changed = binary[:at] + struct.pack("<f", value) + binary[at + 4 :]
-    text = refusal(tmp_path / "a.glb", document, changed)
+    text = refused(tmp_path / "a.glb", document, changed)
     assert text.startswith("byte ") and f", row 5: {NAME}:{attribute} {message}" in text
 
 

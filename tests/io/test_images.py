@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, ImageSequence
 from support.openexr import read_exr
 
 from drgs.core.errors import UserError
@@ -16,12 +16,9 @@ NOISE = np.random.default_rng(0).uniform(size=(3, 64, 64, 3))
 
 
 def frames_of(path):
-    rendered, frames = Image.open(path), []
-    for index in range(rendered.n_frames):
-        rendered.seek(index)
-        frames.append(np.asarray(rendered.convert("RGB")))
+    rendered = Image.open(path)
     assert rendered.info["loop"] == 0
-    return frames
+    return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(rendered)]
 
 
 def test_png_contains_the_image_rounded_and_clamped(tmp_path):

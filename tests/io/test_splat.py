@@ -4,9 +4,9 @@ import struct
 
 import numpy as np
 import pytest
-from support.formats import gaussians_within_ranges
+from support.formats import gaussians_within_ranges, refusal
 
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserNote
 from drgs.gaussians.parameters import Gaussians
 
 
@@ -51,6 +51,4 @@ def test_rows_are_sorted_by_opacity_times_volume(tmp_path):
 )
 def test_incomplete_rows_are_refused(tmp_path, content, message):
     (tmp_path / "a.splat").write_bytes(content)
-    with pytest.raises(UserError) as error:
-        Gaussians.load(tmp_path / "a.splat")
-    assert str(error.value).startswith(f"{tmp_path}/a.splat: {message}")
+    assert refusal(tmp_path / "a.splat").startswith(message)
