@@ -9,10 +9,8 @@ from drgs.core.arrays import (
     Rows,
     first_numbers,
     from_host,
-    interleave,
     load_columns,
     quotient,
-    scatter_rows,
     store_columns,
 )
 
@@ -26,16 +24,6 @@ def numbered(precision, count, length=5) -> list:
 
 def table(count, length=5) -> np.ndarray:
     return np.arange(length)[:, None] * 100.0 + np.arange(count)
-
-
-@both_precisions
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 9, 45, 64])
-def test_columns_are_transposed_to_rows(precision, count):
-    flat = np.array(interleave(numbered(precision, count))).reshape(-1, count)
-    np.testing.assert_array_equal(flat, table(count))
-    order = UInt32(4, 0, 3, 1, 2)
-    flat = np.array(scatter_rows(numbered(precision, count), order, 5)).reshape(-1, count)
-    np.testing.assert_array_equal(flat[np.array(order)], table(count))
 
 
 @both_precisions
@@ -68,15 +56,6 @@ def test_contiguous_rows_are_loaded_and_stored(precision, width, num_rows):
     stored = store_columns(numbered(precision, width, num_rows))
     dr.eval(stored)
     np.testing.assert_array_equal(first_numbers(stored, num_rows * width), np.array(flat))
-
-
-@both_precisions
-def test_host_arrays_are_copied(precision):
-    values = np.arange(6.0).reshape(2, 3)
-    copy = from_host(precision.Float, values)
-    values[:] = -1
-    np.testing.assert_array_equal(np.array(copy), np.arange(6.0))
-    assert type(from_host(UInt32, [3, 1])) is UInt32 and dr.width(from_host(UInt32, [])) == 0
 
 
 def test_alignment_of_numpy_arrays_does_not_affect_kernels():

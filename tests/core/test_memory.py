@@ -103,24 +103,16 @@ def test_byte_counts_are_written_with_three_digits():
     assert texts == ["24.1 GB", "1 GB", "5,000 GB", "123 kB"]
 
 
-def test_images_that_do_not_fit_are_refused_with_numbers(monkeypatch):
+def test_images_are_limited_by_memory_and_by_drjits_arrays(monkeypatch):
+    """``test_image_limits.py`` checks the messages."""
     monkeypatch.setattr(memory, "available_memory", lambda: 8 * GB)
     assert memory.too_large_reason(4000, 5000) is None
-    needed = 20_000**2 * memory.IMAGE_BYTES / GB
-    assert memory.too_large_reason(20_000, 20_000) == (
-        f"20000 x 20000 px need about {needed:g} GB of memory, of which 8 GB are available; at "
-        f"most {8 * GB // memory.IMAGE_BYTES:,} pixels fit"
-    )
+    assert "need about" in memory.too_large_reason(20_000, 20_000)
     assert "with 1,000 samples each need about" in memory.too_large_reason(400, 400, samples=1000)
-    # In the largest memory, Dr.Jit's arrays are the limit.
     monkeypatch.setattr(memory, "available_memory", lambda: 10**15)
     assert memory.too_large_reason(2**15, 2**15 - 1) is None
-    assert memory.too_large_reason(10**9, 100) == (
-        "1000000000 x 100 px are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
-        "1,073,741,823 pixels fit"
-    )
-    assert "too many for Dr.Jit" in memory.too_large_reason(400, 400, samples=10**9)
-    assert "too many for Dr.Jit" in memory.too_large_reason(2000, 2000, channels=2000)
+    for size in ((2**15, 2**15), (400, 400, 3, 10**9), (2000, 2000, 2000)):
+        assert "too many for Dr.Jit" in memory.too_large_reason(*size)
 
 
 def test_drjit_malloc_cache_counts_as_available(monkeypatch):

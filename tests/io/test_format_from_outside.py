@@ -105,8 +105,8 @@ NPZ = r'"npz" \(npz_format\)'
         ("return content.getvalue()", "return 1 / 0", f"file format {NPZ}: ZeroDivisionError: div"),
         (
             *('suffix = ".npz"', 'suffix = "npz"'),
-            r'load the extension "npz" of the package drgs-npz \(npz_format\): TypeError: Npz\.suffix'
-            " must be a suffix in small",
+            r'load the extension "npz" of the package drgs-npz \(npz_format\): TypeError: Npz\.suff'
+            "ix must be a suffix in small",
         ),
         ("import io", "import no_such_module", 'load the extension "npz" .*no_such_module'),
     ],

@@ -2,12 +2,10 @@
 
 import struct
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image, ImageCms, ImageSequence
-from support.openexr import read_exr
 
 from drgs.core.errors import UserError
 from drgs.io import images
@@ -58,20 +56,6 @@ def test_a_large_animation_is_written_at_a_lower_quality(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "WEBP_BYTES", size - 1)
     images.write_animation(tmp_path / "coarse.webp", list(NOISE))
     assert (tmp_path / "coarse.webp").stat().st_size < size
-
-
-def test_an_exr_is_written_with_one_thread(tmp_path):
-    """Mitsuba alone would wait for ever."""
-    mi.set_variant("llvm_ad_rgb")
-    pixels = np.random.default_rng(0).normal(size=(5, 7, 4)).astype(np.float32)
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        images.write_exr(tmp_path / "new" / "a.exr", mi.Bitmap(pixels))
-        assert dr.thread_count() == 1
-    finally:
-        dr.set_thread_count(threads)
-    np.testing.assert_array_equal(np.array(read_exr(tmp_path / "new" / "a.exr")), pixels)
 
 
 def write_tiff16(path, pixels):

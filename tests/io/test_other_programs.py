@@ -15,6 +15,7 @@ import pytest
 from support.formats import (
     FLOAT32,
     PRECISION,
+    Precision,
     assert_within,
     gaussians_within_ranges,
     matched,
@@ -105,25 +106,22 @@ def gsply():
     return pytest.importorskip("gsply")
 
 
+FLOATS = Precision(*(40 * FLOAT32,) * 4, 10 * FLOAT32, 40 * FLOAT32)
+"""A few operations in float32 on numbers up to 10; gsply keeps opacities from 1e-6 on."""
+
+
 def assert_found_alike(theirs, ours):
     """Check that both readers agree, in the axes of the file; logits of opacities 0 and 1 are a
     choice."""
-
-    def opacities(logits):
-        return 1 / (1 + np.exp(-np.asarray(logits, np.float64).ravel()))
-
-    pairs = {
-        "means": (theirs.means, ours["means"]),
-        "quats": (theirs.quats, ours["quats"]),
-        "scales": (theirs.scales, ours["log_scales"]),
-        "opacities": (opacities(theirs.opacities), opacities(ours["logit_opacities"])),
-        "sh0": (theirs.sh0, ours["sh0"][:, 0]),
-    }
-    if ours["shN"].size:
-        pairs["shN"] = (theirs.shN, ours["shN"])
-    for name, (expected, found) in pairs.items():
-        # A few operations in float32 on numbers up to 10; gsply keeps opacities from 1e-6 on.
-        np.testing.assert_allclose(found, expected, atol=40 * FLOAT32, err_msg=name)
+    expected = Gaussians(
+        means=theirs.means,
+        quats=theirs.quats,
+        log_scales=theirs.scales,
+        logit_opacities=np.ravel(theirs.opacities),
+        sh0=theirs.sh0[:, None],
+        shN=theirs.shN if ours["shN"].size else ours["shN"],
+    )
+    assert_within(FLOATS, expected, Gaussians(**ours))
 
 
 @pytest.mark.parametrize("degree", [0, 3])

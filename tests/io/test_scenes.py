@@ -1,9 +1,10 @@
-"""Scenes that commands are given: on one thread, and with what Mitsuba would not survive."""
+"""OpenEXR files on one thread, and scenes that Mitsuba would not survive."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.openexr import read_exr
 
 from drgs.capture.path_tracing import load_scene
 from drgs.core.errors import UserError
@@ -39,19 +40,22 @@ def sky(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_scene_with_openexr_files_is_loaded_on_any_number_of_threads(sky, count):
+def test_openexr_files_are_written_and_loaded_on_any_number_of_threads(sky, count):
     """Mitsuba alone would wait for ever on one."""
     before = dr.thread_count()
     dr.set_thread_count(count)
+    pixels = np.random.default_rng(0).normal(size=(5, 7, 4)).astype(np.float32)
     program = sky.with_name("scene.py")
     program.write_text(PROGRAM.replace('"sample_count": 0', '"sample_count": 4'))
     try:
+        write_exr(sky.parent / "new" / "a.exr", mi.Bitmap(pixels))
         for scene in (load_scene_file(sky), load_scene(program)):
             assert scene.environment() is not None and dr.thread_count() == count
         with openexr_threads():
             assert dr.thread_count() == max(count, 2)
     finally:
         dr.set_thread_count(before)
+    np.testing.assert_array_equal(np.array(read_exr(sky.parent / "new" / "a.exr")), pixels)
 
 
 @pytest.mark.parametrize("sampler", ["independent", "multijitter", "stratified"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -25,21 +26,16 @@ def camera_gaussian(gaussians, camera, n) -> tuple[np.ndarray, np.ndarray]:
     return camera.rotation @ (gaussians.means[n] - camera.center), factor
 
 
-def textbook_unscented(mean, factor, function, alpha, beta, kappa):
-    """(mean, covariance) of function(x): the scaled unscented transform as Julier writes it."""
-    n = len(mean)
-    lam = alpha**2 * (n + kappa) - n
-    offsets = math.sqrt(n + lam) * factor.T
-    points = [mean, *(mean + offsets), *(mean - offsets)]
-    mean_weights = [lam / (n + lam)] + 2 * n * [1 / (2 * (n + lam))]
-    cov_weights = [mean_weights[0] + 1 - alpha**2 + beta, *mean_weights[1:]]
-    values = [function(point) for point in points]
-    center = sum(w * value for w, value in zip(mean_weights, values, strict=True))
-    covariance = sum(
-        w * np.outer(value - center, value - center)
-        for w, value in zip(cov_weights, values, strict=True)
-    )
-    return center, covariance
+def unscented(mean, factor, function):
+    """(mean, covariance) of function(x): Julier's scaled transform, alpha = 1, beta = 2, kappa = 0.
+
+    Of 3 dimensions: lambda = 0, so the mean itself has the weights 0 and 1 - alpha^2 + beta.
+    """
+    offsets = math.sqrt(3) * factor.T
+    values = np.array([function(point) for point in (mean, *(mean + offsets), *(mean - offsets))])
+    center = values[1:].mean(axis=0)
+    apart = values - center
+    return center, 2 * np.outer(apart[0], apart[0]) + apart[1:].T @ apart[1:] / 6
 
 
 def naive_film(mean, factor, camera, model):
@@ -62,7 +58,7 @@ def naive_film(mean, factor, camera, model):
     cov = linear @ sigma @ linear.T
     is_clamped = not np.array_equal(slope, clamped)
     if model.projection == "unscented" and is_usable(mean, factor) and not is_clamped:
-        mean2d, cov = textbook_unscented(mean, factor, pinhole, alpha=1, beta=2, kappa=0)
+        mean2d, cov = unscented(mean, factor, pinhole)
     return mean2d, cov, linear @ sigma[:, 2] / z, sigma[2, 2] / z**2
 
 
@@ -137,37 +133,32 @@ def naive_color(gaussians, camera, model, n, position) -> np.ndarray:
     return np.maximum(basis @ coefficients + 0.5, 0)
 
 
-def naive_image(gaussians, camera, model) -> dict[str, np.ndarray]:
+def naive_image(gaussians, camera, model) -> SimpleNamespace:
     shape = camera.height, camera.width
-    rendered = {
-        "image": np.zeros((*shape, 3)),
-        "depth": np.zeros(shape),
-        "transmittance": np.ones(shape),
-    }
+    image, depth, transmittance = np.zeros((*shape, 3)), np.zeros(shape), np.ones(shape)
     splats = [naive_splat(gaussians, camera, n, model) for n in range(len(gaussians.means))]
-    for row, column in np.ndindex(shape):
-        position = np.array([column + 0.5, row + 0.5])
+    for pixel in np.ndindex(shape):
+        position = np.array([pixel[1] + 0.5, pixel[0] + 0.5])
         hits = [(splat(position), n) for n, splat in enumerate(splats) if splat]
         hits = sorted((hit[1], n, hit[0], hit[2]) for hit, n in hits if hit)
-        transmittance, last = 1.0, -math.inf
+        left, last = 1.0, -math.inf
         slope = (position - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-        for key, n, alpha, depth in hits:
+        for key, n, alpha, z in hits:
             if (key - last) * math.hypot(*slope, 1) < model.step:
                 continue
             last = key
-            behind = transmittance * (1 - alpha)
-            if (behind if model.stop == "before" else transmittance) < model.transmittance_stop:
+            behind = left * (1 - alpha)
+            if (behind if model.stop == "before" else left) < model.transmittance_stop:
                 break
-            color = naive_color(gaussians, camera, model, n, position)
-            rendered["image"][row, column] += transmittance * alpha * color
-            rendered["depth"][row, column] += transmittance * alpha * depth
-            transmittance *= 1 - alpha
-        rendered["image"][row, column] += transmittance * BACKGROUND
-        rendered["transmittance"][row, column] = transmittance
-    return rendered
+            image[pixel] += left * alpha * naive_color(gaussians, camera, model, n, position)
+            depth[pixel] += left * alpha * z
+            left = behind
+        image[pixel] += left * BACKGROUND
+        transmittance[pixel] = left
+    return SimpleNamespace(image=image, depth=depth, transmittance=transmittance)
 
 
 def assert_images_agree(rendered, expected, atol) -> None:
     for name in ("image", "depth", "transmittance"):
-        wanted = expected[name] if isinstance(expected, dict) else getattr(expected, name)
-        np.testing.assert_allclose(getattr(rendered, name), wanted, rtol=0, atol=atol, err_msg=name)
+        found, wanted = getattr(rendered, name), getattr(expected, name)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=atol, err_msg=name)
