@@ -1,15 +1,15 @@
 """A file format in one file outside of drgs works wherever a shipped one does."""
 
-import os
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import assert_ends_well
 from support.small_capture import blobs
 
+from drgs import export, render
 from drgs.core import registry
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -38,14 +38,6 @@ def installed(monkeypatch, tmp_path):
     sys.modules.pop("npz_format", None)
 
 
-def drgs(folder, *arguments):
-    """The output of a command, as a user runs it."""
-    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
-    command = [sys.executable, "-m", "drgs", *map(str, arguments)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    return done.returncode, done.stdout + done.stderr
-
-
 def test_gaussians_are_saved_and_loaded(installed, tmp_path):
     given = replace(blobs(), origin=(4e6, 0.0, 1e6), rendered_with={"low_pass": 0.1})
     given.save(tmp_path / "a.npz")
@@ -58,14 +50,13 @@ def test_gaussians_are_saved_and_loaded(installed, tmp_path):
 @pytest.mark.slow
 def test_commands_export_and_render_it(installed, tmp_path):
     blobs().save(tmp_path / "a.ply")
-    _, text = drgs(installed, "export", "--help")
-    assert "npz: NumPy's archive of arrays" in " ".join(text.split())
-    status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
-    assert (status, f"written: {tmp_path / 'a.npz'} (" in text) == (0, True), text
+    shown = assert_ends_well(export.main, "--help").stdout
+    assert "npz: NumPy's archive of arrays" in " ".join(shown.split())
+    shown = assert_ends_well(export.main, tmp_path / "a.ply", "--format", "npz").stdout
+    assert f"written: {tmp_path / 'a.npz'} (" in shown
     assert np.array_equal(np.load(tmp_path / "a.npz")["means"], blobs().means)
     options = ["--orbit", 2, "--size", 16, 16, "--out", tmp_path / "out"]
-    status, text = drgs(installed, "render", tmp_path / "a.npz", *options)
-    assert status == 0, text
+    assert_ends_well(render.main, tmp_path / "a.npz", *options)
     assert list((tmp_path / "out").glob("**/*.png"))
 
 

@@ -21,7 +21,7 @@ LOOP_ROUNDING = 1e-11
 
 
 @pytest.mark.parametrize(("antialiased", "sh_degree"), [(False, None), (True, 1)])
-def test_default_model_matches_the_reference(antialiased, sh_degree):
+def test_default_model_matches_the_reference_and_a_loop(antialiased, sh_degree):
     gaussians, camera = small_scene()
     model = ImageModel(antialiased=antialiased, sh_degree=sh_degree)
     # Wide enough that the scene, which keeps 5e-4 clear of thresholds, has marked pixels.
@@ -30,6 +30,8 @@ def test_default_model_matches_the_reference(antialiased, sh_degree):
     rendered = rays.render(gaussians, camera, BACKGROUND, model, threshold_width=width)
     # Rounding only: C is inverted in another order of operations. Measured 1e-15.
     assert_images_agree(rendered, expected, atol=1e-13)
+    # Both are float64; the loop's determinants and inverses lose a digit or two.
+    assert_images_agree(expected, naive_image(gaussians, camera, model), 1e-12)
     np.testing.assert_array_equal(rendered.alpha, 1 - rendered.transmittance)
     assert expected.near_threshold.any() and not expected.near_threshold.all()
     np.testing.assert_array_equal(rendered.near_threshold, expected.near_threshold)

@@ -1,4 +1,4 @@
-"""The float64 reference of splatting: a loop over pixels, central differences, hard input."""
+"""The float64 reference of splatting: central differences, decisions, hard input."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 from support.helpers import assert_arrays_agree
-from support.reference_loops import MARKED_DISTANCES, assert_images_agree, naive_image
+from support.reference_loops import MARKED_DISTANCES
 from support.reference_scenes import (
     BACKGROUND,
     PARAMETERS,
@@ -21,19 +21,7 @@ from support.reference_scenes import (
 )
 
 from drgs.reference import splatting as reference
-from drgs.reference.rays import ImageModel
 from drgs.reference.splatting import Camera, Gaussians
-
-
-@pytest.mark.parametrize(("antialiased", "sh_degree"), [(False, 0), (True, 3)])
-def test_image_equals_a_loop_over_pixels(antialiased, sh_degree):
-    gaussians, camera = small_scene()
-    model = ImageModel(antialiased=antialiased, sh_degree=sh_degree)
-    rendered = reference.render(gaussians, camera, BACKGROUND, sh_degree, antialiased)
-    # Both are float64; the loop's determinants and inverses lose a digit or two.
-    assert_images_agree(rendered, naive_image(gaussians, camera, model), 1e-12)
-    np.testing.assert_array_equal(rendered.alpha, 1 - rendered.transmittance)
-
 
 # The difference quotient is off by STEP^2 / 6 times the third derivative, which at 100 per world
 # unit is 2e-9 of the derivative, and by rounding, 1e-16 / STEP = 1e-10 a pixel. Measured:
