@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.reference_lenses import camera_at_origin, gaussians_at
-from support.reference_loops import assert_images_agree
 from support.reference_scenes import (
     BACKGROUND,
+    assert_images_agree,
     rotation_about,
     small_camera,
     small_scene,

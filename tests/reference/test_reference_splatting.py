@@ -8,9 +8,9 @@ import warnings
 import numpy as np
 import pytest
 from support.helpers import assert_arrays_agree
-from support.reference_loops import MARKED_DISTANCES
 from support.reference_scenes import (
     BACKGROUND,
+    MARKED_DISTANCES,
     PARAMETERS,
     cotangents,
     needle,

@@ -1,4 +1,4 @@
-"""Small scenes for the float64 reference, and numeric derivatives of what it computes."""
+"""Small scenes for the float64 reference, and comparisons of what it computes."""
 
 from __future__ import annotations
 
@@ -169,3 +169,13 @@ def needle(log_scales) -> tuple[Gaussians, Camera]:
         ),
         camera,
     )
+
+
+MARKED_DISTANCES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
+"""(relative distance from a threshold, whether a width of 1e-6 marks the pixel)"""
+
+
+def assert_images_agree(rendered, expected, atol) -> None:
+    for name in ("image", "depth", "transmittance"):
+        found, wanted = getattr(rendered, name), getattr(expected, name)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=atol, err_msg=name)
