@@ -6,13 +6,6 @@ from glob import glob
 import pytest
 
 from drgs.core import llvm
-from drgs.core.llvm import (
-    LLVMVersionError,
-    ensure_usable_llvm,
-    installed_libraries,
-    select_newest_llvm,
-    version_from_name,
-)
 
 
 @pytest.fixture
@@ -51,36 +44,41 @@ def set_loaded_version(monkeypatch, *version):
     ],
 )
 def test_the_version_is_read_from_the_file_name(path, version):
-    assert version_from_name(path) == version
+    assert llvm.version_from_name(path) == version
 
 
 def test_unversioned_link_has_the_version_of_its_target(tmp_path):
     (tmp_path / "libLLVM.so.21.1").touch()
     (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.21.1")
-    assert version_from_name(tmp_path / "libLLVM.so") == (21, 1)
+    assert llvm.version_from_name(tmp_path / "libLLVM.so") == (21, 1)
 
 
 def test_the_newest_library_is_selected_even_if_it_is_a_link(machine):
     folder = machine("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "target")
     for name, target in (("libLLVM.so.100.1", "target"), ("libLLVM.so.200.1", "nowhere")):
         (folder / name).symlink_to(target)
-    assert [version for version, _ in installed_libraries()] == [(100, 1), (19, 1), (15,), (9,)]
-    select_newest_llvm()
+    assert [version for version, _ in llvm.installed_libraries()] == [
+        (100, 1),
+        (19, 1),
+        (15,),
+        (9,),
+    ]
+    llvm.select_newest_llvm()
     assert os.environ[llvm.PATH_VARIABLE] == str(folder / "libLLVM.so.100.1")
 
 
 def test_nothing_is_selected_where_the_choice_is_made(machine, monkeypatch):
     """No library is usable; the user has chosen one; Dr.Jit has loaded one."""
     machine("libLLVM-15.so.1", "libLLVM-16.so.1")
-    select_newest_llvm()
+    llvm.select_newest_llvm()
     assert llvm.PATH_VARIABLE not in os.environ
     machine("libLLVM.so.22.1")
     with monkeypatch.context() as chosen:
         chosen.setenv(llvm.PATH_VARIABLE, "/mine.so")
-        select_newest_llvm()
+        llvm.select_newest_llvm()
         assert os.environ[llvm.PATH_VARIABLE] == "/mine.so"
     monkeypatch.setitem(sys.modules, "drjit", object())
-    select_newest_llvm()
+    llvm.select_newest_llvm()
     assert llvm.PATH_VARIABLE not in os.environ
 
 
@@ -89,13 +87,13 @@ def test_tested_versions_pass_silently(machine, monkeypatch, version):
     set_loaded_version(monkeypatch, *version)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        ensure_usable_llvm()
+        llvm.ensure_usable_llvm()
 
 
 def test_17_and_18_warn_as_untested(machine, monkeypatch):
     set_loaded_version(monkeypatch, 18, 0, 6)
     with pytest.warns(UserWarning) as record:
-        ensure_usable_llvm()
+        llvm.ensure_usable_llvm()
     assert str(record[0].message) == (
         "drgs: libLLVM 18.0.6 is untested; 19 or newer is recommended: apt-get install libllvm19"
     )
@@ -119,8 +117,8 @@ def test_unusable_libraries_are_refused(machine, monkeypatch, version, names, mo
     if "variable" in more:
         monkeypatch.setenv(llvm.PATH_VARIABLE, more["variable"])
     set_loaded_version(monkeypatch, *version)
-    with pytest.raises(LLVMVersionError) as error:
-        ensure_usable_llvm()
+    with pytest.raises(llvm.LLVMVersionError) as error:
+        llvm.ensure_usable_llvm()
     assert str(error.value).startswith("drgs: libLLVM 17 or newer is needed (19 is tested), found ")
     assert message.format(folder) in str(error.value)
 

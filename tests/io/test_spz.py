@@ -92,7 +92,7 @@ def test_extensions_are_skipped(tmp_path):
     content = unpacked(gaussians_within_ranges(5))
     expected, _ = Spz().read(written(tmp_path / "a.spz", content))
     path = written(tmp_path / "b.spz", content + b"of a vendor" * 99)
-    assert "the end was expected after 5 Gaussians" in refusal(path, Spz().read)
+    assert "the end was expected after 5 Gaussians" in refusal(path)
     content[FLAGS] |= 2
     with pytest.warns(UserNote, match=r"b.spz: has extensions of a vendor, which are passed over"):
         found, _ = Spz().read(written(path, content + b"of a vendor" * 99))
@@ -114,17 +114,15 @@ def test_extensions_are_skipped(tmp_path):
 def test_a_wrong_header_is_refused(tmp_path, at, data, message):
     content = unpacked(gaussians_within_ranges(5))
     content[at : at + len(data)] = data
-    assert refusal(written(tmp_path / "a.spz", content), Spz().read).startswith(message)
+    assert refusal(written(tmp_path / "a.spz", content)).startswith(message)
 
 
 def test_wrong_checksum_and_trailing_bytes_are_refused(tmp_path):
     content = gaussians_within_ranges(5).to_bytes("spz")
     (tmp_path / "a.spz").write_bytes(content[:-8] + b"1234" + content[-4:])
-    assert "the gzip stream is damaged" in refusal(tmp_path / "a.spz", Spz().read)
+    assert "the gzip stream is damaged" in refusal(tmp_path / "a.spz")
     (tmp_path / "a.spz").write_bytes(content + b"more")
-    assert "the gzip stream is damaged: Not a gzipped file" in refusal(
-        tmp_path / "a.spz", Spz().read
-    )
+    assert "the gzip stream is damaged: Not a gzipped file" in refusal(tmp_path / "a.spz")
 
 
 def test_a_grid_of_equal_gaussians_is_read(tmp_path):
@@ -163,12 +161,12 @@ def test_version_4_contains_the_same_gaussians(tmp_path, degree):
     assert all((found[name] == expected[name]).all() for name in expected)
     for end in range(len(content)):
         (tmp_path / "b.spz").write_bytes(content[:end])
-        assert refusal(tmp_path / "b.spz", Spz().read).startswith("byte ")
+        assert refusal(tmp_path / "b.spz").startswith("byte ")
 
 
 def test_version_4_without_zstandard_reports_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
     (tmp_path / "a.spz").write_bytes(streams_of(gaussians_within_ranges(2), bytes))
-    assert refusal(tmp_path / "a.spz", Spz().read).endswith(
+    assert refusal(tmp_path / "a.spz").endswith(
         "version 4: needs zstandard, which is not installed; pip install 'drgs[spz]'"
     )
