@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from support.formats import refusal
 
 from drgs.core.errors import UserError
 from drgs.core.folders import FolderRecord, digest, sole_writer
@@ -22,13 +23,6 @@ def write(folder, **files):
         (folder / name).write_text(text)
 
 
-def refusal(function, *arguments, **options):
-    with pytest.raises(UserError) as error:
-        function(*arguments, **options)
-    (line,) = str(error.value).splitlines()
-    return line
-
-
 def test_claimed_files_may_be_rewritten_until_they_are_sealed(tmp_path):
     """Also by another process, when the first was killed."""
     record(tmp_path).claim("ab")
@@ -38,8 +32,8 @@ def test_claimed_files_may_be_rewritten_until_they_are_sealed(tmp_path):
     record(tmp_path).seal()
     assert not record(tmp_path).foreign_files("abc")
     write(tmp_path, b="theirs", c="theirs")  # c did not exist when the record was sealed
-    message = f"{tmp_path}: holds b, c, which this command would replace"
-    assert refusal(record(tmp_path).claim, "abc").startswith(message)
+    refused = refusal(tmp_path, lambda folder: record(folder).claim("abc"))
+    assert refused.startswith("holds b, c, which this command would replace")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".drgs-render.json", *"abc"]
 
 
@@ -57,7 +51,8 @@ def test_files_of_a_version_without_records_are_claimed_once(tmp_path):
     record(tmp_path).claim(["a"], earlier={"a", "b"})
     record(tmp_path).claim(["b"])
     write(tmp_path, c="theirs")
-    assert "holds c, which" in refusal(record(tmp_path).claim, ["c"], earlier={"c"})
+    refused = refusal(tmp_path, lambda folder: record(folder).claim("c", earlier="c"))
+    assert refused.startswith("holds c, which")
 
 
 def test_non_utf8_names_and_paths_are_recorded(tmp_path):
@@ -75,7 +70,7 @@ def test_non_utf8_names_and_paths_are_recorded(tmp_path):
 )
 def test_a_damaged_record_is_refused_by_name(tmp_path, text):
     record(tmp_path).path.write_text(text)
-    assert "must be the record of the files that were written here" in refusal(record, tmp_path)
+    assert "must be the record of the files that were written here" in refusal(tmp_path, record)
 
 
 def test_removed_record_leaves_no_file(tmp_path):

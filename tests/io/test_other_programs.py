@@ -15,6 +15,7 @@ import pytest
 from support.formats import (
     FLOAT32,
     PRECISION,
+    Z_TO_Y,
     Precision,
     assert_within,
     gaussians_within_ranges,
@@ -36,8 +37,6 @@ splat_transform = pytest.mark.skipif(
 pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
 
 SAME = np.eye(3)
-Z_TO_Y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-
 SPZ_WORLD = np.diag([1, -1, -1]) @ Z_TO_Y
 """From our world to right, up, back, as SPZ has it, and on to right, down, forward, as
 splat-transform takes PLY files to be."""

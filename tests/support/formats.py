@@ -14,6 +14,9 @@ from drgs.gaussians.similarity import Similarity
 
 SH_C0 = 0.28209479177387814
 
+Z_TO_Y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""From our z up to the y up of a file: right, up, back."""
+
 FLOAT32 = 2.0**-23
 """One rounding and one of the next, relative: what comes through float32 arithmetic."""
 
