@@ -55,15 +55,6 @@ def test_film_points_match_opencv_and_colmap(lens):
     np.testing.assert_allclose(actual, KNOWN_FILM[lens], rtol=1e-13)
 
 
-@pytest.mark.parametrize("degrees", [1e-6, 30, 90, 120, 170])
-def test_plain_fisheye_is_proportional_to_the_angle(degrees):
-    camera, theta = camera_at_origin(fy=230.0), math.radians(degrees)
-    point = 3.0 * np.array([[math.sin(theta) * 0.6, math.sin(theta) * -0.8, math.cos(theta)]])
-    assert Fisheye().is_seen(camera, point).all()
-    expected = 230 * theta * np.array([[0.6, -0.8]]) + [140, 95]
-    np.testing.assert_allclose(Fisheye().film_points(camera, point), expected, rtol=1e-13)
-
-
 def limit_of(lens) -> float:
     """The slope, or angle, up to which a lens is made."""
     return lens.valid_radius if isinstance(lens, OpenCV) else lens.valid_angle

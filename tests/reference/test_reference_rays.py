@@ -1,4 +1,7 @@
-"""Approximations against scalar loops and textbook formulas; orders; pixels near a decision."""
+"""Approximations against scalar loops and textbook formulas; orders; pixels near a decision.
+
+The laws compare unscented splats, and peaks behind the camera, with the kernels.
+"""
 
 from __future__ import annotations
 
@@ -42,18 +45,6 @@ def camera_gaussian(gaussians, camera, n) -> tuple[np.ndarray, np.ndarray]:
     return camera.rotation @ (gaussians.means[n] - camera.center), factor
 
 
-def unscented(mean, factor, function):
-    """(mean, covariance) of function(x): Julier's scaled transform, alpha = 1, beta = 2, kappa = 0.
-
-    Of 3 dimensions: lambda = 0, so the mean itself has the weights 0 and 1 - alpha^2 + beta.
-    """
-    offsets = math.sqrt(3) * factor.T
-    values = np.array([function(point) for point in (mean, *(mean + offsets), *(mean - offsets))])
-    center = values[1:].mean(axis=0)
-    apart = values - center
-    return center, 2 * np.outer(apart[0], apart[0]) + apart[1:].T @ apart[1:] / 6
-
-
 def naive_film(mean, factor, camera, model):
     """(mean2d, C without low-pass, k, w) of one Gaussian in camera axes."""
     x, y, z = mean
@@ -62,25 +53,11 @@ def naive_film(mean, factor, camera, model):
     half = np.array([camera.width, camera.height]) / focal / 2
     low = -np.array([camera.cx, camera.cy]) / focal
     clamped = np.clip(slope, low - 0.3 * half, low + 2.3 * half)
-
-    def jacobian(slope):
-        return np.column_stack([np.diag(focal), -focal * slope]) / z
-
-    def pinhole(point):
-        return focal * point[:2] / point[2] + [camera.cx, camera.cy]
-
+    at = slope if model.projection == "exact" else clamped
+    linear = np.column_stack([np.diag(focal), -focal * at]) / z
     sigma = factor @ factor.T
-    mean2d, linear = pinhole(mean), jacobian(slope if model.projection == "exact" else clamped)
-    cov = linear @ sigma @ linear.T
-    is_clamped = not np.array_equal(slope, clamped)
-    if model.projection == "unscented" and is_usable(mean, factor) and not is_clamped:
-        mean2d, cov = unscented(mean, factor, pinhole)
-    return mean2d, cov, linear @ sigma[:, 2] / z, sigma[2, 2] / z**2
-
-
-def is_usable(mean, factor) -> bool:
-    """Whether the nearest sigma point is not nearer than a third of the mean's depth."""
-    return mean[2] - math.sqrt(3) * np.abs(factor[2]).max() >= mean[2] / 3
+    mean2d = focal * slope + [camera.cx, camera.cy]
+    return mean2d, linear @ sigma @ linear.T, linear @ sigma[:, 2] / z, sigma[2, 2] / z**2
 
 
 def naive_splat(gaussians, camera, n, model):
@@ -198,8 +175,6 @@ def test_default_model_matches_the_reference_and_a_loop(antialiased, sh_degree):
 
 MODELS = [
     ImageModel("ewa", "pixel"),
-    ImageModel("unscented"),
-    ImageModel("unscented", "pixel", antialiased=True),
     ImageModel("exact", antialiased=True),
     ImageModel("exact", "pixel", low_pass=0.0),
     ImageModel("exact", "pixel", "pixel"),
@@ -208,7 +183,7 @@ MODELS = [
     ImageModel("ewa", "center", "pixel", sh_degree=2),
     *(
         replace(UNCUT, projection=projection, **change)
-        for projection in ("ewa", "unscented", "exact")
+        for projection in ("ewa", "exact")
         for change in (
             {},
             {"alpha_max": 0.6},
@@ -331,25 +306,6 @@ def test_splat_around_the_camera_is_invisible_in_entry_order():
         for order, alpha in [("entry", 0.5 * exists), ("pixel", 0.5)]:
             model = ImageModel("exact", order, extent=extent, low_pass=0.0)
             assert rays.render(gaussians, camera, model=model).alpha[4, 4] == alpha
-
-
-def test_splats_with_their_peak_behind_the_camera_are_invisible():
-    """A needle whose line passes the camera: rays to one side meet it in front, others behind."""
-    camera, angle = straight_camera(focal=4.0), math.radians(80)
-    quat = [math.cos(angle / 2), 0, math.sin(angle / 2), 0]
-    gaussians = gaussians_at([0, 0, 0.5], [2.0, 0.05, 0.05], quats=quat)
-    mean, factor = camera_gaussian(gaussians, camera, 0)
-    precision = np.linalg.inv(factor @ factor.T)
-    middle_row = np.column_stack([(np.arange(9) - 4) / 4, np.zeros(9), np.ones(9)])
-    behind = middle_row @ precision @ mean <= 0
-    assert 1 <= behind.sum() <= 5
-    for projection, order in [("exact", "center"), ("exact", "pixel"), ("ewa", "pixel")]:
-        model = replace(UNCUT, projection=projection, order=order, low_pass=0.0)
-        alpha = rays.render(gaussians, camera, model=model).alpha[4]
-        assert not alpha[behind].any() and alpha[~behind].all(), (projection, order)
-    # EWA does not need depths when sorted by center.
-    model = replace(UNCUT, low_pass=0.0)
-    assert rays.render(gaussians, camera, model=model).alpha[4].all()
 
 
 def test_ties_are_composited_by_index():
