@@ -92,11 +92,11 @@ def test_tested_versions_pass_silently(machine, monkeypatch, version):
 
 def test_17_and_18_warn_as_untested(machine, monkeypatch):
     set_loaded_version(monkeypatch, 18, 0, 6)
-    with pytest.warns(UserWarning) as record:
-        llvm.ensure_usable_llvm()
-    assert str(record[0].message) == (
-        "drgs: libLLVM 18.0.6 is untested; 19 or newer is recommended: apt-get install libllvm19"
+    message = (
+        r"^drgs: libLLVM 18\.0\.6 is untested; 19 or newer is recommended: apt-get install lib"
     )
+    with pytest.warns(UserWarning, match=message):
+        llvm.ensure_usable_llvm()
 
 
 NONE = "found none that Dr.Jit can load"

@@ -72,12 +72,11 @@ def test_out_of_memory_is_distinguished_from_other_errors(kernel, error, is_exha
 
 def test_memory_request_beyond_available_memory_is_refused(kernel):
     memory.require_memory("a.ply", 8_000_000 * 1024, "a scene")
-    with pytest.raises(UserError) as error:
-        memory.require_memory("a.ply", 8_000_000 * 1024 + 1, "a scene")
-    assert str(error.value) == (
-        "a.ply: a scene takes about 8.19 GB of memory, of which 8.19 GB are available; "
-        f"{memory.FREE_MEMORY}"
+    message = (
+        r"^a\.ply: a scene takes about 8\.19 GB of memory, of which 8\.19 GB are available; cl"
     )
+    with pytest.raises(UserError, match=message):
+        memory.require_memory("a.ply", 8_000_000 * 1024 + 1, "a scene")
 
 
 def test_a_control_group_of_version_1_limits_it(kernel):

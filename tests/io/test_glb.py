@@ -2,7 +2,6 @@
 
 import json
 import struct
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -91,12 +90,6 @@ def test_a_file_follows_the_extensions_specification(gaussians, parts):
     assert harmonics[1:] == [
         f"{NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in (1, 2) for k in range(2 * degree + 1)
     ]
-
-
-def test_origin_is_the_translation_of_the_node(gaussians):
-    """Its y axis is our z axis."""
-    document, _ = split(replace(gaussians, origin=(4.2e6, 1.5, -4.7e6)).to_bytes("glb"))
-    assert document["nodes"][0]["translation"] == [4.2e6, -4.7e6, -1.5]
 
 
 @pytest.mark.parametrize("extras", [7, None, [{"drgs": 1}], {"theirs": {"low_pass": []}}])

@@ -57,6 +57,7 @@ def test_a_format_without_an_origin_is_noted(tmp_path, suffix):
 def test_a_small_translation_of_a_gltf_node_is_added_to_the_means(tmp_path):
     path = tmp_path / "a.glb"
     replace(blobs(), origin=(0.5, -1.5, 2.0)).save(path)
+    assert b'"translation":[0.5,2.0,1.5]' in path.read_bytes()  # its y axis is our z axis
     read = Gaussians.load(path)
     assert read.origin == WORLD
     np.testing.assert_allclose(read.means, blobs().means + np.array([0.5, -1.5, 2.0]), atol=1e-6)

@@ -49,26 +49,11 @@ ALIKE = replace(
 )
 """The same numbers, through two programs' arithmetic in float32."""
 
-READ = {
-    ".compressed.ply": (SAME, ALIKE),
-    ".splat": (SAME, replace(ALIKE, quats=PRECISION["splat"].quats)),  # divides by 255, not 256
-    ".spz": (SPZ_WORLD, ALIKE),
-}
-"""Rotation from our world to that of the converted PLY file, and precision, by suffix."""
-
 COARSE = replace(
     PRECISION["spz"],
     means=2.0**-12 / 2 + 4 * FLOAT32,  # always 12 bits behind the point
     harmonics=np.sqrt(7) * (1 / 256 + 16 / 256) + 4 * FLOAT32,  # 4 of 8 bits
 )
-
-WRITTEN = [
-    (".compressed.ply", [], SAME, PRECISION["compressed-ply"]),
-    (".spz", ["--spz-version", "3"], SPZ_WORLD.T, COARSE),
-    (".spz", ["--spz-version", "4"], SPZ_WORLD.T, COARSE),
-    (".glb", [], Z_TO_Y.T @ HALF_TURN, ALIKE),
-]
-"""Options, rotation from the world of a PLY file to ours after conversion, and precision."""
 
 
 def convert(*arguments) -> None:
@@ -78,9 +63,15 @@ def convert(*arguments) -> None:
 
 
 @splat_transform
-@pytest.mark.parametrize("suffix", READ)
-def test_our_files_are_read_by_splat_transform(tmp_path, suffix):
-    rotation, precision = READ[suffix]
+@pytest.mark.parametrize(
+    ("suffix", "rotation", "precision"),  # from our world to that of the converted PLY file
+    [
+        (".compressed.ply", SAME, ALIKE),
+        (".splat", SAME, replace(ALIKE, quats=PRECISION["splat"].quats)),  # it divides by 255
+        (".spz", SPZ_WORLD, ALIKE),
+    ],
+)
+def test_our_files_are_read_by_splat_transform(tmp_path, suffix, rotation, precision):
     path = tmp_path / f"ours{suffix}"
     gaussians_within_ranges().save(path)
     convert(path, tmp_path / "theirs.ply")
@@ -89,7 +80,15 @@ def test_our_files_are_read_by_splat_transform(tmp_path, suffix):
 
 
 @splat_transform
-@pytest.mark.parametrize(("suffix", "options", "rotation", "precision"), WRITTEN)
+@pytest.mark.parametrize(
+    ("suffix", "options", "rotation", "precision"),  # from the world of a PLY file to ours
+    [
+        (".compressed.ply", [], SAME, PRECISION["compressed-ply"]),
+        (".spz", ["--spz-version", "3"], SPZ_WORLD.T, COARSE),
+        (".spz", ["--spz-version", "4"], SPZ_WORLD.T, COARSE),
+        (".glb", [], Z_TO_Y.T @ HALF_TURN, ALIKE),
+    ],
+)
 def test_files_of_splat_transform_are_read(tmp_path, suffix, options, rotation, precision):
     if "4" in options:
         pytest.importorskip("zstandard")

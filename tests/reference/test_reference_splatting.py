@@ -58,15 +58,15 @@ def test_gradients_equal_central_differences(antialiased, sh_degree):
     assert not actual["shN"][:, (sh_degree + 1) ** 2 - 1 :].any()
 
 
-def one_splat(opacities, offset=(0.0, 0.0)) -> reference.RenderedImage:
-    """White splats of 1 px^2, stacked on the centre of the middle pixel of a 9 x 9 film."""
+def composite(opacities, depths, offset=0.0, colors=None) -> reference.RenderedImage:
+    """Splats of 1 px^2, stacked on the middle pixel of a 9 x 9 film; white by default."""
     n = len(opacities)
     return reference.composite(
-        means2d=np.tile([4.5 - offset[0], 4.5 - offset[1]], (n, 1)),
+        means2d=np.tile([4.5 - offset, 4.5], (n, 1)),
         conics=np.tile(np.eye(2), (n, 1, 1)),
         opacities=np.array(opacities),
-        colors=np.ones((n, 3)),
-        depths=np.arange(1.0, n + 1),
+        colors=np.ones((n, 3)) if colors is None else colors,
+        depths=depths,
         visible=np.ones(n, dtype=bool),
         background=np.zeros(3),
         width=9,
@@ -76,23 +76,19 @@ def one_splat(opacities, offset=(0.0, 0.0)) -> reference.RenderedImage:
 
 def test_a_hundred_ties_are_composited_by_index():
     """Enough of them that a sort which is not stable would reorder them."""
-    opacities = np.linspace(0.01, 0.06, 100)
-    depths = np.tile([2.0, 1.0], 50)
+    opacities, depths = np.linspace(0.01, 0.06, 100), np.tile([2.0, 1.0], 50)
     order = [*range(1, 100, 2), *range(0, 100, 2)]
     transmittances = np.cumprod([1.0, *(1 - opacities[order])])[:-1]
-    rendered = reference.composite(
-        np.full((100, 2), 0.5), np.tile(np.eye(2), (100, 1, 1)), opacities,
-        np.arange(100.0)[:, None] * np.ones(3), depths, np.ones(100, dtype=bool), np.zeros(3), 1, 1,
-    )  # fmt: skip
+    rendered = composite(opacities, depths, colors=np.arange(100.0)[:, None] * np.ones(3))
     expected = np.sum(transmittances * opacities[order] * order)
-    np.testing.assert_allclose(rendered.image[0, 0], expected, rtol=1e-13)
+    np.testing.assert_allclose(rendered.image[4, 4], expected, rtol=1e-13)
 
 
 def test_second_clamped_splat_stops_the_pixel_as_in_single_precision():
     one = np.float32(1)
     behind = one * (one - np.float32(0.99)) * (one - np.float32(0.99))
     assert behind < np.float32(1e-4) and 0.01 * 0.01 >= 1e-4
-    rendered = one_splat([0.999, 0.999])
+    rendered = composite([0.999, 0.999], [1.0, 2.0])
     assert rendered.transmittance[4, 4] == 1 - float(np.float32(0.99))
     assert not rendered.near_threshold[4, 4]
 
@@ -100,9 +96,9 @@ def test_second_clamped_splat_stops_the_pixel_as_in_single_precision():
 @pytest.mark.parametrize(("relative", "is_marked"), MARKED_DISTANCES)
 def test_pixels_near_a_threshold_are_marked(relative, is_marked):
     # At 1/255 the splat's centre is half a pixel away: the opacity itself is above the cut.
-    cut = one_splat([(1 + relative) / 255 * math.exp(0.125)], offset=(0.5, 0.0))
-    clamp = one_splat([0.99 * (1 + relative)])
-    stop = one_splat([0.95, 0.95, 1 - 1e-4 * (1 + relative) / 0.05**2])
+    cut = composite([(1 + relative) / 255 * math.exp(0.125)], [1.0], offset=0.5)
+    clamp = composite([0.99 * (1 + relative)], [1.0])
+    stop = composite([0.95, 0.95, 1 - 1e-4 * (1 + relative) / 0.05**2], [1.0, 2.0, 3.0])
     for rendered in (cut, clamp, stop):
         assert rendered.near_threshold[4, 4] == is_marked
     assert (stop.transmittance[4, 4] < 2e-4) == (relative > 0)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
 from drgs.reference.splatting import Camera, Gaussians
+from support.reference_lenses import gaussians_at
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -158,17 +160,8 @@ def needle(log_scales) -> tuple[Gaussians, Camera]:
     """One Gaussian on the axis at z = 1, its long axis at 45 degrees on the film, f = 1 px."""
     camera = Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 4.0, 4.0, 8, 8)
     eighth_turn = [math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]
-    return (
-        Gaussians(
-            means=[[0, 0, 1]],
-            quats=[eighth_turn],
-            log_scales=[log_scales],
-            logit_opacities=[3.0],
-            sh0=np.zeros((1, 1, 3)),
-            shN=np.zeros((1, 0, 3)),
-        ),
-        camera,
-    )
+    gaussians = gaussians_at([0, 0, 1], quats=eighth_turn)
+    return replace(gaussians, log_scales=[log_scales], logit_opacities=[3.0]), camera
 
 
 MARKED_DISTANCES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
