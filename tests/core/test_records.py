@@ -1,7 +1,6 @@
 """A folder has one writer, which knows the files that it wrote and replaces no others."""
 
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -121,22 +120,17 @@ def test_lock_creates_a_new_folder_on_demand(tmp_path):
             keep_as_well()
 
 
-def _keep(folder, pipe):
-    with sole_writer(folder):
-        pipe.send("kept")
-        pipe.recv()
-
-
 @pytest.mark.slow
-def test_a_killed_process_leaves_no_lock(tmp_path):
-    ours, theirs = multiprocessing.get_context("spawn").Pipe()
-    process = multiprocessing.get_context("spawn").Process(target=_keep, args=(tmp_path, theirs))
-    process.start()
-    assert ours.recv() == "kept"
-    with pytest.raises(UserError), sole_writer(tmp_path):
-        pass
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
+def test_a_killed_process_leaves_no_lock(tmp_path, run_python):
+    program = (
+        "import os, pathlib, signal\n"
+        "from drgs.core.folders import sole_writer\n"
+        f"with sole_writer(pathlib.Path({str(tmp_path)!r})):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    with sole_writer(tmp_path):
+        assert "another command is writing to this folder" in run_python(program).stderr
+    assert run_python(program).returncode == -signal.SIGKILL
     with sole_writer(tmp_path):
         pass
 

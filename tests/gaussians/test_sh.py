@@ -1,6 +1,7 @@
 """Spherical harmonics and their rotation, against the float64 reference and Legendre functions.
 
-Colours and their gradients are those of images: see the laws, and ``tests/splatting``.
+Colours and their gradients are those of images: see the laws, and ``tests/splatting``. Rotated
+harmonics are those of rotated models: see ``test_similarity.py``.
 """
 
 import drjit as dr
@@ -11,7 +12,7 @@ from support.helpers import both_precisions, rows, single
 from support.reference_scenes import legendre_sh_basis
 
 from drgs.gaussians import sh
-from drgs.gaussians.rotation import rotate_sh, sh_rotation_generators, sh_rotation_matrices
+from drgs.gaussians.rotation import sh_rotation_generators, sh_rotation_matrices
 from drgs.reference import splatting as reference
 
 DEGREES = [0, 1, 2, 3]
@@ -43,30 +44,6 @@ def test_nan_stays_nan(precision):
     coefficient = precision.Array3f([np.nan, 0.0, 0.0])
     color = rows(sh.sh_color([coefficient], precision.Array3f(0, 0, 1), 0))
     assert np.isnan(color[0, 0]) and np.isfinite(color[0, 1:]).all()
-
-
-# Values of a basis of at most 1.5 with 1e-16 of rounding, through a least-squares problem of a
-# condition number below 2: some 1e-15.
-ROUNDING = 1e-13
-
-ROTATIONS = Rotation.random(4, random_state=3).as_matrix()
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("rotation", ROTATIONS)
-def test_rotated_sh_equals_sh_of_inversely_rotated_directions(rotation, degree):
-    rng = np.random.default_rng(2)
-    sh0, shN = rng.normal(0, 1, (5, 1, 3)), rng.normal(0, 1, (5, (degree + 1) ** 2 - 1, 3))
-    d = rng.normal(0, 1, (200, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    before = np.concatenate([sh0, shN], axis=1)
-    after = np.concatenate([sh0, rotate_sh(shN, rotation)], axis=1)
-    # d @ R is R^T d for the rows d.
-    expected = np.einsum("dk,nkc->ndc", reference.sh_basis(d @ rotation, degree), before)
-    basis = reference.sh_basis(d, degree)
-    np.testing.assert_allclose(np.einsum("dk,nkc->ndc", basis, after), expected, atol=16 * ROUNDING)
-    if degree > 0:
-        assert np.abs(np.einsum("dk,nkc->ndc", basis, before) - expected).max() > 0.1
 
 
 @pytest.mark.parametrize("axis", range(3))

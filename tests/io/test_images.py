@@ -10,8 +10,6 @@ from PIL import Image, ImageCms, ImageSequence
 from drgs.core.errors import UserError
 from drgs.io import images
 
-NOISE = np.random.default_rng(0).uniform(size=(3, 64, 64, 3))
-
 
 def frames_of(path):
     rendered = Image.open(path)
@@ -51,10 +49,11 @@ def test_compression_leaves_a_flat_background_clean(tmp_path, background):
 
 
 def test_a_large_animation_is_written_at_a_lower_quality(tmp_path, monkeypatch):
-    images.write_animation(tmp_path / "fine.webp", list(NOISE))
+    noise = list(np.random.default_rng(0).uniform(size=(3, 64, 64, 3)))
+    images.write_animation(tmp_path / "fine.webp", noise)
     size = (tmp_path / "fine.webp").stat().st_size
     monkeypatch.setattr(images, "WEBP_BYTES", size - 1)
-    images.write_animation(tmp_path / "coarse.webp", list(NOISE))
+    images.write_animation(tmp_path / "coarse.webp", noise)
     assert (tmp_path / "coarse.webp").stat().st_size < size
 
 

@@ -340,13 +340,6 @@ def test_each_value_is_a_comment_and_is_read_back_with_its_type(tmp_path):
     assert found.to(TensorXf).numpy().rendered_with == VALUES
 
 
-@pytest.mark.parametrize("values", [None, {}])
-def test_without_values_there_are_no_comments(tmp_path, values):
-    replace(gaussians_within_ranges(2), rendered_with=values).save(tmp_path / "a.ply")
-    assert (tmp_path / "a.ply").read_bytes() == with_lines(tmp_path / "b.ply").read_bytes()
-    assert Gaussians.load(tmp_path / "a.ply").rendered_with is None
-
-
 @pytest.mark.parametrize(
     "line",
     [
