@@ -18,13 +18,6 @@ REPORTED = [
     ),
 ]
 
-UNEXPECTED = [
-    OSError("nameless"),
-    ZeroDivisionError(),
-    ImportError("x"),  # a defect of a package, or of this one
-    ImportError("x", name="drgs.nothing"),
-]
-
 
 @pytest.mark.parametrize(("error", "line"), REPORTED)
 def test_commands_report_user_errors_in_one_line(error, line, capsys):
@@ -39,7 +32,15 @@ def test_commands_report_user_errors_in_one_line(error, line, capsys):
     assert out == "" and err.startswith(line) and err.count("\n") == 1
 
 
-@pytest.mark.parametrize("error", UNEXPECTED)
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError("nameless"),
+        ZeroDivisionError(),
+        ImportError("x"),  # a defect of a package, or of this one
+        ImportError("x", name="drgs.nothing"),
+    ],
+)
 def test_commands_keep_the_traceback_of_unexpected_errors(error):
     with pytest.raises(type(error)), exit_on_user_error():
         raise error

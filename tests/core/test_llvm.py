@@ -26,10 +26,6 @@ def machine(tmp_path, monkeypatch):
     return install
 
 
-def set_loaded_version(monkeypatch, *version):
-    monkeypatch.setattr(llvm, "loaded_version", lambda: version or None)
-
-
 @pytest.mark.parametrize(
     ("path", "version"),
     [
@@ -84,14 +80,14 @@ def test_nothing_is_selected_where_the_choice_is_made(machine, monkeypatch):
 
 @pytest.mark.parametrize("version", [(19, 1, 7), (22, 1, 8)])
 def test_tested_versions_pass_silently(machine, monkeypatch, version):
-    set_loaded_version(monkeypatch, *version)
+    monkeypatch.setattr(llvm, "loaded_version", lambda: version)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         llvm.ensure_usable_llvm()
 
 
 def test_17_and_18_warn_as_untested(machine, monkeypatch):
-    set_loaded_version(monkeypatch, 18, 0, 6)
+    monkeypatch.setattr(llvm, "loaded_version", lambda: (18, 0, 6))
     message = (
         r"^drgs: libLLVM 18\.0\.6 is untested; 19 or newer is recommended: apt-get install lib"
     )
@@ -104,9 +100,9 @@ REFUSALS = [
     ((16, 0, 6), [], {}, "found 16.0.6. Install one with 'apt-get install libllvm19', or name its"),
     ((16, 0, 6), [], {"platform": "darwin"}, "Install one with 'brew install llvm', or name"),
     ((15, 0, 6), ["libLLVM.so.19.1"], {}, "; here DRJIT_LIBLLVM_PATH={}/libLLVM.so.19.1 would do."),
-    ((), [], {}, f"{NONE}. Install one"),
-    ((), ["libLLVM-14.so.1"], {}, f"{NONE}. Install one"),
-    ((), [], {"variable": "/none.so"}, f"{NONE} (DRJIT_LIBLLVM_PATH=/none.so). Install one"),
+    (None, [], {}, f"{NONE}. Install one"),
+    (None, ["libLLVM-14.so.1"], {}, f"{NONE}. Install one"),
+    (None, [], {"variable": "/none.so"}, f"{NONE} (DRJIT_LIBLLVM_PATH=/none.so). Install one"),
 ]
 
 
@@ -116,7 +112,7 @@ def test_unusable_libraries_are_refused(machine, monkeypatch, version, names, mo
     monkeypatch.setattr(sys, "platform", more.get("platform", "linux"))
     if "variable" in more:
         monkeypatch.setenv(llvm.PATH_VARIABLE, more["variable"])
-    set_loaded_version(monkeypatch, *version)
+    monkeypatch.setattr(llvm, "loaded_version", lambda: version)
     with pytest.raises(llvm.LLVMVersionError) as error:
         llvm.ensure_usable_llvm()
     assert str(error.value).startswith("drgs: libLLVM 17 or newer is needed (19 is tested), found ")

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 from support.formats import refusal
@@ -12,9 +13,7 @@ from support.formats import refusal
 from drgs.core.errors import UserError
 from drgs.core.folders import FolderRecord, digest, sole_writer
 
-
-def record(folder, command="render"):
-    return FolderRecord(folder, command)
+record = partial(FolderRecord, command="render")
 
 
 def write(folder, **files):
@@ -38,7 +37,7 @@ def test_claimed_files_may_be_rewritten_until_they_are_sealed(tmp_path):
 
 def test_links_folders_and_files_of_other_commands_are_foreign(tmp_path):
     record(tmp_path).claim("ab")
-    record(tmp_path, "fit").claim("c")
+    record(tmp_path, command="fit").claim("c")
     write(tmp_path, photograph="mine", c="of a fit")
     (tmp_path / "a").symlink_to(tmp_path / "photograph")
     (tmp_path / "b").mkdir()

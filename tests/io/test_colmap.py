@@ -25,11 +25,6 @@ def model():
     return some_model(np.random.default_rng(3))
 
 
-@pytest.fixture
-def pycolmap():
-    return pytest.importorskip("pycolmap")
-
-
 def read(folder):
     return read_points3d(read_model(folder).points_file)
 
@@ -79,7 +74,8 @@ def assert_as_colmap_reads(pycolmap, folder):
     np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
-def test_every_model_is_read_like_colmap(tmp_path, pycolmap):
+def test_every_model_is_read_like_colmap(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
     rng = np.random.default_rng(4)
     for name in PARAMETERS:
         assert int(getattr(pycolmap.CameraModelId, name)) == MODELS[name][0]
@@ -92,7 +88,8 @@ def test_every_model_is_read_like_colmap(tmp_path, pycolmap):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL_MODEL.is_dir(), reason="the shared data folder is not here")
-def test_real_model_is_read_like_colmap(tmp_path, pycolmap):
+def test_real_model_is_read_like_colmap(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
     assert_as_colmap_reads(pycolmap, REAL_MODEL)
     reconstruction = pycolmap.Reconstruction(str(REAL_MODEL))
     reconstruction.write_text(str(tmp_path))

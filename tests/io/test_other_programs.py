@@ -99,11 +99,6 @@ def test_files_of_splat_transform_are_read(tmp_path, suffix, options, rotation, 
     assert_within(precision, expected, matched(expected, Gaussians.load(path)))
 
 
-@pytest.fixture
-def gsply():
-    return pytest.importorskip("gsply")
-
-
 FLOATS = Precision(*(40 * FLOAT32,) * 4, 10 * FLOAT32, 40 * FLOAT32)
 """A few operations in float32 on numbers up to 10; gsply keeps opacities from 1e-6 on."""
 
@@ -123,7 +118,8 @@ def assert_found_alike(theirs, ours):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_our_files_are_read_by_gsply(gsply, tmp_path, degree):
+def test_our_files_are_read_by_gsply(tmp_path, degree):
+    gsply = pytest.importorskip("gsply")
     for suffix, theirs, ours in (
         (".compressed.ply", gsply.plyread, CompressedPly()),
         (".spz", gsply.read_spz, Spz()),
@@ -134,7 +130,8 @@ def test_our_files_are_read_by_gsply(gsply, tmp_path, degree):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_spz_files_of_gsply_are_read(gsply, tmp_path, version):
+def test_spz_files_of_gsply_are_read(tmp_path, version):
+    gsply = pytest.importorskip("gsply")
     if version == 4:
         pytest.importorskip("zstandard")
     gaussians_within_ranges().save(tmp_path / "ours.spz")

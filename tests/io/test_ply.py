@@ -277,10 +277,12 @@ def edited_headers(lines):
 
 @pytest.mark.parametrize("name", ["ply", "compressed-ply"])
 def test_malformed_headers_are_refused(tmp_path, name):
-    header, end, rows = gaussians_within_ranges(300, 1).to_bytes(name).partition(b"end_header\n")
+    content = gaussians_within_ranges(300, 1).to_bytes(name)
+    (tmp_path / "a.ply").write_bytes(content)
+    assert Gaussians.load(tmp_path / "a.ply").num_gaussians == 300  # whatever its suffix
+    header, end, rows = content.partition(b"end_header\n")
     lines = (header + end).splitlines()
     edits = dict(edited_headers(lines))
-    assert len(edits) > 3 * len(lines)
     if name == "compressed-ply":
         first, *_, last = (at for at, line in enumerate(lines) if line.startswith(b"element"))
         edits["reordered"] = [*lines[:first], *lines[last:-1], *lines[first:last], lines[-1]]

@@ -90,8 +90,9 @@ def with_invisible(gaussians, camera, point_logit=-1e3) -> Gaussians:
         "sh0": np.ones((7, 1, 3)),
         "shN": np.ones((7, 15, 3)),
     }
-    names = PARAMETERS
-    return Gaussians(**{n: np.concatenate([getattr(gaussians, n), strange[n]]) for n in names})
+    return Gaussians(
+        **{name: np.concatenate([getattr(gaussians, name), strange[name]]) for name in PARAMETERS}
+    )
 
 
 BACKGROUND = np.array([0.9, 0.4, 0.2])
