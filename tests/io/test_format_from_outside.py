@@ -90,11 +90,7 @@ def test_errors_of_the_format_are_reported_with_its_name(installed, tmp_path, co
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "return content.getvalue()",
-            "return 1 / 0",
-            r'format "npz" \(npz_format\): ZeroDivisionErr',
-        ),
+        ("return content.getvalue()", "return 1 / 0", r'"npz" \(npz_format\): ZeroDivisionError'),
         (
             *('suffix = ".npz"', 'suffix = "npz"'),
             r'load the extension "npz" of the package drgs-npz \(npz_format\): TypeError: Npz\.suff'

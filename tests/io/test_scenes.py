@@ -4,10 +4,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.formats import refusal
 from support.openexr import read_exr
 
 from drgs.capture.path_tracing import load_scene
-from drgs.core.errors import UserError
 from drgs.io.images import write_exr
 from drgs.io.scenes import load_scene_file, openexr_threads
 
@@ -61,11 +61,10 @@ def test_openexr_files_are_written_and_loaded_on_any_number_of_threads(sky, coun
 @pytest.mark.parametrize("sampler", ["independent", "multijitter", "stratified"])
 def test_a_sampler_without_samples_is_refused(sky, sampler):
     """``multijitter`` ended the process with SIGFPE when it was made."""
-    message = rf"^{sky}: the sampler '{sampler}' must have a sample_count of at least 1, got 0$"
-    with pytest.raises(UserError, match=message):
-        load_scene_file(sky, sampler=sampler, count="0")
-    with pytest.raises(UserError, match=r"y: the sampler 'multijitter' must have a sample_c"):
-        load_scene(sky.with_name("scene.py"))
+    refused = refusal(sky, lambda path: load_scene_file(path, sampler=sampler, count="0"))
+    assert refused == f"the sampler '{sampler}' must have a sample_count of at least 1, got 0"
+    refused = refusal(sky.with_name("scene.py"), load_scene)
+    assert refused == "the sampler 'multijitter' must have a sample_count of at least 1, got 0"
     # Parameters may be named like options of Mitsuba's parser.
     scene = load_scene_file(sky, sampler=sampler, count="4", filename="3")
     assert "max_depth = 3" in str(scene)

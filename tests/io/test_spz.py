@@ -167,6 +167,5 @@ def test_version_4_contains_the_same_gaussians(tmp_path, degree):
 def test_version_4_without_zstandard_reports_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
     (tmp_path / "a.spz").write_bytes(streams_of(gaussians_within_ranges(2), bytes))
-    assert refusal(tmp_path / "a.spz").endswith(
-        "version 4: needs zstandard, which is not installed; pip install 'drgs[spz]'"
-    )
+    message = "version 4: needs zstandard, which is not installed; pip install 'drgs[spz]'"
+    assert refusal(tmp_path / "a.spz").endswith(message)
