@@ -188,8 +188,9 @@ def test_missing_openusd_is_reported_with_what_to_install(model, monkeypatch):
 
 
 def test_options_select_the_exported_gaussians(model):
+    """Any two opposite corners span a box."""
     out = model.with_name("out.ply")
-    limits = ["--crop", -1, -1, -1, 1, 1, 2, "--min-opacity", 0.2, "--max-size", 0.3]
+    limits = ["--crop", 1, -1, 2, -1, 1, -1, "--min-opacity", 0.2, "--max-size", 0.3]
     outcome = run(model, "--out", out, *limits, "--order", "morton")
     g = Gaussians.load(model)
     inside = ((g.means >= -1) & (g.means <= [1, 1, 2])).all(axis=1)

@@ -5,18 +5,9 @@ import numpy as np
 import pytest
 from support.helpers import both_precisions
 
-from drgs.core.arrays import (
-    Rows,
-    first_numbers,
-    from_host,
-    interleave,
-    load_columns,
-    quotient,
-    scatter_rows,
-    store_columns,
-)
+from drgs.core import arrays
 
-UInt32 = dr.llvm.ad.UInt32
+UInt32, Bool = dr.llvm.ad.UInt32, dr.llvm.ad.Bool
 
 
 def numbered(precision, count, length=5) -> list:
@@ -29,23 +20,18 @@ def table(count, length=5) -> np.ndarray:
 
 
 @both_precisions
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 9, 45, 64])
-def test_columns_are_transposed_to_rows(precision, count):
-    flat = np.array(interleave(numbered(precision, count))).reshape(-1, count)
-    np.testing.assert_array_equal(flat, table(count))
-    order = UInt32(4, 0, 3, 1, 2)
-    flat = np.array(scatter_rows(numbered(precision, count), order, 5)).reshape(-1, count)
-    np.testing.assert_array_equal(flat[np.array(order)], table(count))
-
-
-@both_precisions
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 9, 16, 45])
-def test_stored_rows_are_loaded_unchanged(precision, count):
-    rows = Rows.empty(precision.Float, count, 5)
-    rows.store(numbered(precision, count), dr.arange(UInt32, 5))
-    lanes, active = UInt32(4, 4, 0, 2), dr.llvm.ad.Bool(True, False, True, True)
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 7, 9, 12, 16, 45])
+def test_rows_are_stored_and_loaded_for_active_lanes_only(precision, count):
+    rows = arrays.Rows.empty(precision.Float, count, 6)
+    rows.store([precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
+    lanes, active = UInt32(5, 0, 2, 3, 1), Bool(True, True, True, False, True)
+    rows.store(numbered(precision, count), lanes, active)
+    expected = np.full((6, count), -1.0)
+    expected[[5, 0, 2, 1]] = table(count)[[0, 1, 2, 4]]
+    lanes, active = UInt32(4, 4, 0, 2, 1, 3, 5), Bool(True, False, *[True] * 5)
     loaded = np.stack([np.array(v) for v in rows.load(lanes, active)], axis=1)
-    np.testing.assert_array_equal(loaded, table(count)[[4, 4, 0, 2]] * [[1], [0], [1], [1]])
+    expected = expected[np.array(lanes)] * np.array(active)[:, None]
+    np.testing.assert_array_equal(loaded, expected)
 
 
 # Arrays of one to five rows of 9, 11 and 45 numbers end anywhere in a packet.
@@ -57,33 +43,12 @@ def test_contiguous_rows_are_loaded_and_stored(precision, width, num_rows):
     flat = precision.array(table(width, num_rows).ravel())
     lanes = UInt32(np.arange(num_rows)[::-1].copy())
     for count in {1, width // 2 + 1, width}:
-        loaded = load_columns(flat, lanes, dr.opaque(UInt32, num_rows), width, count)
+        loaded = arrays.load_columns(flat, lanes, dr.opaque(UInt32, num_rows), width, count)
         loaded = np.stack([np.array(v) for v in loaded], axis=1)
         np.testing.assert_array_equal(loaded, table(width, num_rows)[::-1, :count])
-    stored = store_columns(numbered(precision, width, num_rows))
+    stored = arrays.store_columns(numbered(precision, width, num_rows))
     dr.eval(stored)
-    np.testing.assert_array_equal(first_numbers(stored, num_rows * width), np.array(flat))
-
-
-@both_precisions
-@pytest.mark.parametrize("count", [1, 4, 6, 9, 12])
-def test_rows_are_stored_for_active_lanes_only(precision, count):
-    rows = Rows.empty(precision.Float, count, 6)
-    rows.store([precision.array(np.full(6, -1.0))] * count, dr.arange(UInt32, 6))
-    lanes, active = UInt32(5, 0, 2, 3, 1), dr.llvm.ad.Bool(True, True, True, False, True)
-    rows.store(numbered(precision, count), lanes, active)
-    stored = np.stack([np.array(v) for v in rows.load(dr.arange(UInt32, 6))], axis=1)
-    np.testing.assert_array_equal(stored[[5, 0, 2, 1]], table(count)[[0, 1, 2, 4]])
-    assert (stored[[3, 4]] == -1).all()
-
-
-@both_precisions
-def test_host_arrays_are_copied(precision):
-    values = np.arange(6.0).reshape(2, 3)
-    copy = from_host(precision.Float, values)
-    values[:] = -1
-    np.testing.assert_array_equal(np.array(copy), np.arange(6.0))
-    assert type(from_host(UInt32, [3, 1])) is UInt32 and dr.width(from_host(UInt32, [])) == 0
+    np.testing.assert_array_equal(arrays.first_numbers(stored, num_rows * width), np.array(flat))
 
 
 def test_alignment_of_numpy_arrays_does_not_affect_kernels():
@@ -92,7 +57,7 @@ def test_alignment_of_numpy_arrays_does_not_affect_kernels():
         values = np.arange(64, dtype=np.float32)[offset : offset + 40]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            dr.eval(from_host(dr.llvm.ad.Float, values) * 1.25 + 0.5)
+            dr.eval(arrays.from_host(dr.llvm.ad.Float, values) * 1.25 + 0.5)
             hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
     assert len(hashes) == 1
 
@@ -103,4 +68,6 @@ def test_quotients_are_exact_around_multiples(divisor):
     multiples = np.unique(np.linspace(0, last // divisor, 1000).astype(np.uint64)) * divisor
     index = np.concatenate([multiples, multiples[1:] - 1, multiples + (divisor - 1), [last]])
     index = index[index <= last].astype(np.uint32)
-    np.testing.assert_array_equal(np.array(quotient(UInt32(index), divisor)), index // divisor)
+    np.testing.assert_array_equal(
+        np.array(arrays.quotient(UInt32(index), divisor)), index // divisor
+    )

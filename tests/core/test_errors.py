@@ -3,16 +3,8 @@ import sys
 import pytest
 
 from drgs.cli.ending import exit_on_user_error
-from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.errors import UserError
 from drgs.core.llvm import LLVMVersionError
-
-
-def test_did_you_mean_names_the_nearest_candidate():
-    assert did_you_mean("evry", ["start", "every"]) == "; did you mean every?"
-    found = did_you_mean("every", ["model.near", "densify.every"])  # in another section
-    assert found == "; did you mean densify.every?"
-    assert did_you_mean("xyzzy", ["start", "every"]) == ""
-
 
 REPORTED = [
     (UserError("a.yml: wrong"), "error: a.yml: wrong\n"),
@@ -24,13 +16,6 @@ REPORTED = [
         ModuleNotFoundError("No module named 'numpy'", name="numpy"),
         f"error: No module named 'numpy', by {sys.executable}; install drgs there with all",
     ),
-]
-
-UNEXPECTED = [
-    OSError("nameless"),
-    ZeroDivisionError(),
-    ImportError("x"),  # a defect of a package, or of this one
-    ImportError("x", name="drgs.nothing"),
 ]
 
 
@@ -47,7 +32,15 @@ def test_commands_report_user_errors_in_one_line(error, line, capsys):
     assert out == "" and err.startswith(line) and err.count("\n") == 1
 
 
-@pytest.mark.parametrize("error", UNEXPECTED)
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError("nameless"),
+        ZeroDivisionError(),
+        ImportError("x"),  # a defect of a package, or of this one
+        ImportError("x", name="drgs.nothing"),
+    ],
+)
 def test_commands_keep_the_traceback_of_unexpected_errors(error):
     with pytest.raises(type(error)), exit_on_user_error():
         raise error
@@ -66,8 +59,3 @@ def test_closed_output_pipe_ends_a_command_quietly(run_python):
     )
     result = run_python(program)
     assert (result.returncode, result.stderr) == (141, "")
-
-
-def test_foreign_messages_are_put_on_one_line():
-    assert one_line("a\n  b\tc") == "a b c"
-    assert one_line("x" * 10, limit=9) == "xxxxxx..."

@@ -1,6 +1,7 @@
 import errno
 import os
 import re
+from unittest.mock import Mock
 
 import pytest
 
@@ -39,10 +40,7 @@ def test_atomic_path_replaces_the_file_and_creates_folders(tmp_path):
 def test_file_system_errors_are_user_errors(tmp_path, monkeypatch, stage, number, message):
     path = tmp_path / "a.txt"
     path.write_text("old")
-
-    def refuse(*arguments, **options):
-        raise OSError(number, os.strerror(number))
-
+    refuse = Mock(side_effect=OSError(number, os.strerror(number)))
     if stage == "replace":
         monkeypatch.setattr(os, "replace", refuse)
     with pytest.raises(UserError) as error, atomic_path(path) as temporary:

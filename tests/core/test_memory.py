@@ -1,11 +1,10 @@
 """Available memory, from the kernel's files; requests that exceed it are refused."""
 
 import errno
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import drjit as dr
+import psutil
 import pytest
 
 from drgs.core import memory
@@ -20,14 +19,21 @@ def write(folder, **files):
         (folder / name.replace("__", ".")).write_text(text)
 
 
+def limit_process(monkeypatch, limit):
+    """Give this process, of one GB, a limit of its size."""
+    size = SimpleNamespace(vms=GB)
+    process = SimpleNamespace(rlimit=lambda _: (limit, limit), memory_info=lambda: size)
+    monkeypatch.setattr(memory.psutil, "Process", lambda: process)
+
+
 @pytest.fixture
 def kernel(tmp_path, monkeypatch):
-    """A folder with the kernel's files: of a machine with 8 GB to give, and no control group."""
+    """A folder with the kernel's files: of a machine with 8 GB to give, and no other limit."""
     monkeypatch.setattr(memory, "_PROC", tmp_path / "proc")
     monkeypatch.setattr(memory, "_CGROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(memory, "_process_limit", lambda: memory._UNLIMITED_BYTES)
     machine = SimpleNamespace(available=8_000_000 * 1024)
     monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: machine)
+    limit_process(monkeypatch, psutil.RLIM_INFINITY)
     write(tmp_path / "proc" / "self", cgroup="")
     return tmp_path
 
@@ -66,37 +72,28 @@ def test_out_of_memory_is_distinguished_from_other_errors(kernel, error, is_exha
 
 def test_memory_request_beyond_available_memory_is_refused(kernel):
     memory.require_memory("a.ply", 8_000_000 * 1024, "a scene")
-    with pytest.raises(UserError) as error:
-        memory.require_memory("a.ply", 8_000_000 * 1024 + 1, "a scene")
-    assert str(error.value) == (
-        "a.ply: a scene takes about 8.19 GB of memory, of which 8.19 GB are available; "
-        f"{memory.FREE_MEMORY}"
+    message = (
+        r"^a\.ply: a scene takes about 8\.19 GB of memory, of which 8\.19 GB are available; cl"
     )
+    with pytest.raises(UserError, match=message):
+        memory.require_memory("a.ply", 8_000_000 * 1024 + 1, "a scene")
 
 
 def test_a_control_group_of_version_1_limits_it(kernel):
-    lines = ["9:name=systemd:/", "5:cpu,memory:/jobs/7"]
-    write(kernel / "proc" / "self", cgroup="\n".join(lines))
-    names = ("memory__limit_in_bytes", "memory__usage_in_bytes", "memory__stat")
-    unlimited = dict(zip(names, ("9223372036854771712\n", f"{GB}\n", ""), strict=True))
-    write(kernel / "cgroup" / "memory", **unlimited)
+    write(kernel / "proc" / "self", cgroup="9:name=systemd:/\n5:cpu,memory:/jobs/7")
+    root, group = kernel / "cgroup" / "memory", kernel / "cgroup" / "memory" / "jobs" / "7"
+    used = {"memory__usage_in_bytes": f"{GB}\n"}
+    write(root, memory__limit_in_bytes="9223372036854771712\n", memory__stat="", **used)
     assert memory.available_memory() == 8_000_000 * 1024
-    limited = (f"{2 * GB}\n", f"{GB}\n", f"inactive_file 3\ntotal_inactive_file {GB // 4}\n")
-    write(kernel / "cgroup" / "memory" / "jobs" / "7", **dict(zip(names, limited, strict=True)))
+    stat = f"inactive_file 3\ntotal_inactive_file {GB // 4}\n"
+    write(group, memory__limit_in_bytes=f"{2 * GB}\n", memory__stat=stat, **used)
     assert memory.available_memory() == 1.25 * GB
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the size of a process is read from /proc")
-def test_process_memory_limit_counts():
-    code = (
-        "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**9,) * 2);"
-        "from drgs.core.memory import available_memory; print(available_memory())"
-    )
-    code = "import sys, types; sys.modules['drgs'] = m = types.ModuleType('drgs');" + (
-        f"m.__path__ = [{str(memory.__file__.rpartition('core')[0])!r}];" + code
-    )  # without what the package loads
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 2.5e9 < int(done.stdout) < 3e9
+@pytest.mark.skipif(not hasattr(psutil, "RLIMIT_AS"), reason="psutil knows it on Linux only")
+def test_process_memory_limit_counts(kernel, monkeypatch):
+    limit_process(monkeypatch, 3 * GB)
+    assert memory.available_memory() == 2 * GB
 
 
 def test_byte_counts_are_written_with_three_digits():
@@ -105,24 +102,16 @@ def test_byte_counts_are_written_with_three_digits():
     assert texts == ["24.1 GB", "1 GB", "5,000 GB", "123 kB"]
 
 
-def test_images_that_do_not_fit_are_refused_with_numbers(monkeypatch):
+def test_images_are_limited_by_memory_and_by_drjits_arrays(monkeypatch):
+    """``test_image_limits.py`` checks the messages."""
     monkeypatch.setattr(memory, "available_memory", lambda: 8 * GB)
     assert memory.too_large_reason(4000, 5000) is None
-    needed = 20_000**2 * memory.IMAGE_BYTES / GB
-    assert memory.too_large_reason(20_000, 20_000) == (
-        f"20000 x 20000 px need about {needed:g} GB of memory, of which 8 GB are available; at "
-        f"most {8 * GB // memory.IMAGE_BYTES:,} pixels fit"
-    )
+    assert "need about" in memory.too_large_reason(20_000, 20_000)
     assert "with 1,000 samples each need about" in memory.too_large_reason(400, 400, samples=1000)
-    # In the largest memory, Dr.Jit's arrays are the limit.
     monkeypatch.setattr(memory, "available_memory", lambda: 10**15)
     assert memory.too_large_reason(2**15, 2**15 - 1) is None
-    assert memory.too_large_reason(10**9, 100) == (
-        "1000000000 x 100 px are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
-        "1,073,741,823 pixels fit"
-    )
-    assert "too many for Dr.Jit" in memory.too_large_reason(400, 400, samples=10**9)
-    assert "too many for Dr.Jit" in memory.too_large_reason(2000, 2000, channels=2000)
+    for size in ((2**15, 2**15), (400, 400, 3, 10**9), (2000, 2000, 2000)):
+        assert "too many for Dr.Jit" in memory.too_large_reason(*size)
 
 
 def test_drjit_malloc_cache_counts_as_available(monkeypatch):

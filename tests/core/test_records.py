@@ -1,20 +1,19 @@
 """A folder has one writer, which knows the files that it wrote and replaces no others."""
 
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import pytest
+from support.formats import refusal
 
 from drgs.core.errors import UserError
 from drgs.core.folders import FolderRecord, digest, sole_writer
 
-
-def record(folder, command="render"):
-    return FolderRecord(folder, command)
+record = partial(FolderRecord, command="render")
 
 
 def write(folder, **files):
@@ -22,51 +21,27 @@ def write(folder, **files):
         (folder / name).write_text(text)
 
 
-def refusal(function, *arguments, **options):
-    with pytest.raises(UserError) as error:
-        function(*arguments, **options)
-    (line,) = str(error.value).splitlines()
-    return line
-
-
-def test_existing_file_is_foreign(tmp_path):
-    write(tmp_path, a="mine", b="mine")
-    message = refusal(record(tmp_path).claim, ["a", "b", "c"])
-    assert message.startswith(f"{tmp_path}: holds a, b, which this command would replace")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
-
-
-def test_claimed_file_may_be_rewritten_until_sealed(tmp_path):
+def test_claimed_files_may_be_rewritten_until_they_are_sealed(tmp_path):
     """Also by another process, when the first was killed."""
-    record(tmp_path).claim(["a"])
+    record(tmp_path).claim("ab")
     write(tmp_path, a="half")
-    record(tmp_path).claim(["a", "b"])
-    write(tmp_path, a="whole", b="whole")
-    record(tmp_path).seal()
-    record(tmp_path).claim(["a", "b"])
-
-
-def test_file_changed_after_sealing_is_foreign(tmp_path):
     record(tmp_path).claim("abc")
     write(tmp_path, a="ours", b="ours")
     record(tmp_path).seal()
+    assert not record(tmp_path).foreign_files("abc")
     write(tmp_path, b="theirs", c="theirs")  # c did not exist when the record was sealed
-    assert "holds b, c, which this command would replace" in refusal(record(tmp_path).claim, "abc")
-    assert not record(tmp_path).foreign_files(["a", "d"])
+    refused = refusal(tmp_path, lambda folder: record(folder).claim("abc"))
+    assert refused.startswith("holds b, c, which this command would replace")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".drgs-render.json", *"abc"]
 
 
-def test_symlink_or_folder_in_place_of_a_file_is_foreign(tmp_path):
-    record(tmp_path).claim(["a", "b"])
-    write(tmp_path, photograph="mine")
+def test_links_folders_and_files_of_other_commands_are_foreign(tmp_path):
+    record(tmp_path).claim("ab")
+    record(tmp_path, command="fit").claim("c")
+    write(tmp_path, photograph="mine", c="of a fit")
     (tmp_path / "a").symlink_to(tmp_path / "photograph")
     (tmp_path / "b").mkdir()
-    assert record(tmp_path).foreign_files(["a", "b"]) == ["a", "b"]
-
-
-def test_files_of_another_command_are_foreign(tmp_path):
-    record(tmp_path, "fit").claim(["a"])
-    write(tmp_path, a="of a fit")
-    assert record(tmp_path).foreign_files(["a"]) == ["a"]
+    assert record(tmp_path).foreign_files("abcd") == ["a", "b", "c"]
 
 
 def test_files_of_a_version_without_records_are_claimed_once(tmp_path):
@@ -74,7 +49,8 @@ def test_files_of_a_version_without_records_are_claimed_once(tmp_path):
     record(tmp_path).claim(["a"], earlier={"a", "b"})
     record(tmp_path).claim(["b"])
     write(tmp_path, c="theirs")
-    assert "holds c, which" in refusal(record(tmp_path).claim, ["c"], earlier={"c"})
+    refused = refusal(tmp_path, lambda folder: record(folder).claim("c", earlier="c"))
+    assert refused.startswith("holds c, which")
 
 
 def test_non_utf8_names_and_paths_are_recorded(tmp_path):
@@ -92,7 +68,7 @@ def test_non_utf8_names_and_paths_are_recorded(tmp_path):
 )
 def test_a_damaged_record_is_refused_by_name(tmp_path, text):
     record(tmp_path).path.write_text(text)
-    assert "must be the record of the files that were written here" in refusal(record, tmp_path)
+    assert "must be the record of the files that were written here" in refusal(tmp_path, record)
 
 
 def test_removed_record_leaves_no_file(tmp_path):
@@ -143,22 +119,17 @@ def test_lock_creates_a_new_folder_on_demand(tmp_path):
             keep_as_well()
 
 
-def _keep(folder, pipe):
-    with sole_writer(folder):
-        pipe.send("kept")
-        pipe.recv()
-
-
 @pytest.mark.slow
-def test_a_killed_process_leaves_no_lock(tmp_path):
-    ours, theirs = multiprocessing.get_context("spawn").Pipe()
-    process = multiprocessing.get_context("spawn").Process(target=_keep, args=(tmp_path, theirs))
-    process.start()
-    assert ours.recv() == "kept"
-    with pytest.raises(UserError), sole_writer(tmp_path):
-        pass
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
+def test_a_killed_process_leaves_no_lock(tmp_path, run_python):
+    program = (
+        "import os, pathlib, signal\n"
+        "from drgs.core.folders import sole_writer\n"
+        f"with sole_writer(pathlib.Path({str(tmp_path)!r})):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    with sole_writer(tmp_path):
+        assert "another command is writing to this folder" in run_python(program).stderr
+    assert run_python(program).returncode == -signal.SIGKILL
     with sole_writer(tmp_path):
         pass
 

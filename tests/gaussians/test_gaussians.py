@@ -6,7 +6,7 @@ from support.formats import gaussians_within_ranges
 from support.helpers import both_precisions
 
 import drgs
-from drgs.export import find_kept, take
+from drgs.export import take
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
 COUNT = 7
@@ -64,21 +64,6 @@ def test_activated_values_survive_from_numpy(degree):
 def test_invalid_gaussians_are_refused(changes, message):
     with pytest.raises(ValueError, match=rf"Gaussians.from_numpy\(\): {message}"):
         drgs.Gaussians.from_numpy(**{**arrays(), **changes})
-
-
-def test_selection_keeps_gaussians_within_its_limits():
-    g = gaussians_within_ranges(400)
-    x, y, z = g.means.T
-    expected = {
-        "box": (abs(x) <= 1) & (abs(y) <= 1) & (z >= 0) & (z <= 2),
-        "opacity": 1 / (1 + np.exp(-g.logit_opacities)) >= 0.3,
-        "size": np.exp(g.log_scales.max(axis=1)) <= 0.1,
-    }
-    found = find_kept(g, box=(1, -1, 2, -1, 1, 0), min_opacity=0.3, max_scale=0.1)
-    assert found.keys() == expected.keys() and find_kept(g) == {}
-    for name, kept in found.items():
-        np.testing.assert_array_equal(kept, expected[name])
-        assert 0 < kept.sum() < 400
 
 
 def test_rows_are_taken_from_every_parameter():

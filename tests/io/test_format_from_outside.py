@@ -1,15 +1,15 @@
 """A file format in one file outside of drgs works wherever a shipped one does."""
 
-import os
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import assert_ends_well
 from support.small_capture import blobs
 
+from drgs import export, render
 from drgs.core import registry
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -38,34 +38,25 @@ def installed(monkeypatch, tmp_path):
     sys.modules.pop("npz_format", None)
 
 
-def drgs(folder, *arguments):
-    """The output of a command, as a user runs it."""
-    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
-    command = [sys.executable, "-m", "drgs", *map(str, arguments)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    return done.returncode, done.stdout + done.stderr
-
-
 def test_gaussians_are_saved_and_loaded(installed, tmp_path):
     given = replace(blobs(), origin=(4e6, 0.0, 1e6), rendered_with={"low_pass": 0.1})
     given.save(tmp_path / "a.npz")
     read = Gaussians.load(tmp_path / "a.npz")
     assert (read.origin, read.rendered_with) == (given.origin, given.rendered_with)
-    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
+    for name in PARAMETER_NAMES:
         np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
 
 
 @pytest.mark.slow
 def test_commands_export_and_render_it(installed, tmp_path):
     blobs().save(tmp_path / "a.ply")
-    _, text = drgs(installed, "export", "--help")
-    assert "npz: NumPy's archive of arrays" in " ".join(text.split())
-    status, text = drgs(installed, "export", tmp_path / "a.ply", "--format", "npz")
-    assert (status, f"written: {tmp_path / 'a.npz'} (" in text) == (0, True), text
+    shown = assert_ends_well(export.main, "--help").stdout
+    assert "npz: NumPy's archive of arrays" in " ".join(shown.split())
+    shown = assert_ends_well(export.main, tmp_path / "a.ply", "--format", "npz").stdout
+    assert f"written: {tmp_path / 'a.npz'} (" in shown
     assert np.array_equal(np.load(tmp_path / "a.npz")["means"], blobs().means)
     options = ["--orbit", 2, "--size", 16, 16, "--out", tmp_path / "out"]
-    status, text = drgs(installed, "render", tmp_path / "a.npz", *options)
-    assert status == 0, text
+    assert_ends_well(render.main, tmp_path / "a.npz", *options)
     assert list((tmp_path / "out").glob("**/*.png"))
 
 
@@ -96,28 +87,28 @@ def test_errors_of_the_format_are_reported_with_its_name(installed, tmp_path, co
         Gaussians.load(tmp_path / "a.npz")
 
 
-def test_error_while_writing_is_reported_with_the_name(installed):
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("return content.getvalue()", "return 1 / 0", r'"npz" \(npz_format\): ZeroDivisionError'),
+        (
+            *('suffix = ".npz"', 'suffix = "npz"'),
+            r'load the extension "npz" of the package drgs-npz \(npz_format\): TypeError: Npz\.suff'
+            "ix must be a suffix in small",
+        ),
+        ("import io", "import no_such_module", 'load the extension "npz" .*no_such_module'),
+    ],
+)
+def test_errors_of_the_package_are_reported_with_its_name(installed, tmp_path, old, new, message):
+    """Shipped formats go on."""
     module = installed / "npz_format.py"
-    module.write_text(module.read_text().replace("return content.getvalue()", "return 1 / 0"))
-    message = r'file format "npz" \(npz_format\): ZeroDivisionError: division by zero'
+    text = module.read_text()
+    assert old in text
+    module.write_text(text.replace(old, new))
     with pytest.raises(UserError, match=message):
-        blobs().to_bytes("npz")
-
-
-def test_a_format_without_a_suffix_is_refused_with_its_package(installed):
-    module = installed / "npz_format.py"
-    module.write_text(module.read_text().replace('suffix = ".npz"', 'suffix = "npz"'))
-    reason = r"package drgs-npz \(npz_format\): TypeError: Npz\.suffix must be a suffix in small"
-    with pytest.raises(UserError, match=f'cannot load the extension "npz" of the {reason}'):
-        formats.format_for("a.npz")
-
-
-def test_broken_package_does_not_affect_shipped_formats(installed, tmp_path):
-    (installed / "npz_format.py").write_text("import no_such_module")
+        blobs().save(tmp_path / "a.npz")
     blobs().save(tmp_path / "a.ply")
     assert Gaussians.load(tmp_path / "a.ply").num_gaussians == 30
-    with pytest.raises(UserError, match='cannot load the extension "npz"'):
-        blobs().save(tmp_path / "a.npz")
 
 
 def test_the_documented_example_is_the_file():

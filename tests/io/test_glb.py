@@ -2,16 +2,13 @@
 
 import json
 import struct
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.datasets import set_value
-from support.formats import gaussians_within_ranges
+from support.formats import distance_of_ellipsoids, gaussians_within_ranges, refusal
 
-from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.glb import Glb
 
 NAME = "KHR_gaussian_splatting"
 WHERE = "meshes[0].primitives[0]"
@@ -55,12 +52,9 @@ def parts(gaussians):
     return split(gaussians.to_bytes("glb"))
 
 
-def refusal(path, document, binary):
+def refused(path, document, binary):
     path.write_bytes(joined(document, binary))
-    with pytest.raises(UserError) as error:
-        Glb().read(path)
-    assert "\n" not in str(error.value)
-    return str(error.value).removeprefix(f"{path}: ")
+    return refusal(path)
 
 
 def test_a_file_follows_the_extensions_specification(gaussians, parts):
@@ -72,32 +66,30 @@ def test_a_file_follows_the_extensions_specification(gaussians, parts):
     assert primitive["extensions"] == {
         NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     }
-    _, position = numbers(document, binary, "POSITION")
     x, y, z = gaussians.means.T
-    np.testing.assert_array_equal(position, np.column_stack([x, z, -y]))  # z up -> y up
+    expected = {
+        "POSITION": (np.column_stack([x, z, -y]), 0),  # z up -> y up
+        f"{NAME}:SCALE": (gaussians.scales, 1e-6),
+        f"{NAME}:OPACITY": (gaussians.opacities[:, None], 1e-6),
+        f"{NAME}:SH_DEGREE_0_COEF_0": (gaussians.sh0[:, 0], 0),
+    }
+    for name, (values, tolerance) in expected.items():
+        _, found = numbers(document, binary, name)
+        np.testing.assert_allclose(found, values, rtol=tolerance, err_msg=name)
     accessor = document["accessors"][primitive["attributes"]["POSITION"]]
-    assert np.float32(accessor["min"]).tolist() == position.min(axis=0).tolist()
-    assert np.float32(accessor["max"]).tolist() == position.max(axis=0).tolist()
-    _, scales = numbers(document, binary, f"{NAME}:SCALE")
-    np.testing.assert_allclose(scales, gaussians.scales, rtol=1e-6)
-    _, opacities = numbers(document, binary, f"{NAME}:OPACITY")
-    np.testing.assert_allclose(opacities[:, 0], gaussians.opacities, rtol=1e-6)
+    position = expected["POSITION"][0]
+    assert np.float32([accessor["min"], accessor["max"]]).tolist() == [
+        position.min(axis=0).tolist(),
+        position.max(axis=0).tolist(),
+    ]
     _, rotations = numbers(document, binary, f"{NAME}:ROTATION")
     np.testing.assert_allclose(np.linalg.norm(rotations, axis=1), 1, rtol=1e-6)
-    _, base = numbers(document, binary, f"{NAME}:SH_DEGREE_0_COEF_0")
-    np.testing.assert_array_equal(base, gaussians.sh0[:, 0])
-    fallback = numbers(document, binary, "COLOR_0")[1] / 255
-    np.testing.assert_allclose(fallback[:, :3], 0.5 + 0.28209479 * base, atol=0.5 / 255 + 1e-6)
+    fallback, colors = numbers(document, binary, "COLOR_0")[1], 0.5 + 0.28209479 * gaussians.sh0
+    np.testing.assert_allclose(fallback[:, :3] / 255, colors[:, 0], atol=0.5 / 255 + 1e-6)
     harmonics = [n for n in primitive["attributes"] if ":SH_DEGREE_" in n]
     assert harmonics[1:] == [
         f"{NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in (1, 2) for k in range(2 * degree + 1)
     ]
-
-
-def test_origin_is_the_translation_of_the_node(gaussians):
-    """Its y axis is our z axis."""
-    document, _ = split(replace(gaussians, origin=(4.2e6, 1.5, -4.7e6)).to_bytes("glb"))
-    assert document["nodes"][0]["translation"] == [4.2e6, -4.7e6, -1.5]
 
 
 @pytest.mark.parametrize("extras", [7, None, [{"drgs": 1}], {"theirs": {"low_pass": []}}])
@@ -105,7 +97,7 @@ def test_foreign_extras_are_ignored(tmp_path, parts, extras):
     document, binary = parts
     document["meshes"][0]["primitives"][0]["extras"] = extras
     (tmp_path / "a.glb").write_bytes(joined(document, binary))
-    assert Glb().read(tmp_path / "a.glb")[1] == {}
+    assert Gaussians.load(tmp_path / "a.glb").rendered_with is None
 
 
 @pytest.mark.parametrize(
@@ -123,10 +115,8 @@ def test_foreign_extras_are_ignored(tmp_path, parts, extras):
 def test_damaged_drgs_extras_are_refused(tmp_path, parts, extras):
     document, binary = parts
     document["meshes"][0]["primitives"][0]["extras"] = {"drgs": extras}
-    refused = refusal(tmp_path / "a.glb", document, binary)
-    expected = "must be an object of names and values of one word, got "
-    assert refused.startswith(f"{WHERE}.extras.drgs: {expected}")
-    assert len(refused) < 300
+    expected = f"{WHERE}.extras.drgs: must be an object of names and values of one word, got "
+    assert refused(tmp_path / "a.glb", document, binary).startswith(expected)
 
 
 def test_interleaved_and_quantised_numbers_are_read(tmp_path, gaussians, parts):
@@ -146,9 +136,7 @@ def test_interleaved_and_quantised_numbers_are_read(tmp_path, gaussians, parts):
     (tmp_path / "a.glb").write_bytes(joined(document, binary + rows.tobytes()))
     found = Gaussians.load(tmp_path / "a.glb")
     np.testing.assert_allclose(found.opacities, gaussians.opacities, atol=0.5 / 255 + 1e-6)
-    (tmp_path / "b.glb").write_bytes(gaussians.to_bytes("glb"))
-    quats = Gaussians.load(tmp_path / "b.glb").quats
-    np.testing.assert_allclose(found.quats, quats, atol=0.5 / 32767 * 2 + 1e-6)
+    assert distance_of_ellipsoids(found.quats, gaussians.quats).max() <= 0.5 / 32767 * 2 + 1e-6
 
 
 EXTENSION = f"{PRIMITIVE} extensions {NAME}"
@@ -186,7 +174,7 @@ SCALED = {"children": [0], "scale": [2, 2, 2]}
 def test_invalid_document_is_refused(tmp_path, parts, path, value, message):
     document, binary = parts
     set_value(document, path, value)
-    assert refusal(tmp_path / "a.glb", document, binary).startswith(message)
+    assert refused(tmp_path / "a.glb", document, binary).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -202,16 +190,5 @@ def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute,
     start, there = numbers(document, binary, f"{NAME}:{attribute}")
     at = start + 5 * 4 * there.shape[1]
     changed = binary[:at] + struct.pack("<f", value) + binary[at + 4 :]
-    text = refusal(tmp_path / "a.glb", document, changed)
+    text = refused(tmp_path / "a.glb", document, changed)
     assert text.startswith("byte ") and f", row 5: {NAME}:{attribute} {message}" in text
-
-
-def test_zero_scales_and_opacities_are_clamped_before_the_logarithm(tmp_path):
-    gaussians = gaussians_within_ranges(3, degree=0)
-    gaussians.log_scales[1] = -300
-    gaussians.logit_opacities[:] = [-300, 0, 300]
-    gaussians.save(tmp_path / "a.glb")
-    found = Gaussians.load(tmp_path / "a.glb")
-    tiny = np.finfo(np.float32).tiny
-    assert (found.scales[1] <= 2 * tiny).all() and np.isfinite(found.log_scales).all()
-    assert found.opacities[0] <= 8 * tiny and 1 - 2.0**-22 < found.opacities[2] < 1

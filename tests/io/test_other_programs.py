@@ -15,6 +15,8 @@ import pytest
 from support.formats import (
     FLOAT32,
     PRECISION,
+    Z_TO_Y,
+    Precision,
     assert_within,
     gaussians_within_ranges,
     matched,
@@ -35,8 +37,6 @@ splat_transform = pytest.mark.skipif(
 pytestmark = pytest.mark.filterwarnings("ignore:.*left out")
 
 SAME = np.eye(3)
-Z_TO_Y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-
 SPZ_WORLD = np.diag([1, -1, -1]) @ Z_TO_Y
 """From our world to right, up, back, as SPZ has it, and on to right, down, forward, as
 splat-transform takes PLY files to be."""
@@ -49,26 +49,11 @@ ALIKE = replace(
 )
 """The same numbers, through two programs' arithmetic in float32."""
 
-READ = {
-    ".compressed.ply": (SAME, ALIKE),
-    ".splat": (SAME, replace(ALIKE, quats=PRECISION["splat"].quats)),  # divides by 255, not 256
-    ".spz": (SPZ_WORLD, ALIKE),
-}
-"""Rotation from our world to that of the converted PLY file, and precision, by suffix."""
-
 COARSE = replace(
     PRECISION["spz"],
     means=2.0**-12 / 2 + 4 * FLOAT32,  # always 12 bits behind the point
     harmonics=np.sqrt(7) * (1 / 256 + 16 / 256) + 4 * FLOAT32,  # 4 of 8 bits
 )
-
-WRITTEN = [
-    (".compressed.ply", [], SAME, PRECISION["compressed-ply"]),
-    (".spz", ["--spz-version", "3"], SPZ_WORLD.T, COARSE),
-    (".spz", ["--spz-version", "4"], SPZ_WORLD.T, COARSE),
-    (".glb", [], Z_TO_Y.T @ HALF_TURN, ALIKE),
-]
-"""Options, rotation from the world of a PLY file to ours after conversion, and precision."""
 
 
 def convert(*arguments) -> None:
@@ -78,9 +63,15 @@ def convert(*arguments) -> None:
 
 
 @splat_transform
-@pytest.mark.parametrize("suffix", READ)
-def test_our_files_are_read_by_splat_transform(tmp_path, suffix):
-    rotation, precision = READ[suffix]
+@pytest.mark.parametrize(
+    ("suffix", "rotation", "precision"),  # from our world to that of the converted PLY file
+    [
+        (".compressed.ply", SAME, ALIKE),
+        (".splat", SAME, replace(ALIKE, quats=PRECISION["splat"].quats)),  # it divides by 255
+        (".spz", SPZ_WORLD, ALIKE),
+    ],
+)
+def test_our_files_are_read_by_splat_transform(tmp_path, suffix, rotation, precision):
     path = tmp_path / f"ours{suffix}"
     gaussians_within_ranges().save(path)
     convert(path, tmp_path / "theirs.ply")
@@ -89,7 +80,15 @@ def test_our_files_are_read_by_splat_transform(tmp_path, suffix):
 
 
 @splat_transform
-@pytest.mark.parametrize(("suffix", "options", "rotation", "precision"), WRITTEN)
+@pytest.mark.parametrize(
+    ("suffix", "options", "rotation", "precision"),  # from the world of a PLY file to ours
+    [
+        (".compressed.ply", [], SAME, PRECISION["compressed-ply"]),
+        (".spz", ["--spz-version", "3"], SPZ_WORLD.T, COARSE),
+        (".spz", ["--spz-version", "4"], SPZ_WORLD.T, COARSE),
+        (".glb", [], Z_TO_Y.T @ HALF_TURN, ALIKE),
+    ],
+)
 def test_files_of_splat_transform_are_read(tmp_path, suffix, options, rotation, precision):
     if "4" in options:
         pytest.importorskip("zstandard")
@@ -100,34 +99,27 @@ def test_files_of_splat_transform_are_read(tmp_path, suffix, options, rotation, 
     assert_within(precision, expected, matched(expected, Gaussians.load(path)))
 
 
-@pytest.fixture
-def gsply():
-    return pytest.importorskip("gsply")
+FLOATS = Precision(*(40 * FLOAT32,) * 4, 10 * FLOAT32, 40 * FLOAT32)
+"""A few operations in float32 on numbers up to 10; gsply keeps opacities from 1e-6 on."""
 
 
 def assert_found_alike(theirs, ours):
     """Check that both readers agree, in the axes of the file; logits of opacities 0 and 1 are a
     choice."""
-
-    def opacities(logits):
-        return 1 / (1 + np.exp(-np.asarray(logits, np.float64).ravel()))
-
-    pairs = {
-        "means": (theirs.means, ours["means"]),
-        "quats": (theirs.quats, ours["quats"]),
-        "scales": (theirs.scales, ours["log_scales"]),
-        "opacities": (opacities(theirs.opacities), opacities(ours["logit_opacities"])),
-        "sh0": (theirs.sh0, ours["sh0"][:, 0]),
-    }
-    if ours["shN"].size:
-        pairs["shN"] = (theirs.shN, ours["shN"])
-    for name, (expected, found) in pairs.items():
-        # A few operations in float32 on numbers up to 10; gsply keeps opacities from 1e-6 on.
-        np.testing.assert_allclose(found, expected, atol=40 * FLOAT32, err_msg=name)
+    expected = Gaussians(
+        means=theirs.means,
+        quats=theirs.quats,
+        log_scales=theirs.scales,
+        logit_opacities=np.ravel(theirs.opacities),
+        sh0=theirs.sh0[:, None],
+        shN=theirs.shN if ours["shN"].size else ours["shN"],
+    )
+    assert_within(FLOATS, expected, Gaussians(**ours))
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_our_files_are_read_by_gsply(gsply, tmp_path, degree):
+def test_our_files_are_read_by_gsply(tmp_path, degree):
+    gsply = pytest.importorskip("gsply")
     for suffix, theirs, ours in (
         (".compressed.ply", gsply.plyread, CompressedPly()),
         (".spz", gsply.read_spz, Spz()),
@@ -138,7 +130,8 @@ def test_our_files_are_read_by_gsply(gsply, tmp_path, degree):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_spz_files_of_gsply_are_read(gsply, tmp_path, version):
+def test_spz_files_of_gsply_are_read(tmp_path, version):
+    gsply = pytest.importorskip("gsply")
     if version == 4:
         pytest.importorskip("zstandard")
     gaussians_within_ranges().save(tmp_path / "ours.spz")

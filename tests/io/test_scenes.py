@@ -1,12 +1,13 @@
-"""Scenes that commands are given: on one thread, and with what Mitsuba would not survive."""
+"""OpenEXR files on one thread, and scenes that Mitsuba would not survive."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.formats import refusal
+from support.openexr import read_exr
 
 from drgs.capture.path_tracing import load_scene
-from drgs.core.errors import UserError
 from drgs.io.images import write_exr
 from drgs.io.scenes import load_scene_file, openexr_threads
 
@@ -28,13 +29,9 @@ PROGRAM = """def scene():
 """
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture
 def sky(tmp_path):
+    mi.set_variant("llvm_ad_rgb")
     pixels = np.random.default_rng(0).random((4, 8, 3), np.float32)
     write_exr(tmp_path / "sky.exr", mi.Bitmap(pixels))
     (tmp_path / "scene.xml").write_text(SKY)
@@ -43,46 +40,31 @@ def sky(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_scene_with_openexr_files_is_loaded_on_any_number_of_threads(sky, count):
+def test_openexr_files_are_written_and_loaded_on_any_number_of_threads(sky, count):
     """Mitsuba alone would wait for ever on one."""
     before = dr.thread_count()
     dr.set_thread_count(count)
+    pixels = np.random.default_rng(0).normal(size=(5, 7, 4)).astype(np.float32)
     program = sky.with_name("scene.py")
     program.write_text(PROGRAM.replace('"sample_count": 0', '"sample_count": 4'))
     try:
+        write_exr(sky.parent / "new" / "a.exr", mi.Bitmap(pixels))
         for scene in (load_scene_file(sky), load_scene(program)):
             assert scene.environment() is not None and dr.thread_count() == count
         with openexr_threads():
             assert dr.thread_count() == max(count, 2)
     finally:
         dr.set_thread_count(before)
+    np.testing.assert_array_equal(np.array(read_exr(sky.parent / "new" / "a.exr")), pixels)
 
 
 @pytest.mark.parametrize("sampler", ["independent", "multijitter", "stratified"])
 def test_a_sampler_without_samples_is_refused(sky, sampler):
     """``multijitter`` ended the process with SIGFPE when it was made."""
-    message = rf"^{sky}: the sampler '{sampler}' must have a sample_count of at least 1, got 0$"
-    with pytest.raises(UserError, match=message):
-        load_scene_file(sky, sampler=sampler, count="0")
+    refused = refusal(sky, lambda path: load_scene_file(path, sampler=sampler, count="0"))
+    assert refused == f"the sampler '{sampler}' must have a sample_count of at least 1, got 0"
+    refused = refusal(sky.with_name("scene.py"), load_scene)
+    assert refused == "the sampler 'multijitter' must have a sample_count of at least 1, got 0"
     # Parameters may be named like options of Mitsuba's parser.
     scene = load_scene_file(sky, sampler=sampler, count="4", filename="3")
     assert "max_depth = 3" in str(scene)
-
-
-def test_python_scene_with_a_sampler_without_samples_is_refused(sky):
-    with pytest.raises(UserError, match=r"y: the sampler 'multijitter' must have a sample_c"):
-        load_scene(sky.with_name("scene.py"))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.xml", b"\xa9", "a.xml: not a valid scene: it holds bytes that are not UTF-8"),
-        ("\udcff.xml", b"", "Mitsuba takes names in UTF-8 only"),
-    ],
-)
-def test_files_that_are_not_utf_8_are_refused(tmp_path, name, content, message):
-    (tmp_path / name).write_bytes(b'<scene version="3.0.0"><%s/></scene>' % content)
-    with pytest.raises(UserError) as error:
-        load_scene_file(tmp_path / name)
-    assert message in str(error.value)

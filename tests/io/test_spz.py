@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from support.formats import FLOAT32, distance_of_ellipsoids, gaussians_within_ranges
+from support.formats import FLOAT32, distance_of_ellipsoids, gaussians_within_ranges, refusal
 
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
@@ -24,12 +24,6 @@ def unpacked(gaussians):
 def written(path, content):
     path.write_bytes(gzip.compress(bytes(content)))
     return path
-
-
-def refusal(path):
-    with pytest.raises(UserError) as error:
-        Spz().read(path)
-    return str(error.value).removeprefix(f"{path}: ")
 
 
 def with_largest_coordinate(size):
@@ -173,6 +167,5 @@ def test_version_4_contains_the_same_gaussians(tmp_path, degree):
 def test_version_4_without_zstandard_reports_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
     (tmp_path / "a.spz").write_bytes(streams_of(gaussians_within_ranges(2), bytes))
-    assert refusal(tmp_path / "a.spz").endswith(
-        "version 4: needs zstandard, which is not installed; pip install 'drgs[spz]'"
-    )
+    message = "version 4: needs zstandard, which is not installed; pip install 'drgs[spz]'"
+    assert refusal(tmp_path / "a.spz").endswith(message)

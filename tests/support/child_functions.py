@@ -8,19 +8,16 @@ from drgs.core.errors import UserError
 
 
 def add(a, b, report):
-    """Reports both, prints, and returns the sum."""
     report("given", a, b)
     print("libraries print", flush=True)
     return a + b
 
 
 def refuse(report):
-    """Raises what users are shown."""
     raise UserError("a.jpg: cannot be read")
 
 
 def fail(report):
-    """Has a defect."""
     raise ZeroDivisionError("by nothing")
 
 

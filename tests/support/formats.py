@@ -1,17 +1,21 @@
-"""Gaussians for the file formats, how precisely each format holds them, and damaged files."""
+"""Gaussians for the file formats, how precisely each format holds them, and refusals."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 
-from drgs.gaussians.parameters import Gaussians
+from drgs.core.errors import UserError
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.similarity import Similarity
 
 SH_C0 = 0.28209479177387814
+
+Z_TO_Y = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""From our z up to the y up of a file: right, up, back."""
 
 FLOAT32 = 2.0**-23
 """One rounding and one of the next, relative: what comes through float32 arithmetic."""
@@ -110,8 +114,7 @@ def matched(expected: Gaussians, found: Gaussians) -> Gaussians:
     """``found`` in the order of ``expected``, by the nearest mean; each is the nearest of one."""
     _, rows = cKDTree(found.means).query(expected.means)
     assert sorted(rows) == list(range(len(expected.means)))
-    names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-    return Gaussians(**{name: getattr(found, name)[rows] for name in names})
+    return Gaussians(**{name: getattr(found, name)[rows] for name in PARAMETER_NAMES})
 
 
 def distance_of_ellipsoids(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -142,23 +145,10 @@ def assert_within(precision: Precision, expected: Gaussians, found: Gaussians) -
         assert worst <= getattr(precision, name), (name, worst)
 
 
-def damaged(content: bytes, count: int, seed=0) -> Iterator[bytes]:
-    """``content`` with bytes changed, left out, put in, or its end cut off."""
-    rng = np.random.default_rng(seed)
-    for _ in range(count):
-        data = bytearray(content)
-        for _ in range(int(rng.integers(1, 4))):
-            if not data:
-                break
-            # Half of the changes are among the first bytes, where headers are.
-            at = int(rng.integers(min(len(data), 64) if rng.random() < 0.5 else len(data)))
-            kind = int(rng.integers(4))
-            if kind == 0:
-                data[at] = int(rng.integers(256))
-            elif kind == 1:
-                del data[at : at + int(rng.integers(1, 9))]
-            elif kind == 2:
-                data[at:at] = rng.bytes(int(rng.integers(1, 9)))
-            else:
-                del data[max(at, 1) :]
-        yield bytes(data)
+def refusal(path, read=Gaussians.load) -> str:
+    """Return the line that refuses a file, without the file's name."""
+    with pytest.raises(UserError) as error:
+        read(path)
+    (line,) = str(error.value).splitlines()
+    assert len(line) < 400
+    return line.removeprefix(f"{path}: ")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,16 +26,19 @@ def camera_at_origin(**changes) -> Camera:
     return replace(camera, **changes)
 
 
-def gaussians_at(means, scales=0.1, opacity=0.5, quats=(1.0, 0.0, 0.0, 0.0)) -> Gaussians:
-    """Grey Gaussians of degree 0; scales broadcast to (N, 3)."""
+def gaussians_at(
+    means, scales=0.1, opacity=0.5, quats=(1.0, 0.0, 0.0, 0.0), colors=0.5
+) -> Gaussians:
+    """Gaussians of degree 0, grey; scales and colors broadcast to (N, 3), opacity to (N,)."""
     means = np.atleast_2d(np.asarray(means, dtype=np.float64))
     n = len(means)
+    opacities = np.broadcast_to(opacity, n)
     return Gaussians(
         means=means,
         quats=np.tile(quats, (n, 1)),
         log_scales=np.log(np.broadcast_to(scales, (n, 3))),
-        logit_opacities=np.full(n, math.log(opacity / (1 - opacity))),
-        sh0=np.zeros((n, 1, 3)),
+        logit_opacities=np.log(opacities / (1 - opacities)),
+        sh0=(np.broadcast_to(colors, (n, 3)) - 0.5)[:, None] * np.sqrt(4 * np.pi),
         shN=np.zeros((n, 0, 3)),
     )
 

@@ -1,12 +1,15 @@
-"""Small scenes for the float64 reference, and numeric derivatives of what it computes."""
+"""Small scenes for the float64 reference, and comparisons of what it computes."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from drgs.reference.splatting import Camera, Gaussians
+from support.reference_lenses import gaussians_at
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -66,6 +69,32 @@ def small_scene() -> tuple[Gaussians, Camera]:
     return gaussians, camera
 
 
+def only(gaussians, kept) -> Gaussians:
+    return Gaussians(**{name: getattr(gaussians, name)[kept] for name in PARAMETERS})
+
+
+def with_invisible(gaussians, camera, point_logit=-1e3) -> Gaussians:
+    """Seven more Gaussians at the end, which no image shows.
+
+    At the camera's centre, behind it (one of them huge), nearer than the near plane, on the
+    camera's plane, transparent; and a point without extent, of the given logit.
+    """
+    points = [[0, 0, 0], [0, 0, -1], [0, 1e30, -1e30], [0, 0, 0.0099], [1e3, 0, 0]]
+    points += [[0.1, 0, 2]] * 2
+    sizes = np.array([0.0, 80, 0, -2.3, -np.inf, 0, -np.inf])
+    strange = {
+        "means": np.array(points) @ camera.rotation + camera.center,
+        "quats": np.zeros((7, 4)),
+        "log_scales": np.repeat(sizes, 3).reshape(7, 3),
+        "logit_opacities": [*[1e3] * 5, -1e3, point_logit],
+        "sh0": np.ones((7, 1, 3)),
+        "shN": np.ones((7, 15, 3)),
+    }
+    return Gaussians(
+        **{name: np.concatenate([getattr(gaussians, name), strange[name]]) for name in PARAMETERS}
+    )
+
+
 BACKGROUND = np.array([0.9, 0.4, 0.2])
 
 
@@ -109,7 +138,8 @@ def numeric_gradients(outputs, weights, parameters) -> dict[str, np.ndarray]:
     return gradients
 
 
-def legendre_sh_basis(direction, degree) -> np.ndarray:
+@lru_cache
+def legendre_sh_basis(direction: tuple, degree: int) -> np.ndarray:
     """(K,) from associated Legendre functions, with the Condon-Shortley phase, and angles."""
     x, y, z = direction
     azimuth, sine = math.atan2(y, x), math.hypot(x, y)
@@ -131,14 +161,15 @@ def needle(log_scales) -> tuple[Gaussians, Camera]:
     """One Gaussian on the axis at z = 1, its long axis at 45 degrees on the film, f = 1 px."""
     camera = Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 4.0, 4.0, 8, 8)
     eighth_turn = [math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]
-    return (
-        Gaussians(
-            means=[[0, 0, 1]],
-            quats=[eighth_turn],
-            log_scales=[log_scales],
-            logit_opacities=[3.0],
-            sh0=np.zeros((1, 1, 3)),
-            shN=np.zeros((1, 0, 3)),
-        ),
-        camera,
-    )
+    gaussians = gaussians_at([0, 0, 1], quats=eighth_turn)
+    return replace(gaussians, log_scales=[log_scales], logit_opacities=[3.0]), camera
+
+
+MARKED_DISTANCES = [(-2e-6, False), (-5e-7, True), (5e-7, True), (2e-6, False)]
+"""(relative distance from a threshold, whether a width of 1e-6 marks the pixel)"""
+
+
+def assert_images_agree(rendered, expected, atol) -> None:
+    for name in ("image", "depth", "transmittance"):
+        found, wanted = getattr(rendered, name), getattr(expected, name)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=atol, err_msg=name)
