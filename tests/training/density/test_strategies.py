@@ -1,6 +1,7 @@
 """The trainer with any strategy, and strategies that follow one another."""
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,17 +13,19 @@ from support.trainers import make_trainer
 from drgs.config.density import DensifyConfig
 from drgs.config.schema import FitConfig
 from drgs.training import trainer as trainer_module
-from drgs.training.density.strategy import (
-    DensityReport,
-    DensityStrategy,
-    Phases,
-)
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Phases
 from drgs.training.rates import revised_stops
 
 
 def trainer_with(monkeypatch, strategy, **changes):
     monkeypatch.setattr(trainer_module, "density_strategy", lambda *_: strategy)
     return make_trainer(**changes)
+
+
+def strategy_with(**methods):
+    """A strategy with these methods, which take the first argument alone."""
+    own = {k: lambda self, first, *_, act=act: act(first) for k, act in methods.items()}
+    return type("Own", (DensityStrategy,), own)()
 
 
 def red(image, photograph):
@@ -79,18 +82,13 @@ def test_iteration_updates_statistics_then_perturbs_then_refines(monkeypatch):
     ]
 
 
-class Faint(DensityStrategy):
-    """Asks for transparent Gaussians."""
-
-    def penalties(self, parameters, num_rows):
-        assert parameters["logit_opacities"].shape == (40,) and num_rows == 40
-        yield 1e6 * dr.mean(parameters["logit_opacities"].array)
-
-
 def test_penalties_are_terms_of_the_loss(monkeypatch):
     """Adam's first step is as long as the rate, with the sign of the weighted gradient."""
     plain = make_trainer()
-    trainer = trainer_with(monkeypatch, Faint())
+    trainer = trainer_with(
+        monkeypatch,
+        strategy_with(penalties=lambda params: [1e6 * dr.mean(params["logit_opacities"].array)]),
+    )
     logits = trainer.gaussians().logit_opacities
     expected = plain.step().loss + 1e6 * logits.astype(np.float64).mean()
     assert trainer.step().loss == pytest.approx(expected, rel=1e-5)
@@ -98,15 +96,9 @@ def test_penalties_are_terms_of_the_loss(monkeypatch):
     np.testing.assert_allclose(moved, -trainer.config.optimizer.opacities_lr, rtol=1e-4)
 
 
-class Quick(DensityStrategy):
-    """Doubles two rates, in the first iteration alone."""
-
-    def rate_factors(self, iteration):
-        return dict.fromkeys(("means", "sh0"), 2.0 if iteration == 1 else 1.0)
-
-
 def test_learning_rates_are_scaled_in_the_given_iterations(monkeypatch):
-    fits = [make_trainer(), trainer_with(monkeypatch, Quick())]
+    quick = strategy_with(rate_factors=lambda i: dict.fromkeys(("means", "sh0"), 1 + (i == 1)))
+    fits = [make_trainer(), trainer_with(monkeypatch, quick)]
     before = fits[0].gaussians()
     for fit in fits:
         fit.step()
@@ -153,19 +145,8 @@ class Phase(DensityStrategy):
     def refine(self, population, iteration):
         return DensityReport(self.num, num_added=self.num, cloned=2, pruned=1)
 
-    def state(self):
-        return {f"{self.name}_seen": np.array(self.seen)}
-
-    def restore(self, state):
-        self.seen = int(state[f"{self.name}_seen"])
-
     def max_num_gaussians(self, start, iterations):
         return start + self.num
-
-
-@dataclass
-class Seen:
-    iteration: int
 
 
 def test_phases_act_as_one_strategy_and_restart_after_row_changes():
@@ -177,16 +158,12 @@ def test_phases_act_as_one_strategy_and_restart_after_row_changes():
     assert list(phases.penalties({}, 5)) == ["first", "last"]
     assert phases.max_num_gaussians(100, 8) == 117
     for iteration in range(1, 6):
-        phases.update_statistics(Seen(iteration))
+        phases.update_statistics(SimpleNamespace(iteration=iteration))
     assert (first.seen, last.seen) == (4, 5)
     assert phases.refine(None, 2) == DensityReport(10, num_added=10, cloned=2, pruned=1)
     assert (first.seen, last.seen) == (4, 0)
     assert phases.refine(None, 4) == DensityReport(7, num_added=17, cloned=4, pruned=2)
     assert phases.refine(None, 5) is None
-    first.seen, last.seen = 5, 6
-    again = Phases((Phase("first", {2}), Phase("last", {2})))
-    again.restore(phases.state())
-    assert [phase.seen for phase in again.phases] == [5, 6]
 
 
 @pytest.mark.slow
