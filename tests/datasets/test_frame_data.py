@@ -188,13 +188,12 @@ def test_ignored_frame_data_is_listed_and_not_opened(photographs):
         assert (view.lens, view.motion, view.mask, view.depth) == (None,) * 4
 
 
+ROLLING = {"shutter": "rolling"}
+
+
 @pytest.mark.parametrize(
     ("top", "frame", "shutter"),
-    [
-        ({}, {}, "global"),
-        ({}, {"shutter": "rolling"}, "rolling"),
-        ({"shutter": "rolling"}, {}, "rolling"),
-    ],
+    [({}, {}, "global"), ({}, ROLLING, "rolling"), (ROLLING, {}, "rolling")],
 )
 def test_closing_pose_is_read(photographs, top, frame, shutter):
     close = look_at((3.9, 0.5, 1.1), (0, 0, 0))
