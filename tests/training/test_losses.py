@@ -71,7 +71,7 @@ def test_gradient_equals_central_differences(height, width, weight):
     ],
 )
 def test_law_of_the_loss_holds(check):
-    """A law that broken kernels violate: see test_adjoint_mutants.py."""
+    """A law that broken kernels violate: see test_mutants.py."""
     check()
 
 
