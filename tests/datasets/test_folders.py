@@ -56,15 +56,6 @@ def test_transforms_json_is_recognised(photographs):
     assert "cameras of transforms.json" in reasons
 
 
-def test_folders_that_are_no_datasets_are_explained(tmp_path):
-    write_images(tmp_path / "images")
-    with pytest.raises(UserError, match=r"drgs poses"):
-        config_for(tmp_path)
-    (tmp_path / "transforms.json").write_text('{"frames": []}')
-    with pytest.raises(UserError, match=r"transforms\.json: frames"):
-        config_for(tmp_path)
-
-
 def touch(folder, *names):
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -122,18 +113,11 @@ def test_folder_of_folders_of_photographs_is_refused_by_poses(tmp_path, files, m
         photographs_in(tmp_path)
 
 
-def test_file_in_place_of_the_folder_is_refused(tmp_path):
-    touch(tmp_path, "transforms.json")
-    assert refusal(tmp_path / "transforms.json") == (
-        f"data.path: cannot open the folder {tmp_path}/transforms.json: Not a directory"
-    )
-
-
-@pytest.mark.parametrize(
-    ("options", "end"), [({}, ""), ({"source": "our server"}, ", or get it from our server")]
-)
-def test_missing_folder_is_refused(tmp_path, options, end):
-    folder = tmp_path / "none"
-    assert refusal(folder, **options) == (
-        f"data.path: there is no folder {folder}; say where it is (--data DIR){end}"
-    )
+def test_missing_folder_and_file_in_its_place_are_refused(tmp_path):
+    touch(tmp_path, "a")
+    expected = f"data.path: cannot open the folder {tmp_path}/a: Not a directory"
+    assert refusal(tmp_path / "a") == expected
+    message = f"data.path: there is no folder {tmp_path}/none; say where it is (--data DIR)"
+    assert refusal(tmp_path / "none") == message
+    source = {"source": "our server"}
+    assert refusal(tmp_path / "none", **source) == f"{message}, or get it from our server"

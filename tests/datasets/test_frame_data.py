@@ -1,7 +1,6 @@
 """Masks, depths, motion and transparency of frames."""
 
 import io
-import json
 import os
 from dataclasses import replace
 
@@ -9,30 +8,18 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from PIL import Image
-from support.datasets import edit, load, load_noting, look_at, put, refusal, view_at
+from support.datasets import edit, load, load_noting, look_at, put, refusal, view_at, views_by_name
 
 from drgs.cameras.radial_tangential import RadialTangential
-from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.datasets import load_dataset
 from drgs.datasets.images import read_depth, smaller_view
-
-
-def index_of(folder, name):
-    """Return the frame of a photograph in the file; frames are in another order than names."""
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    return next(k for k, frame in enumerate(frames) if frame["file_path"].endswith(name))
 
 
 def give(folder, name="01.png", **values):
     """Add values to the frame of a photograph; return how errors name the frame."""
-    path, index = folder / "transforms.json", index_of(folder, name)
+    path, index = folder / "transforms.json", 9 - int(name[:2])  # in reverse order of names
     edit(path, lambda meta: meta["frames"][index].update(values))
     return f"{path}: frames[{index}]."
-
-
-def view_named(dataset, name="01"):
-    return next(view for view in (*dataset.train, *dataset.test) if view.name == name)
 
 
 def blocks(values, factor):
@@ -67,14 +54,11 @@ def test_mask_keeps_pixels_brighter_than_half_and_opaque(photographs, mask):
     give(photographs, "08.png", mask_path="mask")  # of a test view; .png is added
     dataset = load(photographs)
     for name in ("01", "08"):
-        found = np.asarray(view_named(dataset, name).mask)
+        found = np.asarray(views_by_name(dataset)[name].mask)
         assert found.dtype == np.float32
         np.testing.assert_array_equal(found, COUNTS)
-    assert view_named(dataset, "02").mask is None
+    assert views_by_name(dataset)["02"].mask is None
     assert dataset.description.endswith("; masks of 2 of 10 photographs")
-    ignored = load(photographs, ignore_masks=True)
-    assert all(view.mask is None for view in ignored.train)
-    assert ignored.description.endswith("; masks (mask_path) ignored")
 
 
 STEPS = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
@@ -118,7 +102,9 @@ def test_missing_masks_drop_their_photographs_and_missing_depths_do_not(photogra
     give(photographs, "03.png", depth_file_path="gone.npy")
     dataset, notes = load_noting(photographs)
     assert [view.name for view in dataset.train] == ["01", "03", "04", "05", "06", "07", "08"]
-    assert view_named(dataset, "03").mask is not None and view_named(dataset, "03").depth is None
+    assert (
+        views_by_name(dataset)["03"].mask is not None and views_by_name(dataset)["03"].depth is None
+    )
     path = photographs / "transforms.json"
     assert notes == [
         f"{path}: not there: 1 of 4 masks (gone.png); their photographs are left out",
@@ -130,7 +116,7 @@ def test_a_folder_of_unnamed_masks_is_reported(photographs):
     (photographs / "masks").mkdir()
     iio.imwrite(photographs / "masks" / "01.png", GREY_MASK)
     dataset, (note,) = load_noting(photographs)
-    assert view_named(dataset).mask is None
+    assert views_by_name(dataset)["01"].mask is None
     message = "masks are not used, as no mask_path names them: masks/01.png; all pixels of the ph"
     assert note.startswith(f"{photographs}: {message}")
     assert load_noting(photographs, ignore_masks=True)[1] == []
@@ -155,46 +141,36 @@ def test_empty_mask_is_refused(photographs, name, mask, options):
     assert refusal(photographs, **options).startswith(f"{photographs / 'mask.png'}: {message}")
 
 
+DEPTHS = np.random.default_rng(0).uniform(5, 90, (6, 8))
+DEPTHS[0, :5] = [np.nan, np.inf, -1, 0, np.finfo(np.float64).max]
+
+
 @pytest.mark.parametrize(
-    ("file", "top", "frame", "unit"),
+    ("file", "values", "top", "frame", "unit"),
     [
-        ("depth.png", {}, {}, 1e-3),
-        ("depth.png", {SCALE: 0.25}, {}, 0.25),
-        ("depth.png", {}, {SCALE: 2}, 2.0),
-        ("depth.npy", {}, {}, 1.0),
-        ("depth.npy", {}, {SCALE: 0.25}, 0.25),
+        ("depth.png", STEPS, {}, {}, 1e-3),
+        ("depth.png", STEPS, {SCALE: 0.25}, {}, 0.25),
+        ("depth.png", STEPS, {}, {SCALE: 2}, 2.0),
+        ("depth.npy", DEPTHS, {}, {}, 1.0),
+        ("depth.npy", DEPTHS, {}, {SCALE: 0.25}, 0.25),
     ],
 )
-def test_depths_are_multiples_of_the_unit(photographs, file, top, frame, unit):
+def test_depths_are_multiples_of_the_unit(photographs, file, values, top, frame, unit):
     """Depths that are not finite or not positive are unknown."""
-    depths = np.random.default_rng(0).uniform(5, 90, (6, 8))
-    depths[0, :5] = [np.nan, np.inf, -1, 0, np.finfo(np.float64).max]
-    np.save(photographs / "depth.npy", depths)
-    iio.imwrite(photographs / "depth.png", STEPS)
+    write = iio.imwrite if values is STEPS else np.save
+    write(photographs / file, values)
     give(photographs, depth_file_path=file, **frame)
     edit(photographs / "transforms.json", lambda meta: meta.update(top))
     dataset = load(photographs)
-    depth = view_named(dataset).depth
+    depth = views_by_name(dataset)["01"].depth
     with np.errstate(over="ignore"):
-        expected = ((STEPS if file == "depth.png" else depths) * unit).astype(np.float32)
+        expected = (values * unit).astype(np.float32)
     expected[~(np.isfinite(expected) & (expected > 0))] = 0
     assert depth.dtype == np.float32 and (expected > 0).sum() >= 43
     # Divided by the largest number of 16 bits and multiplied by it: two roundings, and the unit's.
     np.testing.assert_allclose(depth, expected, rtol=4 * 6e-8)
-    assert view_named(dataset, "02").depth is None
+    assert views_by_name(dataset)["02"].depth is None
     assert dataset.description.endswith(f"; depth in units of {unit:g}")
-
-
-@pytest.mark.parametrize("weight", [0.0, 0.2])
-def test_a_fit_without_a_depth_loss_does_not_open_depths(photographs, weight):
-    give(photographs, depth_file_path="nowhere.png")
-    fit = FitConfig(data={"path": str(photographs)}, loss={"depth_weight": weight})
-    assert load_dataset(fit.data_for_rendering).ignored == ("depth",)
-    if weight == 0:
-        assert load_dataset(fit.data_for_training).ignored == ("depth",)
-    else:
-        with pytest.raises(UserError, match="there is no image"):
-            load_dataset(fit.data_for_training)
 
 
 def test_ignored_frame_data_is_listed_and_not_opened(photographs):
@@ -204,36 +180,36 @@ def test_ignored_frame_data_is_listed_and_not_opened(photographs):
     names = ("distortion", "motion", "masks", "depth")
     dataset = load(photographs, **{f"ignore_{name}": True for name in names})
     assert dataset.ignored == names
+    assert dataset.description.endswith(
+        "; lens opencv (k1) ignored; masks (mask_path) ignored; "
+        "depth (depth_file_path) ignored; motion (transform_matrix_close) ignored"
+    )
     for view in (*dataset.train, *dataset.test):
         assert (view.lens, view.motion, view.mask, view.depth) == (None,) * 4
 
 
+ROLLING = {"shutter": "rolling"}
+
+
 @pytest.mark.parametrize(
     ("top", "frame", "shutter"),
-    [
-        ({}, {}, "global"),
-        ({}, {"shutter": "rolling"}, "rolling"),
-        ({"shutter": "rolling"}, {}, "rolling"),
-    ],
+    [({}, {}, "global"), ({}, ROLLING, "rolling"), (ROLLING, {}, "rolling")],
 )
 def test_closing_pose_is_read(photographs, top, frame, shutter):
     close = look_at((3.9, 0.5, 1.1), (0, 0, 0))
     give(photographs, transform_matrix_close=close.tolist(), **frame)
     edit(photographs / "transforms.json", lambda meta: meta.update(top))
     dataset = load(photographs)
-    motion = view_named(dataset).motion
+    motion = views_by_name(dataset)["01"].motion
     assert (motion.shutter, motion.samples) == (shutter, 8)
     # In OpenCV axes.
     np.testing.assert_allclose(motion.close_to_world, close * [1, -1, -1, 1], atol=1e-15)
-    assert view_named(dataset, "02").motion is None
-    assert view_named(load(photographs, shutter_samples=3)).motion.samples == 3
-    ignored = load(photographs, ignore_motion=True)
-    assert view_named(ignored).motion is None
-    assert ignored.description.endswith("; motion (transform_matrix_close) ignored")
+    assert views_by_name(dataset)["02"].motion is None
+    assert views_by_name(load(photographs, shutter_samples=3))["01"].motion.samples == 3
 
 
 def test_synthetic_frames_support_masks_depths_lenses_and_motion(blender):
-    """Mask, depth, lens and second pose, of both splits; what is ignored is named."""
+    """Both splits have them, also at another size."""
     folder, images = blender
     close = look_at((4, 0.5, 0), (0, 0, 0)).tolist()
     mask = np.ones((4, 6), np.uint8)
@@ -241,15 +217,11 @@ def test_synthetic_frames_support_masks_depths_lenses_and_motion(blender):
     iio.imwrite(folder / "mask.png", 255 * mask)
     np.save(folder / "depth.npy", np.arange(24.0).reshape(4, 6))
     values = {"mask_path": "mask.png", "depth_file_path": "depth.npy", "k1": 0.1}
-    values |= {"transform_matrix_close": close, "shutter": "rolling"}
+    values |= {CLOSE: close, "shutter": "rolling"}
     for split in ("train", "val"):
         edit(folder / f"transforms_{split}.json", lambda meta: meta["frames"][1].update(values))
-    dataset = load(folder, ignore_distortion=True)
-    assert dataset.ignored == ("distortion",)
-    assert dataset.description.endswith(
-        "; lens opencv (k1) ignored; masks of 2 of 6 photographs; depth in units of 1"
-    )
-    assert load(folder).train[1].lens == RadialTangential.from_coefficients(k1=0.1)
+    dataset = load(folder)
+    assert dataset.train[1].lens == RadialTangential.from_coefficients(k1=0.1)
     for views in (dataset.train, dataset.test):
         np.testing.assert_array_equal(views[1].mask, mask)
         np.testing.assert_array_equal(views[1].depth, np.arange(24.0).reshape(4, 6))
@@ -271,8 +243,15 @@ def test_smaller_views_average_known_pixels():
     mask = np.ones((30, 40), np.float32)
     mask[3, 7], depth[8, 9] = 0, 0
     alpha = rng.uniform(0, 1, (30, 40)).astype(np.float32)
-    view = view_at((4, 0, 0), (0, 0, 0))
+    image = rng.uniform(0, 1, (30, 40, 3)).astype(np.float32)
+    view = replace(view_at((4, 0, 0), (0, 0, 0)), image=image, cx=13.0)
     smaller = smaller_view(replace(view, alpha=alpha, mask=mask, depth=depth), 5)
+    for channel in range(3):
+        means = blocks(image[..., channel], 5).mean(axis=2)
+        np.testing.assert_allclose(smaller.image[..., channel], means, rtol=1e-6)
+    # Points on the film are at a fifth of their place, counted from the corner.
+    np.testing.assert_allclose(smaller.K[:2], view.K[:2] / 5, rtol=1e-12)
+    np.testing.assert_array_equal(smaller.camera_to_world, view.camera_to_world)
     np.testing.assert_allclose(smaller.alpha, blocks(alpha, 5).mean(axis=2), rtol=1e-5)
     np.testing.assert_array_equal(smaller.mask, blocks(mask, 5).min(axis=2))
     known = (blocks(depth, 5) > 0).all(axis=2)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support import small_capture as capture
 from support import small_fits as fits
+from support.datasets import views_by_name
 
 import drgs
 from drgs.config.load import config_from
@@ -49,17 +50,10 @@ def folder(tmp_path):
     return tmp_path, views
 
 
-def test_documented_example_is_the_file():
-    text = (EXAMPLE.parent.parent.parent / "docs" / "developing.md").read_text()
-    assert f"```python\n{EXAMPLE.read_text()}```" in text
-    assert len(EXAMPLE.read_text().splitlines()) <= 60
-
-
 @pytest.mark.parametrize("kind", ["auto", "numpy_poses"])
 def test_cameras_and_images_come_from_the_folder(folder, kind):
     path, views = folder
-    dataset = load_dataset(path, type=kind, test_every=4)
-    found = {view.name: view for view in (*dataset.train, *dataset.test)}
+    found = views_by_name(load_dataset(path, type=kind, test_every=4))
     assert sorted(found) == [str(index) for index in range(5)]
     for index, view in enumerate(views):
         own = found[str(index)]
@@ -93,12 +87,9 @@ def test_errors_of_the_reader_are_reported(folder):
         load_dataset(path)
 
 
-def test_shipped_readers_come_first(folder, tmp_path):
+def test_shipped_readers_come_first_and_unknown_ones_are_refused(folder, tmp_path):
     path, _ = folder
+    with pytest.raises(UserError, match=r"data\.type must be one of 'auto', .*'numpy_poses'; did"):
+        load_dataset(path, type="numpy_pose")
     (path / "transforms.json").write_text("{}")
     assert find_reader(config_from({"data": {"path": str(path)}}, "x").data)[0] == "nerfstudio"
-
-
-def test_unknown_reader_lists_the_registered_ones(folder):
-    with pytest.raises(UserError, match=r"data\.type must be one of 'auto', .*'numpy_poses'; did"):
-        load_dataset(folder[0], type="numpy_pose")

@@ -1,7 +1,6 @@
 """Cameras to render from: of files and on orbits; those that no image can have are refused."""
 
 import json
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -12,20 +11,12 @@ from drgs.core.errors import UserError, UserNote
 from drgs.datasets.orbits import Orbit, near_plane_of, orbit_of_gaussians, orbit_of_views, up_of
 from drgs.datasets.viewpoints import look_at, read_viewpoints
 
-
-@pytest.fixture(autouse=True)
-def warnings_are_errors():
-    """No camera makes NumPy warn."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
+pytestmark = pytest.mark.filterwarnings("error")  # no camera makes NumPy warn
 
 
 def views_at(azimuths, elevations):
-    return [
-        view(f"{i}", pose_around(a, e), None)
-        for i, (a, e) in enumerate(zip(azimuths, elevations, strict=True))
-    ]
+    poses = map(pose_around, azimuths, elevations)
+    return [view(f"{i}", pose, None) for i, pose in enumerate(poses)]
 
 
 def offsets_of(viewpoints):
@@ -50,8 +41,7 @@ def test_look_at_is_rigid_and_keeps_up_of_any_length_upright(length):
     assert np.linalg.det(rotation) == pytest.approx(1)
     assert pose[:3, 3].tolist() == [1, 2, 3]
     right, down, ahead = rotation.T
-    assert right @ up == pytest.approx(0, abs=1e-12)
-    assert down @ up < 0
+    assert right @ up == pytest.approx(0, abs=1e-12) and down @ up < 0
     assert np.cross(ahead, [-1, -1.5, -4]) == pytest.approx(np.zeros(3), abs=1e-12)
     orbit = orbit_of_gaussians(blobs(), length * up, 40.0)
     np.testing.assert_allclose(orbit.up, up, rtol=0, atol=1e-15)
@@ -96,19 +86,14 @@ def test_orbit_stays_on_the_photographed_side():
     views = views_at(np.linspace(2.5, 4.0, 6), np.full(6, 0.1))
     offsets = offsets_of(orbit_of_views(views, blobs()).viewpoints(20, 40, 40, 40))
     swept = np.arctan2(offsets[:, 1], offsets[:, 0]) % (2 * np.pi)
-    assert swept.min() > 2.5
-    assert swept.max() < 4.0
-    assert np.ptp(swept) > 1.0
+    assert swept.min() > 2.5 and swept.max() < 4.0 and np.ptp(swept) > 1.0
     # There and back: no jump where the animation starts again.
     assert np.abs(np.diff(swept, append=swept[0])).max() < 0.25
 
 
 def test_orbit_of_parallel_cameras_is_around_the_gaussians():
-    first = views_at([0], [0])[0]
-    beside = first.camera_to_world.copy()
-    beside[1, 3] += 1
-    gaussians = blobs()
-    orbit = orbit_of_views([first, replace(first, camera_to_world=beside)], gaussians)
+    (first,), gaussians = views_at([0], [0]), blobs()
+    orbit = orbit_of_views([first, first.with_offset(np.array([0, 1, 0]))], gaussians)
     opaque = gaussians.means[gaussians.opacities >= 0.5]
     assert orbit.focus == pytest.approx(np.median(opaque, axis=0))
     assert_looks_at(orbit.viewpoints(1, 10, 10, 40)[0], orbit.focus)
@@ -149,9 +134,8 @@ def test_near_planes_are_within_limits_for_scenes_of_any_size(size, near):
 
 def write_cameras(path, top, *frames):
     pose = (pose_around(0.3, 0.2) * [1, -1, -1, 1]).tolist()
-    path.write_text(
-        json.dumps({**top, "frames": [{"transform_matrix": pose, **f} for f in frames]})
-    )
+    frames = [{"transform_matrix": pose, **frame} for frame in frames]
+    path.write_text(json.dumps({**top, "frames": frames}))
     return path
 
 

@@ -39,17 +39,6 @@ def test_points_of_a_ball_are_all_over_its_surface():
     assert (0.8 * np.arccos((wanted @ directions.T).max(axis=1).clip(-1, 1))).max() < 2 * cell
 
 
-def test_points_of_a_brick_are_on_its_faces():
-    brick = images_of(box((-0.5, -0.25, -0.75), (0.5, 0.25, 0.75)), 16)
-    points = carved(brick)
-    assert 0.7 * 1500 < len(points) <= 1500
-    assert np.all([opaque_at(view, points) for view in brick])
-    cell = np.sqrt(5.5 / len(points))
-    beyond = np.abs(points) - np.array([0.5, 0.25, 0.75])
-    assert beyond.max() < cell + 0.04
-    assert beyond.max(axis=1).min() > -cell - 0.04
-
-
 def test_small_object_in_a_large_box_has_as_many_points():
     views = images_of(sphere(0.05, (0.3, 0.2, -0.1)), 12, size=200, samples=1)
     points = carved(views, 500)
@@ -65,13 +54,6 @@ def test_thin_pole_is_kept():
     points = carved(views, 600)
     near = points[distances(points[:, :2] - [0, 0.6]) < 0.12]
     assert np.diff(np.sort([-1, *near[:, 2], 1])).max() < 0.25
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_points():
-    first = carved(BALL, 300)
-    assert 0.6 * 300 <= len(first) <= 300
-    np.testing.assert_array_equal(carved(BALL, 300), first)
 
 
 @pytest.mark.slow
@@ -112,15 +94,12 @@ def test_distorted_images_are_carved_without_undistortion():
     assert np.all([opaque_at(view, points, lens) for view in views])
 
 
-def test_contradictory_masks_have_no_hull():
+def test_hull_ends_where_masks_contradict_or_few_images_show_it():
+    points = carved(BALL, 300, within=Box(np.zeros(3), 2.5))
+    assert distances(points).max() < 1.1
     elsewhere = images_of(sphere(0.1, (0, 0, 1.1)), 12)
     assert len(carved([*BALL[::2], *elsewhere])) == 0
     assert len(carved([replace(view, alpha=0 * view.alpha) for view in BALL])) == 0
-
-
-def test_regions_that_few_images_show_are_not_part_of_the_hull():
-    points = carved(BALL, 300, within=Box(np.zeros(3), 2.5))
-    assert distances(points).max() < 1.1
 
 
 OPAQUE = tuple(replace(view, alpha=np.ones_like(view.alpha)) for view in BALL)

@@ -3,9 +3,9 @@
 import numpy as np
 
 from drgs.datasets.types import Dataset, View
-from drgs.reference import effects as reference
-from drgs.reference.splatting import Camera
 from support.datasets import look_at
+from support.lens_scenes import PINHOLE, kernel_lens
+from support.small_fits import reference_camera
 
 WHITE = (1.0, 1.0, 1.0)
 DISTANCE = 4.0
@@ -57,8 +57,7 @@ def image_of(
     shape, name, center, size=64, samples=2, lens=None, background=WHITE, focal=1.4, paint=colors_at
 ):
     """A view towards the origin; lens: of the reference, as well; samples: of a pixel, squared."""
-    pose = look_at(center, (0, 0, 0))
-    pose[:3, 1:3] *= -1
+    pose = look_at(center, (0, 0, 0)) * [1, -1, -1, 1]
     focal, middle = focal * size, size / 2
     fine = (np.arange(size * samples) + 0.5) / samples
     slopes = np.stack(np.meshgrid(fine, fine), axis=-1).reshape(-1, 2) / focal - middle / focal
@@ -77,15 +76,9 @@ def image_of(
 
     alpha = averaged(met.astype(float))
     image = averaged(colors) + (1 - alpha) * np.array(background)
-    host = None
-    if lens is not None:
-        from drgs.cameras.radial_tangential import RadialTangential
-
-        host = RadialTangential.from_coefficients(**{k: v for k, v in vars(lens).items() if v})
-    return View(
-        name, pose, focal, focal, middle, middle, size, size, host,
-        image=image.astype(np.float32), alpha=alpha[..., 0].astype(np.float32),
-    )  # fmt: skip
+    host = lens and kernel_lens(lens)
+    planes = {"image": image.astype(np.float32), "alpha": alpha[..., 0].astype(np.float32)}
+    return View(name, pose, focal, focal, middle, middle, size, size, host, **planes)
 
 
 def images_of(shape, count=20, **options):
@@ -101,16 +94,12 @@ def dataset_of_images(views, half_extent=1.3, background=WHITE, **fields):
     return Dataset(tuple(views), (), "test", background, half_extent, "", **fields)
 
 
-PINHOLE = reference.Pinhole()
-
-
 def opaque_at(view, points, lens=PINHOLE):
     """(N,) bool: whether the image shows something at the places of points (N, 3), world.
 
     Projected by the reference. True where the image does not show them.
     """
-    fields = view.fx, view.fy, view.cx, view.cy, view.width, view.height
-    camera = Camera(view.camera_to_world[:3, :3].T, view.center, *fields, 0.2)
+    camera = reference_camera(view)
     position = (points - view.center) @ view.camera_to_world[:3, :3]
     column, row = np.floor(lens.film_points(camera, position)).astype(int).T
     inside = lens.is_seen(camera, position)

@@ -1,10 +1,11 @@
-"""Folders of small datasets in both layouts."""
+"""Folders of small datasets in both layouts, and clouds of points."""
 
 import json
 import warnings
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, UserNote
@@ -32,6 +33,14 @@ def view_at(center, target, width=40, height=30):
 
 def dataset_of(views, half_extent=None):
     return Dataset(tuple(views), tuple(views), "test", (1.0, 1.0, 1.0), half_extent, "")
+
+
+def write_points(path, positions, colors):
+    kinds = [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+    rows = np.empty(len(positions), kinds)
+    for name, column in zip([n for n, _ in kinds], np.hstack([positions, colors]).T, strict=True):
+        rows[name] = column
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
 
 
 CENTERS = [(4, 0, 0), (0, 4, 1), (-3, 0, 2)]
@@ -62,6 +71,10 @@ def put(path, keys, value):
 
 def load(folder, **options):
     return load_dataset(DataConfig(path=folder, **options))
+
+
+def views_by_name(dataset):
+    return {view.name: view for view in (*dataset.train, *dataset.test)}
 
 
 def load_noting(folder, **options):

@@ -31,9 +31,9 @@ VALUES = {
 }
 
 
-def write_scene(folder: Path, test: int = 1, **values: object) -> Path:
+def write_scene(folder: Path, test: int = 1, train: int = 3, **values: object) -> Path:
     """``data/`` and ``a.yml``, which fits it; values: its other sections. Returns ``a.yml``."""
-    write_dataset(folder / "data", make_dataset(train=3, test=test))
+    write_dataset(folder / "data", make_dataset(train, test))
     (folder / "a.yml").write_text(yaml.safe_dump({**SMALL, **values}))
     return folder / "a.yml"
 

@@ -349,6 +349,13 @@ def kernel_gradients(case, precision, cotangents) -> dict[str, np.ndarray]:
 # ----------------------------------------------------------------------------------------------
 
 
+def central_difference(function, values, index, step) -> float:
+    """Return the derivative of a function of an array with respect to one of its numbers."""
+    change = np.zeros_like(values)
+    change[index] = step
+    return (function(values + change) - function(values - change)) / (2 * step)
+
+
 def relative_errors(actual, expected) -> dict[str, float]:
     """For each array of two dictionaries: largest difference over largest expected value."""
     return {

@@ -2,7 +2,7 @@
 
 import drjit as dr
 import numpy as np
-from drjit.llvm.ad import Float, TensorXf
+from drjit.llvm.ad import TensorXf
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training.optimizer import Population, make_optimizer
@@ -41,16 +41,16 @@ def make(scales, opacities, sh_rows=3, tensor_type=TensorXf, seed=0):
     return optimizer
 
 
-def statistics(gradient_norms, views=None):
-    """Sums of gradient norms and numbers of views, as the strategy adc has them."""
-    norms = np.asarray(gradient_norms, dtype=np.float32)
-    views = np.full(len(norms), 4) if views is None else np.asarray(views)
-    return Float(norms * views), Float(views)
-
-
 def rows_of(optimizer, seed=0):
-    """The same as strategies see them."""
+    """The population of an optimizer as strategies see it."""
     return Population(optimizer, EXTENT, seed)
+
+
+def assert_standard_normal(samples):
+    """Five standard deviations of sample means and covariances."""
+    count, dims = samples.shape
+    assert np.abs(samples.mean(0)).max() < 5 / np.sqrt(count)
+    assert np.abs(np.cov(samples.T) - np.eye(dims)).max() < 5 * np.sqrt(2 / count)
 
 
 def values(optimizer):

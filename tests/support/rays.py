@@ -8,11 +8,11 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import types_of
-from drgs.gaussians.parameters import Gaussians
 from drgs.light.walk import RaySplats, Segment
 from drgs.reference import splatting
 from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.projection import load_rows
+from support.helpers import device_gaussians
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,6 @@ def _single(values) -> np.ndarray:
     return np.asarray(values, np.float32).astype(np.float64)
 
 
-DEFAULT = Cutoffs()
-
-
-def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=DEFAULT) -> RaySplats:
-    ours = Gaussians(
-        **{name: np.asarray(value, precision.dtype) for name, value in vars(gaussians).items()}
-    ).to(precision.TensorXf)
-    return RaySplats.from_gaussians(
-        load_rows(ours, gaussians.sh_degree), gaussians.sh_degree, cutoffs
-    )
+def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=Cutoffs()) -> RaySplats:  # noqa: B008
+    loaded = load_rows(device_gaussians(gaussians, precision), gaussians.sh_degree)
+    return RaySplats.from_gaussians(loaded, gaussians.sh_degree, cutoffs)

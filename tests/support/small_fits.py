@@ -16,6 +16,7 @@ from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import render_views
 from drgs.reference import splatting as reference
+from drgs.results.metrics import ssim
 from drgs.training.effects.base import TrainingEffect
 from drgs.training.trainer import Trainer
 from support import small_capture as capture
@@ -30,6 +31,14 @@ FROZEN_GAUSSIANS = {
     **{f"optimizer__{name}_lr": 0.0 for name in ("quats", "scales", "opacities", "sh0", "shN")},
 }
 """Rates of a fit that optimises only its effects."""
+
+
+CAMERA_RATES = {
+    "cameras__rotation_lr": 1e-3,
+    "cameras__translation_lr": 2e-3,
+    "cameras__focal_lr": 3e-3,
+    "cameras__principal_lr": 4e-3,
+}
 
 
 def double(gaussians: Gaussians) -> reference.Gaussians:
@@ -54,6 +63,12 @@ def photograph(
     )
 
 
+def photometric_loss(image, target, weight=0.2) -> float:
+    """(1 - w) L1 + w (1 - SSIM) in float64; SSIM's images are clipped."""
+    image, target = (np.asarray(values, np.float64) for values in (image, target))
+    return (1 - weight) * np.abs(image - target).mean() + weight * (1 - ssim(image, target))
+
+
 @cache
 def true_blobs() -> Gaussians:
     """Return the photographed blobs: numpy float32, degree 1."""
@@ -73,12 +88,7 @@ def true_dataset(background=WHITE) -> Dataset:
         renders = {"image": np.clip(rendered.image, 0, 1), "alpha": rendered.alpha, "depth": depth}
         return replace(view, **{k: v.astype(np.float32) for k, v in renders.items()})
 
-    return replace(
-        dataset,
-        train=tuple(map(seen, dataset.train)),
-        test=tuple(map(seen, dataset.test)),
-        background=background,
-    )
+    return replace(with_all_views(dataset, seen), background=background)
 
 
 def plain_dataset() -> Dataset:
@@ -86,9 +96,19 @@ def plain_dataset() -> Dataset:
     return with_views(true_dataset(), lambda v: replace(v, alpha=None, depth=None))
 
 
+def transparent_dataset(background=WHITE) -> Dataset:
+    """The photographs with alpha and without depth."""
+    return with_views(true_dataset(background), lambda v: replace(v, depth=None))
+
+
 def with_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
     """Changes of the training views."""
     return replace(dataset, train=tuple(map(change, dataset.train)))
+
+
+def with_all_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
+    """Changes of all views."""
+    return replace(with_views(dataset, change), test=tuple(map(change, dataset.test)))
 
 
 def mask_of(index: int) -> np.ndarray:
@@ -134,6 +154,17 @@ def make_trainer(dataset: Dataset, gaussians: Gaussians | None = None, **changes
     """See :func:`config_of`; ``__`` is written for the dot."""
     values = {key.replace("__", "."): value for key, value in changes.items()}
     return Trainer(config_of(**values), dataset, gaussians or disturbed_blobs())
+
+
+def with_numbers(trainer: Trainer, **values) -> Trainer:
+    """Continue from other numbers of an effect, by name: rows for all views; moments stay."""
+    (effect,) = trainer.effects
+    state = effect.state()
+    for name, value in values.items():
+        key = f"{name}.value"
+        state[key] = np.reshape(value, state[key].shape).astype(np.float32)
+    effect.restore(state)
+    return trainer
 
 
 def steps(trainer: Trainer, count: int) -> Trainer:

@@ -5,17 +5,13 @@ import numpy as np
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.types import Dataset, View
+from drgs.datasets.viewpoints import look_at
 from drgs.initialization.start import Start, gaussians_at
 
 
 def small_view(name, angle):
     """A 20x16 image of random colours, from a circle of radius 3 in the plane z = 0."""
-    center = 3 * np.array([np.cos(angle), np.sin(angle), 0.0])
-    pose = np.eye(4)
-    forward = -center / 3
-    right = np.cross(forward, [0, 0, 1])
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = center
+    pose = look_at((3 * np.cos(angle), 3 * np.sin(angle), 0), (0, 0, 0), (0, 0, 1))
     image = np.random.default_rng(int(10 * angle)).uniform(size=(16, 20, 3)).astype(np.float32)
     return View(name, pose, 24.0, 24.0, 10.0, 8.0, 20, 16, image=image)
 
@@ -28,8 +24,7 @@ def small_dataset():
 def make_trainer(**changes):
     from drgs.training.trainer import Trainer
 
-    values = {"data": {"path": "."}, "iterations": 50, **changes}
-    config = FitConfig.model_validate(values)
+    config = FitConfig.model_validate({"data": {"path": "."}, "iterations": 50, **changes})
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
     half_opaque = with_changes(config, {"init.opacity": 0.5})
     gaussians = gaussians_at(Start(points, None, "random"), half_opaque)

@@ -4,11 +4,11 @@ import time
 from argparse import ArgumentTypeError
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from support.fit_command import assert_fits, run_fit
-from support.small_capture import make_dataset, write_dataset
+from support.fit_command import assert_fits, run_fit, write_scene
 
 from drgs import fit
 from drgs.config.changes import with_changes
@@ -103,10 +103,7 @@ def test_best_strategy_within_the_time_is_chosen():
         (50, {"densify.max_gaussians": 160}, "budget", 80),
         (50, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600}, "mcmc", 300),
         # A hull may have fewer points than were asked for.
-        (
-            *(310, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600}),
-            *("mcmc", 320),
-        ),
+        (310, {"densify.strategy": "mcmc", "densify.mcmc.gaussians": 600}, "mcmc", 320),
     ],
 )
 def test_fraction_of_gaussians_is_at_least_the_start(start, changes, section, expected):
@@ -156,22 +153,25 @@ def clock(monkeypatch):
 class FakeTrainer:
     """A trainer's count of iterations; an iteration takes ``second``."""
 
-    reschedule = Trainer.reschedule
+    reschedule, extent, iteration = Trainer.reschedule, 1.0, 0
 
     def __init__(self, clock, second, **changes):
-        self.clock, self.second, self.iteration = clock, second, 0
-        self.extent = 1.0
+        self.clock, self.second = clock, second
         values = {"iterations": 1000, "densify.start": 100, "densify.stop": 600}
         self.config = with_changes(CONFIG, {**values, **changes})
         self.rates = rates_over_time(self.config, self.extent)
-        self.density = SimpleNamespace(state=dict)
-
-    def _density_from(self, state):
-        return self.density
+        self.density = self._density_from = Mock()
 
     def step(self):
         self.iteration += 1
         self.clock.now += self.second
+
+    def fit(self, seconds):
+        """Iterations until the deadline."""
+        deadline = Deadline(self, self.clock.now + seconds, LINEAR)
+        while deadline.should_continue(self):
+            yield deadline
+            self.step()
 
 
 # Time is proportional to iterations.
@@ -185,12 +185,10 @@ def test_fit_ends_in_time_for_any_iteration_cost(clock, second):
     An iteration or two more or less: the clock is read between them.
     """
     trainer = FakeTrainer(clock, second)
-    deadline = Deadline(trainer, clock.now + 100, LINEAR)
-    assert deadline.num_iterations(trainer) == 1000
-    while deadline.should_continue(trainer):
-        trainer.step()
-        if trainer.iteration == 10:
-            assert deadline.num_iterations(trainer) == 100 / second
+    for deadline in trainer.fit(100):
+        if trainer.iteration in (0, 10):
+            expected = 100 / second if trainer.iteration else 1000
+            assert deadline.num_iterations(trainer) == expected
     assert 200 <= clock.now < 200 + 2 * second
     n = trainer.iteration
     assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
@@ -201,20 +199,15 @@ def test_fit_ends_in_time_for_any_iteration_cost(clock, second):
 
 def test_density_changes_never_end_before_they_start(clock):
     trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
-    deadline = Deadline(trainer, clock.now + 100, LINEAR)
-    while deadline.should_continue(trainer):
-        trainer.step()
+    list(trainer.fit(100))
     assert trainer.config.densify.stop == 591
 
 
 def test_plan_of_a_slowing_fit_is_revised(clock):
-    trainer = FakeTrainer(clock, 0.05)
-    deadline = Deadline(trainer, clock.now + 100, LINEAR)
-    rates = []
-    while deadline.should_continue(trainer):
+    trainer, rates = FakeTrainer(clock, 0.05), []
+    for _ in trainer.fit(100):
         trainer.second = 0.05 if trainer.iteration < 600 else 0.2
-        trainer.step()
-        rates.append(trainer.rates.means(trainer.iteration))
+        rates.append(trainer.rates.means(trainer.iteration + 1))
     assert trainer.iteration == pytest.approx(600 + 70 / 0.2, abs=2)
     # All rates, also those of iterations before a revision, are what the last configuration says.
     assert rates == [trainer.rates.means(i + 1) for i in range(trainer.iteration)]
@@ -226,15 +219,12 @@ def test_plan_of_a_slowing_fit_is_revised(clock):
 @pytest.mark.slow
 def test_fit_ends_in_its_budget_and_its_plan_gives_the_same_bytes(tmp_path, monkeypatch):
     """Without a clock."""
-    write_dataset(tmp_path / "data", make_dataset(train=6, test=2))
-    (tmp_path / "scene.yml").write_text(
-        f"data: {{path: {tmp_path / 'data'}}}\n"
-        "init: {num_points: 300, half_extent: 1.0}\n"
-        "densify: {every: 50, max_gaussians: 600}\n"
-    )
+    sections = {"init": {"num_points": 300, "half_extent": 1.0}}
+    sections |= {"densify": {"every": 50, "max_gaussians": 600}}
+    scene = write_scene(tmp_path, test=2, train=6, **sections)
     out, again, start = tmp_path / "out", tmp_path / "again", time.perf_counter()
     monkeypatch.setattr(fit, "LOADING_SECONDS", 0.0)  # modules are loaded
-    assert_fits(tmp_path / "scene.yml", "--out", out, "--budget", "30")
+    assert_fits(scene, "--out", out, "--budget", "30")
     assert time.perf_counter() - start == pytest.approx(30, rel=0.1)
     text, config = (out / "plan.txt").read_text(), load_config(out / "config.yml")
     assert text.startswith("--budget 30s\n") and "(chosen)" in text
@@ -247,14 +237,9 @@ def test_fit_ends_in_its_budget_and_its_plan_gives_the_same_bytes(tmp_path, monk
         (out, "30", "must be new or empty for a fit with --budget"),
         (tmp_path / "short", "1s", "--budget: must leave time"),
     ):
-        arguments = (tmp_path / "scene.yml", "--out", folder, "--budget", seconds)
-        outcome = run_fit(*arguments)
+        outcome = run_fit(scene, "--out", folder, "--budget", seconds)
         assert outcome.returncode == 2 and message in outcome.stderr
     assert not (tmp_path / "short").exists()
-
-
-def interrupt(*arguments, **others):
-    raise KeyboardInterrupt
 
 
 def test_plan_revised_after_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
@@ -269,7 +254,7 @@ def test_plan_revised_after_the_last_checkpoint_can_be_continued(tmp_path, monke
         (checkpoint, "write_run_config", revised),
     ):
         with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-            patched.setattr(module, name, interrupt)
+            patched.setattr(module, name, Mock(side_effect=KeyboardInterrupt))
             save_checkpoint(tmp_path, revised, state)
         assert load_run_config(tmp_path) == config
         assert load_checkpoint(tmp_path, config).config == saved

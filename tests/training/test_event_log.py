@@ -1,4 +1,4 @@
-"""``fit --tensorboard``: the file is read here by its format, record for record."""
+"""``fit --tensorboard``: its curves are those of the history."""
 
 import csv
 import json
@@ -18,37 +18,15 @@ from support.fit_command import (
 
 from drgs.results.files import EVENTS, HISTORY, TENSORBOARD
 
-needs_tensorboardx = pytest.mark.skipif(
-    "not __import__('importlib.util').util.find_spec('tensorboardX')",
-    reason="tensorboardX is not installed (the extra tensorboard)",
-)
-
 
 @pytest.fixture(autouse=True)
 def no_images(monkeypatch):
     without_images(monkeypatch)
 
 
-def checksum(data):
-    """CRC-32C, bit by bit (RFC 3720, appendix B.4), masked as TensorFlow's record format has it."""
-    crc = 0xFFFFFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
-    crc ^= 0xFFFFFFFF
-    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
-
-
-def records(data):
-    """Return records of TensorFlow's format: a length, its checksum, the data, its checksum."""
-    while data:
-        (length, of_length), data = struct.unpack("<QI", data[:12]), data[12:]
-        record, (of_record,) = data[:length], struct.unpack("<I", data[length : length + 4])
-        data = data[length + 4 :]
-        assert of_length == checksum(struct.pack("<Q", length))
-        assert of_record == checksum(record)
-        yield record
+@pytest.fixture
+def tensorboardx():
+    pytest.importorskip("tensorboardX", reason="the extra tensorboard is not installed")
 
 
 COLUMNS = {
@@ -64,7 +42,13 @@ def curves_of(out):
     """Return [(iteration, value)] by tag."""
     from tensorboardX.proto.event_pb2 import Event
 
-    first, *others = (Event.FromString(r) for r in records((out / EVENTS).read_bytes()))
+    # Records of TensorFlow's format: a length (8 bytes) and its checksum, the data and its own.
+    data, events = (out / EVENTS).read_bytes(), []
+    while data:
+        end = 12 + struct.unpack("<Q", data[:8])[0]
+        events.append(Event.FromString(data[12:end]))
+        data = data[end + 4 :]
+    first, *others = events
     assert first.file_version == "brain.Event:2"
     times = [event.wall_time for event in others]
     assert times == sorted(times)
@@ -87,8 +71,7 @@ def assert_curves_match_the_history(out):
 
 
 @pytest.mark.slow
-@needs_tensorboardx
-def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path):
+def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path, tensorboardx):
     config, out = write_project(tmp_path), tmp_path / "with"
     assert_fits(config, "--out", out, "--tensorboard")
     assert_fits(config, "--out", tmp_path / "without")
@@ -103,8 +86,9 @@ def test_curves_match_the_history_and_logging_does_not_change_the_fit(tmp_path):
 
 
 @pytest.mark.slow
-@needs_tensorboardx
-def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(tmp_path, monkeypatch):
+def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(
+    tmp_path, monkeypatch, tensorboardx
+):
     config, out = write_project(tmp_path), tmp_path / "out"
     with monkeypatch.context() as patch:
         stop_after(patch, 5)  # after the checkpoint of 4
@@ -119,10 +103,5 @@ def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(tmp_path, m
 def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):
     config = write_project(tmp_path)
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    assert_fit_refused(
-        config,
-        "--tensorboard",
-        folder=tmp_path,
-        message="--tensorboard: needs tensorboardX, which is not installed; "
-        "pip install 'drgs[tensorboard]'",
-    )
+    message = "needs tensorboardX, which is not installed; pip install 'drgs[tensorboard]'"
+    assert_fit_refused(config, "--tensorboard", folder=tmp_path, message=message)

@@ -5,13 +5,7 @@ from dataclasses import replace
 import pytest
 from support import small_fits as fits
 
-
-def plain():
-    return fits.plain_dataset()
-
-
-def transparent():
-    return fits.with_views(fits.true_dataset(), lambda view: replace(view, depth=None))
+plain, transparent = fits.plain_dataset, fits.transparent_dataset
 
 
 def masked():
@@ -20,8 +14,8 @@ def masked():
 
 def masked_with_depth():
     """One view has no depth."""
-    dataset = fits.masked(fits.true_dataset())
-    return replace(dataset, train=(replace(dataset.train[0], depth=None), *dataset.train[1:]))
+    first, *others = fits.masked(fits.true_dataset()).train
+    return replace(fits.true_dataset(), train=(replace(first, depth=None), *others))
 
 
 ADC = {
@@ -40,14 +34,7 @@ LATE_STEPS = {
     "densify__stop": 2,
 }
 
-CAMERAS = {
-    "cameras__optimise": True,
-    "cameras__rotation_lr": 1e-3,
-    "cameras__translation_lr": 2e-3,
-    "cameras__focal_lr": 3e-3,
-    "cameras__principal_lr": 4e-3,
-}
-
+CAMERAS = {"cameras__optimise": True, **fits.CAMERA_RATES}
 COLORS = {"colors__lr": 2e-3, "colors__identity_weight": 0.1}
 DEPTH = {"loss__depth_weight": 0.7}
 RANDOM = {"data__random_background": True}
@@ -56,11 +43,9 @@ COARSE = {"coarse": [{"until": 2, "factor": 4}, {"until": 5, "factor": 2}]}
 
 FOUR_VIEWS = {"optimizer__views_per_step": 4, "iterations": 40}
 CHANGES = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
+GROWING = {**FOUR_VIEWS, **CHANGES}
 STRATEGIES = {
-    f"{name}, four views a step": (
-        *(plain, {**FOUR_VIEWS, **CHANGES, "densify__strategy": name}),
-        *(3, 4),
-    )
+    f"{name}, four views a step": (plain, {**GROWING, "densify__strategy": name}, 3, 4)
     for name in ("adc", "budget", "mcmc")
 }
 
@@ -102,18 +87,15 @@ def test_interrupted_fit_continues_to_the_same_bytes(dataset, changes, before, a
     fits.assert_resumes_to_the_same_bytes(make, before, after)
 
 
-@pytest.mark.parametrize(
-    ("dataset", "changes"),
-    [
-        (masked, {}),
-        (fits.true_dataset, DEPTH),
-        (transparent, RANDOM),
-        (plain, CAMERAS),
-        (plain, COLORS),
-        (plain, SMOOTHING),
-    ],
-    ids=["masks", "depth", "random background", "cameras", "colors", "smoothing"],
-)
+EFFECTS = {
+    "masks": (masked, {}),
+    "depth": (fits.true_dataset, DEPTH),
+    "random background": (transparent, RANDOM),
+    **{"cameras": (plain, CAMERAS), "colors": (plain, COLORS), "smoothing": (plain, SMOOTHING)},
+}
+
+
+@pytest.mark.parametrize(("dataset", "changes"), EFFECTS.values(), ids=EFFECTS)
 def test_no_kernel_is_compiled_after_all_views_were_seen(dataset, changes):
     """Kernels by hash: what Dr.Jit's caches hold from other runs does not matter."""
     trainer, seen = fits.make_trainer(dataset(), **changes), set()

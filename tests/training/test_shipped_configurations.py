@@ -3,12 +3,15 @@
 Configurations that ask for the same fit of a dataset share one.
 """
 
+import json
 from functools import cache
 from operator import attrgetter
+from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import REPOSITORY, SHARED_DATA
-from support.photographs import moved
+from scipy.spatial.transform import Rotation
 
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.load import load_config
@@ -73,6 +76,25 @@ def test_faster_and_better_configurations_differ_in_few_values(blender, name):
 
 def test_every_shipped_configuration_is_tested():
     assert set(CONFIGURATIONS) == {*ALIKE, *FASTER_OR_BETTER, "lego_paper"}
+
+
+def moved(source: Path, folder: Path, scale):
+    """``folder`` with the photographs of ``source``, whose world is turned, moved and scaled.
+
+    The origin is the mean of the cameras' positions, as in COLMAP's reconstructions; scale: the
+    largest distance of a camera from there.
+    """
+    meta = json.loads((source / "transforms.json").read_text())
+    poses = np.array([frame["transform_matrix"] for frame in meta["frames"]])
+    poses[:, :3, 3] -= poses[:, :3, 3].mean(axis=0)
+    poses[:, :3, 3] *= scale / np.linalg.norm(poses[:, :3, 3], axis=1).max()
+    poses[:, :3] = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix() @ poses[:, :3]
+    for frame, pose in zip(meta["frames"], poses, strict=True):
+        frame["transform_matrix"] = pose.tolist()
+    folder.mkdir()
+    (folder / "images").symlink_to(source / "images")
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    return folder
 
 
 KINDS = {

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from support import small_capture as capture
 from support import small_fits as fits
+from support.fit_command import assert_fits, without_images, write_scene
 from support.smoothing import smoothed_reference
+from support.viewer_rendering import VIEWER_RENDERING
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.effects.smoothing import bake_smoothing
@@ -64,38 +65,18 @@ def test_coarse_stages_have_wider_filters():
     np.testing.assert_allclose(widths[2], widths[1] / 2, rtol=0.02)
 
 
-FITS = """
-import sys
-from drgs import fit
-for name, *options in {runs!r}:
-    fit.main([{config!r}, "--out", {out!r} + "/" + name, *options])
-    print(name, "drgs.effects.smoothing" in sys.modules)
-"""
-
-
 @pytest.mark.slow
-def test_fit_writes_the_filter_or_baked_gaussians(run_python, tmp_path):
-    """And imports nothing of it where it is not asked for: the first of three."""
-    capture.write_dataset(tmp_path / "data", capture.make_dataset(3, 1))
-    config = tmp_path / "small.yml"
-    config.write_text(
-        f"data: {{path: {tmp_path / 'data'}}}\ninit: {{num_points: 30, half_extent: 1.0}}\n"
-        "model: {low_pass: 0.3, antialiased: false}\niterations: 2\noutput: {save_renders: false}\n"
-    )
-    asked = ("--set", "model.smoothing=true")
-    runs = [
-        ("without",),
-        ("with", *asked),
-        ("baked", *asked, "--set", "output.bake_smoothing=true"),
-    ]
-    result = run_python(FITS.format(config=str(config), out=str(tmp_path), runs=runs))
-    assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
-    assert "without False" in lines and "with True" in lines and "baked True" in lines
-    written = {name: Gaussians.load(tmp_path / name / "point_cloud.ply") for name, *_ in runs}
-    assert written["without"].smoothing is written["baked"].smoothing is None
-    expected = bake_smoothing(written["with"])
+def test_fit_writes_the_filter_or_baked_gaussians(tmp_path, monkeypatch):
+    without_images(monkeypatch)
+    model = {**VIEWER_RENDERING, "smoothing": True}
+    config, written = write_scene(tmp_path, model=model, iterations=2), []
+    for bakes in ("false", "true"):
+        out = tmp_path / bakes
+        assert_fits(config, "--out", out, "--set", f"output.bake_smoothing={bakes}")
+        written.append(Gaussians.load(out / "point_cloud.ply"))
+    filtered, baked = written
+    assert baked.smoothing is None and (baked.log_scales > filtered.log_scales).all()
+    expected = bake_smoothing(filtered)
     for name in PARAMETER_NAMES:
-        actual = getattr(written["baked"], name)
+        actual = getattr(baked, name)
         np.testing.assert_array_equal(actual, getattr(expected, name), err_msg=name)
-    assert (written["baked"].log_scales > written["with"].log_scales).all()

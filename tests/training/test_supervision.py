@@ -9,24 +9,16 @@ import pytest
 from support import small_fits as fits
 from support.helpers import single
 from support.small_capture import HEIGHT, WIDTH
-from support.small_fits import mask_of
+from support.small_fits import mask_of, photometric_loss
 
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.results.metrics import ssim
-from drgs.training.effects.base import training_effects
 
 # Values of order 1 in single precision: sums of 2304 numbers, SSIM's windows.
 VALUE = 2e-6
 
 DEPTH_WEIGHT = 0.7
-
-
-def numpy_loss(image, target, weight=0.2) -> float:
-    """(1 - w) L1 + w (1 - SSIM) in float64."""
-    image, target = (np.asarray(values, np.float64) for values in (image, target))
-    return (1 - weight) * np.abs(image - target).mean() + weight * (1 - ssim(image, target))
 
 
 def random_image(seed) -> np.ndarray:
@@ -35,26 +27,21 @@ def random_image(seed) -> np.ndarray:
 
 def spoiled_dataset(color=(1.0, 0.0, 1.0), depth=77):
     """Masked pixels show another colour and depth. The first view has no mask."""
-    views = []
-    for view in fits.masked(fits.true_dataset()).train:
-        if view.mask is not None:
-            kept = view.mask > 0
-            image = np.where(kept[..., None], view.image, color).astype(np.float32)
-            depths = np.where(kept, view.depth, depth).astype(np.float32)
-            view = replace(view, image=image, depth=depths)
-        views.append(view)
-    return replace(fits.true_dataset(), train=tuple(views))
+
+    def spoil(view):
+        if view.mask is None:
+            return view
+        kept = view.mask > 0
+        image = np.where(kept[..., None], view.image, color).astype(np.float32)
+        return replace(
+            view, image=image, depth=np.where(kept, view.depth, depth).astype(np.float32)
+        )
+
+    return fits.with_views(fits.masked(fits.true_dataset()), spoil)
 
 
 def masked_trainer(**changes):
     return fits.make_trainer(spoiled_dataset(), loss__depth_weight=0.0, **changes)
-
-
-def test_default_configuration_has_effects_of_masks_alone():
-    config = fits.config_of(**{"loss.depth_weight": 0.0})
-    assert training_effects(config, fits.plain_dataset()) == []
-    (effect,) = training_effects(config, spoiled_dataset())
-    assert effect.name == "masks" and effect.state() == {}
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
@@ -67,33 +54,12 @@ def test_loss_is_computed_on_masked_images(weight):
         image = mi.TensorXf(values)
         dr.enable_grad(image)
         shown, loss, _ = trainer.compare(image, view)
-        expected = numpy_loss(values * mask, photo.image * mask, weight)
+        expected = photometric_loss(values * mask, photo.image * mask, weight)
         assert float(loss[0]) == pytest.approx(expected, rel=VALUE)
         np.testing.assert_array_equal(np.array(shown), (values * mask).astype(np.float32))
         dr.backward(loss)
         gradient = np.array(dr.grad(image))
         np.testing.assert_array_equal(gradient != 0, np.broadcast_to(mask > 0, gradient.shape))
-
-
-def test_derivatives_of_a_masked_loss_equal_central_differences():
-    trainer = masked_trainer()
-    view, photo, mask = trainer.views[2], spoiled_dataset().train[2], mask_of(2)[..., None]
-    values = random_image(2)
-    image = mi.TensorXf(values)
-    dr.enable_grad(image)
-    _, loss, _ = trainer.compare(image, view)
-    dr.backward(loss)
-    gradient = np.array(dr.grad(image)).astype(np.float64)
-    step = 1e-6
-    for flat in np.random.default_rng(0).choice(values.size, 40, replace=False):
-        both = []
-        for sign in (1, -1):
-            moved = values.copy()
-            moved.flat[flat] += sign * step
-            both.append(numpy_loss(moved * mask, photo.image * mask))
-        difference = (both[0] - both[1]) / (2 * step)
-        # Single precision of the gradient; rounding of the loss, 1e-16, over the step.
-        assert gradient.flat[flat] == pytest.approx(difference, abs=1e-4 * np.abs(gradient).max())
 
 
 def test_psnr_of_an_iteration_uses_kept_pixels():
@@ -117,16 +83,6 @@ def test_masked_pixels_do_not_affect_a_fit(weight):
         for dataset in (spoiled_dataset(), spoiled_dataset((0.0, 1.0, 0.0), 3))
     ]
     assert states[0] == states[1]
-
-
-def test_coarse_masks_drop_partially_masked_pixels():
-    """A large pixel counts where all small ones do."""
-    trainer = masked_trainer(coarse=[{"until": 2, "factor": 4}])
-    view = trainer.stages[0].views[3]
-    blocks = mask_of(3).reshape(6, 4, 8, 4).min(axis=(1, 3))
-    uploaded = np.array(view.uploads["masks"])
-    np.testing.assert_array_equal(uploaded, np.repeat(blocks[..., None], 3, axis=2))
-    assert 0 < blocks.mean() < 1
 
 
 def depth_trainer(dataset=None):
@@ -155,7 +111,7 @@ def test_depth_penalty_matches_rendered_depth_and_alpha(dataset):
         channels = np.array(image).astype(np.float64)
         assert channels.shape == (HEIGHT, WIDTH, 5)
         mask = np.ones((HEIGHT, WIDTH, 1)) if photo.mask is None else photo.mask[..., None]
-        photometric = numpy_loss(mask * channels[..., :3], mask * photo.image)
+        photometric = photometric_loss(mask * channels[..., :3], mask * photo.image)
         penalty = penalty_in_numpy(channels[..., 3], channels[..., 4], photo)
         shown, loss, _ = trainer.compare(image, view)
         assert float(loss[0]) == pytest.approx(photometric + penalty, rel=10 * VALUE)
@@ -166,13 +122,8 @@ def test_depth_penalty_matches_rendered_depth_and_alpha(dataset):
 def test_gradient_of_the_depth_penalty_equals_differences_of_the_reference():
     """Along a direction of each parameter."""
     start, step, trainer = fits.double(fits.disturbed_blobs()), 1e-6, depth_trainer()
-    photos = fits.true_dataset().train
-    index = next(
-        k
-        for k, photo in enumerate(photos)
-        if not fits.photograph(start, photo).near_threshold.any()
-    )
-    photo, view = photos[index], trainer.views[index]
+    pairs = zip(fits.true_dataset().train, trainer.views, strict=True)
+    photo, view = next(p for p in pairs if not fits.photograph(start, p[0]).near_threshold.any())
     (effect,) = trainer.effects
     effect.adjust(rendered(trainer, view), view)
     (penalty,) = effect.penalties(view)
@@ -190,13 +141,11 @@ def test_gradient_of_the_depth_penalty_equals_differences_of_the_reference():
             continue
         # No two terms of the sum cancel.
         direction = np.sign(gradient) * np.abs(rng.normal(size=gradient.shape))
+        moves = (getattr(start, name) + s * step * direction for s in (1, -1))
         # |x| bends where a pixel's depth is right: none is so close as this step reaches.
-        both = [
-            value(replace(start, **{name: getattr(start, name) + s * step * direction}))
-            for s in (1, -1)
-        ]
+        after, before = (value(replace(start, **{name: values})) for values in moves)
+        expected = (after - before) / (2 * step)
         # Single precision, as in test_rendering.
-        expected = (both[0] - both[1]) / (2 * step)
         assert np.sum(direction * gradient) == pytest.approx(expected, rel=2e-4), name
 
 
@@ -230,13 +179,9 @@ def test_view_without_known_depths_has_no_penalty(change):
 GREY = (0.25, 0.5, 0.75)
 
 
-def transparent_dataset():
-    return fits.with_views(fits.true_dataset(GREY), lambda view: replace(view, depth=None))
-
-
 def random_trainer(dataset=None, **changes):
     return fits.make_trainer(
-        dataset or transparent_dataset(), data__random_background=True, **changes
+        dataset or fits.transparent_dataset(GREY), data__random_background=True, **changes
     )
 
 
@@ -256,26 +201,20 @@ def random_colors(trainer, iterations) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_random_colors_depend_on_seed_and_iteration_only():
-    first, again, other = (random_colors(random_trainer(seed=s), range(5)) for s in (3, 3, 4))
-    np.testing.assert_array_equal(first, again)
-    assert len(np.unique(np.concatenate([first, other]), axis=0)) == 10
-    np.testing.assert_array_equal(random_colors(random_trainer(seed=3), (3, 4)), first[3:])
-
-
-@pytest.mark.slow
-def test_random_colors_are_uniform_in_the_cube():
+def test_random_colors_are_uniform_and_depend_on_seed_and_iteration_only():
     """Their means and variances are those of uniform numbers: 1/2 and 1/12."""
-    found = random_colors(random_trainer(), range(1, 401))
-    assert found.min() >= 0 and found.max() <= 1
+    first, other = (random_colors(random_trainer(seed=s), range(1, 401)) for s in (3, 4))
+    np.testing.assert_array_equal(random_colors(random_trainer(seed=3), (3, 4)), first[2:4])
+    assert len(np.unique(np.concatenate([first, other]), axis=0)) == 800
+    assert first.min() >= 0 and first.max() <= 1
     # Standard errors: 0.289 / 20 = 0.0145, and 0.0037 for the variance; five of them.
-    np.testing.assert_allclose(found.mean(axis=0), 0.5, atol=0.073)
-    np.testing.assert_allclose(found.var(axis=0), 1 / 12, atol=0.02)
+    np.testing.assert_allclose(first.mean(axis=0), 0.5, atol=0.073)
+    np.testing.assert_allclose(first.var(axis=0), 1 / 12, atol=0.02)
 
 
 def test_target_is_the_transparent_image_over_the_random_color():
     """The image was composited over the dataset's background; its colours are unknown here."""
-    trainer, dataset = random_trainer(), transparent_dataset()
+    trainer, dataset = random_trainer(), fits.transparent_dataset(GREY)
     (effect,) = trainer.effects
     blobs = fits.double(fits.true_blobs())
     for iteration, index in ((1, 0), (2, 3)):
@@ -296,7 +235,7 @@ def test_target_is_the_transparent_image_over_the_random_color():
 def test_background_of_the_dataset_is_restored():
     """Rendered over the random colour, true blobs look like the true photographs."""
     trainer = fits.make_trainer(
-        transparent_dataset(), fits.true_blobs(), data__random_background=True
+        fits.transparent_dataset(GREY), fits.true_blobs(), data__random_background=True
     )
     assert trainer.step().psnr > 60
     np.testing.assert_allclose(color_of(trainer), GREY, rtol=1e-7)
@@ -310,7 +249,7 @@ def test_opaque_photographs_are_refused():
 
 def test_masked_pixels_are_black_over_any_color():
     """SSIM's windows that reach into it see the same black in both images."""
-    trainer = random_trainer(fits.masked(transparent_dataset()))
+    trainer = random_trainer(fits.masked(fits.transparent_dataset(GREY)))
     assert [effect.name for effect in trainer.effects] == ["background", "masks"]
     view = trainer.views[3]
     trainer.effects[0].before_render(trainer.fit_state(), view)

@@ -1,20 +1,17 @@
-"""The parts of the training loop that can be stated without running a whole fit."""
+"""The parts of the training loop that can be stated without running a whole fit.
 
-import mitsuba as mi
+Prepared targets stay on the device while there is room, else they are prepared again.
+"""
+
 import numpy as np
 import pytest
+from support import small_fits as fits
 from support.small_fits import kernel_hashes, steps
-from support.trainers import make_trainer, small_dataset, small_view
+from support.trainers import make_trainer
 
-from drgs.datasets.images import smaller_view
-from drgs.training.steps import view_of
-
-
-def test_views_are_shuffled_every_round():
-    rounds = np.array([view_of(i, 10, seed=3) for i in range(1, 51)]).reshape(5, 10)
-    assert np.array_equal(np.sort(rounds, axis=1), np.tile(np.arange(10), (5, 1)))
-    assert len({tuple(r) for r in rounds}) == 5
-    assert [view_of(i, 10, seed=4) for i in range(1, 51)] != rounds.ravel().tolist()
+from drgs.training import memory
+from drgs.training.losses import TARGET_BYTES
+from drgs.training.steps import bytes_per_pixel
 
 
 def test_sh_degree_increases_by_one_at_fixed_intervals():
@@ -46,20 +43,6 @@ def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population(
     assert 4 in compiled and {i for i in compiled if i > 8} == {12, 24, 36}, compiled
 
 
-def test_reported_loss_and_psnr_are_measured_before_the_step():
-    trainer = make_trainer(loss={"dssim_weight": 0.0})
-    report = trainer.step()
-    first = view_of(1, 4, seed=0)
-    untouched = make_trainer(loss={"dssim_weight": 0.0})
-    image = np.array(
-        mi.render(untouched.scene, sensor=untouched.stages[-1].views[first].sensor, spp=1)
-    )
-    photo = small_dataset().train[first].image
-    assert report.loss == pytest.approx(np.abs(image - photo).mean(), rel=1e-5)
-    psnr = -10 * np.log10(np.mean((image.astype(float) - photo) ** 2))
-    assert report.psnr == pytest.approx(psnr, rel=1e-5)
-
-
 def test_coarse_stages_come_first_and_end_as_configured():
     trainer = make_trainer(coarse=[{"until": 2, "factor": 4}, {"until": 5, "factor": 2}])
     sizes, names = [], []
@@ -70,18 +53,6 @@ def test_coarse_stages_come_first_and_end_as_configured():
         names.append(view.name)
     assert sizes == [(5, 4)] * 2 + [(10, 8)] * 3 + [(20, 16)] * 3
     assert sorted(names[:4]) == sorted(names[4:]) == ["v0", "v1", "v2", "v3"]
-
-
-def test_smaller_view_is_the_same_camera_with_larger_pixels():
-    view = small_view("v", 1.0)
-    smaller = smaller_view(view, 4)
-    blocks = view.image.reshape(4, 4, 5, 4, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(smaller.image, blocks, rtol=1e-6)
-    # A point on the film is at a quarter of its place, counted from the corner.
-    point = np.array([0.3, -0.2, 2.0])
-    film, smaller_film = view.K @ point / point[2], smaller.K @ point / point[2]
-    np.testing.assert_allclose(smaller_film[:2], film[:2] / 4, rtol=1e-12)
-    assert smaller.name == "v" and np.array_equal(smaller.camera_to_world, view.camera_to_world)
 
 
 def test_population_may_change_without_higher_degrees():
@@ -99,3 +70,61 @@ def test_population_may_change_without_higher_degrees():
     gaussians = trainer.gaussians()
     assert gaussians.shN.shape == (gaussians.num_gaussians, 0, 3)
     assert gaussians.num_gaussians > 40
+
+
+def indices_on_device(trainer):
+    """Indices of the views whose targets are on the device, by stage."""
+    return [
+        {view.index for view in stage.views if "photograph" in vars(view)}
+        for stage in trainer.stages
+    ]
+
+
+def test_targets_are_cached_within_the_memory_limit(monkeypatch):
+    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 2 * 20 * 16 * TARGET_BYTES + 7)
+    trainer, seen = make_trainer(), []
+    assert indices_on_device(trainer) == [set()]
+    for _ in range(8):  # two rounds of four views
+        trainer.step()
+        seen += [trainer.last_step.views[-1].view.index]
+        assert indices_on_device(trainer) == [set(seen[:2])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effects", [{}, {"data__random_background": True, "colors__lr": 0.02}])
+def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
+    """Nor on effects that upload something of a view."""
+
+    def result():
+        trainer = fits.make_trainer(fits.true_dataset(), loss__depth_weight=0.2, **effects)
+        return trainer, fits.everything_of(steps(trainer, 8))
+
+    _, kept = result()
+    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 0)
+    trainer, made_again = result()
+    assert indices_on_device(trainer) == [set()]
+    assert not any(view.uploads for view in trainer.views)
+    assert made_again == kept
+
+
+def test_device_memory_of_a_view_is_counted():
+    """Effects say what they upload of a pixel."""
+    changes = {"loss__depth_weight": 0.2, "data__random_background": True, "colors__lr": 0.02}
+    trainer = fits.make_trainer(fits.true_dataset(), **changes)
+    view = steps(trainer, 1).last_step.views[-1].view
+    arrays = [view.photograph.values, view.photograph.means, view.photograph.mean_squares]
+    arrays += [view.uploads["colors"].array, view.uploads["background"].array]
+    arrays += view.uploads["depth"]
+    count = sum(len(array) for array in arrays) * 4
+    assert count == view.width * view.height * bytes_per_pixel(trainer.effects)
+
+
+def test_finished_stage_leaves_no_arrays_on_the_device():
+    trainer = make_trainer(coarse=[{"until": 3, "factor": 2}])
+    steps(trainer, 3)
+    coarse, full = indices_on_device(trainer)
+    assert len(coarse) == 3 and not full
+    steps(trainer, 1)
+    coarse, full = indices_on_device(trainer)
+    assert not coarse and len(full) == 1
+    assert np.shape(trainer.last_step.views[-1].view.photograph.image) == (16, 20, 3)

@@ -51,13 +51,6 @@ def test_iterations_improve_images_of_viewers(monkeypatch):
     np.testing.assert_array_equal(list(trainer.images(dataset.test)), before)
 
 
-def test_repeated_tuning_gives_the_same_bytes(tmp_path):
-    for name in ("a.ply", "b.ply"):
-        trainer, _, gaussians = ended_fit(8)
-        for_viewers(trainer, gaussians).gaussians.save(tmp_path / name)
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
 def test_refined_cameras_and_colours_are_kept():
     """Its rates are next to nothing; the views to measure are those of the refined cameras."""
     changes = {"cameras.optimise": True, "cameras.rotation_lr": 1e-3, "colors.lr": 0.02}
@@ -89,14 +82,3 @@ def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
     with pytest.warns(UserNote, match="for viewers are not fitted any further"):
         found = for_viewers(trainer, gaussians)
     np.testing.assert_array_equal(found.gaussians.log_scales, expected.log_scales)
-
-
-def test_population_and_schedule_are_unchanged():
-    config = with_changes(
-        fits.config_of(iterations=400), {**NON_VIEWER_SETTINGS, "model.order": "pixel"}
-    )
-    further = tuning(config)
-    assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
-    assert further.model.approximations.is_default and not config.model.approximations.is_default
-    assert further.model.sh_degree == config.model.sh_degree
-    assert further.loss == config.loss and further.data == config.data

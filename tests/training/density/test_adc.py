@@ -2,17 +2,18 @@
 
 import math
 
+import drjit as dr
 import numpy as np
 import pytest
 from drjit.llvm.ad import Array2f, Bool, Float, TensorXf, TensorXf64
-from support.populations import EXTENT, make, moments, rows_of, statistics, values
+from support.populations import EXTENT, assert_standard_normal, make, moments, rows_of, values
 
 from drgs.config.schema import DensifyConfig
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.training.density.adc import AdaptiveDensityControl
-from drgs.training.density.strategy import DensityReport, StepInfo
+from drgs.training.density.strategy import StepInfo
 
 EARLY, LATE = 600, 3100  # before and after the first opacity reset of the default schedule
 SMALL, LARGE = 0.01, 0.2  # world units: cloned, split
@@ -24,12 +25,11 @@ def config_of(max_gaussians=1_000_000, **adc):
 
 
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
-    strategy = AdaptiveDensityControl(config_of(**config), False, *statistics(gradient_norms))
+    norms = np.asarray(gradient_norms, np.float32)
+    strategy = AdaptiveDensityControl(
+        config_of(**config), False, Float(4 * norms), dr.full(Float, 4, len(norms))
+    )
     return strategy.densify_and_prune(rows_of(optimizer, seed), iteration)
-
-
-def seen(strategy, gradient, visible, width, height):
-    strategy.update_statistics(StepInfo(1, width, height, gradient, visible, {}))
 
 
 @pytest.mark.parametrize("as_tensor", [False, True])
@@ -39,24 +39,17 @@ def test_statistics_are_gradient_norms_in_ndc_over_visible_views(as_tensor):
     gradients = random.standard_normal((3, num, 2))
     visible = random.random((3, num)) < 0.6
     visible[:, 2] = False
-
+    gradients[~visible] = np.nan
     result = AdaptiveDensityControl(DensifyConfig())
     result.begin(rows_of(make([SMALL] * num, 0.5)))
     for gradient, is_seen in zip(gradients, visible, strict=True):
         pixel = TensorXf(gradient) if as_tensor else Array2f(gradient.T)
-        seen(result, pixel, Bool(is_seen), width, height)
+        result.update_statistics(StepInfo(1, width, height, pixel, Bool(is_seen), {}))
 
     # d/dx_ndc = d/dx_px * W / 2, because x_ndc spans 2 over W pixels.
     norms = np.linalg.norm(gradients * [width / 2, height / 2], axis=2)
     np.testing.assert_array_equal(result.views, visible.sum(0))
-    np.testing.assert_allclose(result.gradient_norms, (norms * visible).sum(0), rtol=1e-6)
-
-
-def test_invisible_gradients_are_ignored_even_if_they_are_nan():
-    gradient, visible = Array2f([np.nan, 1], [0, 0]), Bool(False, True)
-    result = AdaptiveDensityControl(DensifyConfig(), False, Float(0, 0), Float(0, 0))
-    seen(result, gradient, visible, 2, 2)
-    np.testing.assert_array_equal(result.gradient_norms, [0, 1])
+    np.testing.assert_allclose(result.gradient_norms, np.nansum(norms, axis=0), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("white", "first"), [(False, 20), (True, 20), (True, None)])
@@ -75,25 +68,6 @@ def test_schedule_matches_the_reference_training_loop(white, first):
         assert strategy.needs_statistics(i) == (i < 200), i
 
 
-def test_large_gaussian_is_replaced_by_smaller_samples():
-    optimizer = make([SMALL, LARGE, SMALL], 0.5)
-    before = values(optimizer)
-    report = run(optimizer, [0, HIGH, 0])
-    assert report == DensityReport(num_added=1, split=1, num_gaussians=4)
-    after = values(optimizer)
-    for name in PARAMETER_NAMES:
-        np.testing.assert_array_equal(after[name][:2], before[name][[0, 2]])
-        if name not in ("means", "log_scales"):
-            np.testing.assert_array_equal(after[name][2:], before[name][[1, 1]])
-        for moment in moments(optimizer, name):
-            assert moment[:2].all()
-            assert not moment[2:].any()
-    # 1e-6: single precision of a logarithm.
-    shrunk = np.exp(before["log_scales"][[1, 1]].astype(float)) / 1.6
-    np.testing.assert_allclose(np.exp(after["log_scales"][2:].astype(float)), shrunk, rtol=1e-6)
-    assert (after["means"][2] != after["means"][3]).all()
-
-
 def test_samples_have_the_mean_and_covariance_of_their_parent():
     count = 20_000
     optimizer = make([LARGE, LARGE], 0.5, tensor_type=TensorXf64)
@@ -102,11 +76,9 @@ def test_samples_have_the_mean_and_covariance_of_their_parent():
     samples = values(optimizer)["means"][1:]
     assert samples.shape == (count, 3)
     covariance = reference.covariances(before["quats"], before["log_scales"])[1]
-    # In the parent's own axes: five standard deviations of a sample mean and covariance.
+    # In the parent's own axes.
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-    normal = (samples - before["means"][1]) @ whiten.T
-    assert np.abs(normal.mean(0)).max() < 5 / math.sqrt(count)
-    assert np.abs(np.cov(normal.T) - np.eye(3)).max() < 5 * math.sqrt(2 / count)
+    assert_standard_normal((samples - before["means"][1]) @ whiten.T)
 
 
 def test_thresholds_compare_like_in_the_reference():
@@ -122,29 +94,6 @@ def test_thresholds_compare_like_in_the_reference():
     assert run(optimizer, [0, 0], **config, reset_opacity=0.3).pruned == 1
 
 
-def test_just_added_rows_are_not_pruned_in_the_same_step():
-    # Half the size of the scene divided by 1.6 is still far above the limit of 0.1 x extent.
-    optimizer = make([2.0, SMALL], 0.5, sh_rows=0)
-    report = run(optimizer, [HIGH, 0], iteration=LATE)
-    assert report == DensityReport(num_added=1, split=1, num_gaussians=3)
-    # In the next step they are old.
-    assert run(optimizer, [0, 0, 0], iteration=LATE + 100).pruned == 2
-
-
-def test_nan_gaussians_are_pruned_and_never_copied():
-    optimizer = make([SMALL, SMALL, SMALL], [0.5, np.nan, 0.5])
-    report = run(optimizer, [np.nan, HIGH, 0])
-    assert report == DensityReport(pruned=1, num_gaussians=2)
-
-
-def test_refine_without_candidates_changes_nothing():
-    optimizer = make([SMALL, LARGE], 0.5)
-    before = dict(optimizer.state)
-    report = run(optimizer, [0, 0], iteration=LATE)
-    assert report == DensityReport(num_gaussians=2)
-    assert all(optimizer.state[key] is entry for key, entry in before.items())
-
-
 def test_last_gaussian_is_not_pruned_silently():
     optimizer = make([SMALL, SMALL], 0.001)
     with pytest.raises(UserError, match="iteration 600: every Gaussian would be pruned"):
@@ -157,7 +106,7 @@ def naive_decisions(norms, scales, opacities, large_is_pruned, config):
     limit = config.adc.prune_scale * EXTENT if large_is_pruned else math.inf
     kinds = []
     for norm, scale, opacity in zip(norms, scales, opacities, strict=True):
-        if opacity < config.adc.prune_opacity:
+        if not opacity >= config.adc.prune_opacity:  # also NaN
             kinds.append("prune")
         elif norm >= config.adc.grad_threshold:
             kinds.append("clone" if scale <= config.adc.clone_scale * EXTENT else "split")
@@ -186,6 +135,7 @@ def test_random_populations_follow_rules_and_cap(seed):
     norms = (random.integers(0, 8, num) * 1e-4).astype(np.float32)
     scales = np.exp(random.uniform(np.log(0.005), np.log(2), num))
     opacities = np.where(random.random(num) < 0.2, 0.001, random.uniform(0.01, 0.9, num))
+    opacities[random.random(num) < 0.1] = norms[random.random(num) < 0.1] = np.nan
     config = {
         "max_gaussians": int(random.integers(50, 110)),
         "split_count": int(random.integers(2, 5)),
@@ -205,13 +155,18 @@ def test_random_populations_follow_rules_and_cap(seed):
     assert report.num_gaussians <= max(config.max_gaussians, len(kept))
     assert (report.cloned, report.split) == (len(cloned), len(split))
     assert report.pruned == num - len(kept) - len(split)
-    for name in ("quats", "logit_opacities", "sh0", "shN"):
-        np.testing.assert_array_equal(after[name], before[name][parents])
     same = len(kept) + len(cloned)
-    np.testing.assert_array_equal(after["means"][:same], before["means"][parents[:same]])
-    for moment in moments(optimizer, "quats"):
-        assert moment[: len(kept)].all()
-        assert not moment[len(kept) :].any()
+    for name in PARAMETER_NAMES:
+        is_sampled = name in ("means", "log_scales")
+        rows = slice(same if is_sampled else None)
+        np.testing.assert_array_equal(after[name][rows], before[name][parents][rows])
+        for moment in moments(optimizer, name):
+            assert moment[: len(kept)].all()
+            assert not moment[len(kept) :].any()
+    shrunk = before["log_scales"][parents[same:]] - math.log(1.6)
+    # 1e-6: single precision of a logarithm.
+    np.testing.assert_allclose(after["log_scales"][same:], shrunk, rtol=0, atol=1e-6)
+    assert len(np.unique(after["means"][same:], axis=0)) == len(parents) - same
 
 
 def test_equal_seeds_give_equal_bytes():

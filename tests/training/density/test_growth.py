@@ -37,6 +37,11 @@ def test_gaussians_with_the_largest_errors_are_split():
     assert np.array_equal(after["sh0"][:4], before["sh0"][[0, 2, 3, 5]])
     assert np.array_equal(after["sh0"][4:], before["sh0"][[1, 4, 1, 4]])
     assert np.array(growth.errors).tolist() == [0] * 8  # and starts again
+    # The last change is at the end, wherever the intervals between the others lead.
+    optimizer = make([0.1] * 6, [0.5] * 6)
+    growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9}, stop=325)
+    assert [k for k in range(1, 500) if growth.is_due(k)] == [150, 200, 250, 300, 325]
+    assert growth.refine(rows_of(optimizer), 325).num_gaussians == 9
 
 
 def test_equal_errors_are_split_by_index_and_zero_errors_never():
@@ -50,7 +55,7 @@ def test_equal_errors_are_split_by_index_and_zero_errors_never():
     assert growth.refine(rows_of(optimizer), 1000).num_gaussians == 5
 
 
-def test_transparent_gaussians_are_removed_and_replaced():
+def test_transparent_gaussians_are_removed_and_replaced_unless_all_are():
     scales, opacities = [0.1, 0.1, 0.1, 4.1, 0.1], [0.5, 0.0049, np.nan, 0.5, 0.0051]
     optimizer = make(scales, opacities)
     before = values(optimizer)["sh0"]
@@ -59,6 +64,9 @@ def test_transparent_gaussians_are_removed_and_replaced():
     assert (report.num_gaussians, report.split, report.pruned) == (5, 2, 2)
     after = values(optimizer)["sh0"]
     assert np.array_equal(after, before[[4, 0, 3, 0, 3]])
+    optimizer = make([0.1] * 3, [0.001] * 3)
+    with pytest.raises(UserError, match=r"every Gaussian would be pruned .*budget\.prune_opacity"):
+        strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).refine(rows_of(optimizer), 500)
 
 
 @pytest.mark.parametrize("tensor_type", [TensorXf, TensorXf64])
@@ -115,29 +123,6 @@ def test_growth_exceeds_neither_curve_nor_cap(seed, num, target, cap, iteration)
     assert growth.max_num_gaussians(num, 1000) >= report.num_gaussians
 
 
-def test_last_change_is_at_the_end_of_growth_and_reaches_the_target():
-    """Wherever the intervals between the others lead."""
-    optimizer = make([0.1] * 6, [0.5] * 6)
-    growth = strategy(optimizer, [1, 5, 3, 0, 4, 2], budget={"gaussians": 9}, stop=325)
-    assert [k for k in range(1, 500) if growth.is_due(k)] == [150, 200, 250, 300, 325]
-    assert growth.refine(rows_of(optimizer), 325).num_gaussians == 9
-
-
-def test_a_population_that_would_vanish_is_refused():
-    optimizer = make([0.1] * 3, [0.001] * 3)
-    with pytest.raises(UserError, match=r"every Gaussian would be pruned .*budget\.prune_opacity"):
-        strategy(optimizer, [1, 1, 1], budget={"gaussians": 5}).refine(rows_of(optimizer), 500)
-
-
-GROWING = {
-    "strategy": "budget",
-    "start": 4,
-    "stop": 24,
-    "every": 4,
-    "budget": {"gaussians": 70, "error_every": 3},
-}
-
-
 @pytest.mark.parametrize(("every", "stop", "error_every"), [(4, 26, 10), (2, 12, 5), (100, 30, 7)])
 def test_each_change_has_accumulated_errors(every, stop, error_every):
     """If there were none since the last change, errors of its own view are used."""
@@ -156,16 +141,16 @@ def test_target_is_reached_with_coarse_images_until_the_end_of_growth():
     coarse = [CoarseStage(until=1000, factor=2)]
     config = DensifyConfig(start=100, stop=1000, every=100, budget={"gaussians": 90})
     growth = GrowthToNumber(config, coarse, first=50)
-    assert [growth.goal(i) for i in (900, 1000)] == [
-        50 + round(40 * math.sqrt(8 / 9) / 2 ** (10 / 9)),
-        90,
-    ]
+    late = 50 + round(40 * math.sqrt(8 / 9) / 2 ** (10 / 9))
+    assert [growth.goal(i) for i in (900, 1000)] == [late, 90]
 
 
 @pytest.mark.slow
 def test_coarse_images_have_fewer_gaussians_and_a_constant_means_rate():
     coarse = [{"until": 9, "factor": 4}, {"until": 17, "factor": 2}]
-    trainer, counts, rates = make_trainer(densify=GROWING, coarse=coarse), [], []
+    budget = {"gaussians": 70, "error_every": 3}
+    densify = {"strategy": "budget", "start": 4, "stop": 24, "every": 4, "budget": budget}
+    trainer, counts, rates = make_trainer(densify=densify, coarse=coarse), [], []
     for _ in range(50):
         report = trainer.step()
         counts.append(report.num_gaussians)

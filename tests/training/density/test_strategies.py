@@ -1,28 +1,38 @@
-"""The trainer with any strategy, and strategies that follow one another."""
+"""The trainer with any strategy, and small fits by each: they resume to the same bytes."""
 
-from dataclasses import dataclass, field
+import sys
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support import small_fits as fits
+from support.small_capture import blobs
 from support.small_fits import everything_of, steps
 from support.trainers import make_trainer
 
+from drgs.config import extensions
 from drgs.config.density import DensifyConfig
 from drgs.config.schema import FitConfig
+from drgs.gaussians.parameters import Gaussians
 from drgs.training import trainer as trainer_module
-from drgs.training.density.strategy import (
-    DensityReport,
-    DensityStrategy,
-    Phases,
-)
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Phases, density_strategy
 from drgs.training.rates import revised_stops
+from drgs.training.trainer import Trainer
 
 
 def trainer_with(monkeypatch, strategy, **changes):
     monkeypatch.setattr(trainer_module, "density_strategy", lambda *_: strategy)
     return make_trainer(**changes)
+
+
+def strategy_with(**methods):
+    """A strategy with these methods, which take the first argument alone."""
+    own = {k: lambda self, first, *_, act=act: act(first) for k, act in methods.items()}
+    return type("Own", (DensityStrategy,), own)()
 
 
 def red(image, photograph):
@@ -79,18 +89,13 @@ def test_iteration_updates_statistics_then_perturbs_then_refines(monkeypatch):
     ]
 
 
-class Faint(DensityStrategy):
-    """Asks for transparent Gaussians."""
-
-    def penalties(self, parameters, num_rows):
-        assert parameters["logit_opacities"].shape == (40,) and num_rows == 40
-        yield 1e6 * dr.mean(parameters["logit_opacities"].array)
-
-
 def test_penalties_are_terms_of_the_loss(monkeypatch):
     """Adam's first step is as long as the rate, with the sign of the weighted gradient."""
     plain = make_trainer()
-    trainer = trainer_with(monkeypatch, Faint())
+    trainer = trainer_with(
+        monkeypatch,
+        strategy_with(penalties=lambda params: [1e6 * dr.mean(params["logit_opacities"].array)]),
+    )
     logits = trainer.gaussians().logit_opacities
     expected = plain.step().loss + 1e6 * logits.astype(np.float64).mean()
     assert trainer.step().loss == pytest.approx(expected, rel=1e-5)
@@ -98,26 +103,20 @@ def test_penalties_are_terms_of_the_loss(monkeypatch):
     np.testing.assert_allclose(moved, -trainer.config.optimizer.opacities_lr, rtol=1e-4)
 
 
-class Quick(DensityStrategy):
-    """Doubles two rates, in the first iteration alone."""
-
-    def rate_factors(self, iteration):
-        return dict.fromkeys(("means", "sh0"), 2.0 if iteration == 1 else 1.0)
-
-
 def test_learning_rates_are_scaled_in_the_given_iterations(monkeypatch):
-    fits = [make_trainer(), trainer_with(monkeypatch, Quick())]
-    before = fits[0].gaussians()
-    for fit in fits:
+    quick = strategy_with(rate_factors=lambda i: dict.fromkeys(("means", "sh0"), 1 + (i == 1)))
+    trainers = [make_trainer(), trainer_with(monkeypatch, quick)]
+    before = trainers[0].gaussians()
+    for fit in trainers:
         fit.step()
-    plain, quick = (fit.gaussians() for fit in fits)
+    plain, quick = (fit.gaussians() for fit in trainers)
     for name, factor in (("means", 2), ("sh0", 2), ("log_scales", 1)):
         start = getattr(before, name).astype(np.float64)
         moves = [np.abs(getattr(g, name) - start).max() for g in (plain, quick)]
         # Values of order 1 in single precision, steps of 1.6e-4 and more.
         assert moves[1] == pytest.approx(factor * moves[0], rel=2e-3), name
     rates = []
-    for fit in fits:
+    for fit in trainers:
         fit.step()
         rates.append([entry[2] for entry in fit.optimizer.state.values()])
     assert rates[0] == rates[1]
@@ -153,19 +152,8 @@ class Phase(DensityStrategy):
     def refine(self, population, iteration):
         return DensityReport(self.num, num_added=self.num, cloned=2, pruned=1)
 
-    def state(self):
-        return {f"{self.name}_seen": np.array(self.seen)}
-
-    def restore(self, state):
-        self.seen = int(state[f"{self.name}_seen"])
-
     def max_num_gaussians(self, start, iterations):
         return start + self.num
-
-
-@dataclass
-class Seen:
-    iteration: int
 
 
 def test_phases_act_as_one_strategy_and_restart_after_row_changes():
@@ -177,16 +165,12 @@ def test_phases_act_as_one_strategy_and_restart_after_row_changes():
     assert list(phases.penalties({}, 5)) == ["first", "last"]
     assert phases.max_num_gaussians(100, 8) == 117
     for iteration in range(1, 6):
-        phases.update_statistics(Seen(iteration))
+        phases.update_statistics(SimpleNamespace(iteration=iteration))
     assert (first.seen, last.seen) == (4, 5)
     assert phases.refine(None, 2) == DensityReport(10, num_added=10, cloned=2, pruned=1)
     assert (first.seen, last.seen) == (4, 0)
     assert phases.refine(None, 4) == DensityReport(7, num_added=17, cloned=4, pruned=2)
     assert phases.refine(None, 5) is None
-    first.seen, last.seen = 5, 6
-    again = Phases((Phase("first", {2}), Phase("last", {2})))
-    again.restore(phases.state())
-    assert [phase.seen for phase in again.phases] == [5, 6]
 
 
 @pytest.mark.slow
@@ -223,3 +207,118 @@ def test_earlier_stops_of_a_plan_are_kept_for_past_iterations():
     assert revised_stops(config, 6, 9) == [{"after": 0, "stop": 20}, {"after": 6, "stop": 9}]
     with pytest.raises(ValueError, match="must begin after iteration 0, with growing after"):
         DensifyConfig(stop_aims=[{"after": 3, "stop": 9}])
+
+
+MODULES = {"adc", "budget", "mcmc", "pruning"}
+
+MCMC = {
+    "densify__strategy": "mcmc",
+    "densify__mcmc__gaussians": 60,
+    "densify__mcmc__growth": 0.1,
+    "init__num_points": 48,
+}
+
+BUDGET = {"densify__strategy": "budget", "densify__budget__gaussians": 60}
+SELECTION = {"densify__prune__to": 20}
+
+STRATEGIES = {
+    "mcmc": MCMC,
+    "selection": SELECTION,
+    "importance": {**SELECTION, "densify__prune__method": "importance"},
+    "budget and selection": BUDGET | SELECTION,
+    "mcmc and selection": MCMC | SELECTION,
+}
+
+
+def many_blobs(count=48) -> Gaussians:
+    """Return the start of a fit whose population changes: half of the blobs are transparent."""
+    logits = np.where(np.arange(count) % 2, -6.0, 0.0).astype(np.float32)
+    return replace(blobs(count, seed=5), logit_opacities=logits)
+
+
+def trainer_of(name, **changes):
+    schedule = {
+        "densify__start": 2,
+        "densify__stop": 14,
+        "densify__every": 4,
+        "densify__prune__every": 3,
+        "densify__prune__stop": 24,
+        "iterations": 30,
+    }
+    values = schedule | STRATEGIES[name] | changes
+    return fits.make_trainer(fits.plain_dataset(), many_blobs(), **values)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pause", [5, 16])
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_fit_resumes_to_the_same_bytes_from_any_iteration(name, pause):
+    whole = trainer_of(name)
+    sizes = []
+    for iteration in range(1, 28):
+        sizes.append(whole.step().num_gaussians)
+        if iteration == pause:
+            state = whole.state()
+    resumed = trainer_of(name)
+    resumed.restore(state)
+    steps(resumed, 27 - pause)
+    expected, got = everything_of(whole), everything_of(resumed)
+    assert got.keys() == expected.keys()
+    assert [key for key in expected if got[key] != expected[key]] == []
+    assert len(set(sizes)) > 2
+    if "mcmc" in name or "budget" in name:
+        assert max(sizes) <= 60
+    if name != "mcmc":
+        assert sizes[23:] == [20] * 4
+
+
+@pytest.mark.slow
+def test_revised_plan_keeps_a_phase_that_has_begun():
+    trainer = steps(trainer_of("selection", densify__prune__stop=None), 17)
+    assert trainer.config.densify.prune_window(30) == (14, 22)
+    trainer.reschedule(60, 14)
+    assert trainer.config.densify.prune_window(60) == (14, 22)
+    assert steps(trainer, 5).num_gaussians == 20
+    early = steps(trainer_of("selection", densify__prune__stop=24), 5)
+    early.reschedule(60, 30)
+    assert early.config.densify.prune_window(60) == (30, 48)
+
+
+@pytest.mark.slow
+def test_revised_plan_with_a_future_phase_equals_a_plan_from_the_start():
+    """The phase would have begun before the revision, had it been planned so."""
+    window = {"densify__prune__start": 20, "densify__prune__stop": 26}
+    revised = trainer_of("selection", **window)
+    for iteration in range(1, 25):
+        revised.step()
+        if iteration == 18:
+            revised.reschedule(24, 14)
+    assert revised.config.densify.prune_window(24)[0] == 18
+    again = steps(replanned(revised), 24)
+    assert everything_of(again) == everything_of(revised)
+
+
+@pytest.mark.slow
+def test_phase_without_time_is_skipped():
+    trainer = steps(trainer_of("selection", densify__prune__start=20), 16)
+    trainer.reschedule(16, 14)
+    again = steps(replanned(trainer), 16)
+    assert again.num_gaussians == trainer.num_gaussians > 20
+
+
+def replanned(trainer):
+    """A trainer that knows the plan from the start."""
+    return Trainer(trainer.config, fits.plain_dataset(), many_blobs())
+
+
+def test_unused_strategies_are_not_imported(monkeypatch):
+    names = {f"drgs.training.density.{module}" for module in MODULES}
+    for name in names:  # registered once, whatever ran before: the patches end with these
+        import_module(name)
+    for strategy in ("adc", "budget", "mcmc"):
+        for name in names & set(sys.modules):
+            monkeypatch.delitem(sys.modules, name)
+        monkeypatch.setattr(extensions.STRATEGIES, "_extensions", {})  # private: not registered yet
+        density_strategy(FitConfig(data={"path": "."}, densify={"strategy": strategy}))
+        imported = {name.rpartition(".")[2] for name in names & set(sys.modules)}
+        assert imported == {strategy}

@@ -1,4 +1,4 @@
-"""``mpiexec -n K python -m drgs.fit``: one voice, one folder, and nobody who waits for ever."""
+"""``mpiexec -n K drgs fit`` and ``render``: the same files, one error, and all processes end."""
 
 import csv
 import json
@@ -56,54 +56,46 @@ def assert_all_end(word):
         time.sleep(0.05)
 
 
-@pytest.mark.slow
-def test_distributed_fit_is_the_same(config, tmp_path):
-    path = config()
-    status, output, errors = parallel_processes.run(2, command(path, "--out", tmp_path / "two"))
-    assert status == 0, errors
-    assert output.count("written: ") == 1 and "Traceback" not in errors
-    assert parallel_processes.run(1, command(path, "--out", tmp_path / "one"))[0] == 0
-    assert result(tmp_path / "two") == result(tmp_path / "one")
-    metrics = json.loads((tmp_path / "two" / "metrics.json").read_text())
-    assert metrics["config"]["optimizer"]["views_per_step"] == 4
-
+SCENES = parallel_processes.REPOSITORY / "scenes"
+KNOT = SCENES / "shapes" / "knot.ply"
 
 REFUSED = [
-    (3, ["--set", "optimizer.views_per_step=2"], "at least the number of processes (3)"),
-    (2, ["--set", "optimizer.views_per_step=101"], "at most the number of training views (100)"),
-    (2, ["--set", "densify.prune.to=1"], "2 processes cannot share 1 Gaussians"),
-    (2, ["--variant", "cuda_ad_rgb"], "--variant cuda_ad_rgb: not usable here"),
-    (2, ["--threads", "100000"], "--threads"),
-    (2, ["--view"], "--view: shows the fit of one process alone"),
-    (2, ["--set", "densify.budget.prune_opacity=0.999"], "every Gaussian would be pruned"),
-    (2, ["--nonsense"], "--nonsense"),
+    (3, ["fit", "--set", "optimizer.views_per_step=2"], "at least the number of processes (3)"),
+    (2, ["fit", "--set", "optimizer.views_per_step=101"], "at most the number of training views"),
+    (2, ["fit", "--set", "densify.prune.to=1"], "2 processes cannot share 1 Gaussians"),
+    (2, ["fit", "--variant", "cuda_ad_rgb"], "--variant cuda_ad_rgb: not usable here"),
+    (2, ["fit", "--threads", "100000"], "--threads"),
+    (2, ["fit", "--view"], "--view: shows the fit of one process alone"),
+    (2, ["fit", "--set", "densify.budget.prune_opacity=0.999"], "every Gaussian would be pruned"),
+    (2, ["fit", "--nonsense"], "--nonsense"),
+    (2, ["export", KNOT], "mpiexec: processes can share fit and render"),
+    (2, ["render", SCENES / "hybrid.xml"], "a scene of Mitsuba is rendered by one process"),
 ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "words", "message"), REFUSED)
 def test_error_is_reported_once(config, tmp_path, size, words, message):
-    out = tmp_path / "out"
-    status, _, errors = parallel_processes.run(size, command(config(), "--out", out, *words))
+    (name, *words), out = words, tmp_path / "a.spz"
+    files = [config()] if name == "fit" else []
+    command = ["-m", f"drgs.{name}", *files, *words, "--out", out]
+    status, _, errors = parallel_processes.run(size, command)
     assert (status, errors.count("error: ")) == (2, 1), errors
-    assert message in errors
-
-
-SCENES = parallel_processes.REPOSITORY / "scenes"
-
-SINGLE_PROCESS = [
-    ("export", SCENES / "shapes" / "knot.ply", "mpiexec: processes can share fit and render"),
-    ("render", SCENES / "hybrid.xml", "a scene of Mitsuba is rendered by one process"),
-]
+    assert message in errors and not out.is_file()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "file", "message"), SINGLE_PROCESS)
-def test_single_process_command_is_refused_once(tmp_path, name, file, message):
-    words = ["-m", f"drgs.{name}", file, "--out", tmp_path / "a.spz"]
-    status, _, errors = parallel_processes.run(2, words)
-    assert (status, errors.count("error: ")) == (2, 1), errors
-    assert message in errors and not (tmp_path / "a.spz").exists()
+def test_processes_share_the_frames_of_an_orbit(tmp_path):
+    outputs, files = [], []
+    for size in (1, 3):
+        out = tmp_path / str(size)
+        words = ["-m", "drgs.render", KNOT, "--orbit", 5, "--size", 30, 20, "--out", out]
+        status, output, errors = parallel_processes.run(size, words)
+        assert status == 0, errors
+        outputs.append(output.replace(str(out), "OUT"))
+        files.append({p.name: p.read_bytes() for p in out.iterdir() if p.suffix != ".json"})
+    assert outputs[0] == outputs[1]
+    assert files[0] == files[1] and len(files[0]) == 7  # frames, and two animations
 
 
 MISSING = "ModuleNotFoundError('No module named mpi4py', name='mpi4py')"
@@ -142,15 +134,20 @@ def test_unexpected_error_of_one_process_prints_one_traceback_and_ends_all(confi
     assert errors.endswith("RuntimeError: a bug\n")
 
 
+def wait_for(process, is_reached):
+    """Wait until a running process has done something."""
+    end = time.monotonic() + 60
+    while not is_reached():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.05)
+
+
 @pytest.mark.slow
 def test_ctrl_c_during_a_rehearsal_ends_all_processes(config, tmp_path):
     """In a rehearsal: nothing is to be saved, and nobody is left behind."""
     path, out = config(iterations=100_000), tmp_path / "out"
     process = parallel_processes.start(2, command(path, "--out", out, "--budget", "1h"))
-    end = time.monotonic() + 60
-    while len(parallel_processes.ranks_of(str(out))) < 2:
-        assert process.poll() is None and time.monotonic() < end
-        time.sleep(0.05)
+    wait_for(process, lambda: len(parallel_processes.ranks_of(str(out))) >= 2)
     time.sleep(2.5)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
@@ -162,10 +159,7 @@ def test_ctrl_c_during_a_rehearsal_ends_all_processes(config, tmp_path):
 def started(path, out, size=2):
     """A fit that has saved a checkpoint and goes on."""
     process = parallel_processes.start(size, command(path, "--out", out))
-    end = time.monotonic() + 60
-    while not (out / "checkpoint.npz").exists():
-        assert process.poll() is None and time.monotonic() < end
-        time.sleep(0.1)
+    wait_for(process, (out / "checkpoint.npz").exists)
     return process
 
 
@@ -176,7 +170,10 @@ def test_fit_stopped_by_ctrl_c_resumes_on_another_number_of_processes(config, tm
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130 and "stopped; continue with" in output
-    assert parallel_processes.run(3, command("--resume", tmp_path / "out"))[0] == 0
+    status, output, errors = parallel_processes.run(3, command("--resume", tmp_path / "out"))
+    assert status == 0 and output.count("written: ") == 1 and "Traceback" not in errors
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["config"]["optimizer"]["views_per_step"] == 4
     assert parallel_processes.run(1, command(path, "--out", tmp_path / "whole"))[0] == 0
     assert result(tmp_path / "out") == result(tmp_path / "whole")
 
@@ -216,13 +213,8 @@ def test_full_disk_ends_all_processes_and_the_fit_resumes(config, tmp_path):
         pytest.skip("only root can mount a small disk")
     path, disk, kept = config(iterations=800), tmp_path / "disk", tmp_path / "kept"
     disk.mkdir()
-    words = [
-        parallel_processes.mpiexec(),
-        "-n",
-        "2",
-        sys.executable,
-        *command(path, "--out", disk / "out"),
-    ]
+    launcher = [parallel_processes.mpiexec(), "-n", "2", sys.executable]
+    words = [*launcher, *command(path, "--out", disk / "out")]
     done = subprocess.run(
         ["unshare", "--mount", "sh", "-c", SMALL_DISK_SCRIPT, "-", disk, kept, *words],
         cwd=parallel_processes.REPOSITORY,

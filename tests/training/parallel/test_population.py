@@ -56,18 +56,6 @@ def test_single_process_does_not_import_the_parallel_package(run_python, tmp_pat
 
 
 @pytest.mark.slow
-def test_mpiexec_without_the_extra_is_refused(run_python):
-    code = (
-        "import sys; sys.modules['mpi4py'] = None\n"
-        "from drgs.fit import main\n"
-        "main(['scenes/lego_mini.yml'])"
-    )
-    result = run_python(code, PMI_RANK="0")
-    assert result.returncode == 2
-    assert "mpiexec: needs mpi4py" in result.stderr and "drgs[mpi]" in result.stderr
-
-
-@pytest.mark.slow
 def test_launcher_of_another_mpi_is_refused(run_python):
     """Each of its processes would fit alone, into the same folder."""
     pytest.importorskip("mpi4py", reason="the extra mpi is not installed")

@@ -11,12 +11,9 @@ def settings(views_per_step=4, **changes):
 
 
 CHANGES = {"densify__start": 2, "densify__stop": 30, "densify__every": 5}
+STATIC = {"densify__start": 1, "densify__stop": 2}
 PRUNING = {"to": 15, "start": 4, "stop": 24, "every": 7}
-PRUNED = {
-    "densify__start": 1,
-    "densify__stop": 2,
-    **{f"densify__prune__{name}": value for name, value in PRUNING.items()},
-}
+PRUNED = STATIC | {f"densify__prune__{name}": value for name, value in PRUNING.items()}
 ADC = {**CHANGES, "densify__strategy": "adc", "densify__adc__grad_threshold": 1e-6}
 BUDGET = {"densify__budget__gaussians": 60, "densify__budget__error_every": 3}
 MCMC = {"densify__mcmc__gaussians": 60, "densify__mcmc__min_opacity": 0.3}
@@ -34,12 +31,7 @@ EFFECTS = {
     "colors__lr": 0.02,
     "coarse": [{"until": 10, "factor": 2}],
 }
-LATE = {
-    "optimizer__views": 8,
-    "optimizer__views_from": 0.0,
-    "densify__start": 1,
-    "densify__stop": 2,
-}
+LATE = {"optimizer__views": 8, "optimizer__views_from": 0.0, **STATIC}
 
 FITS = {
     "adc": (settings(**ADC), [1, 2, 3, 4], "plain"),
@@ -65,7 +57,7 @@ def test_any_number_of_processes_gives_the_same_bytes(changes, sizes, data):
     alone = fits.Trainer(fits.config_of(**changes), dataset, fits.disturbed_blobs())
     expected = parallel_processes.hashes_and_reports(alone, 8)
     for size in sizes:
-        state, reports = parallel_processes.fitted(size, 8, changes, data)
+        state, reports = parallel_processes.fitted(size, changes, data, steps=8)
         assert reports == expected[1], size
         assert state == expected[0], size
 
@@ -75,4 +67,5 @@ def test_nonfinite_value_is_reported_by_all_processes():
     alone = fits.make_trainer(fits.plain_dataset(), optimizer__views_per_step=4)
     expected = parallel_processes.spoiled(alone, 17)
     assert "in row 17" in expected
-    assert parallel_processes.state_text(3, 17) == expected
+    changes = {"optimizer.views_per_step": 4}
+    assert parallel_processes.fitted(3, changes, spoiled=17) == expected

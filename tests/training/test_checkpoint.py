@@ -1,6 +1,7 @@
-"""A checkpoint that is damaged, or edited, is refused in one line, and kept."""
+"""Checkpoints that are damaged are refused, and kept; those of earlier versions are continued."""
 
 import io
+import json
 import os
 import shutil
 import zipfile
@@ -8,6 +9,14 @@ import zipfile
 import numpy as np
 import pytest
 from support.fit_command import assert_fits, run_fit, stop_after, without_images, write_scene
+from support.small_capture import make_dataset
+
+from drgs.config.changes import with_changes
+from drgs.config.schema import FitConfig
+from drgs.core.errors import UserError
+from drgs.datasets.fingerprint import fingerprint_of
+from drgs.training.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from drgs.training.loop import History
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +117,7 @@ DAMAGE = {
     "late iteration": (edit("trainer.iteration", lambda a: a + 9), "between 0 and 4, got 11"),
     "several iterations": (edit("trainer.iteration", lambda a: np.array([a, a])), "iteration must"),
     "history of text": (edit("history", lambda a: a.astype("U")), "history must be of shape"),
-    "history of 5 columns": (
-        edit("history", lambda a: a[:, :5]),
-        "must be of shape (2, 7)",
-    ),
+    "history of 5 columns": (edit("history", lambda a: a[:, :5]), "must be of shape (2, 7)"),
     "NaN in the history": (edit("history", lambda a: a * np.nan), "history must hold finite"),
     "changes that are none": (
         edit("density", lambda a: a[:, :3]),
@@ -151,3 +157,51 @@ def test_damaged_checkpoint_is_refused_and_kept(checkpoint, damage, message):
 def test_intact_checkpoint_is_continued(checkpoint, monkeypatch):
     without_images(monkeypatch)
     assert "continues at iteration 2" in assert_fits("--resume", checkpoint.parent).stdout
+
+
+@pytest.fixture
+def config(tmp_path):
+    config = FitConfig(data={"path": tmp_path}, densify={"strategy": "adc"}, iterations=7000)
+    return with_changes(config, {"data.background": "white", "model.near": 0.2})
+
+
+def saved_as(folder, config, change):
+    """Save a checkpoint of ``config``, and change its record of it."""
+
+    def changed(text):
+        values = json.loads(str(text))
+        change(values)
+        return np.array(json.dumps(values, sort_keys=True))
+
+    data, state = fingerprint_of(make_dataset(1, 1)), {"iteration": np.array(3)}
+    save_checkpoint(folder, config, Checkpoint(state, *History().arrays(), 0.0, data))
+    for name in ("config", "config_before"):
+        edit(name, changed)(folder / "checkpoint.npz")
+
+
+def remove_new_keys(values):
+    del values["data"]["ignore_points"], values["init"]["start"], values["init"]["scale"]
+    for name in ("decay", "decay_from", "views", "views_from"):
+        del values["optimizer"][name]
+    densify = values["densify"]
+    kept = ("strategy", "start", "stop", "every", "max_gaussians", "adc")
+    values["densify"] = {name: densify[name] for name in kept}
+
+
+def test_checkpoint_of_an_earlier_version_is_continued(tmp_path, config):
+    saved_as(tmp_path, config, remove_new_keys)
+    assert int(load_checkpoint(tmp_path, config).trainer["iteration"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [("model", "near", 0.1), ("data", "background", "black"), ("densify", "stop", 15_000)],
+)
+def test_checkpoint_with_different_values_is_refused(tmp_path, config, section, key, value):
+    def change(values):
+        remove_new_keys(values)
+        values[section][key] = value
+
+    saved_as(tmp_path, config, change)
+    with pytest.raises(UserError, match="belongs to another configuration"):
+        load_checkpoint(tmp_path, config)
