@@ -185,9 +185,11 @@ def all_extensions() -> list[Extension]:
 def temporary_registrations() -> Iterator[None]:
     """Undo at the end what is registered within the block: for tests of extensions."""
     before = [(registry, dict(registry._extensions)) for registry in _registries]
+    loaded = set(_loaded)
     try:
         yield
     finally:
+        _loaded.intersection_update(loaded)
         for registry, extensions in before:
             registry._extensions.clear()
             registry._extensions.update(extensions)

@@ -1,10 +1,6 @@
 """A dataset reader that lives outside of drgs."""
 
-import importlib
 import json
-import sys
-from importlib.metadata import EntryPoint
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -12,29 +8,20 @@ import pytest
 from support import small_capture as capture
 from support import small_fits as fits
 from support.datasets import views_by_name
+from support.installed_examples import installed_examples
 
 import drgs
 from drgs.config.load import config_from
-from drgs.core import registry
 from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
 from drgs.datasets.folders import find_reader
 from drgs.io.images import write_png
 
-EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "numpy_poses.py"
-
 
 @pytest.fixture(autouse=True)
-def example(monkeypatch):
-    """The module of the example, found as that of an installed package is."""
-    monkeypatch.syspath_prepend(EXAMPLE.parent)
-    point = EntryPoint("numpy_poses", "numpy_poses", registry.ENTRY_POINT_GROUP)
-    monkeypatch.setattr(registry, "entry_points", lambda group: [point])
-    yield importlib.import_module("numpy_poses")
-    for each in registry._registries:  # private: a process does not unload packages
-        each._extensions.pop("numpy_poses", None)  # private, as above
-    registry._loaded.discard("numpy_poses")  # private, as above
-    sys.modules.pop("numpy_poses", None)
+def example():
+    with installed_examples("numpy_poses") as modules:
+        yield modules["numpy_poses"]
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -30,12 +31,8 @@ def installed(monkeypatch, tmp_path):
     (about / "entry_points.txt").write_text("[drgs]\nnpz = npz_format\n")
     formats.file_formats()  # imports those that are shipped
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr(registry, "_loaded", set())  # private: a process unloads no packages
-    extensions = dict(formats.FORMATS._extensions)  # private, as above
-    monkeypatch.setattr(formats.FORMATS, "_extensions", extensions)
-    monkeypatch.delitem(sys.modules, "npz_format", raising=False)
-    yield folder
-    sys.modules.pop("npz_format", None)
+    with mock.patch.dict(sys.modules), registry.temporary_registrations():
+        yield folder
 
 
 def test_gaussians_are_saved_and_loaded(installed, tmp_path):
@@ -109,7 +106,3 @@ def test_errors_of_the_package_are_reported_with_its_name(installed, tmp_path, o
         blobs().save(tmp_path / "a.npz")
     blobs().save(tmp_path / "a.ply")
     assert Gaussians.load(tmp_path / "a.ply").num_gaussians == 30
-
-
-def test_the_documented_example_is_the_file():
-    assert f"```python\n{EXAMPLE.read_text()}```" in (ROOT / "docs" / "developing.md").read_text()

@@ -1,20 +1,15 @@
 """Extensions of a fit that live outside of drgs: by name in a configuration, and as objects."""
 
-import importlib
-import sys
-from importlib.metadata import EntryPoint
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
 import pytest
 from support import small_fits as fits
+from support.installed_examples import installed_examples
 
 import drgs
 from drgs.cli.commands import CommandParser
 from drgs.config.changes import with_changes
 from drgs.config.load import config_from, dump_config, load_config
-from drgs.core import registry
 from drgs.core.errors import UserError
 from drgs.fit import add_arguments
 from drgs.integrator.summary import format_effects
@@ -22,24 +17,11 @@ from drgs.training.effects.base import training_effects
 from drgs.training.losses import prepare_target
 from drgs.training.summary import summary_of_fit
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-NAMES = ("binary_opacity", "charbonnier", "halving", "vignetting")
-
 
 @pytest.fixture(autouse=True)
-def examples(monkeypatch):
-    """The modules of the examples, found as those of an installed package are."""
-    monkeypatch.syspath_prepend(EXAMPLES)
-    points = [EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in NAMES]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points)
-    yield {name: importlib.import_module(name) for name in NAMES}
-    # Private names: nothing else forgets an extension.
-    for each in registry._registries:
-        for name in NAMES:
-            each._extensions.pop(name, None)
-    registry._loaded.difference_update(NAMES)
-    for name in NAMES:
-        sys.modules.pop(name, None)
+def examples():
+    with installed_examples("binary_opacity", "charbonnier", "halving", "vignetting") as modules:
+        yield modules
 
 
 def configured(**changes):
@@ -55,14 +37,6 @@ def configured(**changes):
     }
     values["iterations"], values["init"] = 12, {"num_points": 40}
     return config_from(values, "x.yml")
-
-
-def test_documented_examples_are_the_files():
-    text = (EXAMPLES.parent.parent / "docs" / "developing.md").read_text()
-    for name in (*NAMES, "numpy_poses"):
-        source = (EXAMPLES / f"{name}.py").read_text()
-        assert f"```python\n{source}```" in text, name
-        assert 15 <= len(source.splitlines()) <= 60
 
 
 def test_a_configuration_names_extensions_and_sets_their_sections(tmp_path):

@@ -1,0 +1,29 @@
+"""Examples of extensions, found as those of an installed package are."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import ModuleType
+from unittest import mock
+
+from drgs.core import registry
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+
+@contextmanager
+def installed_examples(*names: str) -> Iterator[dict[str, ModuleType]]:
+    """Within the block, entry points name these modules of ``examples``; yields the modules."""
+    points = [EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in names]
+    with (
+        mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]),
+        mock.patch.object(registry, "entry_points", lambda group: points),
+        mock.patch.dict(sys.modules),
+        registry.temporary_registrations(),
+    ):
+        yield {name: importlib.import_module(name) for name in names}
