@@ -3,10 +3,8 @@
 import json
 import shutil
 
-import numpy as np
 import pytest
-import yaml
-from support.commands import assert_ends_well, assert_refused
+from support.commands import assert_ends_well
 from support.fit_command import (
     ITERATIONS,
     assert_fit_refused,
@@ -55,13 +53,10 @@ def stopped(projects, tmp_path):
 
 def copied(project, folder):
     """The project, as if it had been made in ``folder``."""
-    project = shutil.copytree(project, folder / project.name)
-    path = project / "out" / "config.yml"
-    values = yaml.safe_load(path.read_text())
-    values["data"]["path"] = str(project / "data")
-    values["output"]["dir"] = str(project / "out")
-    path.write_text(yaml.safe_dump(values, sort_keys=False))
-    return project
+    copy = shutil.copytree(project, folder / project.name)
+    path = copy / "out" / "config.yml"
+    path.write_text(path.read_text().replace(str(project), str(copy)))
+    return copy
 
 
 @pytest.fixture(autouse=True)
@@ -149,20 +144,24 @@ def test_folder_in_use_by_another_fit_is_refused(stopped):
     assert_fits("--resume", out)
 
 
-def replace_an_image(data):
-    shutil.copy(data / "train" / "r_0.png", data / "train" / "r_1.png")
-
-
 @pytest.mark.slow
-def test_fit_with_changed_data_is_not_continued(stopped, projects):
+def test_fit_with_other_or_missing_data_is_not_continued(stopped, projects, tmp_path):
     out, data = stopped / "out", stopped / "data"
+    other = shutil.copytree(data, tmp_path / "other")
     image = (data / "train" / "r_1.png").read_bytes()
-    replace_an_image(data)
-    message = f"checkpoint.npz: belongs to other data than {data}: the image of training view r_1;"
-    for words in (["--resume", out], [stopped / "a.yml", "--out", out]):
-        assert_fit_refused(*words, folder=stopped, message=message)
+    for folder in (data, other):
+        shutil.copy(folder / "train" / "r_0.png", folder / "train" / "r_1.png")
+    message = "checkpoint.npz: belongs to other data than {}: the image of training view r_1;"
+    for words in (("--resume", out), (stopped / "a.yml", "--out", out)):
+        assert_fit_refused(*words, folder=stopped, message=message.format(data))
+    words = ("--resume", out, "--data", other)
+    assert_fit_refused(*words, folder=stopped, message=message.format(other))
     (data / "train" / "r_1.png").write_bytes(image)
-    assert "continues at iteration 4" in assert_fits("--resume", out).stdout
+    data.rename(tmp_path / "elsewhere")
+    message = f"data.path: there is no folder {data}; say where it is (--data DIR)"
+    assert_fit_refused("--resume", out, folder=stopped, message=message)
+    outcome = assert_fits("--resume", out, "--data", tmp_path / "elsewhere")
+    assert "continues at iteration 4" in outcome.stdout
     assert_as_uninterrupted(stopped, projects)
 
 
@@ -179,19 +178,6 @@ def test_moved_project_is_continued(stopped, projects, tmp_path, by):
     assert_as_uninterrupted(moved, projects)
 
 
-def test_other_and_moved_data_are_reported(stopped, projects, tmp_path):
-    shutil.copytree(stopped / "data", tmp_path / "other")
-    replace_an_image(tmp_path / "other")
-    words = ("--resume", stopped / "out", "--data", tmp_path / "other")
-    message = f"belongs to other data than {tmp_path / 'other'}: the image of training view r_1;"
-    assert_fit_refused(*words, folder=stopped, message=message)
-    (stopped / "data").rename(tmp_path / "elsewhere")
-    message = f"data.path: there is no folder {stopped / 'data'}; say where it is (--data DIR)"
-    assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
-    assert_fits("--resume", stopped / "out", "--data", tmp_path / "elsewhere")
-    assert_as_uninterrupted(stopped, projects)
-
-
 @pytest.mark.slow
 def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     config = write_project(tmp_path, init={"point_cloud": "data/points.ply"})
@@ -205,53 +191,33 @@ def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     assert found.init.point_cloud == tmp_path / "elsewhere" / "points.ply"
 
 
-def test_finished_fit_stays_finished_without_its_data(ended, tmp_path):
-    before = contents(ended)
-    for options in ([], ["--data", tmp_path]):
-        outcome = assert_fits("--resume", ended / "out", *options)
-        assert "this fit is finished" in outcome.stdout
+def test_earlier_result_is_kept(ended, tmp_path):
+    """Even without its data, and if the fit that replaces it cannot begin."""
+    before, out, config = contents(ended), ended / "out", ended / "a.yml"
+    (ended / "data").rename(tmp_path / "data")
+    for words in (("--resume", out), ("--resume", out, "--data", tmp_path)):
+        assert "this fit is finished" in assert_fits(*words).stdout
+    (tmp_path / "data").rename(ended / "data")
+    assert "this fit is finished" in assert_fits(config, "--out", out).stdout
     assert contents(ended) == before
-
-
-def test_moved_fit_without_a_record_is_continued(stopped, projects, tmp_path):
-    """And its files have fewer values."""
-    out = stopped.rename(tmp_path / "after") / "out"
-    with np.load(out / "checkpoint.npz") as file:
-        arrays = dict(file)
-    for name in ("config", "config_before"):
-        config = json.loads(str(arrays[name]))
-        del config["model"]["smoothing"]
-        arrays[name] = np.array(json.dumps(config, sort_keys=True))
-    np.savez(out / "checkpoint.npz", **arrays)
-    values = yaml.safe_load((out / "config.yml").read_text())
-    del values["model"]["smoothing"]
-    (out / "config.yml").write_text(yaml.safe_dump(values, sort_keys=False))
-    outcome = assert_fits("--resume", out)
-    assert "continues at iteration 4" in outcome.stdout
-    assert_as_uninterrupted(out.parent, projects)
+    (ended / "data" / "transforms_train.json").write_text("{")
+    message = "transforms_train.json: not valid JSON"
+    assert_fit_refused(config, "--out", out, "--overwrite", folder=ended, message=message)
 
 
 def test_orbit_needs_only_the_folder_of_a_fit(ended, tmp_path):
-    """Neither its data nor a path to it; the images are those of the cameras of the data."""
+    """Neither its data nor a path to it; views of a moved project are rendered by its data."""
     orbit = ("--orbit", 2, "--out")
-    arguments = (ended / "out", "--data", ended / "data", *orbit, tmp_path / "by data")
-    assert_ends_well(render.main, *arguments)
-    (ended / "out").rename(tmp_path / "alone")
-    shutil.rmtree(ended)
+    moved = ended.rename(tmp_path / "moved")
+    outcome = assert_ends_well(render.main, moved / "out", "--out", tmp_path / "renders")
+    assert f"taken from {moved / 'data'}" in outcome.stdout
+    assert_ends_well(render.main, moved / "out", *orbit, tmp_path / "by data")
+    (moved / "out").rename(tmp_path / "alone")
+    shutil.rmtree(moved)
     assert_ends_well(render.main, tmp_path / "alone", *orbit, tmp_path / "orbit")
     assert contents(tmp_path / "orbit") == contents(tmp_path / "by data")
     views = json.loads((tmp_path / "alone" / "views.json").read_text())["frames"]
     assert [view["file_path"] for view in views] == ["r_0", "r_1", "r_2"]
-
-
-def test_views_of_a_moved_project_are_rendered(ended, tmp_path):
-    moved = ended.rename(tmp_path / "moved")
-    outcome = assert_ends_well(render.main, moved / "out", "--out", tmp_path / "renders")
-    assert f"taken from {moved / 'data'}" in outcome.stdout
-    (moved / "data").rename(tmp_path / "elsewhere")
-    message = "there is no folder /"
-    arguments = (moved / "out", "--out", tmp_path / "b")
-    assert_refused(render.main, *arguments, folder=tmp_path, message=message)
 
 
 def test_folder_is_fitted_without_a_configuration(tmp_path):
