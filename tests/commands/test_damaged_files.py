@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 import yaml
 from plyfile import PlyData
-from support.attacks.mutations import mutate_bytes, mutate_chunks, mutate_header, mutate_tree
+from support.attacks.mutations import (
+    mutate_bytes,
+    mutate_chunks,
+    mutate_header,
+    mutate_json,
+    mutate_yaml,
+)
 from support.colmap_models import Model, write_binary
 from support.small_capture import blobs
 
@@ -68,15 +74,16 @@ def is_refused(seed, file, read):
     return refused
 
 
-def check(files, mutate, read, least=0.3):
+def check(files, contents, mutate, read, least=0.3):
     """Read files of changed contents; some must still be valid, many not.
 
-    mutate: of a generator and its seed, the content.
+    mutate: of a generator and a content; half of the contents have changed bytes instead.
     """
     refused = []
     for seed in range(COUNT):
-        path = files[seed % len(files)]
-        path.write_bytes(mutate(np.random.default_rng(seed), seed))
+        path, rng = files[seed % len(files)], np.random.default_rng(seed)
+        change = mutate if seed % 2 else mutate_bytes
+        path.write_bytes(change(rng, contents[seed % len(contents)]))
         refused.append(is_refused(seed, path, lambda path=path: read(path)))
         path.unlink()
     assert least * COUNT < sum(refused) < COUNT
@@ -85,33 +92,22 @@ def check(files, mutate, read, least=0.3):
 @pytest.mark.parametrize("read", [Gaussians.load, read_points])
 def test_damaged_ply_files_are_read_or_refused(tmp_path, read):
     path, contents = tmp_path / "a.ply", []
-    for text in (False, True):
+    for text in (True, False, False):
         blobs(3).save(path)
         data = PlyData.read(str(path), mmap=False)
         data.text = text
         data.write(str(path))
         contents.append(path.read_bytes())
-
-    def mutate(rng, seed):
-        change = mutate_header if seed % 2 else mutate_bytes
-        return change(rng, contents[seed % 3 == 0])
-
-    check([path], mutate, read)
+    check([path], contents, mutate_header, read)
 
 
 def test_damaged_transforms_files_are_read_or_refused(folder):
-    content = (folder / "transforms.json").read_bytes()
-    config = FitConfig(data={"path": folder}, init={"num_points": 4})
-
-    def mutate(rng, seed):
-        if seed % 2:
-            return json.dumps(mutate_tree(rng, json.loads(content))).encode()
-        return mutate_bytes(rng, content)
-
-    def read(path):
-        initial_gaussians(config, load_dataset(config.data))
-
-    check([folder / "transforms.json"], mutate, read)
+    path, config = (
+        folder / "transforms.json",
+        FitConfig(data={"path": folder}, init={"num_points": 4}),
+    )
+    read = lambda path: initial_gaussians(config, load_dataset(config.data))  # noqa: E731
+    check([path], [path.read_bytes()], mutate_json, read)
 
 
 @pytest.mark.parametrize("layout", ["transforms.json", "COLMAP"])
@@ -134,19 +130,19 @@ def test_damaged_masks_are_read_or_refused(folder, layout):
         assert all(np.isin(mask, (0, 1)).all() and mask.any() for mask in masks)
         assert len(masks) == 1
 
-    check(files, lambda rng, i: (mutate_chunks if i % 2 else mutate_bytes)(rng, content), read)
+    check(files, [content], mutate_chunks, read)
 
 
 def test_strange_names_are_found_or_reported(folder):
     """Names of photographs, masks, clouds and lists: only files are read, and none twice."""
-    content = (folder / "transforms.json").read_text()
+    path = folder / "transforms.json"
     parts = [
         *("00", "01", "02", "03", "images", "..", ".", "", "C:", "\\", "/", "//", "a" * 300, "\0"),
         *("\ud800", ".png", ".PNG", ".jpg", "é", "e\u0301", "*", "~", " ", "\n", "mask"),
         str(folder),
     ]
 
-    def mutate(rng, seed):
+    def rename(rng, content):
         meta = json.loads(content)
         places = [(frame, "file_path") for frame in meta["frames"][:4]]
         places += [(meta["frames"][6], "mask_path"), (meta, "ply_file_path")]
@@ -161,33 +157,23 @@ def test_strange_names_are_found_or_reported(folder):
         files = [view.files["image"] for view in (*dataset.train, *dataset.test)]
         assert all(file.is_file() for file in files) and len(set(files)) == len(files)
 
-    check([folder / "transforms.json"], mutate, read, least=0.1)
+    check([path], [path.read_bytes()], rename, read, least=0.1)
 
 
 def test_damaged_images_are_read_or_refused(tmp_path):
     path = tmp_path / "a.png"
     iio.imwrite(path, np.random.default_rng(0).integers(0, 256, (5, 7, 4), np.uint8))
-    content = path.read_bytes()
-    check(
-        [path],
-        lambda rng, seed: (mutate_chunks if seed % 2 else mutate_bytes)(rng, content),
-        lambda path: composite(read_image(path), (1, 1, 1)),
-    )
+    read = lambda path: composite(read_image(path), (1, 1, 1))  # noqa: E731
+    check([path], [path.read_bytes()], mutate_chunks, read)
 
 
 def test_damaged_configurations_are_read_or_refused(tmp_path):
     values = FitConfig(data=DataConfig(path="x", background=(0, 0.5, 1))).model_dump(mode="json")
-
-    def mutate(rng, seed):
-        if seed % 2:
-            text = yaml.safe_dump(mutate_tree(rng, values), sort_keys=False)
-            return text.encode(errors="surrogatepass")
-        return mutate_bytes(rng, yaml.safe_dump(values).encode())
 
     def read(path):
         config = load_config(path)
         dump_config(config, tmp_path / "again.yml")
         assert load_config(tmp_path / "again.yml") == config
 
-    check([tmp_path / "a.yml"], mutate, read)
+    check([tmp_path / "a.yml"], [yaml.safe_dump(values).encode()], mutate_yaml, read)
     assert [path.name for path in tmp_path.iterdir()] == ["again.yml"]

@@ -27,7 +27,7 @@ from drgs import fit
 from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
 from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER
-from support.attacks.observer import Fault, observed
+from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
 from support.small_capture import (
     HEIGHT,
@@ -115,11 +115,10 @@ def write_photos(folder: Path) -> None:
 def write_points(path: Path) -> None:
     """A cloud of coloured points."""
     rng = np.random.default_rng(0)
-    types = [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
-    rows = np.zeros(12, types)
+    rows = np.zeros(12, "f4, f4, f4, u1, u1, u1")
+    rows.dtype.names = ("x", "y", "z", "red", "green", "blue")
     for name in rows.dtype.names:
-        is_position = name in "xyz"
-        rows[name] = rng.uniform(-1, 1, 12) if is_position else rng.integers(0, 256, 12)
+        rows[name] = rng.uniform(-1, 1, 12) if name in "xyz" else rng.integers(0, 256, 12)
     PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
 
 
@@ -173,13 +172,13 @@ class AttackFolder:
     def __init__(self, base: Path, with_results: bool = True) -> None:
         """with_results: whether there are folders that the commands have written."""
         self.folder, self._kept = base / "workshop", base / "kept"
+        self.undisturbed: dict[tuple, dict[str, str]] = {}  # files of commands without faults
         self.folder.mkdir(parents=True)
         write_inputs(self.folder)
         if with_results:
             with current_folder(self.folder), stub_results():
                 self._run_commands()
         shutil.copytree(self.folder, self._kept)
-        self._pristine = contents(self.folder)
 
     def _run_commands(self) -> None:
         """``stopped/``, ``run/`` and ``captured/``: a fit with a checkpoint, one that has ended,
@@ -194,17 +193,12 @@ class AttackFolder:
 
     def restore_files(self) -> None:
         """Undo what an attack did."""
-        now = contents(self.folder)
-        for path in sorted(now.keys() - self._pristine.keys(), reverse=True):
-            _remove(self.folder / path)
-        for path, what in sorted(self._pristine.items()):
-            if now.get(path) == what:
-                continue
-            _remove(self.folder / path)
-            if what == FOLDER:
-                (self.folder / path).mkdir()
+        for path in self.folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
             else:
-                shutil.copy2(self._kept / path, self.folder / path)
+                path.unlink()
+        shutil.copytree(self._kept, self.folder, dirs_exist_ok=True)
 
 
 class _CtrlCAtCheckpoint(Fault):
@@ -215,40 +209,27 @@ class _CtrlCAtCheckpoint(Fault):
             signal.raise_signal(signal.SIGINT)
 
 
-FOLDER = "folder"
+MAX_READ_BYTES = 1 << 26
+"""Larger files are sparse, and nobody writes a part of them."""
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Return type or digest of everything below ``folder``, by relative path."""
+    """Return kind, target or digest of everything below ``folder``, by relative path."""
     paths = [
         os.path.join(parent, name)
         for parent, folders, files in os.walk(folder)
         for name in (*folders, *files)
     ]
-    return {os.path.relpath(path, folder): digest_or_kind(path) for path in paths}
+    return {os.path.relpath(path, folder): _digest_or_kind(path) for path in paths}
 
 
-def digest_or_kind(path: str) -> str:
-    """A digest, the target of a link, or the kind."""
-    mode = os.lstat(path).st_mode
-    if stat.S_ISDIR(mode):
-        return FOLDER
-    if stat.S_ISLNK(mode):
+def _digest_or_kind(path: str) -> str:
+    status = os.lstat(path)
+    if stat.S_ISLNK(status.st_mode):
         return f"link to {os.readlink(path)}"
-    if not stat.S_ISREG(mode):
-        return f"special {stat.S_IFMT(mode)}"
-    if os.stat(path).st_size > MAX_READ:
-        return f"{os.stat(path).st_size} bytes"
+    if not stat.S_ISREG(status.st_mode):
+        return f"special {stat.S_IFMT(status.st_mode)}"
+    if status.st_size > MAX_READ_BYTES:
+        return f"{status.st_size} bytes"
     with open(path, "rb") as file:
         return blake2b(file.read(), digest_size=16).hexdigest()
-
-
-MAX_READ = 1 << 26
-"""Bytes: larger ones are sparse files, of which nobody writes a part."""
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

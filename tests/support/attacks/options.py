@@ -17,52 +17,37 @@ import yaml
 from support.attacks.attack import Attack
 from support.attacks.attack_folder import CAPTURE, SETTINGS
 
-FIT_OPTIONS = (
-    ("fit.yml",),
-    ("--resume", "stopped"),
-    ("--data", "lego"),
-    ("--out", "out"),
-    ("--overwrite",),
-    ("--set", "seed=1"),
-    ("--threads", "1"),
-    ("--budget", "0.01s"),
-)
+FIT_OPTIONS = """
+    fit.yml; --resume stopped; --data lego; --out out; --overwrite; --set seed=1; --threads 1;
+    --budget 0.01s
+"""
 """Arguments of ``fit`` that are valid on their own."""
 
-RENDER_OPTIONS = (
-    ("--split", "test"),
-    ("--orbit", "2"),
-    ("--camera", "camera.json"),
-    ("--origin", "3", "0", "1"),
-    ("--target", "0", "0", "0.5"),
-    ("--up", "0", "1", "0"),
-    ("--fov", "50"),
-    ("--size", "8", "6"),
-    ("--background", "black"),
-    ("--background", "sky.png"),
-    ("--ignore", "motion"),
-    ("--scene", "photos.yml"),
-    ("--data", "lego"),
-    ("--set", "data.image_size=10"),
-    ("--define", "a=b"),
-    ("--threads", "1"),
-    ("--variant", "scalar_rgb"),
-)
+RENDER_OPTIONS = """
+    --split test; --orbit 2; --camera camera.json; --origin 3 0 1; --target 0 0 0.5; --up 0 1 0;
+    --fov 50; --size 8 6; --background black; --background sky.png; --ignore motion;
+    --scene photos.yml; --data lego; --set data.image_size=10; --define a=b; --threads 1;
+    --variant scalar_rgb
+"""
 """Those of ``render``."""
 
 SUBJECTS = ("run", "gaussians.ply", "splats.xml", "stopped", "photos")
 """Inputs of ``render``."""
 
 
+def _pairs(options: str) -> Iterator[tuple[str, ...]]:
+    for left, right in combinations(options.split(";"), 2):
+        yield (*left.split(), *right.split())
+
+
 def combination_attacks() -> Iterator[Attack]:
     """Every two options of ``fit``, and every two of ``render`` for each kind of subject."""
-    for left, right in combinations(FIT_OPTIONS, 2):
-        words = (*left, *right)
+    for words in _pairs(FIT_OPTIONS):
         out = "stopped" if "--resume" in words else "out"
         yield Attack(f"together/fit/{' '.join(words)}", "fit", words, out=out)
     for subject in SUBJECTS:
-        for left, right in combinations(RENDER_OPTIONS, 2):
-            words = (subject, *left, *right)
+        for pair in _pairs(RENDER_OPTIONS):
+            words = (subject, *pair)
             yield Attack(f"together/render/{' '.join(words)}", "render", (*words, "--out", "out"))
 
 
@@ -129,10 +114,8 @@ def folder_attacks() -> Iterator[Attack]:
         yield Attack(f"folder/fit over a result/{file}", "fit", words, change, theirs=theirs)
     for name, options in (("fit", ()), ("fit over", ("--overwrite",))):
         words = ("out/config.yml", *options, "--out", "out")
-        theirs = ("out/config.yml",)
-        yield Attack(
-            f"folder/{name}/its configuration", "fit", words, _config_inside, theirs=theirs
-        )
+        label, theirs = f"folder/{name}/its configuration", ("out/config.yml",)
+        yield Attack(label, "fit", words, _config_inside, theirs=theirs)
 
 
 NAMES = {
@@ -182,12 +165,9 @@ def name_attacks() -> Iterator[Attack]:
             "data": ("fit", (*fit, "--data", path), partial(_moved, "lego", name)),
             "configuration": ("fit", (f"{path}.yml",), partial(_moved, "fit.yml", f"{name}.yml")),
             "image": ("fit", fit, partial(_renamed_image, name)),
-            "scene": (
-                "render",
-                (f"{path}.xml", "--out", "out"),
-                partial(_moved, "splats.xml", f"{name}.xml"),
-            ),
         }
+        move = partial(_moved, "splats.xml", f"{name}.xml")
+        uses["scene"] = ("render", (f"{path}.xml", "--out", "out"), move)
         for use, (command, words, change) in uses.items():
             more = {"change": change} if change else {"out": name}
             for encoding in ("utf-8", "ascii"):

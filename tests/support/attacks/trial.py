@@ -17,9 +17,8 @@ from importlib import import_module
 from pathlib import Path
 
 from drgs.__main__ import COMMANDS
-from support.attacks.attack import Attack
+from support.attacks.attack import Attack, Changes, Killed, observed
 from support.attacks.attack_folder import AttackFolder, contents, current_folder, stub_results
-from support.attacks.observer import Changes, Killed, observed
 
 PIPE_BYTES = 1 << 20
 """Limit of a command's output."""
@@ -177,19 +176,16 @@ def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
     ]
 
 
-_undisturbed: dict[tuple, dict[str, str]] = {}
-
-
 def files_without_faults(attack: Attack, attack_folder: AttackFolder) -> dict[str, str]:
     """Return the command's files when nothing happens; puts the attack folder back."""
-    key = str(attack_folder.folder), attack.command, attack.words
-    if key not in _undisturbed:
+    key = attack.command, attack.words
+    if key not in attack_folder.undisturbed:
         attack_folder.restore_files()
         attack.change(attack_folder.folder)
         outcome = run(replace(attack, fault=None))
         assert outcome.status == 0, outcome.err
-        _undisturbed[key] = contents(attack_folder.folder / attack.out)
-    return _undisturbed[key]
+        attack_folder.undisturbed[key] = contents(attack_folder.folder / attack.out)
+    return attack_folder.undisturbed[key]
 
 
 def _last_lines(text: str) -> str:
