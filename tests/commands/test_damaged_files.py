@@ -74,15 +74,15 @@ def is_refused(seed, file, read):
     return refused
 
 
-def check(files, contents, mutate, read, least=0.3):
+def check(files, contents, mutate, read, others=mutate_bytes, least=0.3):
     """Read files of changed contents; some must still be valid, many not.
 
-    mutate: of a generator and a content; half of the contents have changed bytes instead.
+    mutate, others: of a generator and a content, in turn.
     """
     refused = []
     for seed in range(COUNT):
         path, rng = files[seed % len(files)], np.random.default_rng(seed)
-        change = mutate if seed % 2 else mutate_bytes
+        change = mutate if seed % 2 else others
         path.write_bytes(change(rng, contents[seed % len(contents)]))
         refused.append(is_refused(seed, path, lambda path=path: read(path)))
         path.unlink()
@@ -157,7 +157,7 @@ def test_strange_names_are_found_or_reported(folder):
         files = [view.files["image"] for view in (*dataset.train, *dataset.test)]
         assert all(file.is_file() for file in files) and len(set(files)) == len(files)
 
-    check([path], [path.read_bytes()], rename, read, least=0.1)
+    check([path], [path.read_bytes()], rename, read, rename, least=0.1)
 
 
 def test_damaged_images_are_read_or_refused(tmp_path):
