@@ -4,6 +4,7 @@ The clock of a fit with a budget is replaced: its plan is revised after iteratio
 """
 
 import os
+from functools import partial
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -13,6 +14,7 @@ from support.folders import visible
 
 from drgs.config.load import load_config
 from drgs.training import session
+from drgs.training.loop import StopCriterion
 
 PLANS = {2: 10, 3: 9, 5: 8}
 """Total number of iterations of the plan revised at each iteration; the clock ends it after 7."""
@@ -32,7 +34,7 @@ class Killed(BaseException):
     """An exception that no code handles."""
 
 
-class Revised:
+class Revised(StopCriterion):
     """The length of a fit whose plan changes on the way."""
 
     def __init__(self, *_):
@@ -44,20 +46,14 @@ class Revised:
             trainer.reschedule(PLANS.get(done, LAST), trainer.config.densify.stop)
         return done < LAST
 
-    def num_iterations(self, trainer):
-        return trainer.config.iterations
-
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """No time is spent on plans and reports."""
     without_images(monkeypatch)
 
-    def plan(config, *_):
-        chosen = SimpleNamespace(curve=None)
-        return SimpleNamespace(config=config, reasons="planned", chosen=chosen, end=0.0)
-
-    monkeypatch.setattr(session, "plan_fit", plan)
+    plan = partial(SimpleNamespace, reasons="planned", chosen=Mock(), end=0.0)
+    monkeypatch.setattr(session, "plan_fit", lambda config, *_: plan(config=config))
     monkeypatch.setattr(session, "rehearse", lambda *_: (Mock(), 1.0))
     monkeypatch.setattr(session, "Deadline", Revised)
 
@@ -100,18 +96,13 @@ def assert_done(out):
     assert len(rows) == load_config(out / "config.yml").iterations + 1
 
 
-def moments_of(config, tmp_path, *budget):
-    _, names = run_crashing_fit(None, False, config, "--out", tmp_path / "whole", *budget)
-    assert_done(tmp_path / "whole")
-    return names
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("budget", [(), BUDGET], ids=["plain", "budget"])
 def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
     """Also between the two files of a revised plan, and behind the last file."""
-    names = moments_of(config, tmp_path, *budget)
+    _, names = run_crashing_fit(None, False, config, "--out", tmp_path / "whole", *budget)
+    assert_done(tmp_path / "whole")
     if budget:
         saved = [moment for moment, name in enumerate(names) if name == "checkpoint.npz"]
         # After iterations 2, 4, 6 and 7.
@@ -124,23 +115,17 @@ def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
             outcome = assert_fits("--resume", out)
             is_finished = "metrics.json" in (names if behind else names[:-1])
             assert ("this fit is finished" in outcome.stdout) == is_finished, names
+            if "history.csv" in names and not is_finished and not budget:  # results, once more
+                assert f"continues at iteration {ITERATIONS}\n" in outcome.stdout
+                for name in RESULTS - {"history.csv", "metrics.json", "config.yml"}:
+                    expected = (tmp_path / "whole" / name).read_bytes()
+                    assert (out / name).read_bytes() == expected, name
         else:
             assert_fits(config, "--out", out, *budget)
         assert_done(out)
         assert_fits(out / "config.yml", "--out", again)
         for name in ("point_cloud.ply", "renders/test/r_1.png"):
             assert (out / name).read_bytes() == (again / name).read_bytes(), name
-
-
-@pytest.mark.slow
-def test_fit_killed_while_writing_results_repeats_no_iteration(config, tmp_path):
-    moment = moments_of(config, tmp_path).index("history.csv")
-    assert run_crashing_fit(moment, True, config, "--out", tmp_path / "out")[0]
-    outcome = assert_fits("--resume", tmp_path / "out")
-    assert f"continues at iteration {ITERATIONS}\n" in outcome.stdout
-    for name in RESULTS - {"history.csv", "metrics.json", "config.yml"}:  # times, and a folder
-        expected = (tmp_path / "whole" / name).read_bytes()
-        assert (tmp_path / "out" / name).read_bytes() == expected, name
 
 
 @pytest.mark.slow

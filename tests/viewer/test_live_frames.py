@@ -68,9 +68,6 @@ def test_depths_are_colored_from_near_to_far(scene):
     assert (frame.pixels[empty] == round(255 * BACKDROP_GRAY)).all()
     red, _, blue = frame.pixels[opacity.min(axis=2) > 200].astype(int).T
     assert (red > blue).any() and (blue > red).any()
-
-
-def test_empty_view_has_no_depth(scene):
     away = ViewerCamera(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
     frame = scene.frame(replace(REQUEST, camera=away, content="depth"))
     assert frame.note == "nothing is seen" and np.ptp(frame.pixels) == 0
@@ -162,8 +159,7 @@ def speck(depth):
 
 
 def place(rendered):
-    """Return the middle (px) of pixels that differ from the background, and their largest
-    difference."""
+    """Return the middle (px) of pixels other than the background, and the largest difference."""
     difference = np.abs(rendered[:, :, :3] - SKY_BLUE).sum(axis=2)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     middle = [(difference * axis).sum() / difference.sum() for axis in (x, y)]
@@ -178,17 +174,12 @@ def test_orthographic_view_matches_the_pinhole_at_the_focus_distance(depth):
     assert middle == pytest.approx(expected, abs=0.1)
 
 
-def test_a_closed_aperture_is_a_pinhole(capfd):
-    """Mitsuba's warning appears at most once an image."""
-    dot = speck(2 * RADIUS)
-    assert np.array_equal(seen(dot, "thin lens", aperture=0.0), seen(dot))
-    assert "aperture" not in "".join(capfd.readouterr())
-
-
 @pytest.mark.parametrize("focus", [1.0, 1.5])
-def test_thin_lens_is_sharp_at_its_focus_only(focus):
+def test_thin_lens_is_sharp_at_its_focus_only(focus, capfd):
     dot = speck(focus * RADIUS)
     sharp = seen(dot)
+    assert np.array_equal(seen(dot, "thin lens", aperture=0.0), sharp)  # a pinhole
+    assert "aperture" not in "".join(capfd.readouterr())  # Mitsuba warns at most once an image
     focused = seen(dot, "thin lens", aperture=0.1, focus=focus)
     assert np.abs(focused - sharp).max() < 1e-4  # roundings of the field of view
     blurred = seen(dot, "thin lens", aperture=0.1, focus=focus / 2)

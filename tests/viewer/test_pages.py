@@ -2,6 +2,7 @@
 
 import warnings
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -117,17 +118,10 @@ def test_every_control_is_in_the_request(page, server):
     assert requested(page).approximations.extent == 3.5  # has no control
 
 
-@pytest.fixture
-def text(page, monkeypatch):
-    """The text of the page of client 7."""
-    scene = SimpleNamespace(set_background_image=lambda *image, **options: None)
-    client = SimpleNamespace(client_id=7, camera=browser_camera(), scene=scene, flush=lambda: None)
+def test_number_beyond_its_limits_is_reported_and_not_rendered(page, server, monkeypatch):
+    client = Mock(client_id=7, camera=browser_camera())
     monkeypatch.setattr(page.server, "get_clients", lambda: {7: client})
-    page._texts[7] = SimpleNamespace(content="")  # private: only a browser has one
-    return page._texts[7]  # private, as above
-
-
-def test_number_beyond_its_limits_is_reported_and_not_rendered(page, server, text):
+    page._texts[7] = text = Mock()  # private: only a browser has one
     controls_of(server)["alpha_cut"].value = 1.0
     page.update()
     assert "alpha_cut must be from 0 to below 1" in text.content
@@ -163,19 +157,15 @@ def test_only_same_origin_requests_are_served(host, origin, address, expected):
     assert is_same_origin(headers, address) == expected
 
 
-def test_page_of_another_origin_cannot_connect(server):
+def test_page_of_another_origin_and_closed_browsers_get_nothing(server):
     with connect_to(server.get_port(), origin=url(server)) as connection:
         assert connection.recv(timeout=5)
     with pytest.raises(InvalidStatus, match="403"):
         connect_to(server.get_port(), origin="https://elsewhere.org")
-
-
-def test_images_for_a_closed_browser_give_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with run_server("127.0.0.1", None, ("", "")) as server:
-            server._websock_server._broadcast_buffer.set_done()  # viser's, as when it is closed
-            server.gui.add_markdown("late")
+        server._websock_server._broadcast_buffer.set_done()  # viser's, as when it is closed
+        server.gui.add_markdown("late")
 
 
 def test_the_page_of_a_fit_follows_its_history(server):

@@ -51,23 +51,13 @@ class Stage:
         for client in clients:
             self.requests.put(client, REQUEST)
 
-    def widths(self):
-        return [width for _, width, _ in self.shown]
-
 
 @pytest.fixture
-def make_stage(monkeypatch):
-    def make(refresh_after=None):
-        stage = Stage(refresh_after)
-        monkeypatch.setattr(scheduler, "time", stage.clock)
-        return stage
-
-    return make
-
-
-@pytest.fixture
-def stage(make_stage):
-    return make_stage()
+def stage(monkeypatch, request):
+    """Parameter: seconds until an image is rendered again, of its own seconds; None: never."""
+    stage = Stage(getattr(request, "param", None))
+    monkeypatch.setattr(scheduler, "time", stage.clock)
+    return stage
 
 
 def test_moving_camera_gets_small_images_and_static_one_full_size(stage):
@@ -88,17 +78,17 @@ def test_images_of_a_moving_camera_meet_their_time_limit(stage):
     for _ in range(8):
         stage.ask(1)
         assert stage.serve()
-    assert stage.widths() == [400] + 7 * [267]
+    assert [width for _, width, _ in stage.shown] == [400] + 7 * [267]
     assert 800 * 600 / 4 * 1e-6 > MOVING_SECONDS > 800 * 600 / 9 * 1e-6
     stage.seconds_a_pixel = 1e-8
     for _ in range(3):
         stage.ask(1)
         assert stage.serve()
-    assert stage.widths()[-2:] == [400, 800]
+    assert [width for _, width, _ in stage.shown[-2:]] == [400, 800]
 
 
-def test_changing_content_is_rendered_again_after_a_while(make_stage):
-    stage = make_stage(lambda seconds: 10 * seconds)
+@pytest.mark.parametrize("stage", [lambda seconds: 10 * seconds], indirect=True)
+def test_changing_content_is_rendered_again_after_a_while(stage):
     stage.seconds_a_pixel = 1e-6
     stage.ask(1)
     stage.serve()

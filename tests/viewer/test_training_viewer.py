@@ -135,16 +135,6 @@ def test_fit_ended_early_equals_a_fit_of_fewer_iterations(end_at):
     assert_same_bytes(trainer, again)
 
 
-def test_ending_before_the_start_or_after_the_end_has_no_effect():
-    dataset, queue = plain_dataset(), RenderRequests()
-    queue.end()
-    trainer = make_trainer(dataset, iterations=3)
-    assert EarlyStop(StopCriterion(), queue).should_continue(trainer)  # nothing is fitted yet
-    queue = RenderRequests()
-    run(trainer, queue, dataset, lambda iteration: iteration == 3 and queue.end())
-    assert trainer.iteration == trainer.config.iterations == 3
-
-
 @pytest.mark.slow
 def test_pause_stops_fit_and_clock_and_serves_requests(monkeypatch):
     dataset, queue, during = plain_dataset(), RenderRequests(), []
@@ -177,9 +167,14 @@ def test_pause_stops_fit_and_clock_and_serves_requests(monkeypatch):
 
 @pytest.mark.parametrize("ends", [False, True])
 def test_ctrl_c_and_ending_early_work_during_a_pause(ends):
+    """Ending before the start or after the end has no effect."""
     queue, trainer = RenderRequests(), make_trainer(plain_dataset(), iterations=3)
     queue.pause(True)
     if ends:
         queue.end()
+        assert EarlyStop(StopCriterion(), queue).should_continue(trainer)  # nothing is fitted yet
     run(trainer, queue, plain_dataset(), stops=lambda: not ends)
     assert trainer.iteration == (1 if ends else 3)
+    queue, trainer = RenderRequests(), make_trainer(plain_dataset(), iterations=3)
+    run(trainer, queue, plain_dataset(), lambda iteration: iteration == 3 and queue.end())
+    assert trainer.iteration == trainer.config.iterations == 3
