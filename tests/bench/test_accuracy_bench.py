@@ -35,9 +35,8 @@ def subject():
 
 
 def image_of(subject, **approximations):
-    return accuracy.RungRenderer.from_rung(
-        accuracy.Rung("", approximations), subject, subject.cameras[0]
-    ).image()
+    rung = accuracy.Rung("", approximations)
+    return accuracy.RungRenderer.from_rung(rung, subject, subject.cameras[0]).image()
 
 
 def test_each_rung_comes_closer_to_the_most_accurate_image(subject):
@@ -63,6 +62,7 @@ def test_most_accurate_image_is_close_to_one_without_cuts(subject):
 
 
 def test_measurement_matches_its_columns(subject):
+    """Masked pixels of a photograph are left out."""
     accurate = [accuracy.most_accurate(subject, c, accuracy.MIN_ALPHA) for c in subject.cameras]
     rungs = [accuracy.RUNGS[0], accuracy.Rung("4 samples", {"low_pass": 0.0}, False, samples=4)]
     default, sampled = accuracy.measure(subject, accurate, rungs, 1)
@@ -77,19 +77,25 @@ def test_measurement_matches_its_columns(subject):
     assert default.photo_psnr == pytest.approx(
         metrics.psnr(image, subject.photographs[0].image), abs=1e-3
     )
+    mask = np.ones((24, 24), np.float32)
+    mask[:, 5:] = 0
+    masked = replace(subject, photographs=[replace(subject.photographs[0], mask=mask)])
+    (found,) = accuracy.measure(masked, accurate, rungs[:1], 1)
+    expected = metrics.psnr(image[:, :5], subject.photographs[0].image[:, :5])
+    assert found.photo_psnr == pytest.approx(expected, abs=1e-3)
+    assert abs(expected - default.photo_psnr) > 0.1
     assert 0 < default.milliseconds < default.both_milliseconds
     assert 1000 < default.operations < sampled.operations
 
 
-def measurement(name, ms, psnr, is_approximation=True):
-    return accuracy.AccuracyMeasurement(
-        "scene", name, is_approximation, ms, 2 * ms, 1, psnr, 0.9, 0.1, None
-    )
-
-
 def test_pareto_front_contains_undominated_measurements():
-    a, b, c = measurement("a", 1, 30), measurement("b", 2, 40), measurement("c", 3, 35)
-    d, other = measurement("d", 4, 50), measurement("other", 0.5, 90, is_approximation=False)
+    rows = [("a", 1, 30), ("b", 2, 40), ("c", 3, 35), ("d", 4, 50), ("other", 0.5, 90)]
+    a, b, c, d, other = (
+        accuracy.AccuracyMeasurement(
+            "scene", name, name != "other", ms, 2 * ms, 1, psnr, 0.9, 0.1, None
+        )
+        for name, ms, psnr in rows
+    )
     assert accuracy.pareto_front([d, c, other, b, a]) == [a, b, d]
     text = accuracy.table([a, b, c, d, other])
     assert "| a * | 1 ms, 1.00x | 2 ms, 1.00x | 1 | 30.0 dB |" in text
@@ -111,18 +117,6 @@ def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monke
         (scene, rung) for scene in ("few", "stress") for rung in ("default", "unscented", "exact")
     ]
     assert Image.open(tmp_path / "accuracy.png").size[0] > 800
-
-
-def test_masked_pixels_are_left_out(subject):
-    """The mask is the photograph's."""
-    accurate = [accuracy.most_accurate(subject, c, accuracy.MIN_ALPHA) for c in subject.cameras]
-    (view,), mask = subject.photographs, np.ones((24, 24), np.float32)
-    mask[:, 5:] = 0
-    masked = replace(subject, photographs=[replace(view, mask=mask)])
-    (found,) = accuracy.measure(masked, accurate, accuracy.RUNGS[:1], 1)
-    expected = metrics.psnr(image_of(subject)[:, :5], view.image[:, :5])
-    assert found.photo_psnr == pytest.approx(expected, abs=1e-3)
-    assert abs(expected - metrics.psnr(image_of(subject), view.image)) > 0.1
 
 
 def test_measurement_includes_the_smoothing_filter(tmp_path, subject):

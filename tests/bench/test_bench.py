@@ -43,11 +43,8 @@ def test_stability_finds_no_error_beyond_the_conditioning(tmp_path):
 
 def test_useful_pairs_match_the_reference():
     case = clear(Case("pairs", 40, 35, 0, count=80))
-    frame = rendering.render(
-        device_gaussians(case.gaussians, SINGLE), device_camera(case.camera, SINGLE),
-        rendering.Pipeline(0),
-    )  # fmt: skip
-    work = timing.count_work(frame)
+    inputs = device_gaussians(case.gaussians, SINGLE), device_camera(case.camera, SINGLE)
+    work = timing.count_work(rendering.render(*inputs, rendering.Pipeline(0)))
     splats = reference.project(case.gaussians, case.camera)
     order = reference.depth_order(splats.depths, splats.visible)
     y, x = np.mgrid[: case.height, : case.width] + 0.5
@@ -95,19 +92,15 @@ def test_renderers_do_not_reuse_a_frame(small_scene):
         assert len(dr.kernel_history()) == first >= 10
 
 
-def test_exponents_of_a_power_law_are_recovered():
-    work = timing.Work(1, 1, 1, 1)
+def test_entries_per_gaussian_stay_constant_as_their_number_grows():
+    """In the first sweep the film grows and the Gaussians shrink; a power law is recovered."""
+    work, ratios = timing.Work(1, 1, 1, 1), []
     found = [
         scaling.Result(scaling.Point("Gaussians", n, 400, 2), 3e-3 * n**1.5, 7 * n, 0, work)
         for n in (1000, 5000, 20_000)
     ]
     assert scaling.exponent(found, "milliseconds") == pytest.approx(1.5)
     assert scaling.exponent(found, "device_bytes") == pytest.approx(1)
-
-
-def test_entries_per_gaussian_stay_constant_as_their_number_grows():
-    """In the first sweep the film grows and the Gaussians shrink."""
-    ratios = []
     for point in scaling.points(quick=True):
         if point.sweep.startswith("constant"):
             gaussians = scenes.bench_gaussians(point.count)
@@ -118,29 +111,17 @@ def test_entries_per_gaussian_stay_constant_as_their_number_grows():
     assert len(ratios) >= 2 and max(ratios) / min(ratios) < 1.1
 
 
-def measurement(text):
-    """``measure(folder)``, which writes ``text`` as ``it.csv``."""
+def test_a_measurement_is_replaced_by_the_next_unless_it_was_edited(tmp_path):
+    path, text = tmp_path / "it.csv", ""
     parser = argparse.ArgumentParser()
-    add_out(parser, lambda args: (args.out / "it.csv").write_text(text), "it.csv")
-
-    def measure(folder):
-        args = parser.parse_args(["--out", str(folder)])
+    add_out(parser, lambda args: path.write_text(text), "it.csv")
+    args = parser.parse_args(["--out", str(tmp_path)])
+    for text in ("first", "second"):  # noqa: B007  (the measurement writes it)
         args.run(args)
-
-    return measure
-
-
-def test_a_measurement_is_replaced_by_the_next_and_nothing_else(tmp_path):
-    (tmp_path / "it.csv").write_text("mine")
-    with pytest.raises(UserError, match=r"holds it\.csv"):
-        measurement("first")(tmp_path)
-    path = tmp_path / "out" / "it.csv"
-    measurement("first")(path.parent)
-    measurement("second")(path.parent)
     assert path.read_text() == "second"
     path.write_text("edited")
     with pytest.raises(UserError, match=r"holds it\.csv"):
-        measurement("third")(path.parent)
+        args.run(args)
     assert path.read_text() == "edited"
 
 
@@ -196,16 +177,11 @@ def test_every_case_renders_a_different_image(small):
         assert (np.abs(image - plain).max() < 1e-4) == same, key
 
 
-def test_images_are_never_reused(small):
-    """Each is rendered: the second launches what the first did."""
-    renderer = effects.CaseRenderer(effects.rendering_cases()[0], scenes.bench_gaussians(150))
-    counts = [effects.operations(renderer) for _ in range(2)]
-    assert counts[0] == counts[1] > 1000
-
-
 def test_derivatives_do_not_add_up_over_rounds(small):
     cases = {c.effect: c for c in effects.rendering_cases()}
     renderer = effects.CaseRenderer(cases["camera refinement"], scenes.bench_gaussians(150))
+    first, second = (effects.operations(renderer) for _ in range(2))
+    assert first == second > 1000  # images are never reused
     found = []
     for _ in range(2):
         renderer.forward_and_backward()

@@ -13,6 +13,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from PIL import Image
 from support.commands import run_in_process
 
@@ -197,7 +198,7 @@ def test_help_shows_the_command_with_an_example(main, words, called):
     assert outcome.returncode == 0
     assert outcome.stdout.startswith(f"usage: {called} ")
     assert f"  {called} " in outcome.stdout.partition("\nexample")[2]
-    assert "%(prog)s" not in outcome.stdout
+    assert "%(prog)s" not in outcome.stdout and str(REPOSITORY) not in outcome.stdout
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
-from drgs.__main__ import COMMANDS
-from drgs.bench.__main__ import COMMANDS as MEASUREMENTS
-from drgs.cli.commands import CommandParser
-
 SCENES = REPOSITORY / "scenes"
 STUDIES = SCENES / "studies"
-MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name in MEASUREMENTS]
 
 SCRIPTS = {
     "compare_shapes": ((), {"out/shapes.png"}),
@@ -83,15 +78,6 @@ def test_script_writes_to_the_current_folder(load_script, monkeypatch, tmp_path,
     assert files_of_the_checkout() == before
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.p*")} == written
     assert written or capsys.readouterr().out.count("\n") >= 4
-
-
-@pytest.mark.parametrize("module", MODULES)
-def test_commands_write_to_the_current_folder_by_default(module):
-    parser = CommandParser(prog="command")
-    importlib.import_module(module).add_arguments(parser)
-    for action in parser._actions:  # argparse has no public list
-        if action.dest == "out":
-            assert action.required or action.default is None or not action.default.is_absolute()
 
 
 @pytest.mark.parametrize("name", main_scripts(STUDIES))

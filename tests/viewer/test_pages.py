@@ -157,15 +157,16 @@ def test_only_same_origin_requests_are_served(host, origin, address, expected):
     assert is_same_origin(headers, address) == expected
 
 
-def test_page_of_another_origin_and_closed_browsers_get_nothing(server):
-    with connect_to(server.get_port(), origin=url(server)) as connection:
-        assert connection.recv(timeout=5)
-    with pytest.raises(InvalidStatus, match="403"):
-        connect_to(server.get_port(), origin="https://elsewhere.org")
+def test_page_of_another_origin_and_closed_browsers_get_nothing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        server._websock_server._broadcast_buffer.set_done()  # viser's, as when it is closed
-        server.gui.add_markdown("late")
+        with run_server("127.0.0.1", None, ("", "")) as server:
+            with connect_to(server.get_port(), origin=url(server)) as connection:
+                assert connection.recv(timeout=5)
+            with pytest.raises(InvalidStatus, match="403"):
+                connect_to(server.get_port(), origin="https://elsewhere.org")
+            server._websock_server._broadcast_buffer.set_done()  # viser's, as when it is closed
+            server.gui.add_markdown("late")
 
 
 def test_the_page_of_a_fit_follows_its_history(server):

@@ -24,16 +24,14 @@ def main(patterns: list[str]) -> None:
         for family in FAMILIES:
             if not patterns:
                 print(f"{family}: {len(attacks(family, attack_folder))}")
-                continue
-            if not any(pattern.partition("/")[0] == family for pattern in patterns):
-                continue
-            for attack in attacks(family, attack_folder):
-                if any(attack.name == p or fnmatch(attack.name, p) for p in patterns):
-                    started = time.perf_counter()
-                    wrong = server.trial(attack.name, attack.seconds)
-                    print(f"{time.perf_counter() - started:6.2f} s  {attack.name}")
-                    print(*(f"          WRONG: {line}\n" for line in wrong), sep="", end="")
-                    sys.stdout.flush()
+            elif any(pattern.partition("/")[0] == family for pattern in patterns):
+                for attack in attacks(family, attack_folder):
+                    if any(fnmatch(attack.name, p) or attack.name == p for p in patterns):
+                        started = time.perf_counter()
+                        wrong = server.trial(attack.name, attack.seconds)
+                        print(f"{time.perf_counter() - started:6.2f} s  {attack.name}")
+                        print(*(f"          WRONG: {line}\n" for line in wrong), sep="", end="")
+                        sys.stdout.flush()
 
 
 if __name__ == "__main__":

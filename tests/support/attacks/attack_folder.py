@@ -84,13 +84,11 @@ CAPTURE = (
 """A capture of the least there is."""
 
 
-def pose(angle: float) -> list[list[float]]:
-    """Camera to world, OpenGL axes."""
-    return (pose_around(angle, 0.3) * [1, -1, -1, 1]).tolist()
+def _pose(angle: float) -> list[list[float]]:
+    return (pose_around(angle, 0.3) * [1, -1, -1, 1]).tolist()  # OpenGL axes
 
 
-def noise(seed: int, channels: int) -> np.ndarray:
-    """An image of random bytes."""
+def _noise(seed: int, channels: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, channels), np.uint8)
 
 
@@ -99,12 +97,12 @@ def write_photos(folder: Path) -> None:
     folder.mkdir()
     frames = []
     for i in range(4):
-        frames.append({"file_path": f"{i}.png", "transform_matrix": pose(1.5 * i)})
-        iio.imwrite(folder / f"{i}.png", noise(i, 3))
-    frames[1] |= {"mask_path": "mask.png", "transform_matrix_close": pose(1.51)}
+        frames.append({"file_path": f"{i}.png", "transform_matrix": _pose(1.5 * i)})
+        iio.imwrite(folder / f"{i}.png", _noise(i, 3))
+    frames[1] |= {"mask_path": "mask.png", "transform_matrix_close": _pose(1.51)}
     frames[2] |= {"depth_file_path": "depth.npy"}
     frames[3] |= {"depth_file_path": "depth.png"}
-    iio.imwrite(folder / "mask.png", np.where(noise(5, 1)[:, :, 0] > 20, 255, 0).astype(np.uint8))
+    iio.imwrite(folder / "mask.png", np.where(_noise(5, 1)[:, :, 0] > 20, 255, 0).astype(np.uint8))
     iio.imwrite(folder / "depth.png", np.full((HEIGHT, WIDTH), 4000, np.uint16))
     np.save(folder / "depth.npy", np.full((HEIGHT, WIDTH), 4, np.float32))
     meta = {"fl_x": 27.0, "fl_y": 27.0, "cx": 16.0, "cy": 12.0, "w": WIDTH, "h": HEIGHT}
@@ -132,12 +130,12 @@ def write_inputs(folder: Path) -> None:
     replace(blobs(12), shN=np.zeros((12, 0, 3), np.float32)).save(folder / "gaussians.splat")
     (folder / "fit.yml").write_text(yaml.safe_dump(SETTINGS))
     (folder / "photos.yml").write_text(yaml.safe_dump(SETTINGS | PHOTOGRAPHS))
-    frame = {"transform_matrix": pose(0.5)}
+    frame = {"transform_matrix": _pose(0.5)}
     camera = {"camera_angle_x": 0.7, "w": WIDTH, "h": HEIGHT, "frames": [frame]}
     (folder / "camera.json").write_text(json.dumps(camera))
     (folder / "splats.xml").write_text(SPLATS)
     (folder / "ball.xml").write_text(BALL)
-    iio.imwrite(folder / "sky.png", noise(9, 3))
+    iio.imwrite(folder / "sky.png", _noise(9, 3))
     (folder / "mine").mkdir()
     (folder / "mine" / "notes.txt").write_text("not to be touched")
 
@@ -181,9 +179,7 @@ class AttackFolder:
         shutil.copytree(self.folder, self._kept)
 
     def _run_commands(self) -> None:
-        """``stopped/``, ``run/`` and ``captured/``: a fit with a checkpoint, one that has ended,
-        and a capture.
-        """
+        """``stopped/``: a fit with a checkpoint; ``run/``: one that has ended; ``captured/``."""
         with observed(self.folder, _CtrlCAtCheckpoint("interrupt", 0)):
             outcome = run_in_process(fit.main, "fit.yml", "--out", "stopped")
         assert outcome.returncode == 130, outcome
@@ -202,8 +198,6 @@ class AttackFolder:
 
 
 class _CtrlCAtCheckpoint(Fault):
-    """When the first checkpoint is about to be put in place."""
-
     def strike(self, number: int, event: str, path: str) -> None:
         if event == "os.rename" and path.endswith(CHECKPOINT):
             signal.raise_signal(signal.SIGINT)

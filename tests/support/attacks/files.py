@@ -63,14 +63,10 @@ READERS = {
 
 
 def _attack(name: str, file: str, change: Callable[[Path], None], **more: object) -> Attack:
-    """An attack by what is at the path of a file; the reader's message names it."""
+    """An attack by what is at the path of a file."""
     command, *words = READERS[file]
     out = words[-1] if words[-2] in ("--out", "--resume") else "out"
-    return Attack(name, command, tuple(words), partial(_apply, change, file), out=out, **more)
-
-
-def _apply(change: Callable[[Path], None], file: str, folder: Path) -> None:
-    change(folder / file)
+    return Attack(name, command, tuple(words), lambda f: change(f / file), out=out, **more)
 
 
 def _replaced(make: Callable[[Path], None], path: Path) -> None:
@@ -99,7 +95,7 @@ REPLACEMENTS = {
     "UTF-16": lambda path: path.write_bytes("a: 1".encode("utf-16")),
     "a web page": lambda path: path.write_text("<!DOCTYPE html><html><body>404</body></html>"),
     "an LFS pointer": lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"),
-    "an archive": lambda path: path.write_bytes(_archive()),
+    "an archive": lambda path: zipfile.ZipFile(path, "w").writestr("a.txt", "a"),
     "a pickle": lambda path: path.write_bytes(b"cos\nsystem\n(S'touch hacked'\ntR."),
     "its first half": lambda path: os.truncate(path, path.stat().st_size // 2),
     "all but its last byte": lambda path: os.truncate(path, path.stat().st_size - 1),
@@ -133,13 +129,6 @@ MAY_BE_ACCEPTED = {
 }
 """A fit without a checkpoint begins anew. The last two: whole rows without a header that says how
 many there were, and YAML that may end between two values."""
-
-
-def _archive() -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as file:
-        file.writestr("a.txt", "a")
-    return stream.getvalue()
 
 
 def other_file_attacks() -> Iterator[Attack]:

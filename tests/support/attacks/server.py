@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+from support.attacks.attack import Attack
 from support.attacks.attack_folder import AttackFolder
 from support.attacks.catalogue import attacks
 from support.attacks.trial import trial
@@ -32,7 +33,7 @@ class Server:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._stop()
+        self.stop()
 
     def trial(self, name: str, seconds: float) -> list[str]:
         """Return the faults of an attack; seconds: its time limit."""
@@ -46,14 +47,14 @@ class Server:
             theirs.close()
         self._pipe.send(name)
         if not self._pipe.poll(seconds + GRACE_SECONDS):
-            self._stop()
+            self.stop()
             return ["did not end, in native code"]
         try:
             return self._pipe.recv()
         except (EOFError, OSError):
-            return [f"the process ended with {self._stop()}"]
+            return [f"the process ended with {self.stop()}"]
 
-    def _stop(self) -> int | None:
+    def stop(self) -> int | None:
         process, self._process = self._process, None
         if process is None:
             return None
@@ -70,13 +71,11 @@ def serve(base: Path, pipe: Connection) -> None:
     dr.set_thread_count(1)
     attack_folder = AttackFolder(base)
 
-    @cache
-    def of_family(family: str) -> dict:
-        return {attack.name: attack for attack in attacks(family, attack_folder)}
-
-    while True:
-        try:
+    families: dict[str, dict[str, Attack]] = {}
+    with suppress(EOFError, OSError):
+        while True:
             name = pipe.recv()
-        except (EOFError, OSError):
-            return
-        pipe.send(trial(of_family(name.partition("/")[0])[name], attack_folder))
+            family = name.partition("/")[0]
+            if family not in families:
+                families[family] = {a.name: a for a in attacks(family, attack_folder)}
+            pipe.send(trial(families[family][name], attack_folder))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from functools import partial
 from importlib import import_module
@@ -70,12 +69,10 @@ def schema_attacks() -> Iterator[Attack]:
                 continue
             sets = [word for other in (*others, f"{key}={text}") for word in ("--set", other)]
             words, out = (config, *sets), "out"
-            if key != "output.dir":
-                words += ("--out", "out")
-            elif text != "null":
-                out = text or "."
+            if key == "output.dir":
+                out = "out/fit" if text == "null" else text or "."
             else:
-                out = "out/fit"
+                words += ("--out", "out")
             yield Attack(f"schema/{key}={label(text)}", "fit", words, out=out)
 
 
@@ -122,19 +119,15 @@ COSTLY = {
 """Valid values that mean a lot of work, by command and option."""
 
 
-def options_of(command: str) -> list[argparse.Action]:
-    """The options of a command and its positional argument, without those that take no value."""
-    parser = CommandParser(prog=command)
-    import_module(COMMANDS[command].module).add_arguments(parser)
-    return [action for action in parser._actions if action.nargs != 0]  # argparse has no other list
-
-
 def option_attacks() -> Iterator[Attack]:
-    """Each option of the commands with each of the words above."""
+    """Each option that takes values, and the positional argument, with each of the words above."""
     for kind, (command, base, given) in BASES.items():
-        for action in options_of(command):
+        parser = CommandParser(prog=command)
+        import_module(COMMANDS[command].module).add_arguments(parser)
+        for action in parser._actions:  # argparse has no other list
             option = action.option_strings[0] if action.option_strings else ""
-            if given is RENDER_WORDS and (not option or option in base):
+            is_known = given is RENDER_WORDS and (not option or option in base)
+            if action.nargs == 0 or is_known:
                 continue
             count = action.nargs if isinstance(action.nargs, int) else 1
             for word in given:
@@ -144,9 +137,7 @@ def option_attacks() -> Iterator[Attack]:
                     yield Attack(name, command, words, out=out)
 
 
-def _words(
-    base: tuple[str, ...], option: str, values: tuple[str, ...]
-) -> tuple[tuple[str, ...], str]:
+def _words(base: tuple, option: str, values: tuple) -> tuple[tuple[str, ...], str]:
     """The command line with one option set, and the folder that it may fill."""
     if not option:
         return (*values, *base[1:], "--out", "out"), "out"
@@ -154,11 +145,7 @@ def _words(
         return (*base, option, *values), values[0] or "."
     if option == "--resume":
         return (option, *values), values[0]
-    if option in base:
-        at = base.index(option)
-        end = next((i for i in range(at + 1, len(base)) if base[i].startswith("--")), len(base))
-        base = base[:at] + base[end:]
-    return (*base, "--out", "out", option, *values), "out"
+    return (*base, "--out", "out", option, *values), "out"  # of two values the last one counts
 
 
 SCENE_WORDS = ("splats.xml", "--out", "out")
@@ -211,15 +198,13 @@ PLACES = {
 }
 """Objects of a scene that get another property: their beginning, and properties."""
 
-OTHER_SIDE = {"width": "height", "height": "width"}
-
 
 def _insert_property(place: str, name: str, text: str, folder: Path) -> None:
     """Add a property to an object of the scene, in place of one of that name."""
     start = PLACES[place][0]
     lines = [line for line in SPLATS.splitlines() if f'name="{name}"' not in line or start in line]
-    if name in OTHER_SIDE:
-        text += f'<integer name="{OTHER_SIDE[name]}" value="16"/>'
+    if name in ("width", "height"):  # which are on one line
+        text += f'<integer name="{"height" if name == "width" else "width"}" value="16"/>'
     scene = "\n".join(lines).replace(start, f"{start}\n{text}")
     if place == "lens":
         scene = scene.replace('"perspective"', '"thinlens"')
@@ -254,10 +239,8 @@ AOV = '<integrator type="aov"><string name="aovs" value="d:depth"/><integrator t
 PATH, DIRECT, NESTED = (f'<integrator type="{kind}"/>' for kind in ("path", "direct", "splats"))
 POSE = '<lookat origin="4, 0, 1" target="0, 0, 0" up="0, 0, 1"/>'
 
-ENTITIES = "".join(
-    f'<!ENTITY {name} "{text * 10}">'
-    for name, text in (("a", "a"), ("b", "&a;"), ("c", "&b;"), ("d", "&c;"))
-)
+LETTERS = ("a", "a"), ("b", "&a;"), ("c", "&b;"), ("d", "&c;")
+ENTITIES = "".join(f'<!ENTITY {name} "{text * 10}">' for name, text in LETTERS)
 """Ten thousand letters."""
 
 REPLACED = {
