@@ -5,33 +5,44 @@ from dataclasses import replace
 from itertools import combinations
 
 import imageio.v3 as iio
+import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
+from conftest import REPOSITORY
+from support import small_capture
 from support.folders import visible
+from support.openexr import read_exr
 from support.render_command import (
-    BLACK,
-    WHITE,
+    EIGHT_BITS,
     assert_shows,
     rendered,
     run,
+    sensor,
+    write_scene,
 )
 from support.small_capture import (
     FIELD_OF_VIEW,
     FOCUS,
     HEIGHT,
     WIDTH,
+    assert_images_agree,
     blobs,
     decibels,
     make_dataset,
+    photograph,
     pose_around,
     write_dataset,
     write_fit,
 )
-from support.small_capture import view as small_view
 
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
+from drgs.io.images import write_exr
 from drgs.results.refined_cameras import write_views
+
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+POSE = pose_around(0.8, 0.3)
+VIEW = small_capture.view("", POSE, None)
 
 
 def photo(fit, name, background, split="test"):
@@ -87,18 +98,7 @@ def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
     assert metrics["views"]["r_1"]["psnr"] == pytest.approx(score, abs=1e-3)
 
 
-def test_depths_are_not_opened(tmp_path):
-    """There are none: nothing that is rendered looks at them."""
-    fit = write_fit(tmp_path, make_dataset(1, 1))
-    for path in (tmp_path / "data").glob("transforms_*.json"):
-        values = json.loads(path.read_text())
-        values["frames"][0]["depth_file_path"] = "nowhere.png"
-        path.write_text(json.dumps(values))
-    run(fit, "--out", tmp_path / "out")
-    assert (tmp_path / "out" / "r_0.png").is_file()
-
-
-def test_orbit_is_around_the_focus_of_the_photographs(fit, tmp_path):
+def test_orbit_is_around_the_focus_of_the_photographs_or_the_gaussians(fit, tmp_path):
     run(fit, "--orbit", "5", "--out", tmp_path)
     names = [f"orbit_{i:03d}.png" for i in range(5)]
     assert visible(tmp_path) == {"orbit.webp", "orbit.gif", *names}
@@ -106,24 +106,20 @@ def test_orbit_is_around_the_focus_of_the_photographs(fit, tmp_path):
     cameras = orbit_of_views(make_dataset().train, blobs()).viewpoints(5, WIDTH, HEIGHT, fov)
     for name, camera in zip(names, cameras, strict=True):
         assert_shows(tmp_path / name, camera, WHITE)
-
-
-def test_an_orbit_of_a_ply_needs_no_photographs(fit, tmp_path):
     arguments = ("--orbit", "3", "--size", "30", "20", "--background", "black", "--fov", "60")
     run(fit / "point_cloud.ply", *arguments, "--out", tmp_path)
     orbit = orbit_of_gaussians(blobs(), np.array([0, 0, 1]), 60)
     for index, camera in enumerate(orbit.viewpoints(3, 30, 20, 60)):
-        assert_shows(tmp_path / f"orbit_{index:03d}.png", camera, (0, 0, 0))
+        assert_shows(tmp_path / f"orbit_{index:03d}.png", camera, BLACK)
 
 
-def test_cameras_of_a_transforms_file_render_the_images_of_the_split(fit, tmp_path):
-    run(fit, "--out", tmp_path / "split")
-    transforms = fit.parent / "data" / "transforms_test.json"
-    size = ("--size", WIDTH, HEIGHT)
-    run(fit, "--camera", transforms, *size, "--out", tmp_path / "cameras")
-    for index in range(4):
-        expected = (tmp_path / "split" / f"r_{index}.png").read_bytes()
-        assert (tmp_path / "cameras" / f"camera_{index}.png").read_bytes() == expected
+def test_depths_are_not_opened(tmp_path):
+    fit = write_fit(tmp_path, make_dataset(1, 1))
+    for path in (tmp_path / "data").glob("transforms_*.json"):
+        values = json.loads(path.read_text())
+        values["frames"][0]["depth_file_path"] = "nowhere.png"
+        path.write_text(json.dumps(values))
+    run(fit, "--out", tmp_path / "out")
 
 
 def write_camera(path, begin, end=None, **values):
@@ -160,7 +156,7 @@ def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path):
 
 @pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
 def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys, ignored):
-    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3), pose_around(0.8, 0.3), k1=0.1)
+    path = write_camera(tmp_path / "c.json", POSE, POSE, k1=0.1)
     values = json.loads(path.read_text())
     plain = {"transform_matrix": values["frames"][0]["transform_matrix"]}
     path.write_text(json.dumps(values | {"frames": [plain, *values["frames"]]}))
@@ -176,12 +172,11 @@ def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys
 
 def test_camera_set_by_options_is_used(fit, tmp_path):
     """A file's background is black; a folder's is that of its configuration."""
-    pose = pose_around(0.8, 0.3)
-    words = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", np.degrees(FIELD_OF_VIEW)]
+    words = ["--origin", *POSE[:3, 3], "--target", *FOCUS, "--fov", np.degrees(FIELD_OF_VIEW)]
     words += ["--size", WIDTH, HEIGHT, "--out", tmp_path]
     for what, background in ((fit / "point_cloud.ply", BLACK), (fit, WHITE)):
         run(what, *words)
-        assert_shows(tmp_path / "camera.png", small_view("", pose, None), background)
+        assert_shows(tmp_path / "camera.png", VIEW, background)
 
 
 HEADER = {"antialiased": True, "low_pass": 0.02}
@@ -236,3 +231,80 @@ def test_header_overrides_configuration_and_set_overrides_header(shown):
     assert shown("plain", *sets[0], config="plain")[0] == own
     image, said = shown("native", *sets[1], config="plain")
     assert image == plain and "set by the file" not in said
+
+
+def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
+    run(write_scene(tmp_path, sensor(POSE)), "--out", tmp_path / "out")
+    assert visible(tmp_path / "out") == {"blobs.exr", "blobs.png"}
+    image_on_black = photograph(blobs(), VIEW, BLACK)
+    encoded = image_on_black.image + image_on_black.transmittance[..., None]
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
+    assert_images_agree(exr, linear, image_on_black, 1e-4)
+    png = rendered(tmp_path / "out" / "blobs.png")
+    assert_images_agree(png, np.clip(encoded, 0, 1), image_on_black, EIGHT_BITS)
+
+
+def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
+    settings = '<boolean name="srgb_primitives" value="false"/>'
+    run(write_scene(tmp_path, sensor(POSE), settings=settings), "--out", tmp_path / "out")
+    assert_shows(tmp_path / "out" / "blobs.png", VIEW, WHITE)
+    expected = photograph(blobs(), VIEW, WHITE)
+    exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
+    assert_images_agree(exr, expected.image, expected, 1e-4)
+
+
+def test_every_sensor_of_a_scene_is_rendered(tmp_path):
+    sensors = sensor(POSE), sensor(pose_around(2.0, 0.3), "rgba")
+    run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")
+    expected = {f"blobs_{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")}
+    assert visible(tmp_path / "out") == expected
+    assert np.array(read_exr(tmp_path / "out" / "blobs_1.exr")).shape == (HEIGHT, WIDTH, 4)
+    assert rendered(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_scene_without_splats_is_rendered(tmp_path):
+    body = f'{sensor(POSE)}<shape type="sphere"/><emitter type="constant"/>'
+    scene = f'<scene version="3.0.0"><integrator type="direct"/>{body}</scene>'
+    (tmp_path / "sphere.xml").write_text(scene)
+    run(tmp_path / "sphere.xml", "--out", tmp_path / "out")
+    assert rendered(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_parameters_of_a_scene_file_can_be_given(tmp_path):
+    path = write_scene(tmp_path, sensor(POSE))
+    run(path, "--out", tmp_path / "written")
+    text = path.read_text().replace('"model.ply"', '"$model"').replace("1, 1, 1", "$color")
+    path.write_text(text)
+    (tmp_path / "model.ply").rename(tmp_path / "a=b.ply")
+    run(path, "-D", "model=a=b.ply", "--define", "color=1, 1, 1", "--out", tmp_path / "given")
+    images = [rendered(tmp_path / folder / "blobs.png") for folder in ("given", "written")]
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.slow
+def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
+    """Some pixels show what is seen there without the model, others do not."""
+    path = REPOSITORY / "scenes" / "hybrid.xml"
+    values = {"model": str(REPOSITORY / "scenes" / "shapes" / "knot.ply"), "spp": "4"}
+    values |= {"width": "60", "height": "40", "light": "none", "shadows": ""}
+    definitions = [word for name in values for word in ("-D", f"{name}={values[name]}")]
+    run(path, *definitions, "--out", tmp_path)
+    shown = np.array(read_exr(tmp_path / "hybrid.exr"))
+    scene = mi.load_file(str(path), **values)
+    objects = np.array(mi.render(scene, integrator=scene.integrator().state.nested, spp=4))
+    # The file has half precision: 11 bits.
+    agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
+    assert 0.3 < agree.mean() < 0.9
+
+
+def test_a_scene_with_an_environment_is_rendered_on_one_thread(tmp_path):
+    """Files of OpenEXR are read and written, by threads that there are none of."""
+    write_exr(tmp_path / "sky.exr", mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32)))
+    path = write_scene(tmp_path, sensor(POSE))
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
+    path.write_text(path.read_text().replace("</scene>", sky))
+    for threads in (1, 2):
+        run(path, "--out", tmp_path / f"out_{threads}", "--threads", threads)
+    one, two = (tmp_path / f"out_{threads}" / "blobs.exr" for threads in (1, 2))
+    np.testing.assert_array_equal(np.array(read_exr(one)), np.array(read_exr(two)))
