@@ -10,7 +10,6 @@ from contextlib import nullcontext
 from types import ModuleType
 from unittest.mock import Mock
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.commands import assert_ends_well
@@ -31,7 +30,6 @@ from drgs import fit
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
 from drgs.results.folder import remove_run
 from drgs.training import fit_folder
@@ -149,23 +147,18 @@ def fitted(tmp_path_factory):
     return folder / "out", outcome
 
 
-def test_both_files_record_their_approximations(fitted):
-    out, _ = fitted
+def test_metrics_include_what_viewers_show(fitted, tmp_path):
+    """Both files record their approximations; the float64 reference renders as viewers do."""
+    out, outcome = fitted
     native, other = (Gaussians.load(out / name) for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS))
     assert native.rendered_with == FITTED_WITH
     assert other.rendered_with == {"antialiased": False, "low_pass": 0.3}
     assert native.num_gaussians == other.num_gaussians and (native.means != other.means).any()
-
-
-def test_metrics_include_what_viewers_show(fitted, tmp_path):
-    """The float64 reference renders as viewers do."""
-    out, outcome = fitted
     metrics = json.loads((out / METRICS).read_text())
     dataset = load_dataset(load_config(out / "config.yml").data)
-    gaussians = double(Gaussians.load(out / GAUSSIANS_FOR_VIEWERS))
     scores = []
     for view in dataset.test:
-        seen = photograph(gaussians, view, np.array(dataset.background))
+        seen = photograph(double(other), view, np.array(dataset.background))
         scores.append(decibels(np.clip(seen.image, 0, 1), np.asarray(view.image)))
     found = metrics["viewers"]
     assert found["psnr"] == pytest.approx(np.mean(scores), abs=1e-3)
@@ -175,20 +168,6 @@ def test_metrics_include_what_viewers_show(fitted, tmp_path):
     render(out / GAUSSIANS_FOR_VIEWERS, "--scene", out / "config.yml", "--out", tmp_path)
     again = json.loads((tmp_path / METRICS).read_text())
     assert again["mean"]["psnr"] == found["psnr"]
-
-
-def test_plugin_renders_the_file_like_the_fit(fitted):
-    """To the last bit: by its name alone, and by the scene that the trainer has."""
-    out, _ = fitted
-    config = load_config(out / "config.yml")
-    dataset = load_dataset(config.data)
-    scene = make_scene(Gaussians.load(out / GAUSSIANS), config.model, dataset.background)
-    (expected,) = render_views(scene, dataset.test[:1])
-    integrator = {"type": "splats", "filename": str(out / GAUSSIANS), "near": 0.2}
-    integrator |= {"background": list(dataset.background), "srgb_primitives": False}
-    (sensor,) = make_sensors(dataset.test[:1])
-    by_name = mi.render(mi.load_dict({"type": "scene", "integrator": integrator}), sensor=sensor)
-    np.testing.assert_array_equal(np.clip(np.array(by_name), 0, 1), expected)
 
 
 @pytest.mark.slow

@@ -69,15 +69,13 @@ def test_up_direction_can_be_set(fit, name):
             view.start_of(args, model, cameras)
 
 
-def test_missing_input_is_refused(tmp_path):
+def test_missing_input_and_extra_are_reported(fit, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
-    message = "there is no such file or folder"
-    assert_refused(view.main, tmp_path / "nothing", folder=tmp_path, message=message)
-    message = "must be the output folder of a fit that has ended"
-    assert_refused(view.main, tmp_path, folder=tmp_path, message=message)
-
-
-def test_missing_extra_is_reported_with_what_to_install(fit, monkeypatch):
+    for path, message in (
+        (tmp_path / "nothing", "there is no such file or folder"),
+        (tmp_path, "must be the output folder of a fit that has ended"),
+    ):
+        assert_refused(view.main, path, folder=tmp_path, message=message)
     monkeypatch.setitem(sys.modules, "viser", None)
     message = "drgs view: needs viser, which is not installed; pip install 'drgs[viewer]'"
     assert_refused(view.main, fit, folder=fit, message=message)

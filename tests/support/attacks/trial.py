@@ -96,8 +96,7 @@ def run(attack: Attack) -> Outcome:
 
 def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
     """Return faults of its end and its output."""
-    wrong = []
-    kind = attack.fault.kind if attack.fault else None
+    wrong, kind = [], attack.fault.kind if attack.fault else None
     if outcome.status not in (0, {"kill": 137, "interrupt": 130}.get(kind, 2)):
         reached = "an exception" if outcome.status is None else f"status {outcome.status}"
         return [f"ended with {reached}: {_last_lines(outcome.err)}"]
@@ -110,12 +109,8 @@ def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
     if outcome.megabytes > attack.megabytes:
         wrong.append(f"took {outcome.megabytes:.0f} MB more")
     tried = f"{os.path.normpath(attack.out)}/"  # a device, of which no folder can be made
-    outside = [
-        path
-        for path in outcome.changes.outside
-        if not CACHES.search(path) and not f"{path}/".startswith(tried)
-    ]
-    if outside:
+    paths = (p for p in outcome.changes.outside if not f"{p}/".startswith(tried))
+    if outside := [path for path in paths if not CACHES.search(path)]:
         wrong.append(f"wrote outside: {outside[:3]}")
     return wrong
 
@@ -165,14 +160,13 @@ def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
     if outcome.status != 0:
         return [f"again: ended with {outcome.status}: {_last_lines(outcome.err)}"]
     found = contents(attack_folder.folder / attack.out)
-    wrong = [f"again: left {path}" for path in found if TEMPORARY.search(path)]
     expected = files_without_faults(attack, attack_folder)
-    wrong += [f"again: {n} is missing" for n in expected.keys() - found.keys()]
-    wrong += [f"again: {n} is too much" for n in found.keys() - expected.keys()]
-    return wrong + [
-        f"again: {name} has other bytes"
-        for name in attack.results
-        if name in found and found[name] != expected.get(name)
+    changed = [n for n in attack.results if n in found and found[n] != expected.get(n)]
+    return [
+        *(f"again: left {path}" for path in found if TEMPORARY.search(path)),
+        *(f"again: {name} is missing" for name in expected.keys() - found.keys()),
+        *(f"again: {name} is too much" for name in found.keys() - expected.keys()),
+        *(f"again: {name} has other bytes" for name in changed),
     ]
 
 
@@ -218,7 +212,9 @@ def _captured(encoding: str, outcome: Outcome) -> Iterator[None]:
             warnings.simplefilter("always")
             for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
                 warnings.simplefilter("ignore", kind)
-            warnings.showwarning = _show_warning
+            warnings.showwarning = lambda message, category, *_, **__: print(
+                f"{category.__name__}: {message}", file=sys.stderr
+            )
             yield
     finally:
         warnings.showwarning = showwarning
@@ -231,15 +227,9 @@ def _captured(encoding: str, outcome: Outcome) -> Iterator[None]:
         for number, copy in kept.items():
             os.dup2(copy, number)  # closes the pipe's end
             os.close(copy)
-        texts = []
         for start, _ in pipes.values():
             with open(start, "rb") as file:
-                texts.append(file.read().decode("utf-8", "replace"))
-        _, outcome.err = texts
-
-
-def _show_warning(message: object, category: type, *others: object, **more: object) -> None:
-    print(f"{category.__name__}: {message}", file=sys.stderr)
+                outcome.err = file.read().decode("utf-8", "replace")  # of the last, 2
 
 
 @contextmanager
