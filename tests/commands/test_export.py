@@ -282,7 +282,7 @@ def test_page_of_a_fit_shows_its_own_gaussians_if_the_page_supports_them(fit, tm
     assert scene["lowPass"] == pytest.approx(low_pass)
     assert scene["antialiased"] == (order == "center")
     assert scene["settings"]["background"]["color"] == [0.25, 0.5, 0.75]
-    assert page.texts["title"] == "run: Gaussian splats"
+    assert page.texts["title"].strip() == "run: Gaussian splats"
 
 
 @pytest.mark.parametrize("name", ["point_cloud.ply", "."])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -23,7 +24,7 @@ class Server:
     """Runs attacks by name; a context manager. base: a folder, for the attack folders."""
 
     def __init__(self, base: Path) -> None:
-        self._base, self._started, self._pool = base, 0, None
+        self._base, self._pool = base, None
 
     def __enter__(self) -> Server:
         return self
@@ -35,9 +36,7 @@ class Server:
     def trial(self, name: str, seconds: float) -> list[str]:
         """Return the faults of an attack; seconds: its time limit."""
         if self._pool is None:
-            self._started += 1
-            folder = self._base / f"{self._started}"
-            self._pool = multiprocessing.get_context("spawn").Pool(1, _start, (folder,))
+            self._pool = multiprocessing.get_context("spawn").Pool(1, _start, (self._base,))
         try:
             return self._pool.apply_async(_run, (name,)).get(seconds + GRACE_SECONDS)
         except multiprocessing.TimeoutError:
@@ -53,7 +52,7 @@ _folders: list[AttackFolder] = []
 def _start(base: Path) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
-    _folders.append(AttackFolder(base))
+    _folders.append(AttackFolder(Path(tempfile.mkdtemp(dir=base))))
 
 
 @cache
