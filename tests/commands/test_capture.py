@@ -83,7 +83,7 @@ def ball(tmp_path_factory):
 
 def run(scene, out, *options):
     """The command, in this process."""
-    capture.main([str(scene), "--out", str(out), *map(str, options)])
+    return assert_ends_well(capture.main, scene, "--out", out, *options)
 
 
 @pytest.fixture(scope="module")
@@ -183,8 +183,8 @@ def test_points_of_a_python_scene_lie_on_the_cube(tmp_path):
 def test_points_are_optional_and_images_need_not_be_square(ball, tmp_path, capfd):
     out = tmp_path / "out"
     # No two whole numbers of similar size make 7: Mitsuba's sampler takes one path more.
-    run(ball, out, *SMALL, "--test-views", 0, "--size", 24, 12, "--fov", 60, "--spp", 7)
-    printed, errors = capfd.readouterr()
+    words = ("--test-views", 0, "--size", 24, 12, "--fov", 60, "--spp", 7)
+    printed, errors = run(ball, out, *SMALL, *words).stdout, "".join(capfd.readouterr())
     assert "image 6/6" in printed and "600 points" in printed and "24x12" in printed
     assert "\r" not in printed and "WARN" not in printed + errors
     alpha = iio.imread(out / "train" / "r_0.png")[:, :, 3]
@@ -232,15 +232,11 @@ def cornell(tmp_path_factory):
     return write(tmp_path_factory.mktemp("scene"), "cornell.py", CORNELL)
 
 
-def capture_room(scene, out, *options):
-    return assert_ends_well(capture.main, scene, "--out", out, *TINY, *options)
-
-
 @pytest.fixture(scope="module")
 def inside(cornell, tmp_path_factory):
     """The outcome of the command, and its folder; its name has a space."""
     out = tmp_path_factory.mktemp("captured") / "a room"
-    return capture_room(cornell, out), out
+    return run(cornell, out, *TINY), out
 
 
 def test_room_is_captured_from_inside_without_dark_images(inside):
@@ -277,7 +273,7 @@ def test_output_ends_with_the_command_to_fit_the_result(inside):
     ],
 )
 def test_mostly_black_or_empty_images_give_a_one_line_warning(cornell, tmp_path, options, message):
-    (line,) = capture_room(cornell, tmp_path / "out", *options).stderr.splitlines()
+    (line,) = run(cornell, tmp_path / "out", *TINY, *options).stderr.splitlines()
     assert line.startswith("warning: ") and message in line
 
 
@@ -344,10 +340,6 @@ def test_splats_in_a_captured_scene_are_refused(tmp_path, suffix, change, messag
 LEAST = ["--views", 2, "--test-views", 1, "--size", 4, 4, "--spp", 1, "--points", 8]
 
 
-def run_least(scene, out, *options):
-    assert_ends_well(capture.main, scene, "--out", out, *LEAST, *options)
-
-
 def refused(scene, out, *options, folder, message):
     words = (scene, "--out", out, *LEAST, *options)
     return assert_refused(capture.main, *words, folder=folder, message=message)
@@ -356,13 +348,13 @@ def refused(scene, out, *options, folder, message):
 def test_edited_files_are_kept(ball, tmp_path):
     """A mask in a frame, an image that was touched up; what is missing is made again."""
     out = tmp_path / "out"
-    run_least(ball, out)
+    run(ball, out, *LEAST)
     captured = contents(out)
     edited = ("transforms_train.json", "points3d.ply", "train/r_0.png")
     for name in edited:
         (out / name).write_text("mine")
     (out / "transforms_test.json").unlink()
-    run_least(ball, out)
+    run(ball, out, *LEAST)
     assert contents(out) == {**captured, **dict.fromkeys(edited, b"mine")}
 
 
@@ -455,7 +447,7 @@ def test_foreign_folders_are_left_alone(ball, tmp_path):
     message = "--out must be a folder"
     refused(ball, tmp_path / "notes.txt", folder=tmp_path, message=message)
     out = tmp_path / "out"
-    run_least(ball, out)
+    run(ball, out, *LEAST)
     with sole_writer(out):
         message = "out: another command is writing to this folder; wait"
         refused(ball, out, folder=out, message=message)
@@ -472,12 +464,12 @@ def test_foreign_folders_are_left_alone(ball, tmp_path):
 
 
 def test_captured_image_of_another_size_is_refused(ball, tmp_path):
-    run_least(ball, tmp_path / "out")
+    run(ball, tmp_path / "out", *LEAST)
     captured, path = contents(tmp_path / "out"), tmp_path / "out" / "train" / "r_1.png"
     iio.imwrite(path, np.zeros((4, 5, 4), np.uint8))
     (tmp_path / "out" / "points3d.ply").unlink()  # or no image would be looked at
     message = f"{path}: must be an RGBA image of 4 x 4 px of this capture, got 5 x 4"
     refused(ball, tmp_path / "out", folder=tmp_path, message=message)
     path.unlink()
-    run_least(ball, tmp_path / "out")
+    run(ball, tmp_path / "out", *LEAST)
     assert contents(tmp_path / "out") == captured

@@ -124,23 +124,14 @@ def test_existing_user_image_is_kept(stopped):
     assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
 
 
-def test_record_of_a_finished_fit_lists_every_file(ended):
-    files = json.loads((ended / "out" / ".drgs-fit.json").read_text())["files"]
-    assert set(files) == visible(ended / "out") - {"config.yml"}
-    assert all(files.values())
-
-
-MESSAGE = "out: another command is writing to this folder; wait until it has ended, or choose an"
-
-
 @pytest.mark.slow
 def test_folder_in_use_by_another_fit_is_refused(stopped):
     """Whether it is resumed, replaced or begun again; afterwards it goes on."""
-    out = stopped / "out"
+    out, message = stopped / "out", "out: another command is writing to this folder; wait until"
     same = (stopped / "a.yml", "--out", out)
     with sole_writer(out):
         for words in (same, ("--resume", out), (*same, "--overwrite")):
-            assert_fit_refused(*words, folder=stopped, message=MESSAGE)
+            assert_fit_refused(*words, folder=stopped, message=message)
     assert_fits("--resume", out)
 
 
@@ -194,6 +185,8 @@ def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
 def test_earlier_result_is_kept(ended, tmp_path):
     """Even without its data, and if the fit that replaces it cannot begin."""
     before, out, config = contents(ended), ended / "out", ended / "a.yml"
+    recorded = json.loads((out / ".drgs-fit.json").read_text())["files"]
+    assert recorded.keys() == visible(out) - {"config.yml"} and all(recorded.values())
     (ended / "data").rename(tmp_path / "data")
     for words in (("--resume", out), ("--resume", out, "--data", tmp_path)):
         assert "this fit is finished" in assert_fits(*words).stdout

@@ -66,7 +66,7 @@ class Browser:
     byte, on its file descriptors 3 and 4. options: of graphics, as SOFTWARE_WEBGL.
     """
 
-    def __init__(self, *options: str) -> None:
+    def __init__(self, *options: str):
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         theirs_in, self._out = _pipe()
         self._in, theirs_out = _pipe()
@@ -82,7 +82,7 @@ class Browser:
         self.events: list[dict] = []
         threading.Thread(target=self._listen, daemon=True).start()
 
-    def close(self) -> None:
+    def close(self):
         """End the browser's own process group: nothing else."""
         os.killpg(self._process, signal.SIGTERM)
         end = time.monotonic() + EXIT_SECONDS
@@ -95,7 +95,7 @@ class Browser:
         os.close(self._out)
         self._profile.cleanup()
 
-    def call(self, method: str, session: str | None = None, **parameters: object) -> dict:
+    def call(self, method, session=None, **parameters):
         """The answer to a command; what happens until then is added to ``events``."""
         self._count += 1
         message = {"id": self._count, "method": method, "params": parameters}
@@ -107,7 +107,7 @@ class Browser:
         assert "error" not in heard, f"{method}: {heard['error']}"
         return heard["result"]
 
-    def _listen(self) -> None:
+    def _listen(self):
         begun = b""
         while data := os.read(self._in, 1 << 20):
             *messages, begun = (begun + data).split(b"\0")
@@ -119,7 +119,7 @@ class Browser:
 class Window:
     """A window of a browser; width, height: px, one of the screen for each of the page."""
 
-    def __init__(self, browser: Browser, width: int, height: int) -> None:
+    def __init__(self, browser: Browser, width: int, height: int):
         self._browser = browser
         target = browser.call("Target.createTarget", url="about:blank")["targetId"]
         answer = browser.call("Target.attachToTarget", targetId=target, flatten=True)
@@ -129,19 +129,19 @@ class Window:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **size)
 
-    def call(self, method: str, **parameters: object) -> dict:
+    def call(self, method: str, **parameters: object):
         return self._browser.call(method, self._session, **parameters)
 
-    def cut_off(self) -> None:
+    def cut_off(self):
         """Turn its network off."""
         nothing = {"latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
         self.call("Network.emulateNetworkConditions", offline=True, **nothing)
 
-    def open(self, address: str) -> None:
+    def open(self, address: str):
         self.call("Page.navigate", url=address)
         self.wait_for("!!document.body")
 
-    def evaluate(self, expression: str) -> object:
+    def evaluate(self, expression: str):
         """A JavaScript expression's value, or what its promise becomes."""
         answer = self.call(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
@@ -149,19 +149,19 @@ class Window:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def wait_for(self, expression: str) -> None:
+    def wait_for(self, expression: str):
         end = time.monotonic() + TIMEOUT_SECONDS
         while not self.evaluate(expression):
             assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
             time.sleep(0.05)
 
-    def rendered(self) -> np.ndarray:
+    def rendered(self):
         """(height, width, 3) display space, 0 to 1."""
         data = self.call("Page.captureScreenshot", format="png")["data"]
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
             return np.asarray(image.convert("RGB")) / 255
 
-    def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10) -> None:
+    def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10):
         """Drag the mouse with its left button; px."""
         held = {"button": "left", "clickCount": 1}
         self._mouse("mousePressed", *start, buttons=1, **held)
@@ -171,11 +171,11 @@ class Window:
             self.evaluate("new Promise(requestAnimationFrame)")
         self._mouse("mouseReleased", *end, **held)
 
-    def requests(self) -> list[str]:
+    def requests(self):
         """The addresses of all that it has asked for."""
         return [p["request"]["url"] for p in self._events("Network.requestWillBeSent")]
 
-    def console_errors(self) -> list[str]:
+    def console_errors(self):
         """Exceptions, errors and warnings."""
         levels = ("assert", "error", "warning")
         entries = [p["entry"] for p in self._events("Log.entryAdded")]
@@ -186,10 +186,10 @@ class Window:
             *(str(p["args"]) for p in calls if p["type"] in levels),
         ]
 
-    def _mouse(self, kind: str, x: float, y: float, **others: object) -> None:
+    def _mouse(self, kind: str, x: float, y: float, **others: object):
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **others)
 
-    def _events(self, method: str) -> list[dict]:
+    def _events(self, method: str):
         self.evaluate("0")  # what came before is heard now
         events = self._browser.events
         mine = (event for event in events if event.get("sessionId") == self._session)
@@ -206,7 +206,7 @@ def browser_page(width: int, height: int, options=SOFTWARE_WEBGL):
         browser.close()
 
 
-def _pipe() -> tuple[int, int]:
+def _pipe():
     """Its ends, neither of which is a descriptor that the browser expects."""
     ends = []
     for end in os.pipe():
@@ -298,14 +298,14 @@ def opened(path, query="", size=(WIDTH, HEIGHT)):
         assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
 
 
-def settle(page) -> None:
+def settle(page):
     """Wait until the camera stands still, and what it sees is sorted and drawn."""
     before = None
     while before != (before := page.evaluate(CAMERA)):
         page.evaluate("new Promise((done) => setTimeout(done, 700))")
 
 
-def ours(camera, gaussians, **model) -> np.ndarray:
+def ours(camera, gaussians, **model):
     mi.set_variant("llvm_ad_rgb")
     scene = make_scene(gaussians, ModelConfig(**{**FITTED_WITH, **model}), BACKGROUND)
     (image,) = render_views(scene, [camera])
@@ -321,7 +321,7 @@ def shown_camera(page, initial_view):
     return pinhole("shown", pose, WIDTH, HEIGHT, FIELD_OF_VIEW)
 
 
-def assert_shown_as_fitted(rendered, camera, gaussians) -> None:
+def assert_shown_as_fitted(rendered, camera, gaussians):
     """With harmonics, low-pass and compensation."""
     flat = replace(gaussians, shN=0 * gaussians.shN)
     left_out = {

@@ -1,6 +1,7 @@
 """``drgs.fit`` on a scene so small that a fit takes a fraction of a second."""
 
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
 import yaml
@@ -8,7 +9,7 @@ import yaml
 from drgs import fit
 from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
-from support.commands import Outcome, assert_ends_well, assert_refused, run_in_process
+from support.commands import assert_ends_well, assert_refused, run_in_process
 from support.small_capture import make_dataset, write_dataset
 from support.viewer_rendering import VIEWER_RENDERING
 
@@ -43,12 +44,12 @@ def write_project(folder: Path, **values: object) -> Path:
     return write_scene(folder, test=2, **{**VALUES, **values})
 
 
-def run_fit(*arguments: object) -> Outcome:
+def run_fit(*arguments: object) -> CompletedProcess[str]:
     """The command, in this process."""
     return run_in_process(fit.main, *arguments)
 
 
-def assert_fits(*arguments: object) -> Outcome:
+def assert_fits(*arguments: object) -> CompletedProcess[str]:
     """The command ends well."""
     return assert_ends_well(fit.main, *arguments)
 

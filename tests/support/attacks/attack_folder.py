@@ -81,7 +81,6 @@ CAPTURE = (
     *("ball.xml", "--views", "2", "--test-views", "1", "--spp", "1", "--points", "9"),
     *("--max-depth", "2", "--size", "4", "4"),
 )
-"""A capture of the least there is."""
 
 
 def _pose(angle: float) -> list[list[float]]:

@@ -92,7 +92,6 @@ FAMILIES: dict[str, Callable[[AttackFolder], Iterable[Attack]]] = {
     "property": lambda _: property_attacks(),
     "object": lambda _: object_attacks(),
 }
-"""Attacks by the first part of their name."""
 
 KNOWN_FAILURES: dict[str, str] = {
     "schema/densify.budget.prune_opacity=0.5": "known once the fit has begun: its folder stays",

@@ -102,7 +102,6 @@ REPLACEMENTS = {
     "itself twice": lambda path: path.write_bytes(path.read_bytes() * 2),
     "itself and a line": lambda path: path.write_bytes(path.read_bytes() + b"\nmore"),
 }
-"""Replacements of a file, by name."""
 
 HARMLESS = ("itself and a line", "all but its last byte", "itself twice")
 """After which a file may still be what it was."""
@@ -212,8 +211,7 @@ MUTATIONS = {
 }
 """Damage beside that of bytes, by suffix: functions of a random generator and the content."""
 
-NUM_DAMAGED = 40
-"""Number of damaged versions of each file, by kind."""
+NUM_DAMAGED = 40  # versions of each file, by kind
 
 
 def damage_attacks() -> Iterator[Attack]:
@@ -324,14 +322,12 @@ SPECIAL = {
     "photos/mask.png": IMAGES,
     "photos/depth.png": BOMB,
 }
-"""Special replacements, by file."""
 
 FORMATS = (
     *(("JPEG", "RGB"), ("JPEG", "L"), ("JPEG", "CMYK"), ("WEBP", "RGB"), ("WEBP", "RGBA")),
     *(("GIF", "P"), ("BMP", "RGB"), ("TIFF", "RGB"), ("TIFF", "CMYK"), ("TIFF", "F")),
     *(("TIFF", "I"), ("ICO", "RGBA"), ("PPM", "RGB"), ("PNG", "1"), ("PNG", "P"), ("PNG", "LA")),
 )
-"""Pillow's formats and modes."""
 
 
 def special_attacks() -> Iterator[Attack]:

@@ -29,10 +29,8 @@ RENDER_OPTIONS = """
     --scene photos.yml; --data lego; --set data.image_size=10; --define a=b; --threads 1;
     --variant scalar_rgb
 """
-"""Those of ``render``."""
 
 SUBJECTS = ("run", "gaussians.ply", "splats.xml", "stopped", "photos")
-"""Inputs of ``render``."""
 
 
 def _pairs(options: str) -> Iterator[tuple[str, ...]]:
@@ -90,10 +88,10 @@ def _link(target: str, folder: Path) -> None:
 
 
 def _config_inside(folder: Path) -> None:
+    values = {"data": {"path": "../lego"}, "init": {"point_cloud": "../points.ply"}}
+    values["output"] = {"dir": "."}
     (folder / "out").mkdir()
-    values = SETTINGS | {"data": {"path": "../lego"}, "init": {"point_cloud": "../points.ply"}}
-    values |= {"output": {"dir": "."}}
-    (folder / "out" / "config.yml").write_text(f"# my own words\n{yaml.safe_dump(values)}")
+    (folder / "out" / "config.yml").write_text(f"# mine\n{yaml.safe_dump(SETTINGS | values)}")
 
 
 def folder_attacks() -> Iterator[Attack]:
@@ -137,7 +135,6 @@ NAMES = {
     "backslash": "a\\b",
     "dots": "...",
 }
-"""Names of folders, images and configurations."""
 
 
 def _moved(old: str, new: str, folder: Path) -> None:
@@ -175,21 +172,20 @@ def name_attacks() -> Iterator[Attack]:
                 yield Attack(full, command, words, encoding=encoding, **more)
 
 
-def _tiny_images(folder: Path) -> None:
-    """Write images of one pixel."""
-    for path in (folder / "lego").glob("*/*.png"):
-        iio.imwrite(path, np.full((1, 1, 4), 200, np.uint8))
-
-
 def drawn_attacks() -> Iterator[Attack]:
     """Fits with everything that they draw, which takes seconds each."""
+
+    def shrink_images(folder: Path) -> None:
+        for path in (folder / "lego").glob("*/*.png"):
+            iio.imwrite(path, np.full((1, 1, 4), 200, np.uint8))
+
     words = ("fit.yml", "--out", "out")
     attacks = {
         "as it is": (words, {}),
         "markup": (words, {"change": partial(_renamed_image, NAMES["markup"])}),
         "not UTF-8": (words, {"change": partial(_renamed_image, NAMES["not UTF-8"])}),
         "newline": (("fit.yml", "--out", NAMES["newline"]), {"out": NAMES["newline"]}),
-        "one pixel": (words, {"change": _tiny_images}),
+        "one pixel": (words, {"change": shrink_images}),
         "photographs": (("photos.yml", "--out", "out"), {}),
         "one iteration": ((*words, "--set", "iterations=1"), {}),
     }

@@ -20,8 +20,7 @@ from drgs.__main__ import COMMANDS
 from support.attacks.attack import Attack, Changes, Killed, observed
 from support.attacks.attack_folder import AttackFolder, contents, current_folder, stub_results
 
-PIPE_BYTES = 1 << 20
-"""Limit of a command's output."""
+PIPE_BYTES = 1 << 20  # limit of a command's output
 
 CACHES = re.compile(
     r"/(\.drjit|\.cache|__pycache__|\.nv|\.config/matplotlib)(/|$)|^/dev/(null|tty)$|^/proc/self/"

@@ -86,7 +86,6 @@ WORDS = (
     *("fit.yml", "gaussians.ply", "splats.xml", "camera.json", "a=b", "iterations=1"),
     *("5m5", "1h30", "99999h", "0.001s", "-", "--"),
 )
-"""Arguments of options."""
 
 RENDER_WORDS = ("", "0", "1", "1e300", "1000000000", "a\0b", "photos")
 
@@ -241,7 +240,6 @@ POSE = '<lookat origin="4, 0, 1" target="0, 0, 0" up="0, 0, 1"/>'
 
 LETTERS = ("a", "a"), ("b", "&a;"), ("c", "&b;"), ("d", "&c;")
 ENTITIES = "".join(f'<!ENTITY {name} "{text * 10}">' for name, text in LETTERS)
-"""Ten thousand letters."""
 
 REPLACED = {
     "no Gaussians": ('name="filename"', 'name="nonsense"'),
@@ -277,7 +275,6 @@ ADDED = {
     "a file that is missing": '<include filename="nowhere.xml"/>',
     "a thousand levels": "<shape>" * 1000 + "</shape>" * 1000,
 }
-"""What comes at the scene's end."""
 
 OBJECTS = {
     **{name: SPLATS.replace(old, new) for name, (old, new) in REPLACED.items()},
@@ -289,7 +286,6 @@ OBJECTS = {
     "an entity of a file": '<!DOCTYPE a [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
     + SPLATS.replace("gaussians.ply", "&a;"),
 }
-"""Scenes, by name."""
 
 
 def object_attacks() -> Iterator[Attack]:
