@@ -1,6 +1,7 @@
 """``python -m drgs.render``, against the float64 reference and PSNR computed plainly."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import combinations
 
@@ -11,6 +12,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 from support import small_capture
+from support.commands import assert_ends_well
 from support.folders import visible
 from support.openexr import read_exr
 from support.render_command import (
@@ -36,8 +38,13 @@ from support.small_capture import (
     write_fit,
 )
 
+from drgs import export
+from drgs.core.errors import UserNote
+from drgs.datasets import load_dataset
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
+from drgs.gaussians.parameters import Gaussians
 from drgs.io.images import write_exr
+from drgs.results.files import VIEWS
 from drgs.results.refined_cameras import write_views
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -308,3 +315,71 @@ def test_a_scene_with_an_environment_is_rendered_on_one_thread(tmp_path):
         run(path, "--out", tmp_path / f"out_{threads}", "--threads", threads)
     one, two = (tmp_path / f"out_{threads}" / "blobs.exr" for threads in (1, 2))
     np.testing.assert_array_equal(np.array(read_exr(one)), np.array(read_exr(two)))
+
+
+# A fit in Earth-centred coordinates is shown like one at the origin
+
+PLACE = np.array([4.2e6, 1.7e5, -4.78e6])
+ORIGIN = (4200001.0, 169999.0, -4779998.0)
+"""Origin of the Gaussians, which differs from that of the dataset."""
+
+
+@pytest.fixture(scope="module")
+def far(tmp_path_factory):
+    """A folder as a fit leaves it, whose world is at ``PLACE``."""
+    folder = tmp_path_factory.mktemp("far")
+    dataset = make_dataset()
+    views = {n: tuple(v.with_offset(PLACE) for v in getattr(dataset, n)) for n in ("train", "test")}
+    write_dataset(folder / "data", replace(dataset, **views))
+    means = (blobs().means + (PLACE - ORIGIN)).astype(np.float32)
+    (folder / "run").mkdir()
+    replace(blobs(), means=means, origin=ORIGIN).save(folder / "run" / "point_cloud.ply")
+    config = {"data": {"path": str(folder / "data"), "background": "white"}}
+    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    write_views(folder / "run" / VIEWS, load_dataset(folder / "data"))
+    return folder / "run"
+
+
+def test_cameras_of_files_and_by_hand_are_in_world_coordinates(far, tmp_path):
+    run(far, "--out", tmp_path)
+    for camera in make_dataset().test:
+        assert_shows(tmp_path / f"{camera.name}.png", camera, WHITE)
+    run(far, "--camera", far / VIEWS, "--out", tmp_path / "file")
+    assert json.loads((far / VIEWS).read_text())["origin"] == list(
+        load_dataset(far.parent / "data").origin
+    )
+    for index, camera in enumerate(make_dataset().train):
+        assert_shows(tmp_path / "file" / f"camera_{index}.png", camera, WHITE)
+    pose = pose_around(1.0, 0.4)
+    place, target = (PLACE + point for point in (pose[:3, 3], FOCUS))
+    hand = ["--fov", np.degrees(FIELD_OF_VIEW), "--size", WIDTH, HEIGHT, "--out", tmp_path / "hand"]
+    run(far, "--origin", *place, "--target", *target, *hand)
+    assert_shows(tmp_path / "hand" / "camera.png", small_capture.view("a", pose, None), WHITE)
+
+
+def test_exports_keep_the_origin_and_crop_in_world_coordinates(far, tmp_path):
+    whole, half = tmp_path / "whole.glb", tmp_path / "half.ply"
+    assert_ends_well(export.main, far, "--out", whole, "--up", 0, 0, 1)
+    read = Gaussians.load(whole)
+    assert read.origin == ORIGIN
+    expected = blobs().means + PLACE
+    np.testing.assert_allclose(read.means + np.array(ORIGIN), expected, rtol=0, atol=1e-5)
+    low, high = PLACE - 100, PLACE + np.array([FOCUS[0], 100, 100])
+    assert_ends_well(export.main, far, "--out", half, "--crop", *low, *high)
+    assert Gaussians.load(half).num_gaussians == np.count_nonzero(blobs().means[:, 0] <= FOCUS[0])
+    assert_ends_well(export.main, far, "--format", "html", "--out", tmp_path / "page.html")
+
+
+def test_plugin_renders_relative_to_the_origin_and_notes_it(far, tmp_path):
+    pose = pose_around(1.0, 0.4)
+    path = write_scene(tmp_path, sensor(pose))
+    expected = np.array(mi.render(mi.load_file(str(path))))
+    (tmp_path / "model.ply").write_bytes((far / "point_cloud.ply").read_bytes())
+    pose[:3, 3] += PLACE - ORIGIN
+    numbers = " ".join(repr(float(v)) for v in (pose @ np.diag([-1, -1, 1, 1])).ravel())
+    text = re.sub("<lookat[^>]*>", f'<matrix value="{numbers}"/>', path.read_text())
+    path.write_text(text)
+    with pytest.warns(UserNote, match=r"relative to \(4200001, 169999, -4779998\); place sensors"):
+        scene = mi.load_file(str(path))
+    # Positions relative to the origin are rounded once more.
+    np.testing.assert_allclose(np.array(mi.render(scene)), expected, rtol=0, atol=1e-3)

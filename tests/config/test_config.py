@@ -8,7 +8,7 @@ from support.small_fits import make_trainer, plain_dataset
 
 from drgs.config.approximations import Approximations
 from drgs.config.changes import with_iterations
-from drgs.config.load import PATH_KEYS, dump_config, known_keys, load_config
+from drgs.config.load import PATH_KEYS, known_keys, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 
@@ -126,17 +126,25 @@ WRONG_VALUES = [
     ("coarse: [{until: 9, factor: 2}, {until: 20, factor: 4}]", "coarse must be stages with growi"),
     (
         "optimizer: {means_lr_aims: [{after: 0, end: 9}, {after: 9, end: 9}]}",
-        "optimizer.means_lr_aims must have growing after < end, got "
-        "{after: 0, end: 9}, {after: 9, end: 9}",
+        "optimizer.means_lr_aims must have growing after < end, got {after: 0, end: 9}, {after",
     ),
     ("densify: {start: 900, stop: 800}", "densify.start must be < densify.stop (800), got 900"),
     ("optimizer: {means_lr: 1e-5, means_lr_final: 1e-4}", "optimizer.means_lr_final must be <= op"),
     ("densify: {adc: {prune_opacity: 0.01}}", "densify.adc.prune_opacity must be < densify.adc.re"),
     ("densify: {max_gaussians: 500}\ninit: {num_points: 501}", "init.num_points must be <= densif"),
     ("cameras: {optimise: true}\nmodel: {sh_direction: pixel}", "model.sh_direction must be mean "),
-    ("densify: {every: 0, adc: {split_count: 1}}", "densify.every must be >= 1, got 0; densify.ad"),
-    ('seed: ["a\\nb", 0x' + "f" * 9000 + ']\n"k\\ny": 2', "seed must be an integer, got a number "),
-    ("".join(f"k{i}: 1\n" for i in range(5000)), "unknown key k0; unknown key k1; unknown key k2 "),
+    (
+        "densify: {every: 0, adc: {split_count: 1}}",
+        "densify.every must be >= 1, got 0; densify.adc.split_count must be >= 2, got 1",
+    ),
+    (
+        'seed: ["a\\nb", 0x' + "f" * 9000 + ']\n"k\\ny": 2',
+        "seed must be an integer, got a number of thousands of digits; unknown key k y",
+    ),
+    (
+        "".join(f"k{i}: 1\n" for i in range(5000)),
+        "unknown key k0; unknown key k1; unknown key k2 and 4,997 more",
+    ),
 ]
 
 
@@ -221,21 +229,6 @@ def test_every_value_is_described_and_every_path_listed():
     assert all(field.description for _, field in fields_of(FitConfig))
     paths = {name for name, field in fields_of(FitConfig) if "Path" in str(field.annotation)}
     assert paths == set(PATH_KEYS) and paths <= set(known_keys())
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        MINIMAL,
-        "data: {path: ../x, background: [0.1, 0.2, 0.3], image_size: 7}\n"
-        "optimizer: {epsilon: 1e-15}\ninit: {half_extent: 0.1}\noutput: {dir: y}\n"
-        "coarse: [{until: 5, factor: 4}, {until: 9, factor: 2}]",
-    ],
-)
-def test_a_dumped_configuration_reloads_equal(load, tmp_path, text):
-    config = load(text)
-    dump_config(config, tmp_path / "out" / "config.yml")
-    assert load_config(tmp_path / "out" / "config.yml") == config
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
