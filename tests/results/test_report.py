@@ -118,27 +118,24 @@ def test_one_image_is_in_memory_at_a_time(tmp_path, dataset):
 
 
 def test_comparison_shows_fitted_photograph_and_difference(out, dataset, images):
+    """Masked pixels show no difference."""
     pixels = np.asarray(Image.open(out / "side_by_side" / "test" / "r_2.png")) / 255
-    step = WIDTH + report.IMAGE_GAP_PX
+    step, view = WIDTH + report.IMAGE_GAP_PX, dataset.test[2]
     assert pixels.shape == (HEIGHT, 2 * step + WIDTH, 3)
     assert (pixels[:, WIDTH:step] == 1).all()
-    photograph = dataset.test[2].image
-    difference = np.clip(0.5 + 5 * (images[2] - photograph), 0, 1)
-    for k, expected in enumerate((images[2], photograph, difference)):
+    difference = np.clip(0.5 + 5 * (images[2] - view.image), 0, 1)
+    for k, expected in enumerate((images[2], view.image, difference)):
         shown = pixels[:, k * step : k * step + WIDTH]
         assert np.abs(shown - expected).max() < ROUNDING
 
-
-def test_masked_pixels_show_no_difference(dataset, images):
     half, mask = WIDTH // 2, np.ones((HEIGHT, WIDTH), np.float32)
     mask[:, :half] = 0
-    view = replace(dataset.test[2], mask=mask)
-    shown = report.difference(images[2], view)
+    masked = replace(view, mask=mask)
+    shown = report.difference(images[2], masked)
     assert (shown[:, :half] == 0.5).all()
-    whole = report.difference(images[2], dataset.test[2])
-    np.testing.assert_array_equal(shown[:, half:], whole[:, half:])
+    np.testing.assert_array_equal(shown[:, half:], report.difference(images[2], view)[:, half:])
     expected = decibels(images[2][:, half:].astype(float), view.image[:, half:])
-    assert report.score(images[2], view).psnr == pytest.approx(expected)
+    assert report.score(images[2], masked).psnr == pytest.approx(expected)
 
 
 def test_orbit_has_the_aspect_ratio_of_the_photographs_and_shows_the_scene(out, dataset, scene):
