@@ -11,7 +11,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -192,43 +192,35 @@ def _last_lines(text: str) -> str:
 
 @contextmanager
 def _captured(encoding: str, outcome: Outcome) -> Iterator[None]:
-    """Both standard streams, also what libraries write to them, through pipes that hold it all."""
-    pipes = {number: os.pipe() for number in (1, 2)}
-    kept = {number: os.dup(number) for number in pipes}
-    streams, showwarning = (sys.stdout, sys.stderr), warnings.showwarning
-    for stream in streams:
-        stream.flush()
-    for number, (_, end) in pipes.items():
-        fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        os.dup2(end, number)
-        os.close(end)
-    sys.stdout = open(1, "w", encoding=encoding, errors="strict", closefd=False)  # noqa: SIM115
-    sys.stderr = open(  # noqa: SIM115
-        2, "w", encoding=encoding, errors="backslashreplace", closefd=False, buffering=1
-    )
+    """Standard error, also what libraries write to it, through a pipe that holds it all."""
+    kept, null, (pipe, end) = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY), os.pipe()
+    fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    for number, target in ((1, null), (2, end)):
+        os.dup2(target, number)
+        os.close(target)
     try:
-        with warnings.catch_warnings():
+        with (
+            open(1, "w", encoding=encoding, closefd=False) as out,
+            open(2, "w", 1, encoding, "backslashreplace", closefd=False) as err,
+            redirect_stdout(out),
+            redirect_stderr(err),
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("always")
             for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
                 warnings.simplefilter("ignore", kind)
-            warnings.showwarning = lambda message, category, *_, **__: print(
-                f"{category.__name__}: {message}", file=sys.stderr
+            warnings.showwarning = lambda text, kind, *_, **__: print(
+                f"{kind.__name__}: {text}", file=sys.stderr
             )
             yield
     finally:
-        warnings.showwarning = showwarning
-        try:
-            sys.stdout.flush()
-        except (OSError, UnicodeError) as error:
-            print(f"Traceback: {error}", file=sys.stderr)
-        sys.stderr.flush()
-        sys.stdout, sys.stderr = streams
-        for number, copy in kept.items():
+        for number, copy in enumerate(kept, 1):
             os.dup2(copy, number)  # closes the pipe's end
             os.close(copy)
-        for start, _ in pipes.values():
-            with open(start, "rb") as file:
-                outcome.err = file.read().decode("utf-8", "replace")  # of the last, 2
+        with open(pipe, "rb") as file:
+            outcome.err = file.read().decode("utf-8", "replace")
 
 
 @contextmanager
