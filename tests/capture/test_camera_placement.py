@@ -127,29 +127,13 @@ def test_many_sensors_are_used_as_cameras():
         np.testing.assert_allclose(camera.linear(view)[:, :, :3], shown[:, :, :3], atol=0.075)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("views", 3), ("test_views", 1), ("target", (0.0, 0.0, 0.0))),
-        *(("distance", 2.0), ("fov", 0.5), ("azimuth", (0.0, 1.0))),
-    ],
-)
-def test_placement_options_are_refused_with_sensors(name, value):
-    scene = loaded(ball=BALL, sky=SKY, **ring(12))
-    assert derived(scene, **{name: value}).cameras == "around"
-    with pytest.raises(UserError) as error:
-        derived(scene, cameras="sensors", **{name: value})
-    option = f"--{name.replace('_', '-')}"
-    assert str(error.value) == f"{option}: is not used with --cameras sensors; leave it out"
-
-
-INSIDE = {"cameras": "inside"}
+INSIDE, SENSORS = {"cameras": "inside"}, {"cameras": "sensors"}
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"cameras": "sensors"}, "--cameras sensors: the scene has no sensor of type"),
+        (SENSORS, "--cameras sensors: the scene has no sensor of type"),
         (INSIDE | {"distance": 1.0}, "--distance: is not used with --cameras inside"),
         (INSIDE | {"target": (3.0, 0.0, 0.0)}, "target must lie within the scene's bounding box"),
         ({"azimuth": (30.0, -30.0)}, "azimuth must be two angles in rising order between -360"),
@@ -161,6 +145,16 @@ def test_contradictory_settings_are_refused(given, message):
     scene = loaded(ball=BALL, sky=SKY)
     with pytest.raises(UserError, match=message):
         views_of(scene, derived(scene, **given))
+
+
+def test_placement_options_are_refused_with_sensors():
+    scene = loaded(ball=BALL, sky=SKY, **ring(12))
+    values = {"views": 3, "test_views": 1, "target": (0.0, 0.0, 0.0), "distance": 2.0, "fov": 0.5}
+    for name, value in (values | {"azimuth": (0.0, 1.0)}).items():
+        assert derived(scene, **{name: value}).cameras == "around"
+        message = f"^--{name.replace('_', '-')}: is not used with --cameras sensors; leave it out$"
+        with pytest.raises(UserError, match=message):
+            derived(scene, **SENSORS, **{name: value})
 
 
 def test_cameras_inside_stand_between_target_and_walls():

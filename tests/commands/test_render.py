@@ -43,7 +43,6 @@ from drgs.core.errors import UserNote
 from drgs.datasets import load_dataset
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.images import write_exr
 from drgs.results.files import VIEWS
 from drgs.results.refined_cameras import write_views
 
@@ -303,18 +302,6 @@ def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
     # The file has half precision: 11 bits.
     agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
     assert 0.3 < agree.mean() < 0.9
-
-
-def test_a_scene_with_an_environment_is_rendered_on_one_thread(tmp_path):
-    """Files of OpenEXR are read and written, by threads that there are none of."""
-    write_exr(tmp_path / "sky.exr", mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32)))
-    path = write_scene(tmp_path, sensor(POSE))
-    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
-    path.write_text(path.read_text().replace("</scene>", sky))
-    for threads in (1, 2):
-        run(path, "--out", tmp_path / f"out_{threads}", "--threads", threads)
-    one, two = (tmp_path / f"out_{threads}" / "blobs.exr" for threads in (1, 2))
-    np.testing.assert_array_equal(np.array(read_exr(one)), np.array(read_exr(two)))
 
 
 # A fit in Earth-centred coordinates is shown like one at the origin

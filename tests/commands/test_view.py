@@ -31,11 +31,9 @@ def opened(*arguments):
 @pytest.mark.parametrize("refined", [False, True])
 def test_fit_is_viewed_from_its_training_cameras(fit, tmp_path, refined):
     """Refined cameras are used, where the fit has refined them."""
-    run = tmp_path / "run"
-    shutil.copytree(fit, run)
-    config = yaml.safe_load((run / "config.yml").read_text())
-    config["cameras"] = {"optimise": refined}
-    (run / "config.yml").write_text(yaml.safe_dump(config))
+    run = shutil.copytree(fit, tmp_path / "run")
+    with (run / "config.yml").open("a") as file:
+        yaml.safe_dump({"cameras": {"optimise": refined}}, file)
     few, others = make_dataset(train=3), make_dataset(train=5)
     write_views(run / VIEWS, few)
     write_views(run / CAMERAS, others)

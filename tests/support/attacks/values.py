@@ -110,10 +110,7 @@ COSTLY = {
     ("render", "--orbit"): MANY,
     ("render", "--size"): ("10000",),
     ("capture", "--size"): ("10000",),
-    ("capture", "--views"): MANY,
-    ("capture", "--val-views"): MANY,
-    ("capture", "--test-views"): MANY,
-    ("capture", "--spp"): MANY,
+    **{("capture", f"--{name}"): MANY for name in ("views", "val-views", "test-views", "spp")},
 }
 """Valid values that mean a lot of work, by command and option."""
 
