@@ -60,13 +60,14 @@ TIMEOUT_SECONDS, EXIT_SECONDS = 120.0, 5.0  # of an unresponsive browser, on a b
 
 
 class Browser:
-    """A process, with a profile of its own that goes with it.
+    """A process with one page, and a profile of its own that goes with it.
 
     It listens to a pipe (``--remote-debugging-pipe``): messages are JSON, each ended by a zero
-    byte, on its file descriptors 3 and 4. options: of graphics, as SOFTWARE_WEBGL.
+    byte, on its file descriptors 3 and 4. options: of graphics, as SOFTWARE_WEBGL; width, height:
+    px, one of the screen for each of the page.
     """
 
-    def __init__(self, *options: str):
+    def __init__(self, options, width, height):
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         theirs_in, self._out = _pipe()
         self._in, theirs_out = _pipe()
@@ -78,9 +79,15 @@ class Browser:
         )
         os.close(theirs_in)
         os.close(theirs_out)
-        self._count, self._heard = 0, queue.SimpleQueue()
-        self.events: list[dict] = []
+        self._count, self._heard, self._events, self._session = 0, queue.SimpleQueue(), [], {}
         threading.Thread(target=self._listen, daemon=True).start()
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = {"sessionId": session}
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
 
     def close(self):
         """End the browser's own process group: nothing else."""
@@ -95,15 +102,13 @@ class Browser:
         os.close(self._out)
         self._profile.cleanup()
 
-    def call(self, method, session=None, **parameters):
-        """The answer to a command; what happens until then is added to ``events``."""
+    def call(self, method, **parameters):
+        """The answer to a command; what happens until then is noted."""
         self._count += 1
-        message = {"id": self._count, "method": method, "params": parameters}
-        if session is not None:
-            message["sessionId"] = session
+        message = {"id": self._count, "method": method, "params": parameters, **self._session}
         os.write(self._out, json.dumps(message).encode() + b"\0")
         while (heard := self._heard.get(timeout=TIMEOUT_SECONDS)).get("id") != self._count:
-            self.events.append(heard)
+            self._events.append(heard)
         assert "error" not in heard, f"{method}: {heard['error']}"
         return heard["result"]
 
@@ -114,23 +119,6 @@ class Browser:
             for message in messages:
                 self._heard.put(json.loads(message))
         os.close(self._in)
-
-
-class Window:
-    """A window of a browser; width, height: px, one of the screen for each of the page."""
-
-    def __init__(self, browser: Browser, width: int, height: int):
-        self._browser = browser
-        target = browser.call("Target.createTarget", url="about:blank")["targetId"]
-        answer = browser.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session = answer["sessionId"]
-        for domain in ("Page", "Runtime", "Network", "Log"):
-            self.call(f"{domain}.enable")
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        self.call("Emulation.setDeviceMetricsOverride", **size)
-
-    def call(self, method: str, **parameters: object):
-        return self._browser.call(method, self._session, **parameters)
 
     def cut_off(self):
         """Turn its network off."""
@@ -173,15 +161,15 @@ class Window:
 
     def requests(self):
         """The addresses of all that it has asked for."""
-        return [p["request"]["url"] for p in self._events("Network.requestWillBeSent")]
+        return [p["request"]["url"] for p in self._parameters("Network.requestWillBeSent")]
 
     def console_errors(self):
         """Exceptions, errors and warnings."""
         levels = ("assert", "error", "warning")
-        entries = [p["entry"] for p in self._events("Log.entryAdded")]
-        calls = self._events("Runtime.consoleAPICalled")
+        entries = [p["entry"] for p in self._parameters("Log.entryAdded")]
+        calls = self._parameters("Runtime.consoleAPICalled")
         return [
-            *(str(p["exceptionDetails"]) for p in self._events("Runtime.exceptionThrown")),
+            *(str(p["exceptionDetails"]) for p in self._parameters("Runtime.exceptionThrown")),
             *(entry["text"] for entry in entries if entry["level"] in levels),
             *(str(p["args"]) for p in calls if p["type"] in levels),
         ]
@@ -189,19 +177,17 @@ class Window:
     def _mouse(self, kind: str, x: float, y: float, **others: object):
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **others)
 
-    def _events(self, method: str):
+    def _parameters(self, method: str):
         self.evaluate("0")  # what came before is heard now
-        events = self._browser.events
-        mine = (event for event in events if event.get("sessionId") == self._session)
-        return [event["params"] for event in mine if event["method"] == method]
+        return [event["params"] for event in self._events if event["method"] == method]
 
 
 @contextmanager
-def browser_page(width: int, height: int, options=SOFTWARE_WEBGL):
+def browser_page(width, height, options=SOFTWARE_WEBGL):
     """Yield a page of a new browser, without a window on the screen."""
-    browser = Browser(*options)
+    browser = Browser(options, width, height)
     try:
-        yield Window(browser, width, height)
+        yield browser
     finally:
         browser.close()
 
