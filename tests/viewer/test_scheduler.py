@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ class Stage:
 
     def __init__(self, refresh_after):
         self.clock = SimpleNamespace(now=100.0, monotonic=lambda: self.clock.now)
-        self.seconds_a_pixel, self.shown, self.refused = 0.0, [], []
+        self.seconds_a_pixel, self.shown, self.refuse = 0.0, [], Mock()
         self.requests = RenderRequests()
         self._scheduler = RenderScheduler(self.requests, self.show, self.refuse, refresh_after)
 
@@ -40,9 +41,6 @@ class Stage:
     def show(self, client, request, frame, is_whole):
         assert frame.pixels.shape == (request.height, request.width, 3)
         self.shown.append((client, request.width, is_whole))
-
-    def refuse(self, client, reason):
-        self.refused.append((client, reason))
 
     def serve(self):
         return self._scheduler.serve(lambda: self)
@@ -126,5 +124,5 @@ def test_failing_request_is_reported_once_on_its_page_and_others_are_served(stag
     stage.requests.remove(2)
     stage.clock.now += 10
     assert not stage.serve()
-    assert stage.refused == [(1, reason)]
+    stage.refuse.assert_called_once_with(1, reason)
     assert [client for client, *_ in stage.shown] == [2]

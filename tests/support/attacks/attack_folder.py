@@ -94,13 +94,12 @@ def _noise(seed: int, channels: int) -> np.ndarray:
 def write_photos(folder: Path) -> None:
     """The nerfstudio layout, with a lens, a mask, depths of both kinds, and a camera that moves."""
     folder.mkdir()
-    frames = []
-    for i in range(4):
-        frames.append({"file_path": f"{i}.png", "transform_matrix": _pose(1.5 * i)})
-        iio.imwrite(folder / f"{i}.png", _noise(i, 3))
+    frames = [{"file_path": f"{i}.png", "transform_matrix": _pose(1.5 * i)} for i in range(4)]
     frames[1] |= {"mask_path": "mask.png", "transform_matrix_close": _pose(1.51)}
     frames[2] |= {"depth_file_path": "depth.npy"}
     frames[3] |= {"depth_file_path": "depth.png"}
+    for i in range(4):
+        iio.imwrite(folder / f"{i}.png", _noise(i, 3))
     iio.imwrite(folder / "mask.png", np.where(_noise(5, 1)[:, :, 0] > 20, 255, 0).astype(np.uint8))
     iio.imwrite(folder / "depth.png", np.full((HEIGHT, WIDTH), 4000, np.uint16))
     np.save(folder / "depth.npy", np.full((HEIGHT, WIDTH), 4, np.float32))

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from support.attacks.attack import KINDS, SMALL_FILES, Attack, Fault
 from support.attacks.attack_folder import CAPTURE, AttackFolder, current_folder
 from support.attacks.files import damage_attacks, other_file_attacks, special_attacks
@@ -105,9 +103,3 @@ def attacks(family: str, attack_folder: AttackFolder) -> list[Attack]:
     names = [attack.name for attack in found]
     assert len(set(names)) == len(names), family
     return found
-
-
-def some(found: list[Attack], count: int) -> list[Attack]:
-    """``count`` of them, by a seed, in their order."""
-    chosen = np.random.default_rng(1).permutation(len(found))[:count]
-    return [found[index] for index in sorted(chosen)]
