@@ -2,6 +2,7 @@
 
 import platform
 import sys
+from unittest.mock import Mock
 
 import drjit as dr
 import mitsuba as mi
@@ -96,13 +97,7 @@ def test_denormals_are_flushed_on_any_number_of_threads(count):
 
 
 def test_refused_number_of_threads_is_a_user_error(monkeypatch):
-    set_thread_count = dr.set_thread_count
-
-    def refuse(count):
-        if count == 100_000:
-            raise RuntimeError("Resource temporarily unavailable")
-        set_thread_count(count)
-
+    refuse = Mock(side_effect=RuntimeError("Resource temporarily unavailable"))
     monkeypatch.setattr(dr, "set_thread_count", refuse)
     with (
         pytest.raises(UserError, match=r"--threads 100000: .*: Resource temporarily"),

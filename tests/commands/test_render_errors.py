@@ -121,12 +121,6 @@ def test_camera_file_beyond_limits_is_refused(fit, tmp_path, values, message):
     refused(tmp_path, *words, "data.shutter_samples=1001", message=message)
 
 
-def test_a_folder_that_must_stay_is_not_written(fit, tmp_path):
-    assert_refused(render.main, fit, "--out", fit, folder=fit, message="holds a fit")
-    (tmp_path / "out").write_text("mine")
-    refused(tmp_path, fit, message="cannot write")
-
-
 SENSOR = sensor(pose_around(0.8, 0.3))
 MODEL = '<string name="filename" value="model.ply"/>'
 SAMPLES = '"sample_count" value="{}"'
@@ -233,6 +227,8 @@ def test_files_that_are_not_the_commands_are_kept(fitted, tmp_path, way, name, c
     assert_kept(fitted, *VIEWS[way], "--out", out, message=message)
     message = f"--out {test}: holds images of the dataset (r_0.png, r_1.png); choose"
     assert_kept(fitted, *VIEWS[way], "--out", test, message=message)
+    assert_kept(fitted, *VIEWS[way], "--out", fitted, message="holds a fit")
+    assert_kept(fitted, *VIEWS[way], "--out", out / name, message="cannot write")
 
 
 def test_a_reference_beside_a_scene_is_not_replaced(tmp_path):

@@ -1,4 +1,4 @@
-"""``drgs view``: what it shows, and what it refuses; browsers are in ``tests/live``."""
+"""``drgs view``: what it shows, and what it refuses."""
 
 import shutil
 import sys

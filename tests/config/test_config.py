@@ -52,13 +52,6 @@ def test_lego_paper_is_the_reference_recipe():
     assert config.iterations == 30_000 and config.coarse == []
 
 
-def test_rates_decay_except_with_adc(load):
-    assert load(MINIMAL).optimizer.decay == 0.1
-    assert load(MINIMAL + "densify: {strategy: adc}").optimizer.decay == 1
-    given = load(MINIMAL + "densify: {strategy: adc}\noptimizer: {decay: 0.5}")
-    assert given.optimizer.decay == 0.5
-
-
 @pytest.mark.parametrize(
     ("text", "start", "stop", "degree"),
     [
@@ -72,10 +65,11 @@ def test_rates_decay_except_with_adc(load):
         ("densify: {stop: 90}\niterations: 500", 25, 90, 12),
     ],
 )
-def test_the_schedule_follows_from_the_iterations(load, text, start, stop, degree):
+def test_schedule_and_decay_follow_from_iterations_and_strategy(load, text, start, stop, degree):
     config = load(MINIMAL + text)
     assert (config.densify.start, config.densify.stop) == (start, stop)
     assert config.model.sh_increase_every == degree
+    assert config.optimizer.decay == (1 if "adc" in text else 0.1)
 
 
 def test_shorter_schedule_is_scaled_in_proportion():
@@ -210,11 +204,18 @@ def test_a_wrong_override_is_refused(load, overrides, message):
 
 def test_overrides_win_over_the_file_and_the_last_one_wins(load):
     """Paths need not be valid YAML; numbers may lack a decimal point."""
-    given = ("seed=2", "seed=3", "loss.sigma=2e0", "data.background=[0, 0.5, 1]")
+    given = (
+        "optimizer.decay=0.5",
+        "densify.strategy=adc",
+        "seed=2",
+        "seed=3",
+        "loss.sigma=2e0",
+        "data.background=[0, 0.5, 1]",
+    )
     config = load(MINIMAL + "seed: 1\noptimizer: {epsilon: 1e-8}", *given, "data.path=a: [b")
     assert (config.seed, config.loss.sigma, config.optimizer.epsilon) == (3, 2.0, 1e-8)
     assert config.data.background == config.data.background_rgb == (0.0, 0.5, 1.0)
-    assert config.data.path.name == "a: [b"
+    assert config.data.path.name == "a: [b" and config.optimizer.decay == 0.5
     assert load(MINIMAL, "data.path=2024").data.path.name == "2024"
 
 

@@ -126,10 +126,6 @@ def test_splats_among_surfaces_agree_with_known_results(load_script):
         assert difference < 0.015 and known < 0.95, lamp
 
 
-def distances(found, true) -> dict[str, float]:
-    return {name: float(np.linalg.norm(np.subtract(v, true[name]))) for name, v in found.items()}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["objects", "mirror"])
 def test_relighting_recovers_the_parameters_of_the_target(
@@ -152,9 +148,9 @@ def test_relighting_recovers_the_parameters_of_the_target(
     _, _, *rows = re.findall(r"^\| (.*) \| .* \| .* \| (.*) \|$", output, re.MULTILINE)
     printed = {title: [float(x) for x in row.split(", ")] for title, row in rows}
     found = {key: printed[title] for key, title in case.start.TITLES.items()}
-    at_start, at_end = distances(start, true), distances(found, true)
-    for key in start:
-        assert at_end[key] < at_start[key] / 3, key
+    for key, value in true.items():
+        at_start, at_end = (np.linalg.norm(np.subtract(v[key], value)) for v in (start, found))
+        assert at_end < at_start / 3, key
     for rendered in ("target", "start", "end", "difference"):
         assert iio.imread(tmp_path / f"{rendered}.png").shape == (40, 40, 3)
     with Image.open(tmp_path / "relight.webp") as animation:

@@ -59,7 +59,8 @@ def test_approximations_can_be_changed_and_restored(scene, others):
     assert np.array_equal(pixels(scene), first)
 
 
-def test_depths_are_colored_from_near_to_far(scene):
+def test_depths_and_normals_are_colored(scene):
+    """Depths from near to far; normals point to the camera."""
     frame = scene.frame(replace(REQUEST, content="depth"))
     near, far = (float(word) for word in frame.note.split() if word[0].isdigit())
     assert RADIUS - 1.1 < near < far < RADIUS + 1.1  # the blobs are within a unit of the focus
@@ -69,17 +70,13 @@ def test_depths_are_colored_from_near_to_far(scene):
     assert (frame.pixels[empty] == round(255 * BACKDROP_GRAY)).all()
     red, _, blue = frame.pixels[opacity.min(axis=2) > 200].astype(int).T
     assert (red > blue).any() and (blue > red).any()
-    away = ViewerCamera(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
-    frame = scene.frame(replace(REQUEST, camera=away, content="depth"))
-    assert frame.note == "nothing is seen" and np.ptp(frame.pixels) == 0
-
-
-def test_normals_point_to_the_camera(scene):
-    opaque = pixels(scene, content="opacity").min(axis=2) > 250
-    normals = pixels(scene, content="normals")[opaque] / 255 * 2 - 1
+    normals = pixels(scene, content="normals")[opacity.min(axis=2) > 250] / 255 * 2 - 1
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=0.05)  # eight bits, alpha
     # A sum of unit vectors that point to the camera, seen at most 30 degrees from the axis.
     assert (normals @ EYE.camera_to_world[:3, 2]).max() < 0.5
+    away = ViewerCamera(pose_around(0.4, 0.3) @ np.diag([-1.0, 1, -1, 1]), 40.0, RADIUS)
+    frame = scene.frame(replace(REQUEST, camera=away, content="depth"))
+    assert frame.note == "nothing is seen" and np.ptp(frame.pixels) == 0
 
 
 def test_the_error_is_the_difference_from_the_most_accurate_image(scene):

@@ -29,8 +29,7 @@ WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 KINDS = ("full", "denied", "kill", "interrupt")
 """Faults at a change: no space left; no permission to remove or replace; SIGKILL; Ctrl-C."""
 
-SMALL_FILES = "small files"
-"""A fault of another kind: no file may become larger than ``at`` bytes, and writing stops there."""
+SMALL_FILES = "small files"  # another fault: writing stops when a file has ``at`` bytes
 
 
 class Killed(BaseException):
@@ -78,8 +77,7 @@ class Changes:
             self.fault.strike(number, event, path)
 
 
-_observing: list[Changes] = []
-"""At most one; a list, because a hook cannot be told anything else."""
+_observing: list[Changes] = []  # at most one; a hook cannot be told anything else
 
 
 def _hook(event: str, arguments: tuple) -> None:

@@ -16,8 +16,7 @@ from support.attacks.attack_folder import AttackFolder
 from support.attacks.catalogue import attacks
 from support.attacks.trial import trial
 
-GRACE_SECONDS = 40.0
-"""Seconds beyond an attack's own, after which its process is ended: more than it takes to start."""
+GRACE_SECONDS = 40.0  # beyond an attack's own: more than a process takes to start
 
 
 class Server:
@@ -45,8 +44,7 @@ class Server:
             return ["the process crashed, or did not end, in native code"]
 
 
-_folders: list[AttackFolder] = []
-"""That of a process of the pool."""
+_folders: list[AttackFolder] = []  # that of a process of the pool
 
 
 def _start(base: Path) -> None:

@@ -29,11 +29,8 @@ CACHES = re.compile(
 
 TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
 
-MAX_REFUSAL_CHARS = 2000
-"""Characters in a refusal, beside what the user wrote."""
-
-ADDRESS_SPACE = 4 << 30
-"""Bytes by which it may grow: threads and compilers reserve much more than they use."""
+MAX_REFUSAL_CHARS = 2000  # in a refusal, beside what the user wrote
+ADDRESS_SPACE = 4 << 30  # bytes by which it may grow: compilers reserve more than they use
 
 MAY_CHANGE = {"fit": {"out", "stopped", "run"}, "render": {"out"}, "capture": {"out", "captured"}}
 """Folders in which a command may change existing files."""
