@@ -195,7 +195,7 @@ def test_the_first_interrupt_saves_and_the_second_ends_without_a_traceback(
 
 
 def test_budget_reserves_time_for_results_or_skips_them(monkeypatch):
-    """By a clock that stands still, for results of 6 s, 2 of them for report and images."""
+    """The clock stands still; results take 6 s, 2 of them for report and images."""
     changes = {
         "seconds_of_results": lambda *_: Seconds(6.0, renders=1.0, report=1.0),
         "seconds_of_curves": lambda: 2.0,
