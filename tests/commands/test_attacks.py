@@ -81,11 +81,6 @@ def write(path):
         temporary.write_text("x")
 
 
-def write_elsewhere():
-    write("../elsewhere")
-    os.unlink("../elsewhere")
-
-
 BREACHES = {
     "exception": (lambda: 1 / 0, "ZeroDivisionError: division by zero"),
     "status": (lambda: sys.exit(1), "ended with status 1"),
@@ -102,7 +97,7 @@ BREACHES = {
     "removed": (lambda: os.unlink("sky.png"), "removed sky.png"),
     "beside the output": (lambda: write("new/a"), "made new/a"),
     "refused too late": (lambda: (write("out/a"), refuse("error: no")), "made out/a"),
-    "elsewhere": (write_elsewhere, "wrote outside"),
+    "elsewhere": (lambda: (write("../a"), os.unlink("../a")), "wrote outside"),
     "temporary": (
         lambda: (os.mkdir("out"), Path("out/.a.7.tmp.txt").touch()),
         "left out/.a.7.tmp.txt",
