@@ -97,7 +97,7 @@ def test_denormals_are_flushed_on_any_number_of_threads(count):
 
 
 def test_refused_number_of_threads_is_a_user_error(monkeypatch):
-    refuse = Mock(side_effect=RuntimeError("Resource temporarily unavailable"))
+    refuse = Mock(side_effect=[RuntimeError("Resource temporarily unavailable"), None])
     monkeypatch.setattr(dr, "set_thread_count", refuse)
     with (
         pytest.raises(UserError, match=r"--threads 100000: .*: Resource temporarily"),
