@@ -123,6 +123,7 @@ NOBODY_UID = 65534
 def as_ordinary_user():
     """A scene's folder, with root's rights given up: root may read and write everything."""
     folder = make_scene(Path(tempfile.mkdtemp(prefix="drgs-")))
+    load_dataset(load_config(folder / CONFIG).data)  # imports what only root may read
     was_root = os.geteuid() == 0
     if was_root:
         for path in (folder, *folder.rglob("*")):
@@ -164,6 +165,10 @@ def test_files_and_folders_without_permission_are_named(as_ordinary_user):
         claim_output_folder(folder / "out", config)
     folder.chmod(0o700)
     assert contents(folder) == before
+    (folder / "out").mkdir(mode=0)
+    with pytest.raises(UserError, match=f"out: cannot be the output folder: {message}"):
+        claim_output_folder(folder / "out", config)
+    (folder / "out").chmod(0o700)
 
 
 # Damaged files give an error that names them, or are read; never another exception, never a hang

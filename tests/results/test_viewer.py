@@ -119,6 +119,8 @@ def test_page_of_numbers_it_cannot_show_or_that_is_too_large_is_not_written(
 ):
     wrong = blobs()
     wrong.sh0[3, 0, 1] = np.nan
+    assert viewer.shows_as_fitted(FITTED)
+    assert not viewer.shows_as_fitted(replace(FITTED, order="pixel"))
     with pytest.raises(UserError, match="sh0 of Gaussian 3 is"):
         viewer_page(TITLE, DisplaySettings(wrong, FITTED), initial_view, COLOR)
     path = tmp_path / "viewer.html"
