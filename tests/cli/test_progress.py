@@ -17,17 +17,13 @@ def clock(monkeypatch):
     return now
 
 
-def lines(capsys):
-    return capsys.readouterr().out.splitlines()
-
-
 def test_log_file_gets_a_line_every_ten_seconds_and_the_last(clock, capsys):
     with RunProgress("image", 25) as shown:
         for done in range(1, 26):
             clock[0] += 1.0
             shown.update(done, 25)
     expected = ["image 10/25  left 0:15", "image 20/25  left 0:05", "image 25/25  left 0:00"]
-    assert lines(capsys) == expected
+    assert capsys.readouterr().out.splitlines() == expected
 
 
 def test_pace_is_measured_since_the_first_update(clock, capsys):
@@ -39,46 +35,17 @@ def test_pace_is_measured_since_the_first_update(clock, capsys):
         shown.update(501, 1000, "loss 0.05")
         clock[0] += LOG_SECONDS
         shown.update(601, 801)
-    assert lines(capsys) == [
+    assert capsys.readouterr().out.splitlines() == [
         "iteration 401/1000  loss 0.1",  # no pace is known yet
         "iteration 501/1000  loss 0.05  left 0:49",
         "iteration 601/801  left 0:20",
     ]
 
 
-@pytest.fixture
-def no_notebook(monkeypatch):
-    """Nor one of those that run the tests."""
-    for name in ("JPY_PARENT_PID", "MPLBACKEND", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE"):
-        monkeypatch.delenv(name, raising=False)
-
-
-def written_to(monkeypatch, is_terminal, **variables):
-    """Return the output after 2 of 3 images, and after the third."""
-
-    class Stream(io.StringIO):
-        def isatty(self):
-            return is_terminal
-
-    stream = Stream()
-    monkeypatch.setattr(sys, "stdout", stream)
-    for name, value in {"TERM": "xterm", "COLUMNS": "100", **variables}.items():
-        monkeypatch.setenv(name, value)
-    with RunProgress("image", 3) as shown:
-        shown.update(2, 3, "loss 0.1")
-        shown.update(3, 3, "loss 0.05")
-    return stream.getvalue()
-
-
-def test_a_terminal_gets_a_bar(monkeypatch, no_notebook):
-    written = written_to(monkeypatch, is_terminal=True)
-    assert "image" in written and "3/3" in written and "loss 0.05" in written
-    assert "\x1b[" in written
-
-
 @pytest.mark.parametrize(
     ("is_terminal", "variables"),
     [
+        (True, {}),
         (True, {"JPY_PARENT_PID": "17", "TERM": "xterm-color", "FORCE_COLOR": "1"}),
         (True, {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}),
         (True, {"TERM": "dumb"}),
@@ -86,8 +53,20 @@ def test_a_terminal_gets_a_bar(monkeypatch, no_notebook):
         (False, {"TTY_COMPATIBLE": "1"}),
     ],
 )
-def test_notebooks_and_logs_get_lines_without_escape_codes(
-    monkeypatch, no_notebook, is_terminal, variables
-):
-    written = written_to(monkeypatch, is_terminal, **variables)
-    assert written == "image 3/3  loss 0.05  left 0:00\n"
+def test_terminals_get_a_bar_and_notebooks_and_logs_lines(monkeypatch, is_terminal, variables):
+    stream = io.StringIO()
+    stream.isatty = lambda: is_terminal
+    monkeypatch.setattr(sys, "stdout", stream)
+    for name in ("JPY_PARENT_PID", "MPLBACKEND", "FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in {"TERM": "xterm", "COLUMNS": "100", **variables}.items():
+        monkeypatch.setenv(name, value)
+    with RunProgress("image", 3) as shown:
+        shown.update(2, 3, "loss 0.1")
+        shown.update(3, 3, "loss 0.05")
+    written = stream.getvalue()
+    if is_terminal and not variables:
+        for part in ("image", "3/3", "loss 0.05", "\x1b["):
+            assert part in written
+    else:
+        assert written == "image 3/3  loss 0.05  left 0:00\n"

@@ -9,10 +9,10 @@ import json
 import math
 import shlex
 import sys
-from dataclasses import replace
 from itertools import product
 
 import imageio.v3 as iio
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -25,6 +25,8 @@ from drgs.capture import camera_placement, dataset, path_tracing
 from drgs.capture.path_tracing import CaptureSettings, lit_part
 from drgs.config.load import load_config
 from drgs.config.schema import DataConfig
+from drgs.core import memory
+from drgs.core.folders import sole_writer
 from drgs.datasets import load_dataset
 from drgs.initialization.start import initial_gaussians
 from drgs.io.ply import read_points
@@ -63,8 +65,6 @@ def scene():
     }
 """
 
-SETTINGS = {"views": 6, "test_views": 3, "size": (20, 20), "spp": 16, "points": 600}
-
 SMALL = ["--views", 6, "--test-views", 3, "--size", 20, 20, "--spp", 16, "--points", 600]
 
 DISTANCE = RADIUS * math.sqrt(3) / math.sin(path_tracing.NERF_SYNTHETIC_FOV / 2)
@@ -72,9 +72,8 @@ DISTANCE = RADIUS * math.sqrt(3) / math.sin(path_tracing.NERF_SYNTHETIC_FOV / 2)
 
 
 def write(folder, name, text):
-    path = folder / name
-    path.write_text(text)
-    return path
+    (folder / name).write_text(text)
+    return folder / name
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +83,7 @@ def ball(tmp_path_factory):
 
 def run(scene, out, *options):
     """The command, in this process."""
-    capture.main([str(scene), "--out", str(out), *map(str, options)])
+    return assert_ends_well(capture.main, scene, "--out", out, *options)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +97,7 @@ def encode_srgb(linear):
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def test_layout_matches_nerf_synthetic(captured):
+def test_layout_matches_nerf_synthetic_and_cameras_look_down_at_the_object(captured):
     assert visible(captured) == {
         *("capture.json", "points3d.ply", "transforms_train.json", "transforms_test.json"),
         *(f"train/r_{i}.png" for i in range(6)),
@@ -110,62 +109,22 @@ def test_layout_matches_nerf_synthetic(captured):
     assert names == [f"./train/r_{i}" for i in range(6)]
     image = iio.imread(captured / "train" / "r_0.png")
     assert image.shape == (20, 20, 4) and image.dtype == np.uint8
-
-
-def test_dataset_loads_and_its_cameras_look_at_the_object_from_above(captured):
     dataset = load_dataset(DataConfig(path=captured))
     assert (len(dataset.train), len(dataset.test)) == (6, 3)
     for view in dataset.train + dataset.test:
         rotation = view.camera_to_world[:3, :3]
         x, y, z = view.K @ rotation.T @ (CENTER - view.center)
         # The box is stored in float32, at coordinates around 1.
-        assert x / z == pytest.approx(10, abs=1e-4)
-        assert y / z == pytest.approx(10, abs=1e-4)
-        assert z == pytest.approx(DISTANCE, rel=1e-5)
-        assert view.center[2] > CENTER[2]
+        assert (x / z, y / z) == pytest.approx((10, 10), abs=1e-4)
+        assert z == pytest.approx(DISTANCE, rel=1e-5) and view.center[2] > CENTER[2]
         assert rotation[2, 1] < 0, "the image's downward axis points up"
         assert rotation[2, 0] == pytest.approx(0, abs=1e-12), "the horizon is not level"
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
 
 
-@pytest.mark.parametrize("jitter", [0.0, 1.0])
-def test_directions_are_spread_evenly_over_the_upper_hemisphere(jitter):
-    count = 100
-    directions = camera_placement.hemisphere(count, jitter, np.random.default_rng(3))
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
-    assert (directions[:, 2] > 0).all()
-    # Uniform on the hemisphere: the mean is (0, 0, 1/2) and z is uniform in 0..1.
-    np.testing.assert_allclose(directions.mean(axis=0), [0, 0, 0.5], atol=0.04)
-    np.testing.assert_allclose(directions[:, 2], (np.arange(count) + 0.5) / count, atol=0.5 / count)
-    # No gaps: a direction in the hemisphere has a camera within two mean spacings,
-    # sqrt(2 pi / 100) = 14 degrees.
-    probes = np.random.default_rng(0).normal(size=(500, 3))
-    probes[:, 2] = abs(probes[:, 2])
-    probes /= np.linalg.norm(probes, axis=1, keepdims=True)
-    assert np.degrees(np.arccos((probes @ directions.T).max(axis=1))).max() < 28
-
-
-def test_splits_and_seeds_have_different_cameras():
-    settings = CaptureSettings(views=5, val_views=5, test_views=5)
-    views = [
-        *camera_placement.views_around(settings, np.zeros(3), 4.0),
-        *camera_placement.views_around(replace(settings, seed=1), np.zeros(3), 4.0),
-    ]
-    centers = np.array([view.pose[:3, 3] for view in views])
-    distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
-    assert distances[~np.eye(len(centers), dtype=bool)].min() > 0.01
-
-
-@pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_hemisphere_stands_on_the_chosen_axis(axis):
-    settings, height = CaptureSettings(up=axis, views=9), "xyz".index(axis)
-    for view in camera_placement.views_around(settings, np.array([1.0, 2.0, 3.0]), 4.0):
-        assert view.pose[height, 3] > [1, 2, 3][height] and view.pose[height, 1] > 0
-        assert np.linalg.det(view.pose[:3, :3]) == pytest.approx(1)
-
-
-def test_alpha_is_the_coverage_of_a_disc(captured):
-    size = 20
+def test_images_show_a_disc_of_the_encoded_radiance(captured):
+    """Alpha is the coverage; colours are not premultiplied by it."""
+    size, color = 20, 255 * encode_srgb(ALBEDO)
     focal = size / 2 / math.tan(path_tracing.NERF_SYNTHETIC_FOV / 2)
     radius = focal * math.tan(math.asin(RADIUS / DISTANCE))
     x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
@@ -173,23 +132,17 @@ def test_alpha_is_the_coverage_of_a_disc(captured):
     inside, outside = from_center < radius - 0.75, from_center > radius + 0.75
     assert inside.sum() > 40 and outside.sum() > 100
     for path in captured.glob("*/r_*.png"):
-        alpha = iio.imread(path)[:, :, 3] / 255
-        assert (alpha[inside] == 1).all() and (alpha[outside] == 0).all()
-        assert ((alpha > 0.1) & (alpha < 0.9)).sum() > 10
+        rgba = iio.imread(path).astype(float)
+        alpha = rgba[:, :, 3] / 255
+        assert (alpha[inside] == 1).all() and (rgba[alpha == 0] == 0).all()
+        assert (alpha[outside] == 0).all() and ((alpha > 0.1) & (alpha < 0.9)).sum() > 10
         # About 2 pi r edge pixels, each with an error of at most 1/4 (16 samples in 4x4 strata).
         assert alpha.sum() == pytest.approx(math.pi * radius**2, rel=0.02)
-
-
-def test_color_of_covered_pixels_is_encoded_unpremultiplied_radiance(captured):
-    expected = 255 * encode_srgb(ALBEDO)
-    for path in captured.glob("*/r_*.png"):
-        rgba = iio.imread(path).astype(float)
         covered = rgba[:, :, 3] > 250
-        assert rgba[covered, :3].mean(axis=0) == pytest.approx(expected, abs=1.5)
+        assert rgba[covered, :3].mean(axis=0) == pytest.approx(color, abs=1.5)
         # Edge pixels hold the same colour: 4 covered samples or more have little noise here.
         edge = (rgba[:, :, 3] > 60) & ~covered
-        assert rgba[edge, :3].mean(axis=0) == pytest.approx(expected, abs=3)
-        assert (rgba[rgba[:, :, 3] == 0] == 0).all()
+        assert rgba[edge, :3].mean(axis=0) == pytest.approx(color, abs=3)
 
 
 def test_lamps_are_invisible_and_outside_the_bounding_box(tmp_path, ball, captured):
@@ -202,14 +155,6 @@ def test_lamps_are_invisible_and_outside_the_bounding_box(tmp_path, ball, captur
         assert alpha.sum() == pytest.approx(expected.sum(), rel=0.02)
     positions, _ = read_points(tmp_path / "out" / "points3d.ply")
     assert np.linalg.norm(positions - CENTER, axis=1).max() == pytest.approx(RADIUS, rel=1e-4)
-
-
-def test_known_pixels_are_encoded():
-    half = 0.2145  # linear value of display 0.5005
-    pixels = [[0, 0, 0, 0], [half, 0, 2, 1], [half / 2, 0, 0.5, 0.5], [1e-4, 0, 0, 1e-3]]
-    encoded = path_tracing.encode(np.array([pixels]))
-    expected = [[0, 0, 0, 0], [128, 0, 255, 255], [128, 0, 255, 128], [0, 0, 0, 0]]
-    assert encoded[0].tolist() == expected
 
 
 def test_points_lie_on_the_sphere_with_its_color(captured):
@@ -238,8 +183,8 @@ def test_points_of_a_python_scene_lie_on_the_cube(tmp_path):
 def test_points_are_optional_and_images_need_not_be_square(ball, tmp_path, capfd):
     out = tmp_path / "out"
     # No two whole numbers of similar size make 7: Mitsuba's sampler takes one path more.
-    run(ball, out, *SMALL, "--test-views", 0, "--size", 24, 12, "--fov", 60, "--spp", 7)
-    printed, errors = capfd.readouterr()
+    words = ("--test-views", 0, "--size", 24, 12, "--fov", 60, "--spp", 7)
+    printed, errors = run(ball, out, *SMALL, *words).stdout, "".join(capfd.readouterr())
     assert "image 6/6" in printed and "600 points" in printed and "24x12" in printed
     assert "\r" not in printed and "WARN" not in printed + errors
     alpha = iio.imread(out / "train" / "r_0.png")[:, :, 3]
@@ -249,48 +194,6 @@ def test_points_are_optional_and_images_need_not_be_square(ball, tmp_path, capfd
     assert transforms["camera_angle_x"] == math.radians(60)
     run(ball, tmp_path / "b", *SMALL, "--views", 1, "--test-views", 0, "--points", 0)
     assert visible(tmp_path / "b") == {"capture.json", "transforms_train.json", "train/r_0.png"}
-
-
-def test_the_same_command_gives_the_same_bytes(ball, captured, tmp_path):
-    run(ball, tmp_path / "again", *SMALL)
-    assert contents(tmp_path / "again") == contents(captured)
-
-
-def test_folder_in_use_by_another_capture_is_refused(ball, captured, tmp_path, monkeypatch):
-    out, message = tmp_path / "out", "out: another command is writing to this folder; wait"
-    write_png, refused = dataset.write_png, []
-
-    def write_while_another_begins(path, rendered):
-        if not refused:
-            refused.append(path)
-            assert_refused(capture.main, ball, "--out", out, *SMALL, folder=out, message=message)
-        write_png(path, rendered)
-
-    monkeypatch.setattr(dataset, "write_png", write_while_another_begins)
-    run(ball, out, *SMALL)
-    assert refused and contents(out) == contents(captured)
-
-
-def test_interrupted_capture_continues_to_the_same_bytes(
-    ball, captured, tmp_path, monkeypatch, capsys
-):
-    image, calls = path_tracing.CaptureCamera.image, []
-
-    def interrupted(self, view):
-        calls.append(view)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return image(self, view)
-
-    monkeypatch.setattr(path_tracing.CaptureCamera, "image", interrupted)
-    with pytest.raises(SystemExit) as stop:
-        run(ball, tmp_path / "out", *SMALL)
-    assert stop.value.code == 130
-    assert "the same command continues" in capsys.readouterr().err
-    assert visible(tmp_path / "out") == {"capture.json", *(f"train/r_{i}.png" for i in range(3))}
-    run(ball, tmp_path / "out", *SMALL)
-    assert len(calls) == 4 + 6, "images that were there were taken again"
-    assert contents(tmp_path / "out") == contents(captured)
 
 
 def test_changed_import_of_a_python_scene_changes_its_fingerprint(tmp_path):
@@ -326,24 +229,14 @@ TINY = ["--views", 10, "--test-views", 2, "--size", 12, 12, "--spp", 4, "--point
 
 @pytest.fixture(scope="module")
 def cornell(tmp_path_factory):
-    path = tmp_path_factory.mktemp("scene") / "cornell.py"
-    path.write_text(CORNELL)
-    return path
-
-
-def capture_room(scene, out, *options):
-    return assert_ends_well(capture.main, scene, "--out", out, *TINY, *options)
-
-
-def lit_parts(out):
-    return [lit_part(iio.imread(path)) for path in out.glob("t*/r_*.png")]
+    return write(tmp_path_factory.mktemp("scene"), "cornell.py", CORNELL)
 
 
 @pytest.fixture(scope="module")
 def inside(cornell, tmp_path_factory):
     """The outcome of the command, and its folder; its name has a space."""
     out = tmp_path_factory.mktemp("captured") / "a room"
-    return capture_room(cornell, out), out
+    return run(cornell, out, *TINY), out
 
 
 def test_room_is_captured_from_inside_without_dark_images(inside):
@@ -351,28 +244,23 @@ def test_room_is_captured_from_inside_without_dark_images(inside):
     assert outcome.stderr == ""
     assert "cameras: 12 inside the scene, around (" in outcome.stdout
     assert "field of view 70 degrees" in outcome.stdout
-    parts = lit_parts(out)
-    assert len(parts) == 12 and min(parts) > 0.7
-    # Including its lamp: white, as in a photograph.
     images = [iio.imread(path) for path in out.glob("*/*.png")]
+    assert len(images) == 12 and min(map(lit_part, images)) > 0.7
+    # Including its lamp: white, as in a photograph.
     assert any((rendered[:, :, :3] == 255).all(axis=2).any() for rendered in images)
 
 
-def fitting_command(outcome):
-    """The configuration and the words behind it, as a shell would split what was printed last."""
+def test_output_ends_with_the_command_to_fit_the_result(inside):
+    """Split as by a shell."""
+    outcome, out = inside
     *_, last = outcome.stdout.splitlines()
     assert last.startswith("fit it with: python -m drgs.fit ")
-    config, *words = shlex.split(last)[6:]
-    return REPOSITORY / config, words
-
-
-def test_output_ends_with_the_command_to_fit_the_result(inside):
-    path, (data, folder, assign, assignment) = fitting_command(inside[0])
-    assert (data, folder, assign) == ("--data", str(inside[1]), "--set")
-    config = load_config(path, [f"data.path={folder}", assignment])
+    path, *words, assignment = shlex.split(last)[6:]
+    assert words == ["--data", str(out), "--set"]
+    config = load_config(REPOSITORY / path, [f"data.path={out}", assignment])
     dataset = load_dataset(config.data)
     assert (len(dataset.train), len(dataset.test)) == (10, 2)
-    positions, _ = read_points(inside[1] / "points3d.ply")
+    positions, _ = read_points(out / "points3d.ply")
     assert initial_gaussians(config, dataset).means.tolist() == positions.tolist()
 
 
@@ -385,26 +273,8 @@ def test_output_ends_with_the_command_to_fit_the_result(inside):
     ],
 )
 def test_mostly_black_or_empty_images_give_a_one_line_warning(cornell, tmp_path, options, message):
-    (line,) = capture_room(cornell, tmp_path / "out", *options).stderr.splitlines()
+    (line,) = run(cornell, tmp_path / "out", *TINY, *options).stderr.splitlines()
     assert line.startswith("warning: ") and message in line
-
-
-def test_first_images_are_spread_over_all_views():
-    """Else those near the horizon would decide whether a warning is due."""
-    assert dataset.spread_first(list(range(125)))[:10] == list(range(0, 120, 12))
-    for count in (0, 1, 9, 10, 11, 19, 125):
-        assert sorted(dataset.spread_first(list(range(count)))) == list(range(count))
-
-
-def test_azimuth_and_elevation_keep_cameras_at_the_open_side(cornell, tmp_path):
-    out, elevation = tmp_path / "out", ["--elevation", -15, 20]
-    assert capture_room(cornell, out, "--azimuth", -25, 25, *elevation).stderr == ""
-    assert min(lit_parts(out)) > 0.6
-    noted = json.loads((out / "capture.json").read_text())
-    assert (noted["azimuth"], noted["elevation"]) == ([-25, 25], [-15, 20])
-    words = (cornell, "--out", out, *TINY, "--azimuth", -25, 30, *elevation)
-    message = "azimuth is [-25.0, 25.0], requested is [-25.0, 30.0]"
-    assert_refused(capture.main, *words, folder=out, message=message)
 
 
 def test_sensors_of_the_scene_are_used_if_requested(cornell, tmp_path):
@@ -419,44 +289,28 @@ def test_sensors_of_the_scene_are_used_if_requested(cornell, tmp_path):
     assert "--set data.test_split=train" in outcome.stdout.splitlines()[-1]
 
 
-def write_nested(folder):
-    path = write_scene(folder)
-    text = path.read_text().replace("</integrator>", "</integrator></integrator>")
+def nest(folder):
+    text = (folder / "blobs.xml").read_text().replace("</integrator>", "</integrator></integrator>")
     aov = '<integrator type="aov"><string name="aovs" value="n:sh_normal"/><integrator '
-    path.write_text(text.replace("<integrator ", aov, 1))
-    return path
+    (folder / "blobs.xml").write_text(text.replace("<integrator ", aov, 1))
 
 
-def write_without_model(folder):
-    path = write_scene(folder)
-    (folder / "model.ply").unlink()
-    return path
+SHAPE_SCENE = """
+import mitsuba as mi
+import numpy as np
+
+def scene():
+    values = {'opacities': np.ones((1, 1)), 'sh_coeffs': np.ones((1, 3))}
+    values['data'] = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0, 1]])
+    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in values.items()}
+    shape = {'type': 'ellipsoids', **tensors}
+    instance = {'type': 'instance', 'r': {'type': 'ref', 'id': 'g'}}
+    group = {'type': 'shapegroup', 'id': 'g', 'gaussians': shape}
+    return {'type': 'scene', """
 
 
-def write_shapes(scene):
-    """A function that writes a scene of Gaussian shapes."""
-
-    def write(folder):
-        path = folder / "s.py"
-        path.write_text(
-            "import mitsuba as mi\n"
-            "import numpy as np\n\n"
-            "def scene():\n"
-            "    row = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0, 1]], np.float32)\n"
-            "    values = {'opacities': np.ones((1, 1)), 'sh_coeffs': np.ones((1, 3))}\n"
-            "    tensors = {k: mi.TensorXf(v.astype(np.float32)) for k, v in values.items()}\n"
-            "    shape = {'type': 'ellipsoids', 'data': mi.TensorXf(row), **tensors}\n"
-            f"    return {scene}\n"
-        )
-        return path
-
-    return write
-
-
-INSTANCED = (
-    "{'type': 'scene', 'g': {'type': 'shapegroup', 'id': 'g', 'gaussians': shape}, "
-    "'i': {'type': 'instance', 'r': {'type': 'ref', 'id': 'g'}}}"
-)
+def write_shapes(shapes):
+    return lambda folder: (folder / "blobs.py").write_text(f"{SHAPE_SCENE}{shapes}}}")
 
 
 SHAPES = "the scene holds splats (it has shapes of type ellipsoids)"
@@ -464,17 +318,158 @@ SPLATS = "blobs.xml: the scene holds splats (its integrator is splats)"
 
 
 @pytest.mark.parametrize(
-    ("write", "message"),
+    ("suffix", "change", "message"),
     [
-        (write_scene, SPLATS),
-        (write_nested, SPLATS),
-        (write_shapes("{'type': 'scene', 'gaussians': shape}"), SHAPES),
-        (write_shapes(INSTANCED), SHAPES),
-        (write_without_model, "model.ply: cannot read the file: No such file or directory"),
+        ("xml", lambda folder: None, SPLATS),
+        ("xml", nest, SPLATS),
+        ("py", write_shapes("'gaussians': shape"), SHAPES),
+        ("py", write_shapes("'g': group, 'i': instance"), SHAPES),
+        ("xml", lambda folder: (folder / "model.ply").unlink(), "model.ply: cannot read the file"),
     ],
     ids=["splats", "nested", "shapes", "instanced shapes", "model missing"],
 )
-def test_splats_in_a_captured_scene_are_refused(tmp_path, write, message):
-    words = (write(tmp_path), "--out", tmp_path / "out", *TINY)
+def test_splats_in_a_captured_scene_are_refused(tmp_path, suffix, change, message):
+    if suffix == "xml":
+        write_scene(tmp_path)
+    change(tmp_path)
+    words = (tmp_path / f"blobs.{suffix}", "--out", tmp_path / "out", *TINY)
     line = assert_refused(capture.main, *words, folder=tmp_path, message=message)
     assert ("python -m drgs.render" in line) == ("splats" in message)
+
+
+LEAST = ["--views", 2, "--test-views", 1, "--size", 4, 4, "--spp", 1, "--points", 8]
+
+
+def refused(scene, out, *options, folder, message):
+    words = (scene, "--out", out, *LEAST, *options)
+    return assert_refused(capture.main, *words, folder=folder, message=message)
+
+
+def test_edited_files_are_kept(ball, tmp_path):
+    """A mask in a frame, an image that was touched up; what is missing is made again."""
+    out = tmp_path / "out"
+    run(ball, out, *LEAST)
+    captured = contents(out)
+    edited = ("transforms_train.json", "points3d.ply", "train/r_0.png")
+    for name in edited:
+        (out / name).write_text("mine")
+    (out / "transforms_test.json").unlink()
+    run(ball, out, *LEAST)
+    assert contents(out) == {**captured, **dict.fromkeys(edited, b"mine")}
+
+
+OPTIONS = [
+    (["--views", 0], "--views: must be a whole number >= 1, got 0"),
+    (["--test-views", -1], "--test-views: must be a whole number >= 0, got -1"),
+    (["--size", 400], "--size: expected 2 arguments: --size W H"),
+    (["--size", 0, 9], "--size: must be a whole number >= 1, got 0"),
+    (["--size", 10**9, 10**9], "size must be at most 16,777,216 px"),
+    (["--size", 10**20, 1], "--size: must be at most 2,147,483,647"),
+    (["--size", 4000, 4000], "4000 x 4000 px need about 4 GB of memory, of which 2 GB are avail"),
+    (["--fov", 181], "--fov: must be between 0 and 180 degrees, got 181"),
+    (["--fov", 0], "--fov: must be between 0 and 180 degrees, got 0"),
+    (["--fov", "nan"], "--fov: must be a finite number, got nan"),
+    (["--distance", -1], "distance must be > 0, got -1"),
+    (["--distance", 1e300], "no camera may be farther from the scene than 100000 of its"),
+    (["--distance", 3, "--target", 900, 0, 0], "the cameras see nothing of the scene"),
+    (["--target", 0, "inf", 0], "--target: must be a finite number, got inf"),
+    (["--target", 1e300, 0, 0], "no camera may be farther from the scene than 100000"),
+    (["--points", 10**9], "--points: must be at most 5,000,000"),
+    (["--views", 10**9], "--views: must be at most 100,000"),
+    (["--spp", 10**9], "--spp: must be at most 1,048,576"),
+    (["--max-depth", 10**9], "--max-depth: must be at most 65,536"),
+    (["--seed", "9" * 5000], "--seed: must be a whole number"),
+    (["--out", "/dev/null/out"], "/dev/null"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), OPTIONS, ids=[str(o)[:30] for o, _ in OPTIONS])
+def test_wrong_options_are_refused_before_images_are_taken(
+    ball, tmp_path, monkeypatch, options, message
+):
+    monkeypatch.setattr(memory, "available_memory", lambda: 2 * 10**9)
+    refused(ball, tmp_path / "out", *options, folder=tmp_path, message=message)
+
+
+XML = '<scene version="3.0.0">{}</scene>'
+SCENE_THAT = "import mitsuba as mi\ndef scene():\n    {}\n    return {{'type': 'scene'}}"
+OTHER_VARIANT = "mi.set_variant('scalar_rgb')"
+SCENES = [
+    ("missing.xml", None, "there is no such scene file"),
+    ("a.xml", "no XML", "Mitsuba cannot load the scene"),
+    ("a.xml", XML.format('<shape type="ball"/>'), "cannot load the scene"),
+    ("a.xml", '<bsdf version="3.0.0" type="diffuse"/>', "a.xml"),
+    ("a.xml", XML.format('<emitter type="constant"/>'), "no surfaces"),
+    ("a.py", "x = 1", "must define a function scene()"),
+    ("a.py", "def scene():\n    return []", 'must return a dictionary with "type": "scene"'),
+    ("a.py", "def scene():\n    return {'type': 'sphere'}", 'with "type": "scene"'),
+    ("a.py", "def scene():\n\n    return 1 / 0", "a.py:3: ZeroDivisionError: division by zero"),
+    ("a.py", "import nothing_of_that_name", "a.py:1: ModuleNotFoundError"),
+    ("a.py", "def scene(:", "a.py:1: SyntaxError"),
+    ("a.py", "def scene():\n    return {'type': 'scene', 's': {'type': 'ball'}}", "ball"),
+    ("a.py", SCENE_THAT.format("pass") + f"\n{OTHER_VARIANT}", "must leave Mitsuba's variant at"),
+    ("a.py", SCENE_THAT.format(OTHER_VARIANT), "must leave Mitsuba's variant at"),
+    ("a.py", "raise SystemExit(0)", "SystemExit"),
+    ("a.py", SCENE_THAT.format("raise SystemExit(0)"), "SystemExit"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "message"), SCENES)
+def test_wrong_scenes_are_refused(tmp_path, name, text, message):
+    path = tmp_path / name
+    if text is not None:
+        path.write_text(text)
+    refused(path, tmp_path / "out", folder=tmp_path, message=message)
+    assert mi.variant() == "llvm_ad_rgb"
+
+
+CONTENTS = {
+    "nested without end": ("[" * 200_000, "not valid JSON"),
+    "too long": (" " * (1 << 20) + "{}", "more than 1,048,576 bytes"),
+    "no JSON": ("nonsense", "not valid JSON"),
+    "long value": ('{"scene": "' + 9000 * "x" + '"}', "the folder holds another capture: scene is"),
+    "a list": ("[]", "the folder holds another capture: scene is null"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), CONTENTS.values(), ids=CONTENTS)
+def test_damaged_capture_json_is_refused_and_kept(ball, tmp_path, content, message):
+    path = tmp_path / "capture.json"
+    path.write_text(content)
+    line = refused(ball, tmp_path, folder=tmp_path, message=message)
+    assert line.startswith(f"error: {path}: ") and len(line) < 600
+
+
+def test_foreign_folders_are_left_alone(ball, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    message = "the folder is not empty and holds no capture.json"
+    refused(ball, tmp_path, folder=tmp_path, message=message)
+    message = "--out must be a folder"
+    refused(ball, tmp_path / "notes.txt", folder=tmp_path, message=message)
+    out = tmp_path / "out"
+    run(ball, out, *LEAST)
+    with sole_writer(out):
+        message = "out: another command is writing to this folder; wait"
+        refused(ball, out, folder=out, message=message)
+    for options, message in (
+        (["--spp", 17], "spp is 1, requested is 17"),
+        (["--size", 4, 8], "size is [4, 4], requested is [4, 8]"),
+        (["--fov", 50], "fov is 39.5978, requested is 50.0"),
+    ):
+        refused(ball, out, *options, folder=out, message=message)
+    other = tmp_path / "ball.xml"
+    other.write_text(f"{ball.read_text()}<!-- changed -->")
+    message = "the folder holds another capture: scene_sha256"
+    refused(other, out, folder=out, message=message)
+
+
+def test_captured_image_of_another_size_is_refused(ball, tmp_path):
+    run(ball, tmp_path / "out", *LEAST)
+    captured, path = contents(tmp_path / "out"), tmp_path / "out" / "train" / "r_1.png"
+    iio.imwrite(path, np.zeros((4, 5, 4), np.uint8))
+    (tmp_path / "out" / "points3d.ply").unlink()  # or no image would be looked at
+    message = f"{path}: must be an RGBA image of 4 x 4 px of this capture, got 5 x 4"
+    refused(ball, tmp_path / "out", folder=tmp_path, message=message)
+    path.unlink()
+    run(ball, tmp_path / "out", *LEAST)
+    assert contents(tmp_path / "out") == captured

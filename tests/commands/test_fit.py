@@ -6,26 +6,28 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import make_dataclass
 from datetime import datetime
+from types import SimpleNamespace
 
 import imageio.v3 as iio
-import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY
-from support.fit_command import assert_fits
+from support.fit_command import assert_fits, run_fit, without_images, write_project
 from support.folders import visible
 from support.small_capture import write_dataset
-from support.small_fits import plain_dataset
+from support.small_fits import config_of, plain_dataset, true_blobs
 from support.viewer_rendering import VIEWER_RENDERING
 
-from drgs.cli.execution import execution_settings
-from drgs.config.load import load_config
-from drgs.datasets import load_dataset
+from drgs.config.changes import with_changes
+from drgs.core.errors import UserNote
 from drgs.gaussians.parameters import Gaussians
-from drgs.initialization.start import initial_gaussians
+from drgs.results.report import Seconds
+from drgs.training import budget
 from drgs.training.trainer import Trainer
+from drgs.training.viewers import TIME_SHARE
 
 OUTPUTS = (
     *("point_cloud.ply", "metrics.json", "history.csv", "density.csv", "config.yml"),
@@ -73,8 +75,8 @@ def fitted(configuration, tmp_path_factory):
     return output.splitlines(), out
 
 
-def test_fit_writes_its_outputs_and_prints_its_progress(fitted):
-    """Readable without a terminal."""
+def test_fit_writes_its_outputs_and_prints_its_progress(fitted, configuration):
+    """Readable without a terminal; the report records command, machine and date."""
     lines, out = fitted
     assert visible(out) == set(OUTPUTS)
     assert lines[-1] == f"open {out / 'report.html'}"
@@ -82,12 +84,10 @@ def test_fit_writes_its_outputs_and_prints_its_progress(fitted):
     for word in ("iteration 300/300", "loss", "PSNR", "Gaussians", "left"):
         assert word in last
     assert not any("\x1b" in line for line in lines)
-
-
-def test_report_records_command_machine_and_date(fitted, configuration):
-    _, out = fitted
-    page = (out / "report.html").read_text()
-    metrics = json.loads((out / "metrics.json").read_text())
+    page, metrics = (
+        (out / "report.html").read_text(),
+        json.loads((out / "metrics.json").read_text()),
+    )
     command = f"python -m drgs.fit {configuration} --out {out} --threads 2"
     assert metrics["command"] == command and command in page
     assert metrics["processor"] and metrics["processor"] in page
@@ -118,6 +118,9 @@ def test_history_has_the_population_and_scores(fitted):
     rows = list(csv.DictReader((out / "history.csv").open()))
     assert [int(row["iteration"]) for row in rows] == list(range(10, 301, 10))
     population = [int(row["num_gaussians"]) for row in rows]
+    density = list(csv.DictReader((out / "density.csv").open()))
+    for change in ("cloned", "split", "pruned"):
+        assert sum(int(row[change]) for row in density) > 0, change
     assert len(set(population)) > 1 and max(population) <= 500
     assert Gaussians.load(out / "point_cloud.ply").num_gaussians == population[-1]
     assert float(rows[-1]["loss"]) < 0.5 * float(rows[0]["loss"])
@@ -127,42 +130,9 @@ def test_history_has_the_population_and_scores(fitted):
     assert float(measured["300"]) == pytest.approx(metrics["test"]["psnr"], abs=1e-3)
 
 
-def make_trainer(config):
-    mi.set_variant("llvm_ad_rgb")
-    dataset = load_dataset(config.data)
-    return Trainer(config, dataset, initial_gaussians(config, dataset))
-
-
-@pytest.mark.slow
-def test_configuration_covers_every_change_within_a_fit(fitted, configuration):
-    """The tests below compare the bytes of such fits, this one with those of a longer process."""
-    config = load_config(configuration)
-    reports, degrees, opacities = [], set(), {}
-    with execution_settings(threads=None, debug=False):
-        trainer = make_trainer(config)
-        for iteration in range(1, config.iterations + 1):
-            reports.append(trainer.step().density)
-            degrees.add(trainer.sh_degree)
-            if iteration in (79, 80, 149, 150):
-                opacities[iteration] = trainer.gaussians().opacities.max()
-    densified = [report for report in reports if report is not None]
-    assert len(densified) == 6  # after 80, 100, ..., 180
-    for change in ("cloned", "split", "pruned"):
-        assert sum(getattr(report, change) for report in densified) > 0, change
-    for reset in (80, 150):  # white_background_reset, reset_every
-        assert opacities[reset - 1] > 0.02
-        assert opacities[reset] == pytest.approx(0.01)
-    assert degrees == {0, 1}
-
-    _, first = fitted
-    trainer.gaussians().save(first.parent / "in_process.ply")
-    expected = (first / "point_cloud.ply").read_bytes()
-    assert (first.parent / "in_process.ply").read_bytes() == expected
-
-
 @pytest.mark.slow
 def test_the_resolved_configuration_gives_the_same_bytes_on_any_number_of_threads(fitted, tmp_path):
-    """One thread, and the first fit's two. The configuration itself is fitted again above."""
+    """One thread, and the first fit's two; Gaussians were cloned, split, pruned and reset."""
     _, first = fitted
     again = tmp_path / "again"
     assert_fits(first / "config.yml", "--out", again, "--threads", 1)
@@ -172,36 +142,6 @@ def test_the_resolved_configuration_gives_the_same_bytes_on_any_number_of_thread
         assert (again / name).read_bytes() == (first / name).read_bytes(), name
     page = (first / "viewer.html").read_text().replace("<title>first:", "<title>again:")
     assert (again / "viewer.html").read_text() == page
-
-
-@pytest.mark.slow
-def test_shipped_scene_gives_the_same_bytes_on_any_number_of_threads():
-    """Some moments of 30,000 Gaussians are denormal numbers from the start."""
-    trainer = make_trainer(load_config(REPOSITORY / "scenes" / "lego_mini.yml"))
-    start, results = trainer.state(), []
-    for threads in (1, 2, 5):
-        with execution_settings(threads, debug=False):
-            trainer.restore(start)
-            for _ in range(8):
-                trainer.step()
-            results.append({name: v.tobytes() for name, v in trainer.state().items()})
-    assert results[0] == results[1] == results[2]
-
-
-@pytest.mark.slow
-def test_another_seed_gives_another_result(configuration):
-    """The seed chooses the initial points and the order of the views."""
-    results = []
-    for seed in (0, 0, 1):
-        trainer = make_trainer(load_config(configuration, [f"seed={seed}"]))
-        views = []
-        for _ in range(8):
-            trainer.step()
-            views.append(trainer.last_step.views[-1].view.index)
-        results.append((trainer.gaussians().means.tobytes(), views))
-    first, again, other = results
-    assert first == again
-    assert first[0] != other[0] and first[1] != other[1]
 
 
 @pytest.mark.slow
@@ -227,3 +167,91 @@ def test_stopped_fit_resumes_to_the_same_bytes(fitted, configuration, tmp_path, 
     rows = list(csv.DictReader((out / "history.csv").open()))
     assert [int(row["iteration"]) for row in rows] == list(range(10, 301, 10))
     assert not (out / "checkpoint.npz").exists()
+
+
+@pytest.mark.parametrize(("count", "kept"), [(1, 2), (2, 1)])
+def test_the_first_interrupt_saves_and_the_second_ends_without_a_traceback(
+    tmp_path, monkeypatch, count, kept
+):
+    """Ctrl-C is pressed so often in the second iteration; kept: the checkpoint's iteration."""
+    out, step = tmp_path / "out", Trainer.step
+    config = write_project(tmp_path, iterations=3, output={"checkpoint_every": 1})
+
+    def step_and_interrupt(trainer):
+        report = step(trainer)
+        for _ in range(count if trainer.iteration == 2 else 0):
+            signal.raise_signal(signal.SIGINT)
+        return report
+
+    monkeypatch.setattr(Trainer, "step", step_and_interrupt)
+    before = signal.getsignal(signal.SIGINT)
+    outcome = run_fit(config, "--out", out)
+    signal.signal(signal.SIGINT, before)
+    assert (outcome.returncode, outcome.stderr) == (130, "" if count == 1 else "interrupted\n")
+    assert ("stopped; continue with: " in outcome.stdout) == (count == 1)
+    assert not list(out.glob(".*.tmp*"))
+    with np.load(out / "checkpoint.npz") as checkpoint:
+        assert checkpoint["trainer.iteration"] == kept
+
+
+def test_budget_reserves_time_for_results_or_skips_them(monkeypatch):
+    """The clock stands still; results take 6 s, 2 of them for report and images."""
+    changes = {
+        "seconds_of_results": lambda *_: Seconds(6.0, renders=1.0, report=1.0),
+        "seconds_of_curves": lambda: 2.0,
+        "make_plan": lambda config, *_: make_dataclass("Plan", ["config", "end"])(config, 0.0),
+        "time": SimpleNamespace(perf_counter=lambda: 0.0),
+    }
+    for name, value in changes.items():
+        monkeypatch.setattr(budget, name, value)
+
+    def planned(seconds, **values):
+        config = with_changes(config_of(), {k.replace("__", "."): v for k, v in values.items()})
+        plan = budget.plan_fit(config, plain_dataset(), true_blobs(), seconds, None, 0.1)
+        return plan.end, plan.config.output
+
+    assert planned(100.0)[0] == 90
+    end, _ = planned(100.0, model__antialiased=True)  # and a file for viewers
+    assert end == pytest.approx(84 * (1 - TIME_SHARE))
+    end, output = planned(13.0)
+    assert end == 3 and output.report and output.save_renders
+    with pytest.warns(UserNote, match=r"no report, orbit and images are written"):
+        end, output = planned(12.0)
+    assert end == 6 and not output.report and not output.save_renders
+    end, output = planned(12.0, output__report=False)
+    assert end == 5 and output.save_renders
+    end, output = planned(7.0, output__report=False, output__save_renders=False)
+    assert end == 1 and not output.report and not output.save_renders
+
+
+@pytest.mark.slow
+def test_fit_without_a_report_writes_everything_else(tmp_path):
+    """No test view is measured on the way."""
+    config, written, metrics, histories = write_project(tmp_path), [], [], []
+    for name in ("true", "false"):
+        out = tmp_path / name
+        assert_fits(config, "--out", out, "--set", f"output.report={name}")
+        written.append({path.relative_to(out).parts[0] for path in out.rglob("*")})
+        metrics.append(json.loads((out / "metrics.json").read_text())["test"])
+        histories.append(list(csv.DictReader((out / "history.csv").open())))
+    pages = {"curves.png", "orbit.webp", "orbit.gif", "report.html", "side_by_side", "viewer.html"}
+    assert written[0] - written[1] == pages and written[1] < written[0]
+    assert metrics[0] == metrics[1]
+    for name in set(histories[0][0]) - {"wall_s", "test_psnr"}:
+        first, second = ([row[name] for row in rows] for rows in histories)
+        assert first == second, name
+    measured = [any(row["test_psnr"] for row in rows) for rows in histories]
+    assert measured == [True, False]
+
+
+@pytest.mark.slow
+def test_fit_with_all_effects_writes_their_files(tmp_path, monkeypatch):
+    without_images(monkeypatch)
+    config = write_project(
+        tmp_path,
+        model={"sh_degree": 1, "sh_increase_every": 2, "smoothing": True},
+        colors={"lr": 0.02},
+        cameras={"optimise": True, "focal_lr": 1e-4, "principal_lr": 1e-4},
+    )
+    assert_fits(config, "--out", tmp_path / "out")
+    assert (tmp_path / "out" / "cameras.json").is_file()

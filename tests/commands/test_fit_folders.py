@@ -1,12 +1,18 @@
-"""Folders of ``drgs.fit``: what others wrote stays, and a fit goes on wherever it is moved to."""
+"""Folders of ``drgs.fit``: what others wrote stays, and a fit goes on wherever it is moved to.
+
+It also goes on whenever it was killed. The clock of a fit with a budget is replaced: its plan is
+revised after iterations that are given.
+"""
 
 import json
+import os
 import shutil
+from functools import partial
+from types import SimpleNamespace
+from unittest.mock import Mock
 
-import numpy as np
 import pytest
-import yaml
-from support.commands import assert_ends_well, assert_refused
+from support.commands import assert_ends_well
 from support.fit_command import (
     ITERATIONS,
     assert_fit_refused,
@@ -23,8 +29,40 @@ from drgs import render
 from drgs.config.load import load_config
 from drgs.core.folders import sole_writer
 from drgs.results.folder import continue_run
+from drgs.training import session
+from drgs.training.loop import StopCriterion
 
 POINTS = "out/point_cloud.ply"
+
+PLANS = {2: 10, 3: 9, 5: 8}
+"""Total number of iterations of the plan revised at each iteration; the clock ends it after 7."""
+
+LAST = 7
+
+RESULTS = {
+    *("config.yml", "point_cloud.ply", "history.csv", "density.csv", "views.json"),
+    *("metrics.json", "report.html"),
+    *(f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(2)),
+}
+
+BUDGET = ("--budget", "60s")
+
+
+class Killed(BaseException):
+    """An exception that no code handles."""
+
+
+class Revised(StopCriterion):
+    """The length of a fit whose plan changes on the way."""
+
+    def __init__(self, *_):
+        pass
+
+    def should_continue(self, trainer):
+        done = trainer.iteration
+        if done in PLANS or done == LAST:
+            trainer.reschedule(PLANS.get(done, LAST), trainer.config.densify.stop)
+        return done < LAST
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +93,21 @@ def stopped(projects, tmp_path):
 
 def copied(project, folder):
     """The project, as if it had been made in ``folder``."""
-    project = shutil.copytree(project, folder / project.name)
-    path = project / "out" / "config.yml"
-    values = yaml.safe_load(path.read_text())
-    values["data"]["path"] = str(project / "data")
-    values["output"]["dir"] = str(project / "out")
-    path.write_text(yaml.safe_dump(values, sort_keys=False))
-    return project
+    copy = shutil.copytree(project, folder / project.name)
+    path = copy / "out" / "config.yml"
+    path.write_text(path.read_text().replace(str(project), str(copy)))
+    return copy
 
 
 @pytest.fixture(autouse=True)
-def fast(monkeypatch):
+def quick(monkeypatch):
+    """No time is spent on plans and reports."""
     without_images(monkeypatch)
+
+    plan = partial(SimpleNamespace, reasons="planned", chosen=Mock(), end=0.0)
+    monkeypatch.setattr(session, "plan_fit", lambda config, *_: plan(config=config))
+    monkeypatch.setattr(session, "rehearse", lambda *_: (Mock(), 1.0))
+    monkeypatch.setattr(session, "Deadline", Revised)
 
 
 def assert_as_uninterrupted(folder, projects):
@@ -129,40 +170,35 @@ def test_existing_user_image_is_kept(stopped):
     assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
 
 
-def test_record_of_a_finished_fit_lists_every_file(ended):
-    files = json.loads((ended / "out" / ".drgs-fit.json").read_text())["files"]
-    assert set(files) == visible(ended / "out") - {"config.yml"}
-    assert all(files.values())
-
-
-MESSAGE = "out: another command is writing to this folder; wait until it has ended, or choose an"
-
-
 @pytest.mark.slow
 def test_folder_in_use_by_another_fit_is_refused(stopped):
     """Whether it is resumed, replaced or begun again; afterwards it goes on."""
-    out = stopped / "out"
+    out, message = stopped / "out", "out: another command is writing to this folder; wait until"
     same = (stopped / "a.yml", "--out", out)
     with sole_writer(out):
         for words in (same, ("--resume", out), (*same, "--overwrite")):
-            assert_fit_refused(*words, folder=stopped, message=MESSAGE)
+            assert_fit_refused(*words, folder=stopped, message=message)
     assert_fits("--resume", out)
 
 
-def replace_an_image(data):
-    shutil.copy(data / "train" / "r_0.png", data / "train" / "r_1.png")
-
-
 @pytest.mark.slow
-def test_fit_with_changed_data_is_not_continued(stopped, projects):
+def test_fit_with_other_or_missing_data_is_not_continued(stopped, projects, tmp_path):
     out, data = stopped / "out", stopped / "data"
+    other = shutil.copytree(data, tmp_path / "other")
     image = (data / "train" / "r_1.png").read_bytes()
-    replace_an_image(data)
-    message = f"checkpoint.npz: belongs to other data than {data}: the image of training view r_1;"
-    for words in (["--resume", out], [stopped / "a.yml", "--out", out]):
-        assert_fit_refused(*words, folder=stopped, message=message)
+    for folder in (data, other):
+        shutil.copy(folder / "train" / "r_0.png", folder / "train" / "r_1.png")
+    message = "checkpoint.npz: belongs to other data than {}: the image of training view r_1;"
+    for words in (("--resume", out), (stopped / "a.yml", "--out", out)):
+        assert_fit_refused(*words, folder=stopped, message=message.format(data))
+    words = ("--resume", out, "--data", other)
+    assert_fit_refused(*words, folder=stopped, message=message.format(other))
     (data / "train" / "r_1.png").write_bytes(image)
-    assert "continues at iteration 4" in assert_fits("--resume", out).stdout
+    data.rename(tmp_path / "elsewhere")
+    message = f"data.path: there is no folder {data}; say where it is (--data DIR)"
+    assert_fit_refused("--resume", out, folder=stopped, message=message)
+    outcome = assert_fits("--resume", out, "--data", tmp_path / "elsewhere")
+    assert "continues at iteration 4" in outcome.stdout
     assert_as_uninterrupted(stopped, projects)
 
 
@@ -179,19 +215,6 @@ def test_moved_project_is_continued(stopped, projects, tmp_path, by):
     assert_as_uninterrupted(moved, projects)
 
 
-def test_other_and_moved_data_are_reported(stopped, projects, tmp_path):
-    shutil.copytree(stopped / "data", tmp_path / "other")
-    replace_an_image(tmp_path / "other")
-    words = ("--resume", stopped / "out", "--data", tmp_path / "other")
-    message = f"belongs to other data than {tmp_path / 'other'}: the image of training view r_1;"
-    assert_fit_refused(*words, folder=stopped, message=message)
-    (stopped / "data").rename(tmp_path / "elsewhere")
-    message = f"data.path: there is no folder {stopped / 'data'}; say where it is (--data DIR)"
-    assert_fit_refused("--resume", stopped / "out", folder=stopped, message=message)
-    assert_fits("--resume", stopped / "out", "--data", tmp_path / "elsewhere")
-    assert_as_uninterrupted(stopped, projects)
-
-
 @pytest.mark.slow
 def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     config = write_project(tmp_path, init={"point_cloud": "data/points.ply"})
@@ -205,53 +228,35 @@ def test_point_cloud_moved_with_the_data_is_found(tmp_path, monkeypatch):
     assert found.init.point_cloud == tmp_path / "elsewhere" / "points.ply"
 
 
-def test_finished_fit_stays_finished_without_its_data(ended, tmp_path):
-    before = contents(ended)
-    for options in ([], ["--data", tmp_path]):
-        outcome = assert_fits("--resume", ended / "out", *options)
-        assert "this fit is finished" in outcome.stdout
+def test_earlier_result_is_kept(ended, tmp_path):
+    """Even without its data, and if the fit that replaces it cannot begin."""
+    before, out, config = contents(ended), ended / "out", ended / "a.yml"
+    recorded = json.loads((out / ".drgs-fit.json").read_text())["files"]
+    assert recorded.keys() == visible(out) - {"config.yml"} and all(recorded.values())
+    (ended / "data").rename(tmp_path / "data")
+    for words in (("--resume", out), ("--resume", out, "--data", tmp_path)):
+        assert "this fit is finished" in assert_fits(*words).stdout
+    (tmp_path / "data").rename(ended / "data")
+    assert "this fit is finished" in assert_fits(config, "--out", out).stdout
     assert contents(ended) == before
-
-
-def test_moved_fit_without_a_record_is_continued(stopped, projects, tmp_path):
-    """And its files have fewer values."""
-    out = stopped.rename(tmp_path / "after") / "out"
-    with np.load(out / "checkpoint.npz") as file:
-        arrays = dict(file)
-    for name in ("config", "config_before"):
-        config = json.loads(str(arrays[name]))
-        del config["model"]["smoothing"]
-        arrays[name] = np.array(json.dumps(config, sort_keys=True))
-    np.savez(out / "checkpoint.npz", **arrays)
-    values = yaml.safe_load((out / "config.yml").read_text())
-    del values["model"]["smoothing"]
-    (out / "config.yml").write_text(yaml.safe_dump(values, sort_keys=False))
-    outcome = assert_fits("--resume", out)
-    assert "continues at iteration 4" in outcome.stdout
-    assert_as_uninterrupted(out.parent, projects)
+    (ended / "data" / "transforms_train.json").write_text("{")
+    message = "transforms_train.json: not valid JSON"
+    assert_fit_refused(config, "--out", out, "--overwrite", folder=ended, message=message)
 
 
 def test_orbit_needs_only_the_folder_of_a_fit(ended, tmp_path):
-    """Neither its data nor a path to it; the images are those of the cameras of the data."""
+    """Neither its data nor a path to it; views of a moved project are rendered by its data."""
     orbit = ("--orbit", 2, "--out")
-    arguments = (ended / "out", "--data", ended / "data", *orbit, tmp_path / "by data")
-    assert_ends_well(render.main, *arguments)
-    (ended / "out").rename(tmp_path / "alone")
-    shutil.rmtree(ended)
+    moved = ended.rename(tmp_path / "moved")
+    outcome = assert_ends_well(render.main, moved / "out", "--out", tmp_path / "renders")
+    assert f"taken from {moved / 'data'}" in outcome.stdout
+    assert_ends_well(render.main, moved / "out", *orbit, tmp_path / "by data")
+    (moved / "out").rename(tmp_path / "alone")
+    shutil.rmtree(moved)
     assert_ends_well(render.main, tmp_path / "alone", *orbit, tmp_path / "orbit")
     assert contents(tmp_path / "orbit") == contents(tmp_path / "by data")
     views = json.loads((tmp_path / "alone" / "views.json").read_text())["frames"]
     assert [view["file_path"] for view in views] == ["r_0", "r_1", "r_2"]
-
-
-def test_views_of_a_moved_project_are_rendered(ended, tmp_path):
-    moved = ended.rename(tmp_path / "moved")
-    outcome = assert_ends_well(render.main, moved / "out", "--out", tmp_path / "renders")
-    assert f"taken from {moved / 'data'}" in outcome.stdout
-    (moved / "data").rename(tmp_path / "elsewhere")
-    message = "there is no folder /"
-    arguments = (moved / "out", "--out", tmp_path / "b")
-    assert_refused(render.main, *arguments, folder=tmp_path, message=message)
 
 
 def test_folder_is_fitted_without_a_configuration(tmp_path):
@@ -268,3 +273,96 @@ def test_folder_is_fitted_without_a_configuration(tmp_path):
     assert used.data.path == folder and used.data.type == "nerf_synthetic"
     twice = [folder, "--data", folder, "--out", tmp_path / "b"]
     assert_fit_refused(*twice, folder=tmp_path, message=f"--data: {folder} is a folder already")
+
+
+# A fit that ends at any moment, before or behind any file that it puts in place, goes on
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    return write_project(tmp_path_factory.mktemp("project"))
+
+
+def run_crashing_fit(moment, behind, *arguments):
+    """Run a fit that is ended at the replacement of a file, before or behind it.
+
+    moment: which, by number; None: none. Returns whether it got so far, and the names of what was
+    put in place until then.
+    """
+    replace, names = os.replace, []
+
+    def replace_or_crash(temporary, path):
+        names.append(os.path.basename(path))
+        is_here = len(names) - 1 == moment
+        if is_here and not behind:
+            raise Killed
+        replace(temporary, path)
+        if is_here:
+            raise Killed
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(os, "replace", replace_or_crash)
+        try:
+            assert_fits(*arguments)
+        except Killed:
+            return True, names
+    return False, names
+
+
+def assert_done(out):
+    """All is there and nothing else, and ``config.yml`` says what was done."""
+    assert visible(out) - {"plan.txt"} == RESULTS
+    rows = (out / "history.csv").read_text().splitlines()
+    assert len(rows) == load_config(out / "config.yml").iterations + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("budget", [(), BUDGET], ids=["plain", "budget"])
+def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
+    """Also between the two files of a revised plan, and behind the last file."""
+    _, names = run_crashing_fit(None, False, config, "--out", tmp_path / "whole", *budget)
+    assert_done(tmp_path / "whole")
+    if budget:
+        saved = [moment for moment, name in enumerate(names) if name == "checkpoint.npz"]
+        # After iterations 2, 4, 6 and 7.
+        assert [names[moment + 1] for moment in saved] == ["config.yml"] * 4
+    for moment in range(len(names)):
+        out, again = tmp_path / f"{moment}", tmp_path / f"again {moment}"
+        was_killed, names = run_crashing_fit(moment, behind, config, "--out", out, *budget)
+        assert was_killed
+        if (out / "config.yml").is_file():
+            outcome = assert_fits("--resume", out)
+            is_finished = "metrics.json" in (names if behind else names[:-1])
+            assert ("this fit is finished" in outcome.stdout) == is_finished, names
+            if "history.csv" in names and not is_finished and not budget:  # results, once more
+                assert f"continues at iteration {ITERATIONS}\n" in outcome.stdout
+                for name in RESULTS - {"history.csv", "metrics.json", "config.yml"}:
+                    expected = (tmp_path / "whole" / name).read_bytes()
+                    assert (out / name).read_bytes() == expected, name
+        else:
+            assert_fits(config, "--out", out, *budget)
+        assert_done(out)
+        assert_fits(out / "config.yml", "--out", again)
+        for name in ("point_cloud.ply", "renders/test/r_1.png"):
+            assert (out / name).read_bytes() == (again / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_half_removed_run_is_not_finished(config, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert_fits(config, "--out", out)
+    unlink, removed = os.unlink, []
+
+    def unlink_two(path, *arguments, **options):
+        if len(removed) == 2:
+            raise Killed
+        removed.append(os.path.basename(path))
+        unlink(path, *arguments, **options)
+
+    with monkeypatch.context() as patched, pytest.raises(Killed):
+        patched.setattr(os, "unlink", unlink_two)
+        run_fit(config, "--out", out, "--overwrite")
+    assert removed[0] == "metrics.json"
+    assert "this fit is finished" not in assert_fits(config, "--out", out).stdout
+    assert_done(out)

@@ -6,11 +6,10 @@ The page itself is tested in ``tests/viewer``.
 import json
 import socket
 import sys
-from contextlib import contextmanager
+from contextlib import nullcontext
 from types import ModuleType
 from unittest.mock import Mock
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from support.commands import assert_ends_well
@@ -31,7 +30,6 @@ from drgs import fit
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
 from drgs.results.folder import remove_run
 from drgs.training import fit_folder
@@ -43,56 +41,35 @@ from drgs.viewer.training_viewer import EarlyStop, TrainingViewer
 EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
 
 
-class Screen:
-    """Somebody who asks for more with each image, and for an end at an iteration."""
-
-    def __init__(self, queue, end_at):
-        self.queue, self.end_at, self.shown = queue, end_at, 0
-
-    def show(self, client, request, frame, is_whole):
-        self.shown += 1
-        self.queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT + self.shown % 2))
-
-    def show_progress(self, trainer, history, total):
-        if trainer.iteration == self.end_at:
-            self.queue.end()
-
-    def refuse(self, client, reason):
-        raise AssertionError(reason)
-
-    def show_end(self, iterations):
-        self.iterations = iterations
-
-
 @pytest.fixture
 def viewer_page(monkeypatch):
-    """Makes ``--view`` a page for the screen above, without a server."""
+    """Makes ``--view`` a page, without a server, that asks for more with each image.
 
-    @contextmanager
-    def run_server(*arguments):
-        yield "server"
-
+    Its user ends the fit after 4 iterations.
+    """
     server = ModuleType("drgs.viewer.server")
-    server.run_server, server.url, server.ADDRESS = run_server, lambda _: "http://here", "127.0.0.1"
+    server.run_server = lambda *_: nullcontext("server")
+    server.url, server.ADDRESS = lambda _: "http://here", "127.0.0.1"
     monkeypatch.setitem(sys.modules, "drgs.viewer.server", server)
     monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
     monkeypatch.setattr("drgs.viewer.training_viewer.PROGRESS_SECONDS", 0.0)
-
-    def attach_viewer(end_at=None):
-        screens = []
-
-        def watch(server, trainer, dataset, length):
-            queue = RenderRequests()
-            screens.append(Screen(queue, end_at))
-            queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT))
-            length = EarlyStop(length, queue)
-            return TrainingViewer(queue, screens[0], dataset, length), length
-
-        monkeypatch.setattr(training_viewer, "watch", watch)
-        return screens
-
     without_images(monkeypatch)
-    return attach_viewer
+    screen = Mock()
+
+    def watch(server, trainer, dataset, length):
+        queue = RenderRequests()
+
+        def ask(*_):
+            queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT + screen.show.call_count % 2))
+
+        screen.show.side_effect = ask
+        screen.show_progress.side_effect = lambda t, *_: t.iteration == 4 and queue.end()
+        ask()
+        length = EarlyStop(length, queue)
+        return TrainingViewer(queue, screen, dataset, length), length
+
+    monkeypatch.setattr(training_viewer, "watch", watch)
+    return screen
 
 
 def files_of(out):
@@ -102,29 +79,20 @@ def files_of(out):
 
 
 @pytest.mark.slow
-def test_results_have_the_same_bytes_with_and_without_a_viewer(tmp_path, viewer_page):
-    config, screens = write_project(tmp_path), viewer_page()
-    outcome = assert_fits(config, "--out", tmp_path / "watched", "--view")
-    assert "look on at http://here" in outcome.stdout
-    assert screens[0].shown == screens[0].iterations == 8
-    assert_fits(config, "--out", tmp_path / "alone")
-    assert files_of(tmp_path / "watched") == files_of(tmp_path / "alone")
-    first, second = ((tmp_path / n / "config.yml").read_text() for n in ("watched", "alone"))
-    assert first.replace("watched", "alone") == second
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("killed", [False, True])
 def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page, monkeypatch, killed):
     """Also if it is killed before its results are written, and resumed."""
     config, out = write_project(tmp_path), tmp_path / "out"
-    viewer_page(end_at=4)
     with monkeypatch.context() as patch:
         if killed:
             patch.setattr(fit_folder, "write_images", Mock(side_effect=KeyboardInterrupt))
         outcome = run_fit(config, "--out", out, "--view")
         assert outcome.returncode == (130 if killed else 0)
+        assert "look on at http://here" in outcome.stdout
         assert ("5 iterations in" in outcome.stdout) != killed
+    viewer_page.refuse.assert_not_called()
+    viewer_page.show_end.assert_called_once_with(5)
+    assert viewer_page.show.call_count == 5
     assert ("finished" in assert_fits("--resume", out).stdout) != killed
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["iterations"] == metrics["config"]["iterations"] == 5
@@ -179,23 +147,18 @@ def fitted(tmp_path_factory):
     return folder / "out", outcome
 
 
-def test_both_files_record_their_approximations(fitted):
-    out, _ = fitted
+def test_metrics_include_what_viewers_show(fitted, tmp_path):
+    """Both files record their approximations; the float64 reference renders as viewers do."""
+    out, outcome = fitted
     native, other = (Gaussians.load(out / name) for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS))
     assert native.rendered_with == FITTED_WITH
     assert other.rendered_with == {"antialiased": False, "low_pass": 0.3}
     assert native.num_gaussians == other.num_gaussians and (native.means != other.means).any()
-
-
-def test_metrics_include_what_viewers_show(fitted, tmp_path):
-    """The float64 reference renders as viewers do."""
-    out, outcome = fitted
     metrics = json.loads((out / METRICS).read_text())
     dataset = load_dataset(load_config(out / "config.yml").data)
-    gaussians = double(Gaussians.load(out / GAUSSIANS_FOR_VIEWERS))
     scores = []
     for view in dataset.test:
-        seen = photograph(gaussians, view, np.array(dataset.background))
+        seen = photograph(double(other), view, np.array(dataset.background))
         scores.append(decibels(np.clip(seen.image, 0, 1), np.asarray(view.image)))
     found = metrics["viewers"]
     assert found["psnr"] == pytest.approx(np.mean(scores), abs=1e-3)
@@ -205,20 +168,6 @@ def test_metrics_include_what_viewers_show(fitted, tmp_path):
     render(out / GAUSSIANS_FOR_VIEWERS, "--scene", out / "config.yml", "--out", tmp_path)
     again = json.loads((tmp_path / METRICS).read_text())
     assert again["mean"]["psnr"] == found["psnr"]
-
-
-def test_plugin_renders_the_file_like_the_fit(fitted):
-    """To the last bit: by its name alone, and by the scene that the trainer has."""
-    out, _ = fitted
-    config = load_config(out / "config.yml")
-    dataset = load_dataset(config.data)
-    scene = make_scene(Gaussians.load(out / GAUSSIANS), config.model, dataset.background)
-    (expected,) = render_views(scene, dataset.test[:1])
-    integrator = {"type": "splats", "filename": str(out / GAUSSIANS), "near": 0.2}
-    integrator |= {"background": list(dataset.background), "srgb_primitives": False}
-    (sensor,) = make_sensors(dataset.test[:1])
-    by_name = mi.render(mi.load_dict({"type": "scene", "integrator": integrator}), sensor=sensor)
-    np.testing.assert_array_equal(np.clip(np.array(by_name), 0, 1), expected)
 
 
 @pytest.mark.slow

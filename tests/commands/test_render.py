@@ -1,37 +1,54 @@
 """``python -m drgs.render``, against the float64 reference and PSNR computed plainly."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import combinations
 
 import imageio.v3 as iio
+import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
+from conftest import REPOSITORY
+from support import small_capture
+from support.commands import assert_ends_well
 from support.folders import visible
+from support.openexr import read_exr
 from support.render_command import (
-    BLACK,
-    WHITE,
+    EIGHT_BITS,
     assert_shows,
     rendered,
     run,
+    sensor,
+    write_scene,
 )
 from support.small_capture import (
     FIELD_OF_VIEW,
     FOCUS,
     HEIGHT,
     WIDTH,
+    assert_images_agree,
     blobs,
     decibels,
     make_dataset,
+    photograph,
     pose_around,
     write_dataset,
     write_fit,
 )
-from support.small_capture import view as small_view
 
+from drgs import export
+from drgs.core.errors import UserNote
+from drgs.datasets import load_dataset
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
+from drgs.gaussians.parameters import Gaussians
+from drgs.results.files import VIEWS
 from drgs.results.refined_cameras import write_views
+
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+POSE = pose_around(0.8, 0.3)
+VIEW = small_capture.view("", POSE, None)
 
 
 def photo(fit, name, background, split="test"):
@@ -87,18 +104,7 @@ def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
     assert metrics["views"]["r_1"]["psnr"] == pytest.approx(score, abs=1e-3)
 
 
-def test_depths_are_not_opened(tmp_path):
-    """There are none: nothing that is rendered looks at them."""
-    fit = write_fit(tmp_path, make_dataset(1, 1))
-    for path in (tmp_path / "data").glob("transforms_*.json"):
-        values = json.loads(path.read_text())
-        values["frames"][0]["depth_file_path"] = "nowhere.png"
-        path.write_text(json.dumps(values))
-    run(fit, "--out", tmp_path / "out")
-    assert (tmp_path / "out" / "r_0.png").is_file()
-
-
-def test_orbit_is_around_the_focus_of_the_photographs(fit, tmp_path):
+def test_orbit_is_around_the_focus_of_the_photographs_or_the_gaussians(fit, tmp_path):
     run(fit, "--orbit", "5", "--out", tmp_path)
     names = [f"orbit_{i:03d}.png" for i in range(5)]
     assert visible(tmp_path) == {"orbit.webp", "orbit.gif", *names}
@@ -106,24 +112,20 @@ def test_orbit_is_around_the_focus_of_the_photographs(fit, tmp_path):
     cameras = orbit_of_views(make_dataset().train, blobs()).viewpoints(5, WIDTH, HEIGHT, fov)
     for name, camera in zip(names, cameras, strict=True):
         assert_shows(tmp_path / name, camera, WHITE)
-
-
-def test_an_orbit_of_a_ply_needs_no_photographs(fit, tmp_path):
     arguments = ("--orbit", "3", "--size", "30", "20", "--background", "black", "--fov", "60")
     run(fit / "point_cloud.ply", *arguments, "--out", tmp_path)
     orbit = orbit_of_gaussians(blobs(), np.array([0, 0, 1]), 60)
     for index, camera in enumerate(orbit.viewpoints(3, 30, 20, 60)):
-        assert_shows(tmp_path / f"orbit_{index:03d}.png", camera, (0, 0, 0))
+        assert_shows(tmp_path / f"orbit_{index:03d}.png", camera, BLACK)
 
 
-def test_cameras_of_a_transforms_file_render_the_images_of_the_split(fit, tmp_path):
-    run(fit, "--out", tmp_path / "split")
-    transforms = fit.parent / "data" / "transforms_test.json"
-    size = ("--size", WIDTH, HEIGHT)
-    run(fit, "--camera", transforms, *size, "--out", tmp_path / "cameras")
-    for index in range(4):
-        expected = (tmp_path / "split" / f"r_{index}.png").read_bytes()
-        assert (tmp_path / "cameras" / f"camera_{index}.png").read_bytes() == expected
+def test_depths_are_not_opened(tmp_path):
+    fit = write_fit(tmp_path, make_dataset(1, 1))
+    for path in (tmp_path / "data").glob("transforms_*.json"):
+        values = json.loads(path.read_text())
+        values["frames"][0]["depth_file_path"] = "nowhere.png"
+        path.write_text(json.dumps(values))
+    run(fit, "--out", tmp_path / "out")
 
 
 def write_camera(path, begin, end=None, **values):
@@ -160,7 +162,7 @@ def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path):
 
 @pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
 def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys, ignored):
-    path = write_camera(tmp_path / "c.json", pose_around(0.8, 0.3), pose_around(0.8, 0.3), k1=0.1)
+    path = write_camera(tmp_path / "c.json", POSE, POSE, k1=0.1)
     values = json.loads(path.read_text())
     plain = {"transform_matrix": values["frames"][0]["transform_matrix"]}
     path.write_text(json.dumps(values | {"frames": [plain, *values["frames"]]}))
@@ -176,12 +178,11 @@ def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys
 
 def test_camera_set_by_options_is_used(fit, tmp_path):
     """A file's background is black; a folder's is that of its configuration."""
-    pose = pose_around(0.8, 0.3)
-    words = ["--origin", *pose[:3, 3], "--target", *FOCUS, "--fov", np.degrees(FIELD_OF_VIEW)]
+    words = ["--origin", *POSE[:3, 3], "--target", *FOCUS, "--fov", np.degrees(FIELD_OF_VIEW)]
     words += ["--size", WIDTH, HEIGHT, "--out", tmp_path]
     for what, background in ((fit / "point_cloud.ply", BLACK), (fit, WHITE)):
         run(what, *words)
-        assert_shows(tmp_path / "camera.png", small_view("", pose, None), background)
+        assert_shows(tmp_path / "camera.png", VIEW, background)
 
 
 HEADER = {"antialiased": True, "low_pass": 0.02}
@@ -236,3 +237,136 @@ def test_header_overrides_configuration_and_set_overrides_header(shown):
     assert shown("plain", *sets[0], config="plain")[0] == own
     image, said = shown("native", *sets[1], config="plain")
     assert image == plain and "set by the file" not in said
+
+
+def test_a_mitsuba_scene_becomes_linear_exr_and_srgb_png(tmp_path):
+    run(write_scene(tmp_path, sensor(POSE)), "--out", tmp_path / "out")
+    assert visible(tmp_path / "out") == {"blobs.exr", "blobs.png"}
+    image_on_black = photograph(blobs(), VIEW, BLACK)
+    encoded = image_on_black.image + image_on_black.transmittance[..., None]
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
+    assert_images_agree(exr, linear, image_on_black, 1e-4)
+    png = rendered(tmp_path / "out" / "blobs.png")
+    assert_images_agree(png, np.clip(encoded, 0, 1), image_on_black, EIGHT_BITS)
+
+
+def test_a_scene_in_display_space_is_not_encoded_again(tmp_path):
+    settings = '<boolean name="srgb_primitives" value="false"/>'
+    run(write_scene(tmp_path, sensor(POSE), settings=settings), "--out", tmp_path / "out")
+    assert_shows(tmp_path / "out" / "blobs.png", VIEW, WHITE)
+    expected = photograph(blobs(), VIEW, WHITE)
+    exr = np.array(read_exr(tmp_path / "out" / "blobs.exr"))
+    assert_images_agree(exr, expected.image, expected, 1e-4)
+
+
+def test_every_sensor_of_a_scene_is_rendered(tmp_path):
+    sensors = sensor(POSE), sensor(pose_around(2.0, 0.3), "rgba")
+    run(write_scene(tmp_path, *sensors), "--out", tmp_path / "out")
+    expected = {f"blobs_{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")}
+    assert visible(tmp_path / "out") == expected
+    assert np.array(read_exr(tmp_path / "out" / "blobs_1.exr")).shape == (HEIGHT, WIDTH, 4)
+    assert rendered(tmp_path / "out" / "blobs_1.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_scene_without_splats_is_rendered(tmp_path):
+    body = f'{sensor(POSE)}<shape type="sphere"/><emitter type="constant"/>'
+    scene = f'<scene version="3.0.0"><integrator type="direct"/>{body}</scene>'
+    (tmp_path / "sphere.xml").write_text(scene)
+    run(tmp_path / "sphere.xml", "--out", tmp_path / "out")
+    assert rendered(tmp_path / "out" / "sphere.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_parameters_of_a_scene_file_can_be_given(tmp_path):
+    path = write_scene(tmp_path, sensor(POSE))
+    run(path, "--out", tmp_path / "written")
+    text = path.read_text().replace('"model.ply"', '"$model"').replace("1, 1, 1", "$color")
+    path.write_text(text)
+    (tmp_path / "model.ply").rename(tmp_path / "a=b.ply")
+    run(path, "-D", "model=a=b.ply", "--define", "color=1, 1, 1", "--out", tmp_path / "given")
+    images = [rendered(tmp_path / folder / "blobs.png") for folder in ("given", "written")]
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.slow
+def test_the_shipped_scene_shows_objects_among_splats(tmp_path):
+    """Some pixels show what is seen there without the model, others do not."""
+    path = REPOSITORY / "scenes" / "hybrid.xml"
+    values = {"model": str(REPOSITORY / "scenes" / "shapes" / "knot.ply"), "spp": "4"}
+    values |= {"width": "60", "height": "40", "light": "none", "shadows": ""}
+    definitions = [word for name in values for word in ("-D", f"{name}={values[name]}")]
+    run(path, *definitions, "--out", tmp_path)
+    shown = np.array(read_exr(tmp_path / "hybrid.exr"))
+    scene = mi.load_file(str(path), **values)
+    objects = np.array(mi.render(scene, integrator=scene.integrator().state.nested, spp=4))
+    # The file has half precision: 11 bits.
+    agree = np.all(np.abs(shown - objects) <= 1e-3 * (1 + objects), axis=-1)
+    assert 0.3 < agree.mean() < 0.9
+
+
+# A fit in Earth-centred coordinates is shown like one at the origin
+
+PLACE = np.array([4.2e6, 1.7e5, -4.78e6])
+ORIGIN = (4200001.0, 169999.0, -4779998.0)
+"""Origin of the Gaussians, which differs from that of the dataset."""
+
+
+@pytest.fixture(scope="module")
+def far(tmp_path_factory):
+    """A folder as a fit leaves it, whose world is at ``PLACE``."""
+    folder = tmp_path_factory.mktemp("far")
+    dataset = make_dataset()
+    views = {n: tuple(v.with_offset(PLACE) for v in getattr(dataset, n)) for n in ("train", "test")}
+    write_dataset(folder / "data", replace(dataset, **views))
+    means = (blobs().means + (PLACE - ORIGIN)).astype(np.float32)
+    (folder / "run").mkdir()
+    replace(blobs(), means=means, origin=ORIGIN).save(folder / "run" / "point_cloud.ply")
+    config = {"data": {"path": str(folder / "data"), "background": "white"}}
+    (folder / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    write_views(folder / "run" / VIEWS, load_dataset(folder / "data"))
+    return folder / "run"
+
+
+def test_cameras_of_files_and_by_hand_are_in_world_coordinates(far, tmp_path):
+    run(far, "--out", tmp_path)
+    for camera in make_dataset().test:
+        assert_shows(tmp_path / f"{camera.name}.png", camera, WHITE)
+    run(far, "--camera", far / VIEWS, "--out", tmp_path / "file")
+    assert json.loads((far / VIEWS).read_text())["origin"] == list(
+        load_dataset(far.parent / "data").origin
+    )
+    for index, camera in enumerate(make_dataset().train):
+        assert_shows(tmp_path / "file" / f"camera_{index}.png", camera, WHITE)
+    pose = pose_around(1.0, 0.4)
+    place, target = (PLACE + point for point in (pose[:3, 3], FOCUS))
+    hand = ["--fov", np.degrees(FIELD_OF_VIEW), "--size", WIDTH, HEIGHT, "--out", tmp_path / "hand"]
+    run(far, "--origin", *place, "--target", *target, *hand)
+    assert_shows(tmp_path / "hand" / "camera.png", small_capture.view("a", pose, None), WHITE)
+
+
+def test_exports_keep_the_origin_and_crop_in_world_coordinates(far, tmp_path):
+    whole, half = tmp_path / "whole.glb", tmp_path / "half.ply"
+    assert_ends_well(export.main, far, "--out", whole, "--up", 0, 0, 1)
+    read = Gaussians.load(whole)
+    assert read.origin == ORIGIN
+    expected = blobs().means + PLACE
+    np.testing.assert_allclose(read.means + np.array(ORIGIN), expected, rtol=0, atol=1e-5)
+    low, high = PLACE - 100, PLACE + np.array([FOCUS[0], 100, 100])
+    assert_ends_well(export.main, far, "--out", half, "--crop", *low, *high)
+    assert Gaussians.load(half).num_gaussians == np.count_nonzero(blobs().means[:, 0] <= FOCUS[0])
+    assert_ends_well(export.main, far, "--format", "html", "--out", tmp_path / "page.html")
+
+
+def test_plugin_renders_relative_to_the_origin_and_notes_it(far, tmp_path):
+    pose = pose_around(1.0, 0.4)
+    path = write_scene(tmp_path, sensor(pose))
+    expected = np.array(mi.render(mi.load_file(str(path))))
+    (tmp_path / "model.ply").write_bytes((far / "point_cloud.ply").read_bytes())
+    pose[:3, 3] += PLACE - ORIGIN
+    numbers = " ".join(repr(float(v)) for v in (pose @ np.diag([-1, -1, 1, 1])).ravel())
+    text = re.sub("<lookat[^>]*>", f'<matrix value="{numbers}"/>', path.read_text())
+    path.write_text(text)
+    with pytest.warns(UserNote, match=r"relative to \(4200001, 169999, -4779998\); place sensors"):
+        scene = mi.load_file(str(path))
+    # Positions relative to the origin are rounded once more.
+    np.testing.assert_allclose(np.array(mi.render(scene)), expected, rtol=0, atol=1e-3)

@@ -1,4 +1,4 @@
-"""``drgs view``: what it shows, and what it refuses; browsers are in ``tests/live``."""
+"""``drgs view``: what it shows, and what it refuses."""
 
 import shutil
 import sys
@@ -31,11 +31,9 @@ def opened(*arguments):
 @pytest.mark.parametrize("refined", [False, True])
 def test_fit_is_viewed_from_its_training_cameras(fit, tmp_path, refined):
     """Refined cameras are used, where the fit has refined them."""
-    run = tmp_path / "run"
-    shutil.copytree(fit, run)
-    config = yaml.safe_load((run / "config.yml").read_text())
-    config["cameras"] = {"optimise": refined}
-    (run / "config.yml").write_text(yaml.safe_dump(config))
+    run = shutil.copytree(fit, tmp_path / "run")
+    with (run / "config.yml").open("a") as file:
+        yaml.safe_dump({"cameras": {"optimise": refined}}, file)
     few, others = make_dataset(train=3), make_dataset(train=5)
     write_views(run / VIEWS, few)
     write_views(run / CAMERAS, others)
@@ -69,15 +67,13 @@ def test_up_direction_can_be_set(fit, name):
             view.start_of(args, model, cameras)
 
 
-def test_missing_input_is_refused(tmp_path):
+def test_missing_input_and_extra_are_reported(fit, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="viser is not installed (the extra viewer)")
-    message = "there is no such file or folder"
-    assert_refused(view.main, tmp_path / "nothing", folder=tmp_path, message=message)
-    message = "must be the output folder of a fit that has ended"
-    assert_refused(view.main, tmp_path, folder=tmp_path, message=message)
-
-
-def test_missing_extra_is_reported_with_what_to_install(fit, monkeypatch):
+    for path, message in (
+        (tmp_path / "nothing", "there is no such file or folder"),
+        (tmp_path, "must be the output folder of a fit that has ended"),
+    ):
+        assert_refused(view.main, path, folder=tmp_path, message=message)
     monkeypatch.setitem(sys.modules, "viser", None)
     message = "drgs view: needs viser, which is not installed; pip install 'drgs[viewer]'"
     assert_refused(view.main, fit, folder=fit, message=message)

@@ -1,16 +1,14 @@
-import math
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import REPOSITORY
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from support.small_fits import make_trainer, plain_dataset
 
 from drgs.config.approximations import Approximations
 from drgs.config.changes import with_iterations
-from drgs.config.load import PATH_KEYS, dump_config, known_keys, load_config
+from drgs.config.load import PATH_KEYS, known_keys, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 
@@ -54,13 +52,6 @@ def test_lego_paper_is_the_reference_recipe():
     assert config.iterations == 30_000 and config.coarse == []
 
 
-def test_rates_decay_except_with_adc(load):
-    assert load(MINIMAL).optimizer.decay == 0.1
-    assert load(MINIMAL + "densify: {strategy: adc}").optimizer.decay == 1
-    given = load(MINIMAL + "densify: {strategy: adc}\noptimizer: {decay: 0.5}")
-    assert given.optimizer.decay == 0.5
-
-
 @pytest.mark.parametrize(
     ("text", "start", "stop", "degree"),
     [
@@ -74,10 +65,11 @@ def test_rates_decay_except_with_adc(load):
         ("densify: {stop: 90}\niterations: 500", 25, 90, 12),
     ],
 )
-def test_the_schedule_follows_from_the_iterations(load, text, start, stop, degree):
+def test_schedule_and_decay_follow_from_iterations_and_strategy(load, text, start, stop, degree):
     config = load(MINIMAL + text)
     assert (config.densify.start, config.densify.stop) == (start, stop)
     assert config.model.sh_increase_every == degree
+    assert config.optimizer.decay == (1 if "adc" in text else 0.1)
 
 
 def test_shorter_schedule_is_scaled_in_proportion():
@@ -103,34 +95,18 @@ def test_shorter_schedule_is_scaled_in_proportion():
     assert (short.densify.start, short.densify.stop, short.model.sh_increase_every) == (1, 15, 1)
 
 
-def test_every_value_is_described_and_frozen(load):
-    for name, field in fields_of(FitConfig):
-        assert field.description, name
-    with pytest.raises(ValidationError, match="frozen"):
-        load(MINIMAL).iterations = 3
-
-
 WRONG_VALUES = [
     ("densify: {every: 0}", "densify.every must be >= 1, got 0"),
     ("densify: {evry: 3}", "unknown key densify.evry; did you mean densify.every?"),
     ("grad_threshold: 3", "unknown key grad_threshold; did you mean densify.adc.grad_threshold?"),
-    (
-        "densify: {splt_count: 3}",
-        "unknown key densify.splt_count; did you mean densify.adc.split_count?",
-    ),
+    ("densify: {splt_count: 3}", "unknown key densify.splt_count; did you mean densify.adc.split_"),
     ("zzz: 3", "unknown key zzz"),
+    ("densify: {strategy: abc}", "densify.strategy must be one of '"),
     ("iterations: 1.5", "iterations must be an integer, got 1.5"),
     ("iterations: '7'", "iterations must be an integer, got '7'"),
     ("seed: 3000000000", "seed must be <= 2147483647, got 3000000000"),
-    (
-        "output: {dir: ~not-a-user/x}",
-        "output.dir must be a path in UTF-8, got '~not-a-user/x' (Could not determine home "
-        "directory.)",
-    ),
-    (
-        'output: {dir: "a\\0b"}',
-        "output.dir must be a path in UTF-8, got 'a\\x00b' (embedded null byte)",
-    ),
+    ("output: {dir: ~not-a-user/x}", "output.dir must be a path in UTF-8, got '~not-a-user/x' (Co"),
+    ('output: {dir: "a\\0b"}', "output.dir must be a path in UTF-8, got 'a\\x00b' (embedded null "),
     ("loss: {sigma: big}", "loss.sigma must be a number, got 'big'"),
     ("loss: {sigma: .inf}", "loss.sigma must be a finite number, got .inf"),
     ("loss: {window: 4}", "loss.window must be odd, got 4"),
@@ -141,39 +117,17 @@ WRONG_VALUES = [
     ("coarse: 4", "coarse must be a list, got 4"),
     ("coarse: [{until: 9, factor: 1}]", "coarse.0.factor must be >= 2, got 1"),
     ("coarse: [{until: 9}]", "coarse.0.factor is missing: Width and height are divided by this."),
-    (
-        "coarse: [{until: 9, factor: 2, facto: 2}]",
-        "unknown key coarse.0.facto; did you mean coarse.factor?",
-    ),
-    (
-        "coarse: [{until: 9, factor: 2}, {until: 20, factor: 4}]",
-        "coarse must be stages with growing until and falling factor, got {until: 9, "
-        "factor: 2} before {until: 20, factor: 4}",
-    ),
+    ("coarse: [{until: 9, factor: 2, facto: 2}]", "unknown key coarse.0.facto; did you mean coars"),
+    ("coarse: [{until: 9, factor: 2}, {until: 20, factor: 4}]", "coarse must be stages with growi"),
     (
         "optimizer: {means_lr_aims: [{after: 0, end: 9}, {after: 9, end: 9}]}",
-        "optimizer.means_lr_aims must have growing after < end, got "
-        "{after: 0, end: 9}, {after: 9, end: 9}",
+        "optimizer.means_lr_aims must have growing after < end, got {after: 0, end: 9}, {after",
     ),
     ("densify: {start: 900, stop: 800}", "densify.start must be < densify.stop (800), got 900"),
-    (
-        "optimizer: {means_lr: 1e-5, means_lr_final: 1e-4}",
-        "optimizer.means_lr_final must be <= optimizer.means_lr (1e-05), got 0.0001",
-    ),
-    (
-        "densify: {adc: {prune_opacity: 0.01}}",
-        "densify.adc.prune_opacity must be < densify.adc.reset_opacity (0.01), or a reset "
-        "removes everything, got 0.01",
-    ),
-    (
-        "densify: {max_gaussians: 500}\ninit: {num_points: 501}",
-        "init.num_points must be <= densify.max_gaussians (500), got 501",
-    ),
-    (
-        "cameras: {optimise: true}\nmodel: {sh_direction: pixel}",
-        "model.sh_direction must be mean where cameras.optimise is true (colours along rays "
-        "are not differentiated in the camera), got pixel",
-    ),
+    ("optimizer: {means_lr: 1e-5, means_lr_final: 1e-4}", "optimizer.means_lr_final must be <= op"),
+    ("densify: {adc: {prune_opacity: 0.01}}", "densify.adc.prune_opacity must be < densify.adc.re"),
+    ("densify: {max_gaussians: 500}\ninit: {num_points: 501}", "init.num_points must be <= densif"),
+    ("cameras: {optimise: true}\nmodel: {sh_direction: pixel}", "model.sh_direction must be mean "),
     (
         "densify: {every: 0, adc: {split_count: 1}}",
         "densify.every must be >= 1, got 0; densify.adc.split_count must be >= 2, got 1",
@@ -193,19 +147,14 @@ WRONG_VALUES = [
 def test_a_wrong_value_is_refused_with_file_key_expected_and_got(load, text, message):
     with pytest.raises(UserError) as error:
         load(MINIMAL + text)
-    assert str(error.value) == f"scenes/x.yml: {message}"
+    assert str(error.value).startswith(f"scenes/x.yml: {message}")
 
 
 BACKGROUND = "data.background must be white, black or three numbers in 0..1, got "
 WRONG_FILES = [
     ("data: {path: x, background: grey}", f"{BACKGROUND}'grey'"),
     ("data: {path: x, background: [0, 0, 2]}", f"{BACKGROUND}[0, 0, 2]"),
-    (
-        "data: {path: x, type: llff}",
-        "data.type must be one of 'auto', 'nerf_synthetic', 'nerfstudio', 'colmap' (others "
-        'come with installed packages that have an entry point of the group "drgs"), got '
-        "'llff'",
-    ),
+    ("data: {path: x, type: llff}", "data.type must be one of 'auto', 'nerf_synthetic', 'nerfstud"),
     ("data: {}", "data.path is missing: Dataset folder; relative to the configuration file."),
     ("seed: 1", "data is missing: Photographs, cameras, and how to read them."),
     ("", "must hold sections such as 'data:', got null"),
@@ -214,11 +163,7 @@ WRONG_FILES = [
     ("a: " + "[" * 50_000, "not valid YAML: maximum recursion depth exceeded"),
     ("seed: 2001-02-31", "not valid YAML: day is out of range for month"),
     ("seed: !!int ''", "not valid YAML: string index out of range"),
-    (
-        "seed: \0",
-        "not valid YAML: unacceptable character #x0000: special characters are not "
-        'allowed in "<unicode string>", position 6',
-    ),
+    ("seed: \0", "not valid YAML: unacceptable character #x0000: special characters are not allow"),
     ("#" * 2**20 + "#", "cannot read the configuration: more than 1,048,576 bytes"),
     ("a:\n  - [1\nb: 2", "line 3: not valid YAML: expected ',' or ']', but got ':'"),
 ]
@@ -229,46 +174,42 @@ WRONG_FILES = [
 def test_a_wrong_file_is_refused(load, text, message):
     with pytest.raises(UserError) as error:
         load(text)
-    assert str(error.value) == f"scenes/x.yml: {message}"
-
-
-def test_a_missing_file_and_an_unknown_strategy_are_refused(load, tmp_path):
-    with pytest.raises(UserError, match=r"none.yml: cannot read the configuration: No such file"):
-        load_config(tmp_path / "none.yml")
-    with pytest.raises(UserError, match=r"x.yml: densify.strategy must be .*'adc'.*, got 'abc'$"):
-        load(MINIMAL + "densify: {strategy: abc}")
+    assert str(error.value).startswith(f"scenes/x.yml: {message}")
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["densify.every=0"], "--set densify.every: densify.every must be >= 1, got 0"),
-        (
-            ["densify.evry=9"],
-            "--set densify.evry: unknown key densify.evry; did you mean densify.every?",
-        ),
+        (["densify.evry=9"], "--set densify.evry: unknown key densify.evry; did you mean densify."),
         (["seed"], "--set seed: must be KEY=VALUE, as in densify.every=200"),
         (["seed=["], "--set seed: not a YAML value: ["),
         (
             ["densify.stop=9", "densify.start=500"],
-            "scenes/x.yml with --set densify.start densify.stop: densify.start must be < "
-            "densify.stop (9), got 500",
+            "scenes/x.yml with --set densify.start densify.stop: densify.start must be < densify.s",
         ),
     ],
 )
 def test_a_wrong_override_is_refused(load, overrides, message):
     with pytest.raises(UserError) as error:
         load(MINIMAL, *overrides)
-    assert str(error.value) == message
+    assert str(error.value).startswith(message)
 
 
 def test_overrides_win_over_the_file_and_the_last_one_wins(load):
     """Paths need not be valid YAML; numbers may lack a decimal point."""
-    given = ("seed=2", "seed=3", "loss.sigma=2e0", "data.background=[0, 0.5, 1]")
+    given = (
+        "optimizer.decay=0.5",
+        "densify.strategy=adc",
+        "seed=2",
+        "seed=3",
+        "loss.sigma=2e0",
+        "data.background=[0, 0.5, 1]",
+    )
     config = load(MINIMAL + "seed: 1\noptimizer: {epsilon: 1e-8}", *given, "data.path=a: [b")
     assert (config.seed, config.loss.sigma, config.optimizer.epsilon) == (3, 2.0, 1e-8)
     assert config.data.background == config.data.background_rgb == (0.0, 0.5, 1.0)
-    assert config.data.path.name == "a: [b"
+    assert config.data.path.name == "a: [b" and config.optimizer.decay == 0.5
     assert load(MINIMAL, "data.path=2024").data.path.name == "2024"
 
 
@@ -279,24 +220,10 @@ def test_paths_are_relative_to_the_file_and_in_overrides_to_the_current_folder(l
     assert config.output.dir == tmp_path.resolve() / "there"
 
 
-def test_path_keys_list_every_path_field():
+def test_every_value_is_described_and_every_path_listed():
+    assert all(field.description for _, field in fields_of(FitConfig))
     paths = {name for name, field in fields_of(FitConfig) if "Path" in str(field.annotation)}
     assert paths == set(PATH_KEYS) and paths <= set(known_keys())
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        MINIMAL,
-        "data: {path: ../x, background: [0.1, 0.2, 0.3], image_size: 7}\n"
-        "optimizer: {epsilon: 1e-15}\ninit: {half_extent: 0.1}\noutput: {dir: y}\n"
-        "coarse: [{until: 5, factor: 4}, {until: 9, factor: 2}]",
-    ],
-)
-def test_a_dumped_configuration_reloads_equal(load, tmp_path, text):
-    config = load(text)
-    dump_config(config, tmp_path / "out" / "config.yml")
-    assert load_config(tmp_path / "out" / "config.yml") == config
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
@@ -317,37 +244,22 @@ def test_last_opacity_reset_of_a_short_run_is_long_before_its_end(name):
         assert config.iterations - max([*resets, adc.white_background_reset]) >= 1200
 
 
-def numbers_of(key, model):
-    """(name, (least, most)) of the numbers of a section, and of the sections in it.
-
-    As close as float64 comes to what a number must not be.
-    """
-    for name, field in model.model_fields.items():
-        if field.annotation in (float, float | None):
-            low, high = -math.inf, math.inf
-            for limit in field.metadata:
-                low = max(low, getattr(limit, "ge", low))
-                low = max(low, np.nextafter(getattr(limit, "gt", -math.inf), math.inf))
-                high = min(high, getattr(limit, "le", high))
-                high = min(high, np.nextafter(getattr(limit, "lt", math.inf), -math.inf))
-            yield f"{key}.{name}", (low, high)
-        elif isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            yield from numbers_of(f"{key}.{name}", field.annotation)
-
-
-SECTIONS = ["init", "model", "optimizer", "loss", "colors", "cameras", "densify"]
-
-NUMBERS = [p for s in SECTIONS for p in numbers_of(s, FitConfig.model_fields[s].annotation)]
-
 UNLIMITED = {"model.low_pass", "densify.adc.grad_threshold", "densify.adc.clone_scale",
              "densify.adc.prune_scale", "densify.adc.split_shrink"}  # fmt: skip
 """Compared with, or finite in float32, however large they are."""
 
+UNFITTED = ("data.", "output.", "coarse", "extensions")
 
-def test_every_number_has_two_limits():
-    for key, (low, high) in NUMBERS:
-        assert low > -math.inf
-        assert high < math.inf or key in UNLIMITED, key
+
+def test_every_number_of_a_fit_has_two_limits():
+    for key, field in fields_of(FitConfig):
+        if field.annotation not in (float, float | None) or key.startswith(UNFITTED):
+            continue
+        low, high = (
+            any(hasattr(limit, name) for limit in field.metadata for name in names)
+            for names in (("ge", "gt"), ("le", "lt"))
+        )
+        assert low and (high or key in UNLIMITED), key
 
 
 def test_diverging_focal_lengths_are_an_error_naming_their_rate():

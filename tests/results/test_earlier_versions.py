@@ -25,32 +25,23 @@ ROUNDING = 1e-4
 """Relative: instructions of other processors round differently, and 30 iterations follow."""
 
 
-@pytest.fixture
-def fitted(tmp_path):
-    """The folder of the stopped fit, beside its data."""
-    for name in ("config.yml", "checkpoint.npz"):
-        (tmp_path / "out").mkdir(exist_ok=True)
-        shutil.copy(EARLIER_VERSION / name, tmp_path / "out" / name)
-    write_dataset(tmp_path / "data", make_dataset(train=3, test=2))
-    return tmp_path
-
-
 @pytest.mark.slow
-def test_a_checkpoint_is_continued(fitted):
-    assert_fits("--resume", fitted / "out", "--data", fitted / "data")
-    after, header = Ply().read(fitted / "out" / "point_cloud.ply")
+def test_a_checkpoint_is_continued(tmp_path):
+    out, data = tmp_path / "out", tmp_path / "data"
+    out.mkdir()
+    for name in ("config.yml", "checkpoint.npz"):
+        shutil.copy(EARLIER_VERSION / name, out / name)
+    write_dataset(data, make_dataset(train=3, test=2))
+    assert_fits("--resume", out, "--data", data)
+    after, header = Ply().read(out / "point_cloud.ply")
     expected, earlier_header = Ply().read(EARLIER_VERSION / "point_cloud.ply")
     assert header == earlier_header and after.keys() == expected.keys()
     for name, values in expected.items():
         np.testing.assert_allclose(after[name], values, ROUNDING, ROUNDING, err_msg=name)
 
 
-def test_a_configuration_keeps_its_values(fitted):
+def test_configurations_and_images_of_scenes_stay_the_same():
     values = yaml.safe_load((EARLIER_VERSION / "config.yml").read_text())
-    config = load_config(EARLIER_VERSION / "config.yml").model_dump(mode="json")
-    assert config == values
-
-
-def test_scene_and_ply_header_render_the_same_image():
+    assert load_config(EARLIER_VERSION / "config.yml").model_dump(mode="json") == values
     image = mi.render(mi.load_file(str(EARLIER_VERSION / "scene.xml")), seed=0)
     np.testing.assert_allclose(image, read_exr(EARLIER_VERSION / "scene.exr"), ROUNDING, ROUNDING)

@@ -1,13 +1,17 @@
 """Output folders of fits: which are taken, continued, removed and refused."""
 
+import ast
 import os
 
 import pytest
-from support.folders import contents, visible
+from conftest import REPOSITORY
+from support.folders import contents
 
+from drgs.config.changes import is_open, with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
+from drgs.results import files
 from drgs.results.files import METRICS, RESULTS
 from drgs.results.folder import (
     FOLDERS,
@@ -17,6 +21,7 @@ from drgs.results.folder import (
     load_run_config,
     remove_run,
 )
+from drgs.results.model import load_open_config
 
 IMAGES = image_names("test", ["r_0", "r_1"])
 
@@ -37,16 +42,12 @@ def finished(tmp_path, config):
     return folder
 
 
-def refusal(function, *arguments):
+def assert_refused(message, function, folder, *arguments):
+    """And all files are kept."""
+    before = contents(folder)
     with pytest.raises(UserError) as error:
-        function(*arguments)
-    return str(error.value)
-
-
-def test_missing_folder_is_created_with_the_configuration(tmp_path, config):
-    claim_output_folder(tmp_path / "a" / "b", config)
-    assert visible(tmp_path / "a" / "b") == {"config.yml"}
-    assert load_config(tmp_path / "a" / "b" / "config.yml") == config
+        function(folder, *arguments)
+    assert message in str(error.value) and contents(folder) == before
 
 
 @pytest.mark.parametrize("name", [".DS_Store", "config.yml"])
@@ -56,21 +57,30 @@ def test_folder_without_results_is_accepted(tmp_path, config, name):
     assert load_run_config(tmp_path) == config
 
 
-def test_run_with_the_same_configuration_may_continue(finished, config):
+def test_run_with_the_same_configuration_may_continue_and_finish(finished, config):
     before = contents(finished)
     same = FitConfig(data=config.data, output={"history_every": 3})
     claim_output_folder(finished, same, IMAGES)
     assert load_run_config(finished) == same
     assert {**contents(finished), "config.yml": None} == {**before, "config.yml": None}
-
-
-def test_run_with_its_last_file_and_configuration_is_finished(finished, config):
     assert not is_finished(finished, config)
     (finished / METRICS).write_text("{}")
     assert is_finished(finished, config)
     assert not is_finished(finished, FitConfig(data=config.data, seed=7))
-    (finished / "config.yml").write_text("[")
-    assert not is_finished(finished, config)
+
+
+def test_configuration_before_defaults_matches_those_that_the_data_decided(tmp_path, photographs):
+    photos = REPOSITORY / "scenes" / "photos.yml"
+    config = load_open_config(photos, [f"data.path={photographs}"], None)
+    assert config.data.background_rgb == (0, 0, 0)
+    assert config.model.near == 0.2  # a twenty-fifth of 4.1, to one digit
+    assert not is_open(config) and is_open(load_config(photos))
+    given = FitConfig(data={"path": tmp_path})
+    decided = with_changes(given, {"data.background": "black", "model.near": 0.3})
+    claim_output_folder(tmp_path / "out", decided)
+    (tmp_path / "out" / METRICS).write_text("{}")
+    assert is_finished(tmp_path / "out", given)
+    assert not is_finished(tmp_path / "out", with_changes(given, {"model.near": 0.2}))
 
 
 def test_temporary_files_of_a_killed_run_are_removed(finished, config):
@@ -81,48 +91,33 @@ def test_temporary_files_of_a_killed_run_are_removed(finished, config):
     assert contents(finished).keys() == {".drgs-fit.json", "config.yml", *kept}
 
 
-def test_differing_run_is_reported_with_its_differences(finished, config):
+def test_other_runs_and_foreign_files_are_refused_and_kept(tmp_path, finished, config):
     changes = {"init": {"half_extent": 2.0}, "densify": {"every": 9}, "loss": {"sigma": 2.0}}
-    other = FitConfig(data=config.data, seed=7, **changes)
-    assert (
+    message = (
         "already holds another run, which differs in init.half_extent = None (here 2.0), "
         "loss.sigma = 1.5 (here 2.0), densify.every = 100 (here 9) and 1 more; choose"
-    ) in refusal(claim_output_folder, finished, other)
-
-
-def test_run_with_a_broken_configuration_is_kept(finished, config):
+    )
+    other = FitConfig(data=config.data, seed=7, **changes)
+    assert_refused(message, claim_output_folder, finished, other)
     (finished / "config.yml").write_text("[")
-    before = contents(finished)
-    refused = refusal(claim_output_folder, finished, config)
-    assert "holds another run, with a config.yml that is not readable; choose" in refused
-    assert "not valid YAML" in refusal(remove_run, finished)
-    assert contents(finished) == before
-
-
-def test_folder_with_foreign_files_is_refused(tmp_path, config):
+    message = "holds another run, with a config.yml that is not readable; choose"
+    assert_refused(message, claim_output_folder, finished, config)
+    assert_refused("not valid YAML", remove_run, finished)
+    assert not is_finished(finished, config)
+    (finished / "config.yml").unlink()
+    message = "is not the output folder of a fit: it has no config.yml"
+    assert_refused(message, remove_run, finished)
+    message = f"{tmp_path}/none: is not the output folder of a fit: it does not exist, and so has "
+    assert_refused(message, load_run_config, tmp_path / "none")
+    mine = tmp_path / "mine"
+    mine.mkdir()
     for name in "dbca":
-        (tmp_path / name).write_text("")
-    refused = refusal(claim_output_folder, tmp_path, config)
-    assert "must be new or empty, got one that holds a, b, c and 1 more; choose" in refused
-    assert sorted(os.listdir(tmp_path)) == ["a", "b", "c", "d"]
-
-
-def test_file_in_place_of_the_folder_is_refused(tmp_path, config):
-    (tmp_path / "out").write_text("mine")
-    for folder, reason in (("out", "File exists"), ("out/deeper", "Not a directory")):
-        refused = refusal(claim_output_folder, tmp_path / folder, config)
-        assert f"{reason}; choose another folder: a part of this path is a file" in refused
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-@pytest.mark.parametrize("function", ["mkdir", "listdir"])
-def test_folder_without_permission_is_refused(tmp_path, config, monkeypatch, function):
-    def refuse(*arguments, **options):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(os, function, refuse)
-    refused = refusal(claim_output_folder, tmp_path / "out", config)
-    assert "cannot be the output folder: Permission denied; choose a folder that" in refused
+        (mine / name).write_text("")
+    message = "must be new or empty, got one that holds a, b, c and 1 more; choose"
+    assert_refused(message, claim_output_folder, mine, config)
+    for folder, reason in (("a", "File exists"), ("a/deeper", "Not a directory")):
+        message = f"{reason}; choose another folder: a part of this path is a file"
+        assert_refused(message, claim_output_folder, mine / folder, config)
 
 
 def test_removing_a_run_deletes_every_result(tmp_path, config):
@@ -143,22 +138,20 @@ def test_folder_in_place_of_a_result_is_not_removed(finished, is_recorded):
     if not is_recorded:
         (finished / ".drgs-fit.json").unlink()
     (finished / "curves.png").mkdir()
-    before = contents(finished)
-    assert "got curves.png" in refusal(remove_run, finished, IMAGES)
-    assert contents(finished) == before
+    assert_refused("got curves.png", remove_run, finished, IMAGES)
+    assert (finished / "curves.png").is_dir()
 
 
-def test_foreign_files_are_never_removed(finished):
-    (finished / "notes.txt").write_text("mine")
-    before = contents(finished)
-    message = "must hold nothing but a run to be replaced, got notes.txt; move that away"
-    assert message in refusal(remove_run, finished)
-    assert contents(finished) == before
-    (finished / "config.yml").unlink()
-    message = "is not the output folder of a fit: it has no config.yml"
-    assert message in refusal(remove_run, finished)
+ALLOWED_NAMES = {"fit.py": {files.TENSORBOARD}, "results/files.py": {files.CONFIG, *RESULTS}}
+"""Modules below ``results`` recognise a fit's folder by names that they write out themselves; the
+extra that a command asks for has the name of a folder."""
 
 
-def test_a_folder_without_a_run_cannot_be_continued(tmp_path):
-    message = "is not the output folder of a fit: it does not exist, and so has no config.yml"
-    assert refusal(load_run_config, tmp_path / "none") == f"{tmp_path}/none: {message}"
+@pytest.mark.slow
+def test_file_names_are_written_in_one_module_only():
+    for path in sorted((REPOSITORY / "drgs").rglob("*.py")):
+        # Docstrings and messages are longer than a name.
+        nodes = ast.walk(ast.parse(path.read_text()))
+        strings = {node.value for node in nodes if isinstance(node, ast.Constant)} - {None}
+        module = path.relative_to(REPOSITORY / "drgs").as_posix()
+        assert {files.CONFIG, *RESULTS} & strings == ALLOWED_NAMES.get(module, set()), module

@@ -1,11 +1,25 @@
-"""``viewer.html`` in a real browser: from disk, with the network off."""
+"""``viewer.html`` in a real browser, by the DevTools protocol: from disk, with the network off.
 
+Images are made by software, as test machines have no graphics card.
+"""
+
+import base64
+import io
+import json
+import os
+import queue
+import shutil
+import signal
+import tempfile
+import threading
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from support.small_capture import FOCUS, RADIUS, decibels, pose_around
 
@@ -16,12 +30,176 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results.viewer import DisplaySettings, InitialView, viewer_page
 
-browsers = pytest.importorskip("support.browser", reason="needs POSIX", exc_type=ImportError)
+fcntl = pytest.importorskip("fcntl", reason="needs POSIX")
+
+PROGRAM = next(
+    filter(None, map(shutil.which, ("google-chrome", "chrome", "chromium", "chromium-browser"))),
+    None,
+)
+"""Debian's package is ``chromium``; None: there is none."""
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(browsers.PROGRAM is None, reason="needs Chromium or Chrome"),
+    pytest.mark.skipif(PROGRAM is None, reason="needs Chromium or Chrome"),
 ]
+
+OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",  # which containers do not allow
+    "--remote-debugging-pipe",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-dev-shm-usage",
+    "--disable-extensions",
+)
+
+SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+NO_WEBGL = ("--disable-gpu", "--disable-software-rasterizer", "--disable-3d-apis")
+
+TIMEOUT_SECONDS, EXIT_SECONDS = 120.0, 5.0  # of an unresponsive browser, on a busy core
+
+
+class Browser:
+    """A process with one page, and a profile of its own that goes with it.
+
+    It listens to a pipe (``--remote-debugging-pipe``): messages are JSON, each ended by a zero
+    byte, on its file descriptors 3 and 4. options: of graphics, as SOFTWARE_WEBGL; width, height:
+    px, one of the screen for each of the page.
+    """
+
+    def __init__(self, options, width, height):
+        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        theirs_in, self._out = _pipe()
+        self._in, theirs_out = _pipe()
+        arguments = [PROGRAM, *OPTIONS, *options, f"--user-data-dir={self._profile.name}"]
+        silence = [(os.POSIX_SPAWN_OPEN, n, os.devnull, os.O_WRONLY, 0) for n in (1, 2)]
+        ends = [(os.POSIX_SPAWN_DUP2, theirs_in, 3), (os.POSIX_SPAWN_DUP2, theirs_out, 4)]
+        self._process = os.posix_spawn(
+            PROGRAM, arguments, os.environ, file_actions=[*silence, *ends], setpgroup=0
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self._count, self._heard, self._events, self._session = 0, queue.SimpleQueue(), [], {}
+        threading.Thread(target=self._listen, daemon=True).start()
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = {"sessionId": session}
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
+
+    def close(self):
+        """End the browser's own process group: nothing else."""
+        os.killpg(self._process, signal.SIGTERM)
+        end = time.monotonic() + EXIT_SECONDS
+        while os.waitpid(self._process, os.WNOHANG) == (0, 0):
+            if time.monotonic() > end:
+                os.killpg(self._process, signal.SIGKILL)
+                os.waitpid(self._process, 0)
+                break
+            time.sleep(0.05)
+        os.close(self._out)
+        self._profile.cleanup()
+
+    def call(self, method, **parameters):
+        """The answer to a command; what happens until then is noted."""
+        self._count += 1
+        message = {"id": self._count, "method": method, "params": parameters, **self._session}
+        os.write(self._out, json.dumps(message).encode() + b"\0")
+        while (heard := self._heard.get(timeout=TIMEOUT_SECONDS)).get("id") != self._count:
+            self._events.append(heard)
+        assert "error" not in heard, f"{method}: {heard['error']}"
+        return heard["result"]
+
+    def _listen(self):
+        begun = b""
+        while data := os.read(self._in, 1 << 20):
+            *messages, begun = (begun + data).split(b"\0")
+            for message in messages:
+                self._heard.put(json.loads(message))
+        os.close(self._in)
+
+    def cut_off(self):
+        """Turn its network off."""
+        nothing = {"latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+        self.call("Network.emulateNetworkConditions", offline=True, **nothing)
+
+    def open(self, address: str):
+        self.call("Page.navigate", url=address)
+        self.wait_for("!!document.body")
+
+    def evaluate(self, expression: str):
+        """A JavaScript expression's value, or what its promise becomes."""
+        answer = self.call(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def wait_for(self, expression: str):
+        end = time.monotonic() + TIMEOUT_SECONDS
+        while not self.evaluate(expression):
+            assert time.monotonic() < end, f"{expression} is not true; {self.console_errors()}"
+            time.sleep(0.05)
+
+    def rendered(self):
+        """(height, width, 3) display space, 0 to 1."""
+        data = self.call("Page.captureScreenshot", format="png")["data"]
+        with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+            return np.asarray(image.convert("RGB")) / 255
+
+    def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10):
+        """Drag the mouse with its left button; px."""
+        held = {"button": "left", "clickCount": 1}
+        self._mouse("mousePressed", *start, buttons=1, **held)
+        for step in range(1, steps + 1):
+            x, y = (a + (b - a) * step / steps for a, b in zip(start, end, strict=True))
+            self._mouse("mouseMoved", x, y, buttons=1, button="left")
+            self.evaluate("new Promise(requestAnimationFrame)")
+        self._mouse("mouseReleased", *end, **held)
+
+    def requests(self):
+        """The addresses of all that it has asked for."""
+        return [p["request"]["url"] for p in self._parameters("Network.requestWillBeSent")]
+
+    def console_errors(self):
+        """Exceptions, errors and warnings."""
+        levels = ("assert", "error", "warning")
+        entries = [p["entry"] for p in self._parameters("Log.entryAdded")]
+        calls = self._parameters("Runtime.consoleAPICalled")
+        return [
+            *(str(p["exceptionDetails"]) for p in self._parameters("Runtime.exceptionThrown")),
+            *(entry["text"] for entry in entries if entry["level"] in levels),
+            *(str(p["args"]) for p in calls if p["type"] in levels),
+        ]
+
+    def _mouse(self, kind: str, x: float, y: float, **others: object):
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **others)
+
+    def _parameters(self, method: str):
+        self.evaluate("0")  # what came before is heard now
+        return [event["params"] for event in self._events if event["method"] == method]
+
+
+@contextmanager
+def browser_page(width, height, options=SOFTWARE_WEBGL):
+    """Yield a page of a new browser, without a window on the screen."""
+    browser = Browser(options, width, height)
+    try:
+        yield browser
+    finally:
+        browser.close()
+
+
+def _pipe():
+    """Its ends, neither of which is a descriptor that the browser expects."""
+    ends = []
+    for end in os.pipe():
+        ends.append(fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10))
+        os.close(end)
+    return tuple(ends)
+
 
 WIDTH, HEIGHT = 240, 180
 FIELD_OF_VIEW = 40.0  # degrees, horizontal
@@ -94,7 +272,7 @@ def page(path):
 @contextmanager
 def opened(path, query="", size=(WIDTH, HEIGHT)):
     """The page with the network off."""
-    with browsers.browser_page(*size) as page:
+    with browser_page(*size) as page:
         page.cut_off()
         page.open(path.as_uri() + query)
         page.wait_for("window.viewer?.state.loaded")
@@ -106,14 +284,14 @@ def opened(path, query="", size=(WIDTH, HEIGHT)):
         assert {address.partition(":")[0] for address in others} <= {"blob", "data"}
 
 
-def settle(page) -> None:
+def settle(page):
     """Wait until the camera stands still, and what it sees is sorted and drawn."""
     before = None
     while before != (before := page.evaluate(CAMERA)):
         page.evaluate("new Promise((done) => setTimeout(done, 700))")
 
 
-def ours(camera, gaussians, **model) -> np.ndarray:
+def ours(camera, gaussians, **model):
     mi.set_variant("llvm_ad_rgb")
     scene = make_scene(gaussians, ModelConfig(**{**FITTED_WITH, **model}), BACKGROUND)
     (image,) = render_views(scene, [camera])
@@ -129,7 +307,7 @@ def shown_camera(page, initial_view):
     return pinhole("shown", pose, WIDTH, HEIGHT, FIELD_OF_VIEW)
 
 
-def assert_shown_as_fitted(rendered, camera, gaussians) -> None:
+def assert_shown_as_fitted(rendered, camera, gaussians):
     """With harmonics, low-pass and compensation."""
     flat = replace(gaussians, shN=0 * gaussians.shN)
     left_out = {
@@ -182,7 +360,7 @@ def test_page_with_controls_fits_the_window_and_orbits(path, size):
 
 
 def test_page_without_webgl_explains_what_it_needs(path):
-    with browsers.browser_page(WIDTH, HEIGHT, browsers.NO_WEBGL) as page:
+    with browser_page(WIDTH, HEIGHT, NO_WEBGL) as page:
         page.cut_off()
         page.open(path.as_uri())
         page.wait_for("document.querySelector('p.trouble') !== null")

@@ -1,19 +1,19 @@
-"""Scripts and commands run, and write into the checkout only if they are told to."""
+"""Scripts run, find known results, and write into the checkout only if they are told to."""
 
 import importlib
+import re
 import sys
+from dataclasses import asdict, replace
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-
-from drgs.__main__ import COMMANDS
-from drgs.bench.__main__ import COMMANDS as MEASUREMENTS
-from drgs.cli.commands import CommandParser
+from PIL import Image
 
 SCENES = REPOSITORY / "scenes"
 STUDIES = SCENES / "studies"
-MODULES = [c.module for c in COMMANDS.values()] + [f"drgs.bench.{name}" for name in MEASUREMENTS]
+KNOT = SCENES / "shapes" / "knot.ply"
 
 SCRIPTS = {
     "compare_shapes": ((), {"out/shapes.png"}),
@@ -21,7 +21,7 @@ SCRIPTS = {
     "draw_tiles": ((), {"out/tiles.png"}),
     "flat_mirror": (("--size", 8, "--splats", 20), set()),
     "among_surfaces": ((), set()),
-    "relight": ((SCENES / "shapes" / "knot.ply",), {"out/relight/target.png"}),
+    "relight": ((KNOT,), {"out/relight/target.png"}),
 }
 """Arguments, and the files that are written to the current folder."""
 
@@ -32,10 +32,10 @@ def main_scripts(folder):
 
 def files_of_the_checkout():
     """Return path, size and time of the last change of each file."""
-    folders = (REPOSITORY / name for name in ("docs", "drgs", "plugins", "scenes", "tests"))
-    paths = [path for folder in folders for path in folder.rglob("*")]
-    kept = [path for path in paths if path.is_file() and "__pycache__" not in path.parts]
-    return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in kept}
+    folders = ("docs", "drgs", "plugins", "scenes", "tests")
+    paths = [path for name in folders for path in (REPOSITORY / name).rglob("*.*")]
+    states = {path: path.stat() for path in paths if "__pycache__" not in path.parts}
+    return {path: (state.st_size, state.st_mtime_ns) for path, state in states.items()}
 
 
 @pytest.fixture
@@ -50,12 +50,6 @@ def load_script(monkeypatch, tmp_path):
         return importlib.import_module(name)
 
     return load
-
-
-def write_image(*arguments):
-    """In the place of what a script computes."""
-    arguments[-1].mkdir(parents=True)
-    (arguments[-1] / "target.png").write_text("an image")
 
 
 def test_every_script_is_tested_and_every_study_has_its_result():
@@ -74,7 +68,11 @@ def test_script_writes_to_the_current_folder(load_script, monkeypatch, tmp_path,
         result = module.Result(np.zeros((4, 4, 3)), 1.0)
         monkeypatch.setattr(module, "measure", lambda *arguments: result)
     if name == "relight":
-        monkeypatch.setattr(module, "relight", write_image)
+        image = np.zeros((4, 4, 3), np.uint8)
+        (tmp_path / "out" / "relight").mkdir(parents=True)
+        monkeypatch.setattr(
+            module, "relight", lambda *words: iio.imwrite(words[-1] / "target.png", image)
+        )
     if name == "among_surfaces":
         for rows in ("furnace_rows", "shadow_rows"):
             monkeypatch.setattr(module, rows, lambda *arguments: [])
@@ -83,15 +81,6 @@ def test_script_writes_to_the_current_folder(load_script, monkeypatch, tmp_path,
     assert files_of_the_checkout() == before
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.p*")} == written
     assert written or capsys.readouterr().out.count("\n") >= 4
-
-
-@pytest.mark.parametrize("module", MODULES)
-def test_commands_write_to_the_current_folder_by_default(module):
-    parser = CommandParser(prog="command")
-    importlib.import_module(module).add_arguments(parser)
-    for action in parser._actions:  # argparse has no public list
-        if action.dest == "out":
-            assert action.required or action.default is None or not action.default.is_absolute()
 
 
 @pytest.mark.parametrize("name", main_scripts(STUDIES))
@@ -114,3 +103,79 @@ def test_every_study_has_help(load_script, name, capsys):
 def test_study_runs(load_script, name, arguments, printed, capsys):
     load_script(name, *arguments.split()).main()
     assert printed in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("settings", [{"background": [1.0] * 3}, {}], ids=["background", "sky"])
+def test_white_cloud_before_white_is_white_in_every_pixel(load_script, settings):
+    mean, error = load_script("among_surfaces").furnace(16, settings, {}, rounds=2)
+    assert mean == pytest.approx(1, abs=1e-5) and error < 1e-6
+
+
+@pytest.mark.slow
+def test_splats_among_surfaces_agree_with_known_results(load_script):
+    """A white furnace for every material and light, and the shadow of a ball of splats."""
+    script = load_script("among_surfaces")
+    rows = script.furnace_rows(16, rounds=4)
+    assert len(rows) == 2 + len(script.MATERIALS) * len(script.LIGHTS)
+    for material, light, mean, error in rows:
+        # Four standard errors, and half a thousandth that probes leave.
+        assert abs(mean - 1) < 4 * error + 5e-4, (material, light)
+    for lamp, known, found, difference in script.shadow_rows(16, 4000):
+        # Its outline is soft, by 4 % of its radius: so much more of the light is gone.
+        assert found == pytest.approx(known, abs=0.015), lamp
+        assert difference < 0.015 and known < 0.95, lamp
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["objects", "mirror"])
+def test_relighting_recovers_the_parameters_of_the_target(
+    load_script, monkeypatch, tmp_path, capsys, name
+):
+    """In 40 steps of more paths, from a start that is half as far away."""
+    words = ("--case", name, "--size", 40, "--iterations", 40, "--out", tmp_path)
+    relight = load_script("relight", KNOT, *words)
+    case = relight.CASES[name]
+    true = asdict(case.true)
+    start = {k: ((np.array(v) + true[k]) / 2).tolist() for k, v in asdict(case.start).items()}
+    nearer = replace(case, start=replace(case.start, **start), spp=4 * case.spp)
+    monkeypatch.setitem(relight.CASES, name, nearer)
+    monkeypatch.setattr(relight, "TARGET_SPP", 64)
+    monkeypatch.setattr(relight, "BALL", [0.9, 0.2, 0.45])  # beside the knot
+    relight.main()
+    output = capsys.readouterr().out
+    losses = [float(x) for x in re.findall(r"loss ([\d.e+-]+)", output)]
+    assert losses[-1] < losses[0] / 20
+    _, _, *rows = re.findall(r"^\| (.*) \| .* \| .* \| (.*) \|$", output, re.MULTILINE)
+    printed = {title: [float(x) for x in row.split(", ")] for title, row in rows}
+    found = {key: printed[title] for key, title in case.start.TITLES.items()}
+    for key, value in true.items():
+        at_start, at_end = (np.linalg.norm(np.subtract(v[key], value)) for v in (start, found))
+        assert at_end < at_start / 3, key
+    for rendered in ("target", "start", "end", "difference"):
+        assert iio.imread(tmp_path / f"{rendered}.png").shape == (40, 40, 3)
+    with Image.open(tmp_path / "relight.webp") as animation:
+        assert animation.n_frames == 14 and animation.size == (80, 40)
+
+
+def test_a_models_smoothing_filter_reaches_the_integrator(load_script):
+    relight = load_script("relight")
+    model = relight.load(KNOT)
+    smoothing = np.full(model.num_gaussians, 0.05, np.float32)
+    stages = [relight.Objects.of(one, 20) for one in (model, replace(model, smoothing=smoothing))]
+    plain, smooth = (stage.scene.integrator().smoothing for stage in stages)
+    assert plain is None
+    np.testing.assert_array_equal(np.array(smooth), smoothing)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.ply"], "nowhere.ply: "),
+        ([KNOT, "--iterations", 0], "--iterations must be >= 1, got 0"),
+        ([KNOT, "--size", 90], "--size must be a multiple of 20 px, got 90"),
+    ],
+)
+def test_wrong_arguments_of_relighting_are_refused(load_script, capsys, arguments, message):
+    with pytest.raises(SystemExit, match="2"):
+        load_script("relight", *arguments).main()
+    assert capsys.readouterr().err.startswith(f"error: {message}")

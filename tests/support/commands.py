@@ -3,23 +3,14 @@
 import signal
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
+from subprocess import CompletedProcess
 
 from support.folders import contents
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Exit status and output of a process."""
-
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-def run_in_process(main: Callable[[list[str]], None], *arguments: object) -> Outcome:
+def run_in_process(main: Callable[[list[str]], None], *arguments: object) -> CompletedProcess[str]:
     """Call a command's ``main`` as its process would."""
     out, err = StringIO(), StringIO()
     # The handler of a new process; a command stopped by Ctrl-C removes it.
@@ -30,10 +21,12 @@ def run_in_process(main: Callable[[list[str]], None], *arguments: object) -> Out
             status = 0
         except SystemExit as stop:
             status = stop.code or 0
-    return Outcome(status, out.getvalue(), err.getvalue())
+    return CompletedProcess(arguments, status, out.getvalue(), err.getvalue())
 
 
-def assert_ends_well(main: Callable[[list[str]], None], *arguments: object) -> Outcome:
+def assert_ends_well(
+    main: Callable[[list[str]], None], *arguments: object
+) -> CompletedProcess[str]:
     """With status 0."""
     outcome = run_in_process(main, *arguments)
     assert outcome.returncode == 0, outcome.stderr

@@ -1,5 +1,6 @@
 """``drgs.fit`` on a scene so small that a fit takes a fraction of a second."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import yaml
 from drgs import fit
 from drgs.training import fit_folder
 from drgs.training.trainer import Trainer
-from support.commands import Outcome, assert_ends_well, assert_refused, run_in_process
+from support.commands import assert_ends_well, assert_refused, run_in_process
 from support.small_capture import make_dataset, write_dataset
 from support.viewer_rendering import VIEWER_RENDERING
 
@@ -43,27 +44,14 @@ def write_project(folder: Path, **values: object) -> Path:
     return write_scene(folder, test=2, **{**VALUES, **values})
 
 
-def run_fit(*arguments: object) -> Outcome:
-    """The command, in this process."""
-    return run_in_process(fit.main, *arguments)
-
-
-def assert_fits(*arguments: object) -> Outcome:
-    """The command ends well."""
-    return assert_ends_well(fit.main, *arguments)
-
-
-def assert_fit_refused(*arguments: object, folder: Path, message: str) -> str:
-    """See :func:`assert_refused`."""
-    return assert_refused(fit.main, *arguments, folder=folder, message=message)
+run_fit = partial(run_in_process, fit.main)
+assert_fits = partial(assert_ends_well, fit.main)
+assert_fit_refused = partial(assert_refused, fit.main)
 
 
 def without_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report that takes no time: an empty page."""
-
-    def write_page(out: Path, *_: object) -> None:
-        (out / "report.html").write_text("")
-
+    write_page = lambda out, *_: (out / "report.html").write_text("")  # noqa: E731
     monkeypatch.setattr(fit_folder, "write_results", write_page)
 
 

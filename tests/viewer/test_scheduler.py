@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ class Stage:
 
     def __init__(self, refresh_after):
         self.clock = SimpleNamespace(now=100.0, monotonic=lambda: self.clock.now)
-        self.seconds_a_pixel, self.shown, self.refused = 0.0, [], []
+        self.seconds_a_pixel, self.shown, self.refuse = 0.0, [], Mock()
         self.requests = RenderRequests()
         self._scheduler = RenderScheduler(self.requests, self.show, self.refuse, refresh_after)
 
@@ -41,9 +42,6 @@ class Stage:
         assert frame.pixels.shape == (request.height, request.width, 3)
         self.shown.append((client, request.width, is_whole))
 
-    def refuse(self, client, reason):
-        self.refused.append((client, reason))
-
     def serve(self):
         return self._scheduler.serve(lambda: self)
 
@@ -51,23 +49,13 @@ class Stage:
         for client in clients:
             self.requests.put(client, REQUEST)
 
-    def widths(self):
-        return [width for _, width, _ in self.shown]
-
 
 @pytest.fixture
-def make_stage(monkeypatch):
-    def make(refresh_after=None):
-        stage = Stage(refresh_after)
-        monkeypatch.setattr(scheduler, "time", stage.clock)
-        return stage
-
-    return make
-
-
-@pytest.fixture
-def stage(make_stage):
-    return make_stage()
+def stage(monkeypatch, request):
+    """Parameter: seconds until an image is rendered again, of its own seconds; None: never."""
+    stage = Stage(getattr(request, "param", None))
+    monkeypatch.setattr(scheduler, "time", stage.clock)
+    return stage
 
 
 def test_moving_camera_gets_small_images_and_static_one_full_size(stage):
@@ -88,17 +76,17 @@ def test_images_of_a_moving_camera_meet_their_time_limit(stage):
     for _ in range(8):
         stage.ask(1)
         assert stage.serve()
-    assert stage.widths() == [400] + 7 * [267]
+    assert [width for _, width, _ in stage.shown] == [400] + 7 * [267]
     assert 800 * 600 / 4 * 1e-6 > MOVING_SECONDS > 800 * 600 / 9 * 1e-6
     stage.seconds_a_pixel = 1e-8
     for _ in range(3):
         stage.ask(1)
         assert stage.serve()
-    assert stage.widths()[-2:] == [400, 800]
+    assert [width for _, width, _ in stage.shown[-2:]] == [400, 800]
 
 
-def test_changing_content_is_rendered_again_after_a_while(make_stage):
-    stage = make_stage(lambda seconds: 10 * seconds)
+@pytest.mark.parametrize("stage", [lambda seconds: 10 * seconds], indirect=True)
+def test_changing_content_is_rendered_again_after_a_while(stage):
     stage.seconds_a_pixel = 1e-6
     stage.ask(1)
     stage.serve()
@@ -136,5 +124,5 @@ def test_failing_request_is_reported_once_on_its_page_and_others_are_served(stag
     stage.requests.remove(2)
     stage.clock.now += 10
     assert not stage.serve()
-    assert stage.refused == [(1, reason)]
+    stage.refuse.assert_called_once_with(1, reason)
     assert [client for client, *_ in stage.shown] == [2]

@@ -1,6 +1,7 @@
 """A fit with a viewer: the same bytes, a pause, an early end; no browser is needed."""
 
 import time
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -40,36 +41,33 @@ EVERYTHING = {
 """Settings of a fit with effects, density control and a growing SH degree."""
 
 
-class Screen:
-    """Remembers what it was given."""
+def run(trainer, queue=None, dataset=None, before=lambda iteration: None, **options):
+    """A whole fit, watched if there are queue; before: is called before those are served.
 
-    def __init__(self):
-        self.frames, self.told, self.ended = [], [], None
-
-    def show(self, client, request, frame, is_whole):
-        self.frames.append(frame.pixels)
-
-    def refuse(self, client, reason):
-        raise AssertionError(reason)
-
-    def show_progress(self, trainer, history, total):
-        self.told.append((trainer.iteration, total))
-
-    def show_end(self, iterations):
-        self.ended = iterations
-
-
-def run(trainer, queue=None, dataset=None, before=lambda iteration: None, stops=lambda: False):
-    """A whole fit, watched if there are queue; before: is called before those are served."""
-    screen, length, history = Screen(), StopCriterion(), History()
+    Returns the screen, a mock, and the history. show: what the screen does with an image.
+    """
+    screen, length, history = Mock(), StopCriterion(), History()
+    screen.show.side_effect = options.get("show")
     if queue is not None:
         length = EarlyStop(length, queue)
         watching = TrainingViewer(queue, screen, dataset, length)
     for done in iterations(trainer, history, length):
         if queue is not None:
             before(done.report.iteration)
-            watching.after_iteration(trainer, history, done, stops)
+            watching.after_iteration(trainer, history, done, options.get("stops", lambda: False))
+    screen.refuse.assert_not_called()
     return screen, history
+
+
+def frames_of(screen):
+    return [call.args[2].pixels for call in screen.show.call_args_list]
+
+
+def assert_told(screen, iterations, total):
+    """The last progress, and the end."""
+    trainer, _, told = screen.show_progress.call_args.args
+    assert (trainer.iteration, told) == (iterations, total)
+    screen.show_end.assert_called_once_with(iterations)
 
 
 def requests():
@@ -96,7 +94,7 @@ def test_fit_with_a_viewer_has_the_same_bytes():
     run(alone)
     watched = make_trainer(dataset, **EVERYTHING)
     screen, _ = run(watched, queue, dataset, lambda _: queue.put(1, next(asked)))
-    assert len({frame.tobytes() for frame in screen.frames}) >= 12
+    assert len({frame.tobytes() for frame in frames_of(screen)}) >= 12
     assert alone.num_gaussians != disturbed_blobs().num_gaussians
     assert_same_bytes(alone, watched)
 
@@ -112,9 +110,9 @@ def test_viewer_shows_the_fit_after_the_current_iteration():
     screen, _ = run(trainer, queue, dataset, ask)
     scene = make_scene(trainer.gaussians(), trainer.config.model, (1.0, 1.0, 1.0))
     (expected,) = render_views(scene, [view])
-    assert np.array_equal(screen.frames[-1], np.round(255 * expected))
-    assert not np.array_equal(screen.frames[-1], np.round(255 * stale[-1]))
-    assert screen.told[-1] == (5, 5) and screen.ended == 5
+    assert np.array_equal(frames_of(screen)[-1], np.round(255 * expected))
+    assert not np.array_equal(frames_of(screen)[-1], np.round(255 * stale[-1]))
+    assert_told(screen, 5, 5)
 
 
 @pytest.mark.slow
@@ -128,32 +126,21 @@ def test_fit_ended_early_equals_a_fit_of_fewer_iterations(end_at):
     )
     done = trainer.iteration
     # The request came when this iteration's end was already decided.
-    assert done == end_at + 1 == trainer.config.iterations == screen.ended
-    assert history.rows[-1].iteration == done and screen.told[-1] == (done, done)
+    assert done == end_at + 1 == trainer.config.iterations
+    assert history.rows[-1].iteration == done
+    assert_told(screen, done, done)
     again = Trainer(trainer.config, dataset, disturbed_blobs())
     run(again)
     assert_same_bytes(trainer, again)
 
 
-def test_ending_before_the_start_or_after_the_end_has_no_effect():
-    dataset, queue = plain_dataset(), RenderRequests()
-    queue.end()
-    trainer = make_trainer(dataset, iterations=3)
-    assert EarlyStop(StopCriterion(), queue).should_continue(trainer)  # nothing is fitted yet
-    queue = RenderRequests()
-    run(trainer, queue, dataset, lambda iteration: iteration == 3 and queue.end())
-    assert trainer.iteration == trainer.config.iterations == 3
-
-
 @pytest.mark.slow
-def test_pause_stops_fit_and_clock_and_serves_requests(monkeypatch):
+def test_pause_stops_fit_and_clock_and_serves_requests():
     dataset, queue, during = plain_dataset(), RenderRequests(), []
     trainer = make_trainer(dataset, iterations=4)
-    show = Screen.show
 
-    def show_and_ask(screen, *frame):
+    def ask_for_more(*frame):
         """Asks for more, and then lets the fit go on."""
-        show(screen, *frame)
         during.append(trainer.iteration)
         time.sleep(0.1)
         if len(during) < 5:
@@ -166,20 +153,24 @@ def test_pause_stops_fit_and_clock_and_serves_requests(monkeypatch):
             queue.pause(True)
             queue.put(1, FrameRequest(EYE, 8, 8))
 
-    monkeypatch.setattr(Screen, "show", show_and_ask)
     start = time.perf_counter()
-    screen, history = run(trainer, queue, dataset, pause)
+    screen, history = run(trainer, queue, dataset, pause, show=ask_for_more)
     assert history.wall_s < time.perf_counter() - start - 0.5  # in the pause
     assert during == [2] * 5
-    assert [frame.shape[1] for frame in screen.frames] == [8, 9, 10, 11, 12]
+    assert [frame.shape[1] for frame in frames_of(screen)] == [8, 9, 10, 11, 12]
     assert trainer.iteration == 4
 
 
 @pytest.mark.parametrize("ends", [False, True])
 def test_ctrl_c_and_ending_early_work_during_a_pause(ends):
+    """Ending before the start or after the end has no effect."""
     queue, trainer = RenderRequests(), make_trainer(plain_dataset(), iterations=3)
     queue.pause(True)
     if ends:
         queue.end()
+        assert EarlyStop(StopCriterion(), queue).should_continue(trainer)  # nothing is fitted yet
     run(trainer, queue, plain_dataset(), stops=lambda: not ends)
     assert trainer.iteration == (1 if ends else 3)
+    queue, trainer = RenderRequests(), make_trainer(plain_dataset(), iterations=3)
+    run(trainer, queue, plain_dataset(), lambda iteration: iteration == 3 and queue.end())
+    assert trainer.iteration == trainer.config.iterations == 3

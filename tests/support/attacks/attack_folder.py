@@ -27,7 +27,7 @@ from drgs import fit
 from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
 from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER
-from support.attacks.observer import Fault, observed
+from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
 from support.small_capture import (
     HEIGHT,
@@ -81,30 +81,26 @@ CAPTURE = (
     *("ball.xml", "--views", "2", "--test-views", "1", "--spp", "1", "--points", "9"),
     *("--max-depth", "2", "--size", "4", "4"),
 )
-"""A capture of the least there is."""
 
 
-def pose(angle: float) -> list[list[float]]:
-    """Camera to world, OpenGL axes."""
-    return (pose_around(angle, 0.3) * [1, -1, -1, 1]).tolist()
+def _pose(angle: float) -> list[list[float]]:
+    return (pose_around(angle, 0.3) * [1, -1, -1, 1]).tolist()  # OpenGL axes
 
 
-def noise(seed: int, channels: int) -> np.ndarray:
-    """An image of random bytes."""
+def _noise(seed: int, channels: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, channels), np.uint8)
 
 
 def write_photos(folder: Path) -> None:
     """The nerfstudio layout, with a lens, a mask, depths of both kinds, and a camera that moves."""
     folder.mkdir()
-    frames = []
-    for i in range(4):
-        frames.append({"file_path": f"{i}.png", "transform_matrix": pose(1.5 * i)})
-        iio.imwrite(folder / f"{i}.png", noise(i, 3))
-    frames[1] |= {"mask_path": "mask.png", "transform_matrix_close": pose(1.51)}
+    frames = [{"file_path": f"{i}.png", "transform_matrix": _pose(1.5 * i)} for i in range(4)]
+    frames[1] |= {"mask_path": "mask.png", "transform_matrix_close": _pose(1.51)}
     frames[2] |= {"depth_file_path": "depth.npy"}
     frames[3] |= {"depth_file_path": "depth.png"}
-    iio.imwrite(folder / "mask.png", np.where(noise(5, 1)[:, :, 0] > 20, 255, 0).astype(np.uint8))
+    for i in range(4):
+        iio.imwrite(folder / f"{i}.png", _noise(i, 3))
+    iio.imwrite(folder / "mask.png", np.where(_noise(5, 1)[:, :, 0] > 20, 255, 0).astype(np.uint8))
     iio.imwrite(folder / "depth.png", np.full((HEIGHT, WIDTH), 4000, np.uint16))
     np.save(folder / "depth.npy", np.full((HEIGHT, WIDTH), 4, np.float32))
     meta = {"fl_x": 27.0, "fl_y": 27.0, "cx": 16.0, "cy": 12.0, "w": WIDTH, "h": HEIGHT}
@@ -115,11 +111,10 @@ def write_photos(folder: Path) -> None:
 def write_points(path: Path) -> None:
     """A cloud of coloured points."""
     rng = np.random.default_rng(0)
-    types = [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
-    rows = np.zeros(12, types)
+    rows = np.zeros(12, "f4, f4, f4, u1, u1, u1")
+    rows.dtype.names = ("x", "y", "z", "red", "green", "blue")
     for name in rows.dtype.names:
-        is_position = name in "xyz"
-        rows[name] = rng.uniform(-1, 1, 12) if is_position else rng.integers(0, 256, 12)
+        rows[name] = rng.uniform(-1, 1, 12) if name in "xyz" else rng.integers(0, 256, 12)
     PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
 
 
@@ -133,12 +128,12 @@ def write_inputs(folder: Path) -> None:
     replace(blobs(12), shN=np.zeros((12, 0, 3), np.float32)).save(folder / "gaussians.splat")
     (folder / "fit.yml").write_text(yaml.safe_dump(SETTINGS))
     (folder / "photos.yml").write_text(yaml.safe_dump(SETTINGS | PHOTOGRAPHS))
-    frame = {"transform_matrix": pose(0.5)}
+    frame = {"transform_matrix": _pose(0.5)}
     camera = {"camera_angle_x": 0.7, "w": WIDTH, "h": HEIGHT, "frames": [frame]}
     (folder / "camera.json").write_text(json.dumps(camera))
     (folder / "splats.xml").write_text(SPLATS)
     (folder / "ball.xml").write_text(BALL)
-    iio.imwrite(folder / "sky.png", noise(9, 3))
+    iio.imwrite(folder / "sky.png", _noise(9, 3))
     (folder / "mine").mkdir()
     (folder / "mine" / "notes.txt").write_text("not to be touched")
 
@@ -173,18 +168,16 @@ class AttackFolder:
     def __init__(self, base: Path, with_results: bool = True) -> None:
         """with_results: whether there are folders that the commands have written."""
         self.folder, self._kept = base / "workshop", base / "kept"
+        self.undisturbed: dict[tuple, dict[str, str]] = {}  # files of commands without faults
         self.folder.mkdir(parents=True)
         write_inputs(self.folder)
         if with_results:
             with current_folder(self.folder), stub_results():
                 self._run_commands()
         shutil.copytree(self.folder, self._kept)
-        self._pristine = contents(self.folder)
 
     def _run_commands(self) -> None:
-        """``stopped/``, ``run/`` and ``captured/``: a fit with a checkpoint, one that has ended,
-        and a capture.
-        """
+        """``stopped/``: a fit with a checkpoint; ``run/``: one that has ended; ``captured/``."""
         with observed(self.folder, _CtrlCAtCheckpoint("interrupt", 0)):
             outcome = run_in_process(fit.main, "fit.yml", "--out", "stopped")
         assert outcome.returncode == 130, outcome
@@ -194,61 +187,41 @@ class AttackFolder:
 
     def restore_files(self) -> None:
         """Undo what an attack did."""
-        now = contents(self.folder)
-        for path in sorted(now.keys() - self._pristine.keys(), reverse=True):
-            _remove(self.folder / path)
-        for path, what in sorted(self._pristine.items()):
-            if now.get(path) == what:
-                continue
-            _remove(self.folder / path)
-            if what == FOLDER:
-                (self.folder / path).mkdir()
+        for path in self.folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
             else:
-                shutil.copy2(self._kept / path, self.folder / path)
+                path.unlink()
+        shutil.copytree(self._kept, self.folder, dirs_exist_ok=True)
 
 
 class _CtrlCAtCheckpoint(Fault):
-    """When the first checkpoint is about to be put in place."""
-
     def strike(self, number: int, event: str, path: str) -> None:
         if event == "os.rename" and path.endswith(CHECKPOINT):
             signal.raise_signal(signal.SIGINT)
 
 
-FOLDER = "folder"
+MAX_READ_BYTES = 1 << 26
+"""Larger files are sparse, and nobody writes a part of them."""
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Return type or digest of everything below ``folder``, by relative path."""
+    """Return kind, target or digest of everything below ``folder``, by relative path."""
     paths = [
         os.path.join(parent, name)
         for parent, folders, files in os.walk(folder)
         for name in (*folders, *files)
     ]
-    return {os.path.relpath(path, folder): digest_or_kind(path) for path in paths}
+    return {os.path.relpath(path, folder): _digest_or_kind(path) for path in paths}
 
 
-def digest_or_kind(path: str) -> str:
-    """A digest, the target of a link, or the kind."""
-    mode = os.lstat(path).st_mode
-    if stat.S_ISDIR(mode):
-        return FOLDER
-    if stat.S_ISLNK(mode):
+def _digest_or_kind(path: str) -> str:
+    status = os.lstat(path)
+    if stat.S_ISLNK(status.st_mode):
         return f"link to {os.readlink(path)}"
-    if not stat.S_ISREG(mode):
-        return f"special {stat.S_IFMT(mode)}"
-    if os.stat(path).st_size > MAX_READ:
-        return f"{os.stat(path).st_size} bytes"
+    if not stat.S_ISREG(status.st_mode):
+        return f"special {stat.S_IFMT(status.st_mode)}"
+    if status.st_size > MAX_READ_BYTES:
+        return f"{status.st_size} bytes"
     with open(path, "rb") as file:
         return blake2b(file.read(), digest_size=16).hexdigest()
-
-
-MAX_READ = 1 << 26
-"""Bytes: larger ones are sparse files, of which nobody writes a part."""
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

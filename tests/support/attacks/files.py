@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import json
 import os
 import struct
 import zipfile
@@ -13,13 +12,18 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import yaml
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from support.attacks.attack import Attack
 from support.attacks.attack_folder import CAPTURE
-from support.attacks.mutations import mutate_bytes, mutate_chunks, mutate_header, mutate_tree
+from support.attacks.mutations import (
+    mutate_bytes,
+    mutate_chunks,
+    mutate_header,
+    mutate_json,
+    mutate_yaml,
+)
 from support.small_capture import HEIGHT, WIDTH
 
 LEGO = ("fit", "fit.yml", "--out", "out")
@@ -59,14 +63,10 @@ READERS = {
 
 
 def _attack(name: str, file: str, change: Callable[[Path], None], **more: object) -> Attack:
-    """An attack by what is at the path of a file; the reader's message names it."""
+    """An attack by what is at the path of a file."""
     command, *words = READERS[file]
     out = words[-1] if words[-2] in ("--out", "--resume") else "out"
-    return Attack(name, command, tuple(words), partial(_apply, change, file), out=out, **more)
-
-
-def _apply(change: Callable[[Path], None], file: str, folder: Path) -> None:
-    change(folder / file)
+    return Attack(name, command, tuple(words), lambda f: change(f / file), out=out, **more)
 
 
 def _replaced(make: Callable[[Path], None], path: Path) -> None:
@@ -95,47 +95,32 @@ REPLACEMENTS = {
     "UTF-16": lambda path: path.write_bytes("a: 1".encode("utf-16")),
     "a web page": lambda path: path.write_text("<!DOCTYPE html><html><body>404</body></html>"),
     "an LFS pointer": lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"),
-    "an archive": lambda path: path.write_bytes(_archive()),
+    "an archive": lambda path: zipfile.ZipFile(path, "w").writestr("a.txt", "a"),
     "a pickle": lambda path: path.write_bytes(b"cos\nsystem\n(S'touch hacked'\ntR."),
     "its first half": lambda path: os.truncate(path, path.stat().st_size // 2),
     "all but its last byte": lambda path: os.truncate(path, path.stat().st_size - 1),
     "itself twice": lambda path: path.write_bytes(path.read_bytes() * 2),
     "itself and a line": lambda path: path.write_bytes(path.read_bytes() + b"\nmore"),
 }
-"""Replacements of a file, by name."""
 
 HARMLESS = ("itself and a line", "all but its last byte", "itself twice")
 """After which a file may still be what it was."""
 
-NO_FILES = (
-    *("nothing", "a folder", "a pipe", "a terminal", "a link to nowhere", "a link to itself"),
-    *("an endless device", "an empty device"),
-)
+MISSING = ("nothing", "a link to nowhere", "a link to itself")
+NO_FILES = (*MISSING, "a folder", "a pipe", "a terminal", "an endless device", "an empty device")
 """In whose place there is no file of any kind."""
 
-ONE_OF_SEVERAL = (
-    *("photos/2.png", "photos/depth.npy", "photos/depth.png"),
-    *("lego/train/r_1.png", "lego/test/r_0.png"),
-)
-"""Files without which the others are fitted."""
+ONE_OF_SEVERAL = ("photos/2.png", "photos/depth.npy", "photos/depth.png", "lego/train/r_1.png")
+"""Files without which the others are fitted; so is a test view."""
 
 MAY_BE_ACCEPTED = {
-    ("stopped/checkpoint.npz", "nothing"),
-    ("stopped/checkpoint.npz", "a link to nowhere"),
-    ("stopped/checkpoint.npz", "a link to itself"),
-    *((file, name) for file in ONE_OF_SEVERAL for name in NO_FILES),
+    *(("stopped/checkpoint.npz", name) for name in MISSING),
+    *((file, name) for file in (*ONE_OF_SEVERAL, "lego/test/r_0.png") for name in NO_FILES),
     ("gaussians.splat", "its first half"),
     ("run/config.yml", "its first half"),
 }
 """A fit without a checkpoint begins anew. The last two: whole rows without a header that says how
 many there were, and YAML that may end between two values."""
-
-
-def _archive() -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as file:
-        file.writestr("a.txt", "a")
-    return stream.getvalue()
 
 
 def other_file_attacks() -> Iterator[Attack]:
@@ -151,22 +136,13 @@ def _damaged(mutate: Callable, seed: int, path: Path) -> None:
     path.write_bytes(mutate(np.random.default_rng(seed), path.read_bytes()))
 
 
-def _json_tree(rng: np.random.Generator, content: bytes) -> bytes:
-    return json.dumps(mutate_tree(rng, json.loads(content))).encode()
-
-
 def _glb_tree(rng: np.random.Generator, content: bytes) -> bytes:
     """The JSON part, with the lengths that it then has."""
     size = struct.unpack_from("<I", content, 12)[0]
-    text = _json_tree(rng, content[20 : 20 + size])
+    text = mutate_json(rng, content[20 : 20 + size])
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sIII4s", b"glTF", 2, len(content) - size + len(text), len(text), b"JSON")
     return head + text + content[20 + size :]
-
-
-def _yaml_tree(rng: np.random.Generator, content: bytes) -> bytes:
-    text = yaml.safe_dump(mutate_tree(rng, yaml.safe_load(content)), sort_keys=False)
-    return text.encode(errors="surrogatepass")
 
 
 def _npz_arrays(rng: np.random.Generator, content: bytes) -> bytes:
@@ -217,8 +193,8 @@ def _xml_values(rng: np.random.Generator, content: bytes) -> bytes:
 
 
 MUTATIONS = {
-    ".yml": _yaml_tree,
-    ".json": _json_tree,
+    ".yml": mutate_yaml,
+    ".json": mutate_json,
     ".ply": mutate_header,
     ".png": mutate_chunks,
     ".npy": _npy_header,
@@ -228,8 +204,7 @@ MUTATIONS = {
 }
 """Damage beside that of bytes, by suffix: functions of a random generator and the content."""
 
-NUM_DAMAGED = 40
-"""Number of damaged versions of each file, by kind."""
+NUM_DAMAGED = 40  # versions of each file, by kind
 
 
 def damage_attacks() -> Iterator[Attack]:
@@ -244,11 +219,10 @@ def damage_attacks() -> Iterator[Attack]:
 
 def _ply_of_lists(path: Path) -> None:
     """4 MB, of which every byte is the empty list of a property."""
-    properties = "".join(f"property list uchar float l{i}\n" for i in range(300))
+    lists = "".join(f"property list uchar float l{i}\n" for i in range(300))
     floats = "".join(f"property float {name}\n" for name in "xyz")
-    rows = 12000
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n{floats}{properties}"
-    path.write_bytes(f"{header}end_header\n".encode() + bytes(312 * rows))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 12000\n{floats}{lists}"
+    path.write_bytes(f"{header}end_header\n".encode() + bytes(312 * 12000))
 
 
 def _ply_of_elements(path: Path) -> None:
@@ -261,10 +235,6 @@ def _points(numbers: Iterable[float], path: Path) -> None:
     rows = np.zeros(12, [(name, "f4") for name in "xyz"])
     rows["x"] = numbers
     PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
-
-
-def _deep(path: Path) -> None:
-    path.write_text("[" * 200_000 + "]" * 200_000)
 
 
 def _gzip_bomb(path: Path) -> None:
@@ -284,10 +254,6 @@ def _deep_glb(path: Path) -> None:
     text = b"[" * 200_000
     head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text), len(text), b"JSON")
     path.write_bytes(head + text + struct.pack("<I4s", 0, b"BIN\0"))
-
-
-def _deep_object(path: Path) -> None:
-    path.write_text('{"a":' * 100_000 + "1" + "}" * 100_000)
 
 
 def _zip_bomb(path: Path) -> None:
@@ -319,14 +285,15 @@ def _rotated(orientation: int, path: Path) -> None:
     rendered.save(path, "JPEG", exif=exif)
 
 
-def _png_bomb(path: Path) -> None:
-    """60 million pixels in 8 kB: 0.7 GB of numbers, which a background may take."""
-    Image.new("1", (8000, 7500)).save(path, "PNG")
-
-
 LISTS = {"lists": _ply_of_lists, "elements": _ply_of_elements}
-IMAGES = {"bomb": _png_bomb, "animated": _animated}
-DEEP = {"deep": _deep, "object": _deep_object}
+BOMB = {"bomb": lambda path: Image.new("1", (8000, 7500)).save(path, "PNG")}
+"""60 million pixels in 8 kB: 0.7 GB of numbers, which a background may take."""
+
+IMAGES = {**BOMB, "animated": _animated}
+DEEP = {
+    "deep": lambda path: path.write_text("[" * 200_000 + "]" * 200_000),
+    "object": lambda path: path.write_text('{"a":' * 100_000 + "1" + "}" * 100_000),
+}
 
 SPECIAL = {
     "points.ply": {
@@ -346,16 +313,14 @@ SPECIAL = {
     "photos/2.png": {**IMAGES, **{f"turned {n}": partial(_rotated, n) for n in (1, 3, 6, 8, 77)}},
     "sky.png": IMAGES,
     "photos/mask.png": IMAGES,
-    "photos/depth.png": {"bomb": _png_bomb},
+    "photos/depth.png": BOMB,
 }
-"""Special replacements, by file."""
 
 FORMATS = (
     *(("JPEG", "RGB"), ("JPEG", "L"), ("JPEG", "CMYK"), ("WEBP", "RGB"), ("WEBP", "RGBA")),
     *(("GIF", "P"), ("BMP", "RGB"), ("TIFF", "RGB"), ("TIFF", "CMYK"), ("TIFF", "F")),
     *(("TIFF", "I"), ("ICO", "RGBA"), ("PPM", "RGB"), ("PNG", "1"), ("PNG", "P"), ("PNG", "LA")),
 )
-"""Pillow's formats and modes."""
 
 
 def special_attacks() -> Iterator[Attack]:

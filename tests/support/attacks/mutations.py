@@ -1,8 +1,11 @@
 """Mutations of files, each by a generator of random numbers that the caller seeds."""
 
 import copy
+import json
 import struct
 import zlib
+
+import yaml
 
 STRANGE_VALUES = [
     None, True, 0, -1, 3.5, 10**9, 2**63, 10**400, 1e-320, 1e300, float("nan"), float("inf"),
@@ -67,6 +70,15 @@ def mutate_tree(rng, tree):
             other, other_key = found[rng.integers(len(found))]
             container[key] = copy.deepcopy(other[other_key])
     return tree
+
+
+def mutate_json(rng, content):
+    return json.dumps(mutate_tree(rng, json.loads(content))).encode()
+
+
+def mutate_yaml(rng, content):
+    text = yaml.safe_dump(mutate_tree(rng, yaml.safe_load(content)), sort_keys=False)
+    return text.encode(errors="surrogatepass")
 
 
 def mutate_header(rng, content):

@@ -17,52 +17,35 @@ import yaml
 from support.attacks.attack import Attack
 from support.attacks.attack_folder import CAPTURE, SETTINGS
 
-FIT_OPTIONS = (
-    ("fit.yml",),
-    ("--resume", "stopped"),
-    ("--data", "lego"),
-    ("--out", "out"),
-    ("--overwrite",),
-    ("--set", "seed=1"),
-    ("--threads", "1"),
-    ("--budget", "0.01s"),
-)
+FIT_OPTIONS = """
+    fit.yml; --resume stopped; --data lego; --out out; --overwrite; --set seed=1; --threads 1;
+    --budget 0.01s
+"""
 """Arguments of ``fit`` that are valid on their own."""
 
-RENDER_OPTIONS = (
-    ("--split", "test"),
-    ("--orbit", "2"),
-    ("--camera", "camera.json"),
-    ("--origin", "3", "0", "1"),
-    ("--target", "0", "0", "0.5"),
-    ("--up", "0", "1", "0"),
-    ("--fov", "50"),
-    ("--size", "8", "6"),
-    ("--background", "black"),
-    ("--background", "sky.png"),
-    ("--ignore", "motion"),
-    ("--scene", "photos.yml"),
-    ("--data", "lego"),
-    ("--set", "data.image_size=10"),
-    ("--define", "a=b"),
-    ("--threads", "1"),
-    ("--variant", "scalar_rgb"),
-)
-"""Those of ``render``."""
+RENDER_OPTIONS = """
+    --split test; --orbit 2; --camera camera.json; --origin 3 0 1; --target 0 0 0.5; --up 0 1 0;
+    --fov 50; --size 8 6; --background black; --background sky.png; --ignore motion;
+    --scene photos.yml; --data lego; --set data.image_size=10; --define a=b; --threads 1;
+    --variant scalar_rgb
+"""
 
 SUBJECTS = ("run", "gaussians.ply", "splats.xml", "stopped", "photos")
-"""Inputs of ``render``."""
+
+
+def _pairs(options: str) -> Iterator[tuple[str, ...]]:
+    for left, right in combinations(options.split(";"), 2):
+        yield (*left.split(), *right.split())
 
 
 def combination_attacks() -> Iterator[Attack]:
     """Every two options of ``fit``, and every two of ``render`` for each kind of subject."""
-    for left, right in combinations(FIT_OPTIONS, 2):
-        words = (*left, *right)
+    for words in _pairs(FIT_OPTIONS):
         out = "stopped" if "--resume" in words else "out"
         yield Attack(f"together/fit/{' '.join(words)}", "fit", words, out=out)
     for subject in SUBJECTS:
-        for left, right in combinations(RENDER_OPTIONS, 2):
-            words = (subject, *left, *right)
+        for pair in _pairs(RENDER_OPTIONS):
+            words = (subject, *pair)
             yield Attack(f"together/render/{' '.join(words)}", "render", (*words, "--out", "out"))
 
 
@@ -105,10 +88,10 @@ def _link(target: str, folder: Path) -> None:
 
 
 def _config_inside(folder: Path) -> None:
+    values = {"data": {"path": "../lego"}, "init": {"point_cloud": "../points.ply"}}
+    values["output"] = {"dir": "."}
     (folder / "out").mkdir()
-    values = SETTINGS | {"data": {"path": "../lego"}, "init": {"point_cloud": "../points.ply"}}
-    values |= {"output": {"dir": "."}}
-    (folder / "out" / "config.yml").write_text(f"# my own words\n{yaml.safe_dump(values)}")
+    (folder / "out" / "config.yml").write_text(f"# mine\n{yaml.safe_dump(SETTINGS | values)}")
 
 
 def folder_attacks() -> Iterator[Attack]:
@@ -129,10 +112,8 @@ def folder_attacks() -> Iterator[Attack]:
         yield Attack(f"folder/fit over a result/{file}", "fit", words, change, theirs=theirs)
     for name, options in (("fit", ()), ("fit over", ("--overwrite",))):
         words = ("out/config.yml", *options, "--out", "out")
-        theirs = ("out/config.yml",)
-        yield Attack(
-            f"folder/{name}/its configuration", "fit", words, _config_inside, theirs=theirs
-        )
+        label, theirs = f"folder/{name}/its configuration", ("out/config.yml",)
+        yield Attack(label, "fit", words, _config_inside, theirs=theirs)
 
 
 NAMES = {
@@ -154,7 +135,6 @@ NAMES = {
     "backslash": "a\\b",
     "dots": "...",
 }
-"""Names of folders, images and configurations."""
 
 
 def _moved(old: str, new: str, folder: Path) -> None:
@@ -182,12 +162,9 @@ def name_attacks() -> Iterator[Attack]:
             "data": ("fit", (*fit, "--data", path), partial(_moved, "lego", name)),
             "configuration": ("fit", (f"{path}.yml",), partial(_moved, "fit.yml", f"{name}.yml")),
             "image": ("fit", fit, partial(_renamed_image, name)),
-            "scene": (
-                "render",
-                (f"{path}.xml", "--out", "out"),
-                partial(_moved, "splats.xml", f"{name}.xml"),
-            ),
         }
+        move = partial(_moved, "splats.xml", f"{name}.xml")
+        uses["scene"] = ("render", (f"{path}.xml", "--out", "out"), move)
         for use, (command, words, change) in uses.items():
             more = {"change": change} if change else {"out": name}
             for encoding in ("utf-8", "ascii"):
@@ -195,21 +172,20 @@ def name_attacks() -> Iterator[Attack]:
                 yield Attack(full, command, words, encoding=encoding, **more)
 
 
-def _tiny_images(folder: Path) -> None:
-    """Write images of one pixel."""
-    for path in (folder / "lego").glob("*/*.png"):
-        iio.imwrite(path, np.full((1, 1, 4), 200, np.uint8))
-
-
 def drawn_attacks() -> Iterator[Attack]:
     """Fits with everything that they draw, which takes seconds each."""
+
+    def shrink_images(folder: Path) -> None:
+        for path in (folder / "lego").glob("*/*.png"):
+            iio.imwrite(path, np.full((1, 1, 4), 200, np.uint8))
+
     words = ("fit.yml", "--out", "out")
     attacks = {
         "as it is": (words, {}),
         "markup": (words, {"change": partial(_renamed_image, NAMES["markup"])}),
         "not UTF-8": (words, {"change": partial(_renamed_image, NAMES["not UTF-8"])}),
         "newline": (("fit.yml", "--out", NAMES["newline"]), {"out": NAMES["newline"]}),
-        "one pixel": (words, {"change": _tiny_images}),
+        "one pixel": (words, {"change": shrink_images}),
         "photographs": (("photos.yml", "--out", "out"), {}),
         "one iteration": ((*words, "--set", "iterations=1"), {}),
     }

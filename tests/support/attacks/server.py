@@ -2,81 +2,61 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import tempfile
 from functools import cache
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 
 import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+from support.attacks.attack import Attack
 from support.attacks.attack_folder import AttackFolder
 from support.attacks.catalogue import attacks
 from support.attacks.trial import trial
 
-GRACE_SECONDS = 40.0
-"""Seconds beyond an attack's own, after which its process is ended: more than it takes to start."""
+GRACE_SECONDS = 40.0  # beyond an attack's own: more than a process takes to start
 
 
 class Server:
-    """Runs attacks by name; a context manager.
-
-    base: a folder, for the attack folders.
-    """
+    """Runs attacks by name; a context manager. base: a folder, for the attack folders."""
 
     def __init__(self, base: Path) -> None:
-        self._base, self._started, self._process = base, 0, None
+        self._base, self._pool = base, None
 
     def __enter__(self) -> Server:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._stop()
+        if self._pool is not None:
+            self._pool.terminate()
 
     def trial(self, name: str, seconds: float) -> list[str]:
         """Return the faults of an attack; seconds: its time limit."""
-        if self._process is None:
-            self._started += 1
-            context = get_context("spawn")
-            self._pipe, theirs = context.Pipe()
-            folder = self._base / f"{self._started}"
-            self._process = context.Process(target=serve, args=(folder, theirs))
-            self._process.start()
-            theirs.close()
-        self._pipe.send(name)
-        if not self._pipe.poll(seconds + GRACE_SECONDS):
-            self._stop()
-            return ["did not end, in native code"]
+        if self._pool is None:
+            self._pool = multiprocessing.get_context("spawn").Pool(1, _start, (self._base,))
         try:
-            return self._pipe.recv()
-        except (EOFError, OSError):
-            return [f"the process ended with {self._stop()}"]
-
-    def _stop(self) -> int | None:
-        process, self._process = self._process, None
-        if process is None:
-            return None
-        self._pipe.close()
-        process.join(timeout=5)
-        process.kill()
-        process.join()
-        return process.exitcode
+            return self._pool.apply_async(_run, (name,)).get(seconds + GRACE_SECONDS)
+        except multiprocessing.TimeoutError:
+            self._pool.terminate()
+            self._pool = None
+            return ["the process crashed, or did not end, in native code"]
 
 
-def serve(base: Path, pipe: Connection) -> None:
-    """The other end: answers names with what is wrong."""
+_folders: list[AttackFolder] = []  # that of a process of the pool
+
+
+def _start(base: Path) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
-    attack_folder = AttackFolder(base)
+    _folders.append(AttackFolder(Path(tempfile.mkdtemp(dir=base))))
 
-    @cache
-    def of_family(family: str) -> dict:
-        return {attack.name: attack for attack in attacks(family, attack_folder)}
 
-    while True:
-        try:
-            name = pipe.recv()
-        except (EOFError, OSError):
-            return
-        pipe.send(trial(of_family(name.partition("/")[0])[name], attack_folder))
+@cache
+def _attacks_of(family: str) -> dict[str, Attack]:
+    return {attack.name: attack for attack in attacks(family, _folders[0])}
+
+
+def _run(name: str) -> list[str]:
+    return trial(_attacks_of(name.partition("/")[0])[name], _folders[0])

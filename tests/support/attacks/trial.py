@@ -11,18 +11,16 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 
 from drgs.__main__ import COMMANDS
-from support.attacks.attack import Attack
+from support.attacks.attack import Attack, Changes, Killed, observed
 from support.attacks.attack_folder import AttackFolder, contents, current_folder, stub_results
-from support.attacks.observer import Changes, Killed, observed
 
-PIPE_BYTES = 1 << 20
-"""Limit of a command's output."""
+PIPE_BYTES = 1 << 20  # limit of a command's output
 
 CACHES = re.compile(
     r"/(\.drjit|\.cache|__pycache__|\.nv|\.config/matplotlib)(/|$)|^/dev/(null|tty)$|^/proc/self/"
@@ -31,11 +29,8 @@ CACHES = re.compile(
 
 TEMPORARY = re.compile(r"\.[^/]*\.\d+\.tmp(\.[^/]*)?$")
 
-MAX_REFUSAL_CHARS = 2000
-"""Characters in a refusal, beside what the user wrote."""
-
-ADDRESS_SPACE = 4 << 30
-"""Bytes by which it may grow: threads and compilers reserve much more than they use."""
+MAX_REFUSAL_CHARS = 2000  # in a refusal, beside what the user wrote
+ADDRESS_SPACE = 4 << 30  # bytes by which it may grow: compilers reserve more than they use
 
 MAY_CHANGE = {"fit": {"out", "stopped", "run"}, "render": {"out"}, "capture": {"out", "captured"}}
 """Folders in which a command may change existing files."""
@@ -97,8 +92,7 @@ def run(attack: Attack) -> Outcome:
 
 def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
     """Return faults of its end and its output."""
-    wrong = []
-    kind = attack.fault.kind if attack.fault else None
+    wrong, kind = [], attack.fault.kind if attack.fault else None
     if outcome.status not in (0, {"kill": 137, "interrupt": 130}.get(kind, 2)):
         reached = "an exception" if outcome.status is None else f"status {outcome.status}"
         return [f"ended with {reached}: {_last_lines(outcome.err)}"]
@@ -111,12 +105,8 @@ def faults_of(attack: Attack, outcome: Outcome) -> list[str]:
     if outcome.megabytes > attack.megabytes:
         wrong.append(f"took {outcome.megabytes:.0f} MB more")
     tried = f"{os.path.normpath(attack.out)}/"  # a device, of which no folder can be made
-    outside = [
-        path
-        for path in outcome.changes.outside
-        if not CACHES.search(path) and not f"{path}/".startswith(tried)
-    ]
-    if outside:
+    paths = (p for p in outcome.changes.outside if not f"{p}/".startswith(tried))
+    if outside := [path for path in paths if not CACHES.search(path)]:
         wrong.append(f"wrote outside: {outside[:3]}")
     return wrong
 
@@ -166,30 +156,26 @@ def recovery(attack: Attack, attack_folder: AttackFolder) -> list[str]:
     if outcome.status != 0:
         return [f"again: ended with {outcome.status}: {_last_lines(outcome.err)}"]
     found = contents(attack_folder.folder / attack.out)
-    wrong = [f"again: left {path}" for path in found if TEMPORARY.search(path)]
     expected = files_without_faults(attack, attack_folder)
-    wrong += [f"again: {n} is missing" for n in expected.keys() - found.keys()]
-    wrong += [f"again: {n} is too much" for n in found.keys() - expected.keys()]
-    return wrong + [
-        f"again: {name} has other bytes"
-        for name in attack.results
-        if name in found and found[name] != expected.get(name)
+    changed = [n for n in attack.results if n in found and found[n] != expected.get(n)]
+    return [
+        *(f"again: left {path}" for path in found if TEMPORARY.search(path)),
+        *(f"again: {name} is missing" for name in expected.keys() - found.keys()),
+        *(f"again: {name} is too much" for name in found.keys() - expected.keys()),
+        *(f"again: {name} has other bytes" for name in changed),
     ]
-
-
-_undisturbed: dict[tuple, dict[str, str]] = {}
 
 
 def files_without_faults(attack: Attack, attack_folder: AttackFolder) -> dict[str, str]:
     """Return the command's files when nothing happens; puts the attack folder back."""
-    key = str(attack_folder.folder), attack.command, attack.words
-    if key not in _undisturbed:
+    key = attack.command, attack.words
+    if key not in attack_folder.undisturbed:
         attack_folder.restore_files()
         attack.change(attack_folder.folder)
         outcome = run(replace(attack, fault=None))
         assert outcome.status == 0, outcome.err
-        _undisturbed[key] = contents(attack_folder.folder / attack.out)
-    return _undisturbed[key]
+        attack_folder.undisturbed[key] = contents(attack_folder.folder / attack.out)
+    return attack_folder.undisturbed[key]
 
 
 def _last_lines(text: str) -> str:
@@ -203,47 +189,35 @@ def _last_lines(text: str) -> str:
 
 @contextmanager
 def _captured(encoding: str, outcome: Outcome) -> Iterator[None]:
-    """Both standard streams, also what libraries write to them, through pipes that hold it all."""
-    pipes = {number: os.pipe() for number in (1, 2)}
-    kept = {number: os.dup(number) for number in pipes}
-    streams, showwarning = (sys.stdout, sys.stderr), warnings.showwarning
-    for stream in streams:
-        stream.flush()
-    for number, (_, end) in pipes.items():
-        fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        os.dup2(end, number)
-        os.close(end)
-    sys.stdout = open(1, "w", encoding=encoding, errors="strict", closefd=False)  # noqa: SIM115
-    sys.stderr = open(  # noqa: SIM115
-        2, "w", encoding=encoding, errors="backslashreplace", closefd=False, buffering=1
-    )
+    """Standard error, also what libraries write to it, through a pipe that holds it all."""
+    kept, null, (pipe, end) = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY), os.pipe()
+    fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    for number, target in ((1, null), (2, end)):
+        os.dup2(target, number)
+        os.close(target)
     try:
-        with warnings.catch_warnings():
+        with (
+            open(1, "w", encoding=encoding, closefd=False) as out,
+            open(2, "w", 1, encoding, "backslashreplace", closefd=False) as err,
+            redirect_stdout(out),
+            redirect_stderr(err),
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("always")
             for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
                 warnings.simplefilter("ignore", kind)
-            warnings.showwarning = _show_warning
+            warnings.showwarning = lambda text, kind, *_, **__: print(
+                f"{kind.__name__}: {text}", file=sys.stderr
+            )
             yield
     finally:
-        warnings.showwarning = showwarning
-        try:
-            sys.stdout.flush()
-        except (OSError, UnicodeError) as error:
-            print(f"Traceback: {error}", file=sys.stderr)
-        sys.stderr.flush()
-        sys.stdout, sys.stderr = streams
-        for number, copy in kept.items():
+        for number, copy in enumerate(kept, 1):
             os.dup2(copy, number)  # closes the pipe's end
             os.close(copy)
-        texts = []
-        for start, _ in pipes.values():
-            with open(start, "rb") as file:
-                texts.append(file.read().decode("utf-8", "replace"))
-        _, outcome.err = texts
-
-
-def _show_warning(message: object, category: type, *others: object, **more: object) -> None:
-    print(f"{category.__name__}: {message}", file=sys.stderr)
+        with open(pipe, "rb") as file:
+            outcome.err = file.read().decode("utf-8", "replace")
 
 
 @contextmanager
