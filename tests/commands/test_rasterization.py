@@ -249,6 +249,35 @@ def test_extreme_values_have_finite_gradients():
     assert dr.grad(inputs["opacities"]).numpy()[1:12:2].any()
 
 
+def test_torch_computes_gradients():
+    """The example of the docstring, against Dr.Jit's own gradients."""
+    torch = pytest.importorskip("torch")
+
+    @dr.wrap(source="torch", target="drjit")
+    def rasterize(*arrays):
+        images, alphas, _ = drgs.rasterization(*arrays, **FILM, sh_degree=3)
+        return images, alphas
+
+    names = list(scene())[:-1]  # without backgrounds
+    arrays = [np.asarray(scene()[name], np.float32) for name in names]
+    leaves = [torch.tensor(array, requires_grad=True) for array in arrays]
+    images, alphas = rasterize(*leaves)
+    weights = np.random.default_rng(9).normal(0, 1, images.shape).astype(np.float32)
+    ((images * torch.tensor(weights)).sum() + alphas.square().sum()).backward()
+
+    inputs = [llvm.TensorXf(array) for array in arrays]
+    dr.enable_grad(inputs)
+    own, own_alphas, _ = drgs.rasterization(*inputs, **FILM, sh_degree=3)
+    loss = dr.sum(own.array * llvm.Float(weights.ravel())) + dr.sum(dr.square(own_alphas.array))
+    dr.backward(loss)
+    np.testing.assert_array_equal(images.detach().numpy(), own.numpy())
+    for name, leaf, value in zip(names, leaves, inputs, strict=True):
+        expected = dr.grad(value).numpy()
+        # The two sum alphas' squares in orders of their own; the rest is the same computation.
+        limit = 1e-5 * np.abs(expected).max()
+        np.testing.assert_allclose(leaf.grad.numpy(), expected, rtol=0, atol=limit, err_msg=name)
+
+
 SKEWED = np.tile(np.array([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), (2, 1, 1))
 SKEWED[1, 0, 1] = 0.5
 
