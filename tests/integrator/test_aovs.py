@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -135,25 +134,6 @@ def test_gradients_equal_differences_of_the_reference():
         assert terms.sum() == pytest.approx(expected, abs=GRADIENTS * np.abs(terms).sum()), name
         if name not in ("sh0", "shN"):
             assert np.abs(terms).sum() > 0
-
-
-def test_forward_mode_is_the_transpose_of_the_gradients():
-    scene = clear(Scene())
-    rng = np.random.default_rng(7)
-    weights = rng.normal(0, 1, (*scene.weights().shape[:2], 12))
-    gradients = gradients_of(with_features(scene), weights, NAMES)
-    loaded = with_features(scene)
-    params = mi.traverse(loaded)
-    total = size = 0.0
-    for name in NAMES:
-        value = params[f"integrator.{name}"]
-        direction = rng.normal(0, 1, value.shape).astype(np.float32)
-        dr.enable_grad(value)
-        dr.set_grad(value, type(value)(direction))
-        terms = gradients[name].reshape(direction.shape) * direction
-        total, size = total + terms.sum(), size + np.abs(terms).sum()
-    tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-    assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
 
 
 # ----------------------------------------------------------------------------------------------

@@ -115,22 +115,6 @@ def test_environment_behind_splats_matches_path(emitter):
     assert (np.abs(actual - other).max() > 0.1) == (emitter == "envmap")
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_each_sample_has_its_own_background_radiance(seed):
-    """Opaque splats hide it; elsewhere it is the environment that ``path`` sees at the same
-    points."""
-    sensor, gaussians = Camera().dictionary(), Scene(count=8, seed=1).gaussians
-    loaded = load(sensor, integrator_of(gaussians), sky=EMITTERS["envmap"]())
-    actual = image_of(loaded, spp=4, seed=seed)
-    on_black = image_of(load(sensor, integrator_of(gaussians)), spp=4, seed=seed)
-    behind = path_image(sensor, "envmap", 4, seed)
-    free = on_black[..., 3] < 1e-6
-    assert free.mean() > 0.05
-    np.testing.assert_allclose(actual[free][:, :3], behind[free][:, :3], atol=IMAGE)
-    assert np.abs(actual - behind)[~free].max() > 0.2
-    assert (actual[..., 3] == 1).all()
-
-
 @pytest.mark.parametrize("hide", [True, False])
 def test_hide_emitters_keeps_the_background_color(hide):
     settings = {"hide_emitters": hide, "background": [0.2, 0.4, 0.6]}
@@ -179,19 +163,3 @@ def test_an_environment_replaces_a_background_texture():
     assert np.array_equal(both, alone)
     hidden = image_of(load(sensor, integrator_of(gaussians, hide_emitters=True, **settings), **sky))
     assert np.array_equal(hidden, image_of(load(sensor, integrator_of(gaussians, **settings))))
-
-
-@pytest.mark.parametrize(
-    ("make", "got"),
-    [
-        (lambda: "sky.png", "str"),
-        (lambda: {"type": "constant"}, ""),
-        (lambda: mi.ScalarTransform4f(), ""),
-        (lambda: {"type": "spectrum", "value": 0.5}, ""),
-    ],
-    ids=["text", "emitter", "transform", "spectrum"],
-)
-def test_a_background_that_is_neither_color_nor_texture_is_refused(make, got):
-    message = r"splats: background must be an RGB colour, such as .* or a texture, got " + got
-    with pytest.raises(RuntimeError, match=message):
-        mi.load_dict(integrator_of(Scene(count=8).gaussians, background=make()))

@@ -1,6 +1,5 @@
 """Environments behind splats, out of focus and in motion."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from support.backgrounds import (
     IMAGE,
     VIEW,
     Camera,
-    attached,
     calibrated,
     integrator_of,
     load,
@@ -36,14 +34,6 @@ def thin_lens(**changes) -> Camera:
     return Camera(changes={"type": "thinlens", "fov": 55.0, **APERTURE, **changes})
 
 
-def smooth_sky() -> dict:
-    """Waves of 60 degrees: longer than the 23 degrees of the aperture as it is seen in focus."""
-    y, x = np.mgrid[:64, :128]
-    phases = 6 * np.pi * x / 64 + np.array([0, 2, 4])[:, None, None], 6 * np.pi * y / 64
-    values = np.moveaxis(1 + 0.8 * np.sin(phases[0]) * np.sin(phases[1]), 0, -1)
-    return {"type": "envmap", "bitmap": mi.Bitmap(values.astype(np.float32))}
-
-
 def hidden_splats() -> dict:
     gaussians = tensors(Scene().gaussians)
     return {"type": "splats", **gaussians, "logit_opacities": mi.Float(np.full(40, -20.0))}
@@ -65,34 +55,6 @@ def test_defocused_environment_is_the_mean_of_pinholes_in_the_aperture():
         images.append(image_of(load(pinhole, hidden_splats(), sky=EMITTERS["envmap"]())))
     np.testing.assert_allclose(image, np.mean(images, axis=0), atol=IMAGE)
     assert np.abs(image - images[0]).max() > 0.3
-
-
-@pytest.mark.parametrize("name", ["sensor.aperture_radius", "sensor.focus_distance", "sky.data"])
-def test_defocused_environment_has_derivatives(name):
-    """Against differences, in single precision."""
-    scene = load(thin_lens().dictionary(), hidden_splats(), sky=smooth_sky())
-    # The change by blurring: a loss that all parameters affect.
-    in_focus = load(thin_lens().dictionary(), hidden_splats() | SHARP, sky=smooth_sky())
-    weights = image_of(in_focus) - image_of(scene)
-    params = mi.traverse(scene)
-    value = type(params[name])(params[name])
-    direction = np.random.default_rng(1).uniform(0.5, 1, np.array(value).shape)
-    step = 4e-3
-    losses = []
-    for sign in (1, -1):
-        params[name] = value + type(value)((sign * step * direction).astype(np.float32))
-        params.update()
-        losses.append(np.sum(weights * image_of(scene)))
-    params[name] = value
-    params, leaves = attached(scene, name)
-    image = mi.render(scene, params)
-    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
-    actual = np.sum(direction * np.array(dr.grad(leaves[name])))
-    expected = (losses[0] - losses[1]) / (2 * step)
-    # Rays that cross into another texel within a step, one in 20, have slopes that are off by
-    # some percent, of either sign. Measured: 1e-3.
-    assert actual == pytest.approx(expected, rel=4e-3)
-    assert abs(actual) > 1
 
 
 # ----------------------------------------------------------------------------------------------

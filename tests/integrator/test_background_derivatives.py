@@ -15,13 +15,10 @@ from support.backgrounds import (
     texels,
 )
 from support.helpers import single
-from support.views import VIEWS, Scene, image_of, to_linear, to_linear_derivative
-from support.wall_scenes import to_display
+from support.views import VIEWS, Scene, image_of
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.arrays import from_host
-from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.reference import splatting as reference
 
 
 def tensor(values):
@@ -39,8 +36,6 @@ KEYS = {
     "image": "integrator.background.data",
 }
 """The parameter of each kind of background."""
-
-all_kinds = pytest.mark.parametrize("kind", KEYS)
 
 
 def scene_with(kind, srgb_primitives=True, sensor=None, objects=None, **settings):
@@ -68,30 +63,6 @@ def value_like(parameter, values):
         return mi.Color3f(values.ravel().tolist())
     flat = from_host(mi.Float, values)
     return flat if isinstance(parameter, mi.Float) else mi.TensorXf(flat, values.shape)
-
-
-@all_kinds
-@pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
-def test_derivatives_of_the_radiance_equal_differences(kind, srgb_primitives):
-    """Along random directions. In linear radiance the image is linear in it: any step is exact
-    up to rounding; in display space a step of 1e-2 leaves its square.
-    """
-    loaded, key = scene_with(kind, srgb_primitives)
-    weights = weights_of(loaded)
-    gradient = gradient_of(loaded, key, weights)
-    start = np.array(mi.traverse(loaded)[key])
-    rng, step = np.random.default_rng(3), 0.01
-    for _ in range(3):
-        direction = (np.sign(gradient) * np.abs(rng.normal(size=gradient.shape))).astype(np.float32)
-        both = []
-        for sign in (1, -1):
-            params = mi.traverse(loaded)
-            params[key] = value_like(params[key], start + np.float32(sign * step) * direction)
-            params.update()
-            both.append(np.sum(weights * image_of(loaded)))
-        difference = (both[0] - both[1]) / (2 * step)
-        assert np.sum(gradient * direction) == pytest.approx(difference, rel=3e-3)
-    assert np.abs(gradient).max() > 0
 
 
 def floor() -> dict:
@@ -164,92 +135,6 @@ def test_gradients_reach_the_inputs_of_the_radiance(way, kind):
     # Sums of 3404 terms of one sign, in single precision; of pixels in a curved display space and
     # of what reflects the sky, a step leaves its square.
     assert dr.grad(factor)[0] == pytest.approx((both[0] - both[1]) / (2 * step), rel=3e-3)
-
-
-@all_kinds
-def test_derivatives_of_gaussians_include_the_background(kind):
-    """The reference's gradients with respect to colour and transmittance are chained by hand."""
-    scene = Scene()
-    loaded, _ = scene_with(kind)
-    weights = weights_of(loaded)
-    params = mi.traverse(loaded)
-    for name in PARAMETER_NAMES:
-        dr.enable_grad(params[f"integrator.{name}"])
-    dr.backward(dr.sum(mi.render(loaded, params) * tensor(weights), axis=None))
-    hidden = mi.Float(np.full(40, -20, np.float32))
-    behind = image_of(scene_with(kind, logit_opacities=hidden)[0])[..., :3]
-    rendered = reference.render(scene.gaussians, scene.camera, np.zeros(3), threshold_width=1e-4)
-    assert not rendered.near_threshold.any()
-    coverage, of_colors = rendered.alpha[..., None], weights[..., :3]
-    if kind == "image":  # D(C + T b), and alpha
-        display = to_display(behind)
-        slope = to_linear_derivative(rendered.image + (1 - coverage) * display)
-        d_alpha = weights[..., 3] - np.sum(of_colors * slope * display, axis=-1)
-    else:  # A D(C / A) + T L, and alpha is 1
-        color = rendered.image / np.where(coverage > 0, coverage, 1)
-        slope = to_linear_derivative(color)
-        d_alpha = np.sum(of_colors * (to_linear(color) - color * slope - behind), axis=-1)
-    expected = reference.render_gradients(
-        scene.gaussians, scene.camera, np.zeros(3), of_colors * slope, d_alpha, None, 1, False
-    )
-    for name in PARAMETER_NAMES:
-        actual = np.array(dr.grad(params[f"integrator.{name}"])).astype(np.float64)
-        # Tolerance of test_splats.
-        np.testing.assert_allclose(
-            actual, expected[name], atol=1e-4 * np.abs(expected[name]).max(), err_msg=name
-        )
-
-
-@all_kinds
-@pytest.mark.parametrize("srgb_primitives", [True, False], ids=["linear", "display"])
-def test_forward_and_backward_derivatives_are_transposed(kind, srgb_primitives):
-    """Derivatives with respect to radiance and Gaussians together."""
-    loaded, key = scene_with(kind, srgb_primitives)
-    keys = [key, "integrator.means", "integrator.sh0", "integrator.logit_opacities"]
-    weights, rng = weights_of(loaded), np.random.default_rng(8)
-
-    scene, _ = scene_with(kind, srgb_primitives)
-    params, leaves = attached(scene, *keys)
-    dr.backward(dr.sum(mi.render(scene, params) * tensor(weights), axis=None))
-    gradients = {k: np.array(dr.grad(leaf)).astype(np.float64) for k, leaf in leaves.items()}
-
-    params, leaves = attached(loaded, *keys)
-    # No two terms of a sum cancel.
-    directions = {
-        k: single(np.sign(g) * np.abs(rng.normal(size=g.shape))) for k, g in gradients.items()
-    }
-    for k, direction in directions.items():
-        dr.set_grad(leaves[k], value_like(leaves[k], direction))
-    tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-    terms = [np.sum(directions[k] * gradients[k]) for k in keys]
-    size = np.abs(weights * tangent).sum()
-    assert np.sum(weights * tangent) == pytest.approx(sum(terms), abs=2e-5 * size)
-    assert min(terms) > 5e-4 * size
-
-
-def test_derivatives_of_a_sensor_include_the_environment():
-    """A smooth one, before splats that end nowhere: a quotient in single precision."""
-    y, x = np.mgrid[:32, :64]
-    waves = [np.sin(x / 32 * np.pi), np.cos(y / 32 * np.pi), np.cos(x / 16 * np.pi)]
-    values = (1 + 0.5 * np.stack(waves, axis=-1)).astype(np.float32)
-    settings = {"alpha_cut": 0.0, "extent": 6.0, "transmittance_stop": 0.0}
-
-    sky = {"type": "envmap", "bitmap": mi.Bitmap(values)}
-    scene = load(Camera().dictionary(), integrator_of(Scene().gaussians, **settings), sky=sky)
-    weights, params, turn = weights_of(scene), mi.traverse(scene), mi.Float(0)
-    start = mi.Transform4f(params["sensor.to_world"].matrix)
-
-    def turned(degrees):
-        params["sensor.to_world"] = start.rotate([0.6, -0.48, 0.64], degrees)
-        params.update()
-        return mi.render(scene, params)
-
-    dr.enable_grad(turn)
-    dr.backward(dr.sum(turned(turn) * tensor(weights), axis=None))
-    step = 0.05  # degrees
-    both = [np.sum(weights * np.array(turned(mi.Float(s)), float)) for s in (step, -step)]
-    difference = (both[0] - both[1]) / (2 * step)
-    assert dr.grad(turn)[0] == pytest.approx(difference, rel=0.01)
 
 
 def test_images_and_constant_radiance_are_the_same_bytes_in_two_runs():

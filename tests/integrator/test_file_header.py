@@ -14,11 +14,6 @@ HEADER = {"antialiased": True, "low_pass": 0.1}
 SCENE = Scene()
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture
 def file(tmp_path):
     """A file of Gaussians with these settings in its header."""

@@ -11,12 +11,6 @@ import drgs  # noqa: F401  (registers the plugins)
 from drgs.integrator.mirrors import FlatMirror, Mirrors
 from drgs.results import metrics
 
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 EYE, TARGET = [0.3, 1.0, -2.6], [0, -0.7, 0]
 CONDUCTOR = {"type": "conductor", "material": "none"}
 

@@ -250,30 +250,6 @@ def _cotangents(scene):
     return scene.camera, np.zeros(3), d_image, d_alpha
 
 
-def test_forward_and_backward_mode_are_transposed():
-    """<J v, w> = <v, J^T w>, along the matrix and along raw parameters."""
-    scene, model = scene_and_object()
-    rng = np.random.default_rng(3)
-    direction = rng.normal(0, 1, (4, 4)) * (np.arange(4) < 3)[:, None]
-    loaded = load(scene, model)
-    params = mi.traverse(loaded)
-    dr.enable_grad(params[KEY])
-    moved = mi.Transform4f()
-    moved.matrix = mi.Matrix4f(direction)
-    dr.set_grad(params[KEY], moved)
-    d_raw = {n: rng.normal(0, 0.1, getattr(model, n).shape) for n in PARAMETER_NAMES}
-    for name, values in d_raw.items():
-        parameter = params[f"integrator.{name}"]
-        dr.enable_grad(parameter)
-        dr.set_grad(parameter, type(parameter)(values.astype(np.float32)))
-    d_image = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-    weights = scene.weights()
-    of_raw = gradients_of(load(scene, model), weights, PARAMETER_NAMES)
-    of_matrix = gradient_of_matrix(load(scene, model), weights)
-    terms = [np.sum(direction * of_matrix), *(np.sum(d_raw[n] * of_raw[n]) for n in d_raw)]
-    assert np.sum(d_image * weights) == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
-
-
 def test_setting_a_matrix_that_is_no_similarity_is_refused():
     scene, model = scene_and_object()
     loaded = load(scene, model)

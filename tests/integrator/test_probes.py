@@ -11,12 +11,6 @@ from drgs.core.errors import PluginError, UnsupportedError
 from drgs.light.probe import Probes
 from drgs.reference import splatting
 
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 MIRROR = {"type": "conductor", "material": "none"}
 
 

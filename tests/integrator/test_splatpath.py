@@ -24,11 +24,6 @@ from drgs.integrator.splat_transport import DECODING
 from drgs.reference import light as reference
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def room():
     """A rough floor, a glass ball and a lamp that it may hit."""
     T = mi.ScalarTransform4f
@@ -226,31 +221,6 @@ def test_sum_of_powers_decodes_within_its_error_bound():
     color = np.linspace(0, 1, 1001)
     found = sum(factor * color**k for k, factor in enumerate(DECODING, 1))
     assert np.abs(found - linear(color)).max() < 2e-3
-
-
-@pytest.mark.slow
-def test_materials_and_lamps_have_derivatives_among_splats():
-    """Central differences use images with many paths."""
-    splats = gaussians([[0.3, 1.2, 0.5], [-0.8, 0.6, 0.4]], 0.4, 0.7, 0.8)
-    objects = room()
-    objects["sensor"] = camera([0, 2, 4], [0, 0.3, 0], size=8)
-    scene = scene_of(splats, spp=2048, max_depth=4, **objects)
-    params = mi.traverse(scene)
-    for key in ("floor.bsdf.alpha.value", "matt.bsdf.reflectance.value", "sky.radiance.value"):
-        value = type(params[key])(params[key])
-        params[key] = type(value)(value)
-        dr.enable_grad(params[key])
-        params.update()
-        dr.backward(dr.mean(mi.render(scene, params, seed=1, spp=1).array))
-        gradient = np.sum(np.array(dr.grad(params[key])))
-        step, means = 0.02, []
-        for sign in (-1, 1):
-            params[key] = dr.detach(value) + sign * step
-            params.update()
-            means.append(np.mean([np.array(mi.render(scene, seed=s)).mean() for s in range(3)]))
-        params[key] = dr.detach(value)
-        params.update()
-        assert gradient == pytest.approx((means[1] - means[0]) / (2 * step), rel=0.05), key
 
 
 def test_unsupported_derivatives_and_settings_are_refused():

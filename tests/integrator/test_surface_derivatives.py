@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.helpers import bitwise
 from support.views import gradient, gradients_of, image_of
-from support.wall_scenes import GRADIENTS, IMAGE, SCENE, Wall, apart, blob, expected, load, rgba
+from support.wall_scenes import GRADIENTS, IMAGE, SCENE, Wall, apart, blob, load, rgba
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
@@ -41,57 +41,6 @@ def test_gradients_equal_differences_of_the_reference(srgb_primitives):
         assert size > 0
         difference = (losses[0] - losses[1]) / (2 * STEP)
         assert terms.sum() == pytest.approx(difference, abs=GRADIENTS * size), name
-
-
-def test_gradient_of_wall_radiance_is_its_transmittance():
-    scene = replace(apart(SCENE), srgb_primitives=True)
-    weights = scene.weights()
-    loaded = load(scene)
-    params = mi.traverse(loaded)
-    dr.enable_grad(params[RADIANCE_KEY])
-    image = mi.render(loaded, params)
-    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
-    share = expected(scene)["share"]
-    terms = share[..., None] * weights[..., :3]
-    np.testing.assert_allclose(
-        gradient(params[RADIANCE_KEY]), terms.sum(axis=(0, 1)), atol=GRADIENTS * np.abs(terms).sum()
-    )
-
-
-@pytest.mark.parametrize("srgb_primitives", [False, True])
-def test_forward_mode_is_the_transpose_of_the_gradients(srgb_primitives):
-    """Parameters: the splats, the wall's colour, and the environment past its edges."""
-    scene = apart(replace(SCENE, srgb_primitives=srgb_primitives))
-    weights = scene.weights()
-    keys = [f"integrator.{name}" for name in PARAMETER_NAMES]
-    keys += [RADIANCE_KEY, "sky.radiance.value"]
-    wall = Wall(half=0.5)
-
-    def attached():
-        loaded = load(scene, wall=wall, sky=True, nested_spp=16)
-        params = mi.traverse(loaded)
-        for key in keys:
-            dr.enable_grad(params[key])
-        return loaded, params
-
-    loaded, params = attached()
-    image = mi.render(loaded, params, seed=1, seed_grad=2)
-    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
-    gradients = {key: gradient(params[key]) for key in keys}
-
-    rng = np.random.default_rng(7)
-    loaded, params = attached()
-    total = size = 0.0
-    for key in keys:
-        direction = rng.normal(0, 1, gradients[key].shape).astype(np.float32)
-        dr.set_grad(params[key], type(params[key])(direction))
-        terms = gradients[key] * direction
-        assert np.abs(terms).sum() > 0, key
-        total, size = total + terms.sum(), size + np.abs(terms).sum()
-    # Forward mode's own seed is seed_grad as well.
-    tangent = dr.forward_to(mi.render(loaded, params, seed=1, seed_grad=2))
-    tangent = np.array(tangent).astype(np.float64)
-    assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
 
 
 PERSPECTIVE = {"type": "perspective"}
