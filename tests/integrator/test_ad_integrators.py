@@ -355,8 +355,10 @@ class Parameter:
 RIGHT, BACK, OBLIQUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, -0.6, 0.5)
 TURN = (0.3, -0.5, 0.8, 0.4)  # of a quaternion
 AROUND = (0.6, -0.48, 0.64, 10.0)  # an axis, and degrees for each unit of theta
-TEXELS = Thresholds(3e-3, 0.1, 1e-3)
-"""Where rays cross into another texel within a step, slopes change. Measured: TODO"""
+# Where rays cross into another texel within a step, slopes change. Measured: mean 4e-4, maximum
+# 0.024, of sums 3e-5.
+TEXELS = Thresholds(1e-3, 0.05, 2e-4)
+
 
 PARAMETERS = [
     Parameter("splats", "integrator.means", RIGHT),
@@ -414,7 +416,7 @@ PARAMETERS = [
         Parameter(scene, "integrator.means", RIGHT)
         for scene in (
             *("thin_lens", "orthographic", "rolling_shutter", "global_shutter", "merged"),
-            *("hybrid_display", "sky", "sky_display", "image", "image_display", "placed"),
+            *("hybrid_display", "placed"),
         )
     ),
     Parameter("placed", "integrator.quats", TURN),
@@ -439,6 +441,11 @@ PARAMETERS = [
             Parameter(scene, "shape.opacities"),
             Parameter(scene, "shape.sh_coeffs"),
         )
+    ),
+    *(
+        Parameter(scene, f"integrator.{name}", RIGHT if name == "means" else 1.0)
+        for scene in ("sky", "sky_display", "image", "image_display")
+        for name in ("means", "sh0", "logit_opacities")
     ),
     Parameter("sky", "sky.data"),
     Parameter("sky", "sensor.to_world", AROUND, thresholds=TEXELS),
@@ -542,10 +549,6 @@ def test_images_equal_the_stored_ones(name):
     assert brighter > 0.01
 
 
-IN_ANY_ORDER = ("sampled", "image", "image_display")
-"""Scenes whose sums have terms that are added atomically."""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: f"{p.scene}-{p.key}")
 def test_derivatives_equal_differences(parameter):
@@ -567,9 +570,10 @@ def test_derivatives_equal_differences(parameter):
     actual = backward()
     assert actual == pytest.approx(np.sum(weights * expected), rel=thresholds.backward)
     # Transposed: sums of the same terms in another order, in single precision.
-    assert actual == pytest.approx(np.sum(weights * tangent), rel=2e-5)
+    assert actual == pytest.approx(np.sum(weights * tangent), rel=1e-5)
     # Mitsuba adds what several threads find about texels and materials, and filters, in any order.
-    if parameter.key.startswith(("sensor", "integrator")) and parameter.scene not in IN_ANY_ORDER:
+    is_ordered = parameter.key.startswith(("sensor.", "integrator."))
+    if is_ordered and not parameter.key.endswith("data") and parameter.scene != "sampled":
         assert backward() == actual
     if thresholds is not OF_CUTOFFS:  # an error of one percent is noticed
         assert errors_of_forward(parameter, 1.01 * expected)[0] > thresholds.mean
@@ -652,7 +656,7 @@ def test_pixel_sh_direction_refuses_camera_derivatives():
     params = mi.traverse(loaded)
     dr.enable_grad(params["sensor.x_fov"])
     for derivative in (dr.backward, dr.forward_to):
-        with pytest.raises(NotImplementedError, match="sh_direction.*'mean'"):
+        with pytest.raises(NotImplementedError, match=r"sh_direction.*'mean'"):
             derivative(mi.render(loaded, params))
 
 

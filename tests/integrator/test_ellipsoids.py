@@ -13,21 +13,18 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from support.ellipsoids import (
-    GRADIENTS,
     IMAGE,
     ROTATION,
     SCALE,
     TRANSLATION,
     EllipsoidsCase,
     assert_images_agree,
-    gradients_held,
     joined,
     scene_with,
-    shape_of,
     transform,
     write_model,
 )
-from support.helpers import assert_arrays_agree, clear, single
+from support.helpers import clear, single
 from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -62,48 +59,6 @@ def test_file_renders_the_same_through_a_shape(kind, degree, tmp_path):
     path = write_model(tmp_path / "model.ply", scene.gaussians)
     loaded = EllipsoidsCase().load(shape={"type": kind, "filename": path})
     assert_images_agree(image_of(loaded), image_of(scene.load()))
-
-
-# With these approximations what is left is that volprim_rf_basic composites in the order in which a
-# ray enters the ellipsoids, passes over those entered within 1e-4 behind another, and does not draw
-# those that contain the camera: test_volprim.py measures each where it is alone. Of the mean
-# of this image they make 0.025. A tenth less of all opacities makes 0.07, quaternions read
-# otherwise 0.2, coefficients in another order 0.5.
-VOLPRIM = 0.04
-
-
-VOLPRIM_APPROXIMATIONS = {
-    "projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0,
-    "extent": 3.0, "alpha_max": 0.9999, "alpha_cut": 0.0, "transmittance_stop": 0.01,
-}  # fmt: skip
-
-
-@both_kinds
-def test_shapes_match_volprim_rf_basic(kind):
-    scene = EllipsoidsCase(degree=2, count=60)
-    held = scene.held
-    held["data"][:, 6:] /= np.linalg.norm(held["data"][:, 6:], axis=1, keepdims=True)
-
-    def rendered(held, integrator, **settings):
-        loaded = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": integrator, "srgb_primitives": False, **settings},
-                "sensor": scene.view.sensor(pixel_format="rgb"),
-                "shape": shape_of(held, kind),
-            }
-        )
-        return image_of(loaded, spp=16)
-
-    expected = rendered(held, "volprim_rf_basic", max_depth=256)
-
-    def error(**changes):
-        actual = rendered(held | changes, "splats", **VOLPRIM_APPROXIMATIONS)
-        return np.abs(actual - expected).mean() / expected.mean()
-
-    assert error() < VOLPRIM
-    assert error(opacities=0.9 * held["opacities"]) > 1.5 * VOLPRIM
-    assert error(data=held["data"] * np.repeat([1, -1, 1], [6, 3, 1])) > 4 * VOLPRIM
 
 
 # ----------------------------------------------------------------------------------------------
@@ -156,36 +111,6 @@ def test_each_shape_may_have_its_own_to_world(tmp_path):
     ]
     expected = image_of(scene_with(tensors(joined(*parts)), view))
     assert_images_agree(actual, expected, 3 * IMAGE)
-
-
-def test_tensors_are_moved_like_a_file(tmp_path):
-    scene = Scene(degree=2)
-    path = write_model(tmp_path / "model.ply", scene.gaussians)
-    from_file = mi.load_dict({"type": "splats", "filename": path, "to_world": transform()})
-    from_tensors = mi.load_dict(
-        {"type": "splats", **tensors(scene.gaussians), "to_world": transform()}
-    )
-    moved, same = from_file.gaussians.numpy(), from_tensors.gaussians.numpy()
-    for name in PARAMETER_NAMES:
-        np.testing.assert_array_equal(getattr(moved, name), getattr(same, name))
-    assert not np.array_equal(moved.shN, np.float32(scene.gaussians.shN))
-
-
-def test_gradients_of_rotated_sh_match_unrotated_sh_with_a_rotated_camera(
-    tmp_path,
-):
-    """The images are the same functions of the coefficients."""
-    scene = Scene(degree=3)
-    path = write_model(tmp_path / "model.ply", scene.gaussians)
-    shape = {"type": "ellipsoids", "filename": path}
-    view = VIEWS[1]
-    expected = gradients_held(scene_with({}, view, shape=shape), scene.weights())
-    moved = scene_with(
-        {"shapes_to_world": transform()}, follower(view), shape=shape | {"to_world": transform()}
-    )
-    actual = gradients_held(moved, scene.weights())
-    for name in ("sh_coeffs", "opacities"):
-        assert_arrays_agree({name: actual[name]}, {name: expected[name]}, GRADIENTS)
 
 
 # ----------------------------------------------------------------------------------------------

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.ellipsoids import (
-    GRADIENTS,
     SHAPE_ATTRIBUTES,
     EllipsoidsCase,
     Merged,
@@ -44,21 +42,6 @@ def test_gradients_match_the_reference(scene):
     scene = clear(scene)
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
-
-
-def test_gradients_reach_the_inputs_of_shape_parameters():
-    scene = clear(EllipsoidsCase())
-    loaded = scene.load()
-    params = mi.traverse(loaded)
-    factor = mi.Float(1.0)
-    dr.enable_grad(factor)
-    params["shape.sh_coeffs"] = params["shape.sh_coeffs"] * factor
-    params.update()
-    image = mi.render(loaded, params)
-    dr.backward(dr.sum(image * mi.TensorXf(scene.weights().astype(np.float32)), axis=None))
-    expected = held_gradients(scene.held, scene.gradients(scene.weights()))
-    terms = expected["sh_coeffs"] * scene.held["sh_coeffs"]
-    assert dr.grad(factor)[0] == pytest.approx(terms.sum(), abs=GRADIENTS * np.abs(terms).max())
 
 
 def test_backward_passes_give_the_same_bytes_without_float_atomics():
