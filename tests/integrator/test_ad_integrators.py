@@ -419,6 +419,11 @@ PARAMETERS = [
             *("hybrid_display", "placed"),
         )
     ),
+    *(
+        Parameter(scene, f"integrator.{name}")
+        for scene in ("rolling_shutter", "global_shutter")
+        for name in ("log_scales", "logit_opacities", "sh0")
+    ),
     Parameter("placed", "integrator.quats", TURN),
     Parameter("placed", "integrator.shN", ((1.0,), (-0.5,), (0.25,))),
     Parameter("aovs", "integrator.logit_opacities"),

@@ -173,4 +173,6 @@ def test_documented_defaults_are_used():
     focal = mi.load_dict({"type": "calibrated", "fx": 43.5})
     assert (float(focal.fx[0]), float(focal.fy[0])) == (43.5, 43.5)
     assert (sensor.near_clip(), sensor.far_clip(), sensor.shutter_samples) == (0.01, 1e4, 8)
-    assert not sensor.needs_aperture_sample()
+    assert not sensor.needs_aperture_sample() and sensor.shutter_open_time() == 0
+    moving = MOVING_SENSOR.load()
+    assert (moving.shutter_open(), moving.shutter_open_time()) == (0, 1)

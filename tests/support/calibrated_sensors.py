@@ -10,10 +10,13 @@ import numpy as np
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.reference.effects import Fisheye, OpenCV, Pinhole, ThinPrismFisheye
+from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES
+from support.motion_checks import rolling_image
 from support.views import VIEWS, View, pose, splats_before, tensors
 
 WINDOW = (13, 7, 29, 18)
+SHUTTER_SAMPLES = 3
 
 
 CLOSE = pose([0.1, -1.0, 0.3], 43, (0.5, -0.65, 1.05))
@@ -56,6 +59,7 @@ class Calibrated:
             **{name: common[name] for name in ("near_clip", "to_world", "film", "sampler")},
             **moves,
             "shutter": self.shutter,
+            "shutter_samples": SHUTTER_SAMPLES,
             **others,
         }
 
@@ -76,6 +80,22 @@ class Calibrated:
 
     def camera_at(self, time: float) -> reference.Camera:
         return effects.camera_at(self.camera, self.close_camera, time)
+
+    # What rolling_image expects of a case
+    width = property(lambda self: self.camera.width)
+    height = property(lambda self: self.camera.height)
+    rendered_degree, background = 1, (0.0, 0.0, 0.0)
+
+    def rendered(self, gaussians) -> reference.RenderedImage:
+        """The whole film by the reference, on black; motion with SHUTTER_SAMPLES."""
+        if self.close is None:
+            return effects.render(gaussians, self.camera, self.lens, threshold_width=NEAR_THRESHOLD)
+        if self.shutter == "rolling":
+            return rolling_image(self, gaussians, NEAR_THRESHOLD)
+        return effects.render_motion_blur(
+            gaussians, self.camera, self.close_camera, SHUTTER_SAMPLES, np.zeros(3), self.lens,
+            NEAR_THRESHOLD,
+        )  # fmt: skip
 
     @property
     def corner(self) -> np.ndarray:
@@ -137,11 +157,11 @@ def splats_scene(sensor, gaussians, **settings) -> mi.Scene:
     )  # fmt: skip
 
 
-def clear_gaussians(sensor, render, view=None):
+def clear_gaussians(sensor):
     """Gaussians before the view, and their image, which no threshold is near to."""
     for seed in range(100):
-        gaussians = splats_before(view or sensor.view, 1, 40, seed)
-        rendered = render(gaussians)
+        gaussians = splats_before(sensor.view, 1, 40, seed)
+        rendered = sensor.rendered(gaussians)
         if not rendered.near_threshold[sensor.view.window].any():
             return gaussians, rendered
     raise AssertionError(f"{sensor.name}: no clear seed among 100")
