@@ -57,7 +57,7 @@ def test_file_renders_the_same_through_a_shape(kind, degree, tmp_path):
     """To what float32 makes of exp, log and the sigmoid."""
     scene = Scene(degree=degree)
     path = write_model(tmp_path / "model.ply", scene.gaussians)
-    loaded = EllipsoidsCase().load(shape={"type": kind, "filename": path})
+    loaded = EllipsoidsCase().load_with(objects={"shape": {"type": kind, "filename": path}})
     assert_images_agree(image_of(loaded), image_of(scene.load()))
 
 

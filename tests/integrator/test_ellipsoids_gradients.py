@@ -102,7 +102,9 @@ def test_a_changed_parameter_is_rendered_again(name, counted):
     after = image_of(loaded)
     assert sorted(counted) == ["gaussians"] * 2 + ["render"] * 2
     assert np.abs(after - before).max() > 0.01
-    np.testing.assert_array_equal(after, image_of(scene.load(shape=shape_of(held))))
+    np.testing.assert_array_equal(
+        after, image_of(scene.load_with(objects={"shape": shape_of(held)}))
+    )
 
 
 def test_changed_integrator_parameter_is_rendered_again():
@@ -113,7 +115,7 @@ def test_changed_integrator_parameter_is_rendered_again():
     params["integrator.means"] = params["integrator.means"] + 0.25
     params.update()
     moved = replace(scene.own, means=single(scene.own.means + 0.25))
-    np.testing.assert_array_equal(image_of(loaded), image_of(scene.load(**tensors(moved))))
+    np.testing.assert_array_equal(image_of(loaded), image_of(scene.load_with(**tensors(moved))))
 
 
 def test_integrator_renders_the_shapes_of_the_current_scene():

@@ -78,7 +78,7 @@ def test_numbers_that_shapes_do_not_hold_are_zero_there(name, values, settings):
     kind = mi.Float if values.ndim == 1 else mi.TensorXf
     values = values.astype(np.float32)
     padded = np.concatenate([values, np.zeros_like(values[:35])])
-    loaded = scene.load(**{name: kind(values)}, **settings)
+    loaded = scene.load_with(**{name: kind(values)}, **settings)
     own = scene.settings | tensors(scene.gaussians) | settings | {name: kind(padded)}
     alone = mi.load_dict({"type": "scene", "sensor": scene.view.sensor()})
     expected = image_of(alone, integrator=mi.load_dict(own))
@@ -89,7 +89,7 @@ def test_numbers_that_shapes_do_not_hold_are_zero_there(name, values, settings):
 
 def test_features_beside_shapes_have_derivatives():
     feature = mi.TensorXf(np.ones((40, 2), np.float32))
-    loaded = Merged().load(feature_mine=feature, aovs="f:feature_mine")
+    loaded = Merged().load_with(feature_mine=feature, aovs="f:feature_mine")
     weights = np.ones((23, 37, 6))
     derivative = gradients_of(loaded, weights, ["feature_mine"])["feature_mine"]
     assert derivative.shape == (40, 2) and np.abs(derivative).max() > 0

@@ -51,10 +51,9 @@ def scene_and_object(**settings) -> tuple[Scene, reference.Gaussians]:
 
 
 def load(scene, model, matrix=MATRIX, **settings) -> mi.Scene:
-    settings = scene.settings | tensors(model) | settings
     if matrix is not None:
         settings["to_world"] = mi.ScalarTransform4f(matrix)
-    return mi.load_dict({"type": "scene", "integrator": settings, "sensor": scene.view.sensor()})
+    return scene.load_with(gaussians=model, **settings)
 
 
 def rendered(scene, gaussians) -> np.ndarray:
@@ -231,7 +230,7 @@ def test_unmoved_object_has_the_same_derivatives():
 def test_raw_parameters_have_derivatives_in_the_objects_space():
     """Turned back: of quaternions by their product, of harmonics by their rotation."""
     scene, model = scene_and_object()
-    world = reference.render_gradients(moved_by(MATRIX, model), *_cotangents(scene), None, 3, False)
+    world = scene.gradients(scene.weights(), moved_by(MATRIX, model))
     found = gradients_of(load(scene, model), scene.weights(), PARAMETER_NAMES)
     back = Similarity.from_matrix(np.linalg.inv(MATRIX), "it")
     means, quats, shN = rotate_gaussians(
@@ -240,14 +239,6 @@ def test_raw_parameters_have_derivatives_in_the_objects_space():
     expected = world | {"means": SCALE * means, "quats": quats, "shN": shN}
     expected = {name: expected[name] for name in PARAMETER_NAMES}
     assert_arrays_agree(found, expected, GRADIENTS)
-
-
-def _cotangents(scene):
-    weights = np.zeros((scene.view.height, scene.view.width, 4))
-    weights[scene.view.window] = scene.weights()
-    d_image = weights[..., :3]
-    d_alpha = weights[..., 3] - d_image @ np.array(scene.background)
-    return scene.camera, np.zeros(3), d_image, d_alpha
 
 
 def test_setting_a_matrix_that_is_no_similarity_is_refused():

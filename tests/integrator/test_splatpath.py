@@ -20,7 +20,6 @@ from support.lit_scenes import (
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.splat_transport import DECODING
 from drgs.reference import light as reference
 
 
@@ -198,29 +197,6 @@ def test_bounces_in_a_furnace_of_fog_converge_to_its_radiance(furnace):
         assert (np.abs(radiance.mean(axis=1) - expected) <= 4 * error + ROUNDING).all()
     added = np.diff(found.mean(axis=1))
     assert (added > 0).all() and (added[2:4] < furnace.albedo * added[1:3]).all()
-
-
-@pytest.mark.parametrize("color", [0.02, 0.5, (0.9, 0.3, 0.1)])
-def test_sampled_splats_have_the_mean_colour_of_all_splats(color):
-    """Splats of several colours overlap: their mean is decoded, not each of them."""
-    rng = np.random.default_rng(3)
-    colors = np.clip(np.asarray(color) * rng.uniform(0, 2, (40, 3)), 0, 1)
-    means = rng.normal(0, 0.4, (40, 3)) + np.array([0, 0, 6])
-    splats = gaussians(means, 0.4, 0.6, colors)
-    mirror = before_a_mirror(size=8, fov=0.01)
-    exact = np.array(mi.render(scene_of(splats, light_samples=0, spp=1, **mirror)))
-    scene = scene_of(splats, light_samples=4, spp=1024, **mirror)
-    mean = np.array(mi.render(scene))
-    exact = exact.mean((0, 1))
-    error = mean.std((0, 1)) / np.sqrt(64)
-    assert (error < 2e-3).all() and exact.max() > 1.5e-3
-    np.testing.assert_allclose(mean.mean((0, 1)), exact, atol=2e-3 + 5 * error.max())
-
-
-def test_sum_of_powers_decodes_within_its_error_bound():
-    color = np.linspace(0, 1, 1001)
-    found = sum(factor * color**k for k, factor in enumerate(DECODING, 1))
-    assert np.abs(found - linear(color)).max() < 2e-3
 
 
 def test_unsupported_derivatives_and_settings_are_refused():

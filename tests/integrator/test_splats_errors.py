@@ -10,6 +10,7 @@ import pytest
 from support.views import Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
+from drgs.core.constants import MAX_FEATURES, MAX_INT
 from drgs.core.errors import PluginTypeError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.sensors import read_sensor
@@ -80,10 +81,14 @@ REFUSED = {
     ),
     "sh_degree a float": ({"sh_degree": 0.0}, "sh_degree must be an integer from 0 to 3, got 0.0"),
     "light_samples": (
-        {"light_samples": 10**9},
-        "splats: light_samples must be an integer from 0 to 4096, got 1000000000",
+        {"light_samples": 4097},
+        "splats: light_samples must be an integer from 0 to 4096, got 4097",
     ),
     "nested_spp": ({"nested_spp": 1.5}, "splats: nested_spp must be an integer from 0 to"),
+    "nested_spp beyond integers": (
+        {"nested_spp": 2**32},
+        f"nested_spp must be an integer from 0 to {MAX_INT}, got 4294967296",
+    ),
     "light": ({"light": "beams"}, "light must be one of none, probe, rays, got 'beams'"),
     "near": ({"near": 0.0}, "PluginError: splats: near must be a positive number, got 0.0"),
     "near a string": ({"near": "far"}, "got 'far'"),
@@ -98,7 +103,49 @@ REFUSED = {
     "background a string": ({"background": "white"}, "splats: background must be an RGB colour"),
     "background a spectrum": (
         {"background": {"type": "spectrum", "value": 0.5}},
-        "splats: background must be an RGB colour",
+        "splats: background must be an RGB colour, such as ",
+    ),
+    "background an emitter": (
+        {"background": {"type": "constant"}},
+        "splats: background must be an RGB colour, such as ",
+    ),
+    "background a transform": (
+        {"background": lambda: mi.ScalarTransform4f()},
+        "splats: background must be an RGB colour, such as ",
+    ),
+    "to_world without Gaussians": (
+        {**NONE, "to_world": lambda: mi.ScalarTransform4f().scale(2)},
+        "splats: give 'filename', or the Gaussians as tensors",
+    ),
+    "to_world no similarity": (
+        {"to_world": lambda: mi.ScalarTransform4f().scale([1, 2, 1])},
+        "splats: to_world must be made of rotations, translations and scales",
+    ),
+    "to_world a string": ({"to_world": "up"}, "splats: to_world must be a transform, got str"),
+    "a mirroring shapes_to_world": (
+        {**NONE, "shapes_to_world_a": lambda: mi.ScalarTransform4f().scale([-1, 1, 1])},
+        "splats: shapes_to_world_a must be made of rotations, translations and scales",
+    ),
+    "sh_degree of shapes": (
+        {**NONE, "sh_degree": 4},
+        "splats: sh_degree must be an integer from 0 to 3",
+    ),
+    "aovs of a feature that is not given": (
+        {"aovs": "f:feature_other", "feature_mine": lambda: zeros(8, 2)},
+        "types of depth, alpha, normal, feature_mine, got",
+    ),
+    **{
+        f"a feature of shape {shape}": (
+            {"aovs": "f:feature_mine", "feature_mine": lambda shape=shape: zeros(*shape)},
+            "feature_mine must have the shape (N, C), with N = 8 the rows of means and C at least 1, "
+            f"got {shape}",
+        )
+        for shape in ((7, 2), (8,), (8, 2, 2))
+    },
+    "features of 2,000 columns": (
+        {"aovs": "n:normal, f:feature_x, a:alpha", "feature_x": lambda: zeros(8, 2000)},
+        "splats: aovs can have at most 64 channels together, got 2,003 (n 3, f 2,000); render them "
+        "in parts, which share a kernel",
     ),
     "antialiased": (
         {"antialiased": "no"},
@@ -169,15 +216,10 @@ def test_tensors_of_other_types_are_converted(kind):
     integrator = mi.load_dict({"type": "splats", **valid(), "means": kind(means)})
     assert type(integrator.gaussians.means) is mi.TensorXf
     np.testing.assert_array_equal(integrator.gaussians.means.numpy(), means)
-
-
-def test_parameters_are_assigned_numpy_arrays():
-    integrator = mi.load_dict({"type": "splats", **valid()})
     params = mi.traverse(integrator)
-    means = np.arange(24, dtype=np.float64).reshape(8, 3)
-    params["means"] = means
+    params["means"] = means + 1.0  # numpy's are converted as well
     params.update()
-    np.testing.assert_array_equal(integrator.gaussians.means.numpy(), means)
+    np.testing.assert_array_equal(integrator.gaussians.means.numpy(), means + 1)
 
 
 def test_numpy_arrays_are_refused_with_a_remedy():
@@ -211,10 +253,12 @@ def test_degree_above_that_of_the_gaussians_is_refused(given, use):
         ("means", (9, 3), r"quats must have the shape \(N, 4\), with N = 9"),
         ("shN", (8, 5, 3), r"shN must have the shape"),
         ("shN", (8, 0, 3), r"sh_degree must be an integer from 0 to 0"),
+        ("feature_x", (8, 2000), "aovs can have at most 64 channels together, got 2,000"),
     ],
 )
 def test_parameters_that_do_not_fit_are_refused_when_updated(name, shape, message):
-    params = mi.traverse(mi.load_dict({"type": "splats", **valid()}))
+    feature = {"aovs": "f:feature_x", "feature_x": zeros(8, MAX_FEATURES)}
+    params = mi.traverse(mi.load_dict({"type": "splats", **valid(), **feature}))
     params[name] = zeros(*shape)
     with pytest.raises(ValueError, match=rf"^splats: {message}"):
         params.update()

@@ -186,16 +186,6 @@ def masked(opacity) -> dict:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bsdf", [{"type": "null"}, masked(0.0)], ids=["null", "mask"])
-def test_fully_transparent_surfaces_are_invisible(bsdf):
-    scene = apart(SCENE)
-    image = image_of(load(scene, shapes={"pane": pane(1.7, bsdf)}, aovs="z:depth,n:normal"))
-    expected = image_of(load(scene, aovs="z:depth,n:normal"))
-    # Mitsuba moves the rays that go on from a surface by 1e-4, along its normal.
-    np.testing.assert_allclose(image, expected, rtol=0, atol=4e-4)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("nested", ["path", "prb"])
 @pytest.mark.parametrize("srgb_primitives", [True, False])
 def test_splats_between_windows_and_a_wall_are_visible(srgb_primitives, nested):
@@ -312,10 +302,3 @@ def test_changed_host_values_are_noticed():
     loaded.integrator().state.cache.forget("surfaces")
     np.testing.assert_array_equal(after, image_of(loaded))
     assert np.abs(after - before).max() > 0.01
-
-
-def test_display_space_on_a_film_without_rgb_is_refused():
-    scene = replace(SCENE, srgb_primitives=False)
-    loaded = load(scene, scene.view.sensor("luminance"))
-    with pytest.raises(ValueError, match="pixel_format must be rgb or rgba"):
-        loaded.integrator().render(loaded)

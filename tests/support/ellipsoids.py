@@ -75,11 +75,13 @@ class EllipsoidsCase(Scene):
     def shape(self) -> dict:
         return shape_of(self.held, self.kind)
 
-    def load(self, settings=None, **shapes) -> mi.Scene:
-        shapes = shapes or {"shape": self.shape}
-        sensor = self.view.sensor()
-        integrator = self.settings | (settings or {})
-        return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **shapes})
+    @property
+    def own_tensors(self) -> dict:
+        return {}
+
+    @property
+    def objects(self) -> dict:
+        return {"shape": self.shape}
 
 
 def held_gradients(held, of_gaussians) -> dict[str, np.ndarray]:
@@ -182,19 +184,15 @@ class Merged(Scene):
     def _plain(self) -> Scene:
         return Scene(self.view, count=self.count, seed=self.seed)
 
-    def load(self, **settings) -> mi.Scene:
-        """One shape of each kind, in the order in which Mitsuba lists them, then a mesh."""
+    @property
+    def own_tensors(self) -> dict:
+        return tensors(self.own)
+
+    @property
+    def objects(self) -> dict:
+        """One shape of each kind, in the order in which Mitsuba lists them."""
         first, second = self.shapes
-        integrator = self.settings | tensors(self.own) | settings
-        return mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": integrator,
-                "sensor": self.view.sensor(),
-                "first": shape_of(first.held),
-                "second": shape_of(second.held, "ellipsoidsmesh"),
-            }
-        )
+        return {"first": first.shape, "second": shape_of(second.held, "ellipsoidsmesh")}
 
 
 MERGED = (

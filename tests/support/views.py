@@ -225,13 +225,29 @@ class Scene:
 
     def load(self, **film) -> mi.Scene:
         """A new Mitsuba scene; film: see ``View.sensor``."""
+        return self.load_with(self.view.sensor(**film))
+
+    def load_with(self, sensor=None, objects=None, gaussians=None, **settings) -> mi.Scene:
+        """A new scene with other objects or Gaussians, and more settings of the integrator."""
+        own = self.own_tensors if gaussians is None else tensors(gaussians)
         return mi.load_dict(
             {
                 "type": "scene",
-                "integrator": self.settings | tensors(self.gaussians),
-                "sensor": self.view.sensor(**film),
+                "integrator": self.settings | own | settings,
+                "sensor": sensor or self.view.sensor(),
+                **(self.objects if objects is None else objects),
             }
         )
+
+    @property
+    def own_tensors(self) -> dict:
+        """Gaussians that the integrator is given."""
+        return tensors(self.gaussians)
+
+    @property
+    def objects(self) -> dict:
+        """Shapes and emitters."""
+        return {}
 
     @property
     def camera(self) -> reference.Camera:
@@ -253,7 +269,7 @@ class Scene:
         color = decode(rendered.image + rendered.transmittance[..., None] * self.background)
         return np.concatenate([color, rendered.alpha[..., None]], axis=-1)[self.view.window]
 
-    def gradients(self, weights) -> dict[str, np.ndarray]:
+    def gradients(self, weights, gaussians=None) -> dict[str, np.ndarray]:
         """Gradients of sum(weights * image()), weights (H, W, 4), by the reference.
 
         With P the premultiplied image, D the decoding and B the background, the image is
@@ -269,7 +285,7 @@ class Scene:
         d_background = np.einsum("hw,hwc->c", transmittance, d_image)
         d_alpha = d_alpha - d_image @ background
         gradients = reference.render_gradients(
-            self.gaussians, self.camera, np.zeros(3), d_image, d_alpha, None,
+            gaussians or self.gaussians, self.camera, np.zeros(3), d_image, d_alpha, None,
             self.rendered_degree, self.antialiased,
         )  # fmt: skip
         return gradients | {"background": d_background}
