@@ -16,12 +16,14 @@ from support.calibrated_sensors import (
     PINHOLE,
     POSES,
     SCALED,
+    SHUTTER_SAMPLES,
     WINDOW,
     own_camera,
     own_sensor,
 )
 from support.helpers import clear
 from support.openexr import read_exr
+from support.sensors import PIXELS, camera_of, numbers, points_on_rays
 from support.splats_checks import GRADIENTS, IMAGE
 from support.splats_checks import XYZ as TO_XYZ
 from support.views import Scene, View, gradient, image_of, tensors
@@ -33,7 +35,6 @@ from drgs.io.scenes import openexr_threads
 VIEW = View("", 53, 41, crop=WINDOW)
 OWN_VIEWS = {name: replace(VIEW, to_world=to_world) for name, to_world in (POSES | SCALED).items()}
 ROLLING, BLURRED = (replace(OPENCV, close=CLOSE, shutter=s) for s in ("rolling", "global"))
-TIMES = 3
 
 SENSORS = {
     "perspective": (VIEW.sensor, lambda _: VIEW.camera),
@@ -46,7 +47,7 @@ SENSORS = {
         for name, view in OWN_VIEWS.items()
     },
     **{
-        name: (lambda sensor=sensor: sensor.dictionary(shutter_samples=TIMES), sensor.camera_at)
+        name: (lambda sensor=sensor: sensor.dictionary(), sensor.camera_at)
         for name, sensor in {
             "calibrated": PINHOLE,
             "opencv": OPENCV,
@@ -67,7 +68,7 @@ def depths(name, normal, offset) -> np.ndarray:
     height, width = rows.stop - rows.start, columns.stop - columns.start
     y, x = (np.mgrid[:height, :width] + 0.5) / np.array([height, width])[:, None, None]
     found = []
-    for time in (np.arange(TIMES) + 0.5) / TIMES:
+    for time in (np.arange(SHUTTER_SAMPLES) + 0.5) / SHUTTER_SAMPLES:
         place = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
         ray, _ = sensor.sample_ray(float(time), 0.5, place, mi.Point2f(0.5))
         start, towards = (np.array(v, np.float64).T for v in (ray.o, ray.d))
@@ -119,6 +120,48 @@ def test_depth_of_a_plane_matches_rays_for_every_sensor(name):
     assert np.ptp(expected) > 0.1 and (image[..., 5] == 1).all()
     # Positions of up to 10 units in float32, seen along rays that are 30 degrees off the normal.
     np.testing.assert_allclose(image[..., 4], expected, rtol=2e-5)
+
+
+@pytest.mark.parametrize("crop", [None, WINDOW])
+@pytest.mark.parametrize(
+    ("kind", "to_world"),
+    [("thinlens", m) for m in POSES.values()]
+    + [("orthographic", m) for m in (POSES | SCALED).values()],
+    ids=[f"thinlens, {n}" for n in POSES] + [f"orthographic, {n}" for n in POSES | SCALED],
+)
+def test_points_on_rays_project_to_their_pixels(kind, to_world, crop):
+    """Rays go through the middle of the aperture."""
+    sensor = mi.load_dict(own_sensor(kind, View("", 53, 41, crop=crop, to_world=to_world)))
+    points, expected = points_on_rays(sensor)
+    c = numbers(camera_of(sensor))
+    x, y, z = c["rotation"] @ (points - c["center"]).T
+    film = np.stack([x, y], axis=-1) / (z[:, None] if kind == "thinlens" else 1)
+    assert (z > 0).all()
+    assert np.abs(film * c["focal"] + c["principal"] - expected).max() < PIXELS
+
+
+@pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
+def test_thin_lens_rays_start_on_the_aperture_and_meet_in_focus(to_world):
+    """Rays of one place on the film."""
+    view = View("", 53, 41, to_world=to_world)
+    sensor = mi.load_dict(own_sensor("thinlens", view))
+    camera = camera_of(sensor)
+    sample = np.random.default_rng(0).uniform(size=(2, 1000)).astype(np.float32)
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.3, 0.7), mi.Point2f(sample))
+    c = numbers(camera)
+    origins, directions = (
+        c["rotation"] @ (np.array(v).astype(np.float64) - shift)
+        for v, shift in ((ray.o, c["center"][:, None]), (ray.d, 0))
+    )
+    on_aperture = origins - directions * origins[2] / directions[2]
+    radius, focus_distance = (
+        float(v[0]) for v in (camera.aperture.radius, camera.aperture.focus_distance)
+    )
+    assert np.linalg.norm(on_aperture, axis=0).max() == pytest.approx(radius, rel=0.01)
+    in_focus = on_aperture + directions * focus_distance / directions[2]
+    # Positions of up to 10 units in float32.
+    assert np.ptp(in_focus, axis=1).max() < 1e-5 * focus_distance
+    assert (radius, focus_distance) == pytest.approx((0.125, 3.0), rel=1e-6)
 
 
 COLORS = {"luminance": TO_XYZ[1:2], "xyz": TO_XYZ, "rgb": np.eye(3)}

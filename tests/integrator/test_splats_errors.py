@@ -137,8 +137,7 @@ REFUSED = {
     **{
         f"a feature of shape {shape}": (
             {"aovs": "f:feature_mine", "feature_mine": lambda shape=shape: zeros(*shape)},
-            "feature_mine must have the shape (N, C), with N = 8 the rows of means and C at least 1, "
-            f"got {shape}",
+            f"with N = 8 the rows of means and C at least 1, got {shape}",
         )
         for shape in ((7, 2), (8,), (8, 2, 2))
     },

@@ -27,9 +27,10 @@ MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.radial_tangential",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
-    "effects.smoothing", "integrator.splat_transport", "integrator.shadows",
+    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.gathering",
+    "integrator.splat_transport", "integrator.shadows",
     "integrator.surfaces",
-    "light.grid", "light.walk",
+    "light", "light.grid", "light.probe", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
     "training.effects.view_parameters",
@@ -273,18 +274,25 @@ def sensor(**settings):
     return {{"film": film, **settings}}
 
 capture.blobs().save({ply!r})
-for name, scene in (
-    ("calibrated", {{"sensor": sensor(type="calibrated")}}),
-    ("perspective", {{"sensor": sensor(type="perspective")}}),
-    ("environment", {{"sensor": sensor(type="perspective"), "sky": {{"type": "constant"}}}}),
-    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}),
-    ("thin lens", {{"sensor": sensor(type="thinlens", aperture_radius=0.1, focus_distance=2.0)}}),
-    ("orthographic", {{"sensor": sensor(type="orthographic")}}),
-    ("surface", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
-    ("light", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
+aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
+plain, ball = {{"sensor": sensor(type="perspective")}}, {{"ball": {{"type": "sphere"}}}}
+lit = {{"sky": {{"type": "constant"}}, **ball}}
+for name, scene, settings in (
+    ("calibrated", {{"sensor": sensor(type="calibrated")}}, {{}}),
+    ("perspective", plain, {{"light": "none"}}),
+    ("light without surfaces", plain, {{"light": "rays"}}),
+    ("environment", plain | {{"sky": {{"type": "constant"}}}}, {{}}),
+    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}, {{}}),
+    ("thin lens", {{"sensor": sensor(type="thinlens", **aperture)}}, {{}}),
+    ("orthographic", {{"sensor": sensor(type="orthographic")}}, {{}}),
+    ("surface", plain | lit, {{"light": "none"}}),
+    ("path", plain | lit, {{"nested": {{"type": "path"}}}}),
+    ("splatpath", plain | lit, {{"nested": {{"type": "splatpath"}}}}),
+    ("light", plain | lit, {{"light": "rays"}}),
+    ("shadows", plain | lit, {{"shadows": "ball"}}),
+    ("object in its place", plain, {{"to_world": mi.ScalarTransform4f().scale(2)}}),
 ):
-    integrator = {{"type": "splats", "filename": {ply!r}}}
-    integrator |= {{"light": "rays"}} if name == "light" else {{}}
+    integrator = {{"type": "splats", "filename": {ply!r}, **settings}}
     mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
     now = set(sys.modules) & set({modules!r})
     found[name] = sorted(now - known)
@@ -310,12 +318,27 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
         "perspective": [],
+        "light without surfaces": [],
         "environment": [],
         "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
         "thin lens": ["drgs.effects.defocus"],
         "orthographic": ["drgs.cameras.orthographic"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
-        "light": ["drgs.integrator.splat_transport", "drgs.light.grid", "drgs.light.walk"],
+        "path": [],
+        "splatpath": [],
+        "light": [
+            "drgs.integrator.splat_transport",
+            "drgs.light",
+            "drgs.light.grid",
+            "drgs.light.probe",
+            "drgs.light.walk",
+        ],
+        "shadows": ["drgs.integrator.shadows"],
+        "object in its place": [
+            "drgs.gaussians.rotation",
+            "drgs.gaussians.similarity",
+            "drgs.integrator.gathering",
+        ],
     }
 
 

@@ -49,12 +49,15 @@ class Camera:
     view: View = VIEW
     changes: dict = field(default_factory=dict)
 
-    def dictionary(self, samples=1, **others) -> dict:
-        sensor = self.view.sensor(samples=samples)
-        if self.changes:
-            kept = {k: sensor[k] for k in ("to_world", "film", "sampler", "near_clip")}
-            sensor = kept | {k: v() if callable(v) else v for k, v in self.changes.items()}
-        return sensor | others
+    def dictionary(self) -> dict:
+        if not self.changes:
+            return self.view.sensor()
+        return self.view.sensor_like(
+            **{
+                "kind" if k == "type" else k: v() if callable(v) else v
+                for k, v in self.changes.items()
+            }
+        )
 
 
 def calibrated(**changes) -> Camera:

@@ -189,11 +189,9 @@ SCALED = {
 
 
 def own_sensor(kind, view) -> dict:
-    dictionary = view.sensor()
-    others = {name: dictionary[name] for name in ("to_world", "film", "sampler", "near_clip")}
-    if kind == "thinlens":
-        others["fov"] = view.fov
-    return {"type": kind, **others, **SENSORS[kind]}
+    return view.sensor_like(
+        kind, **SENSORS[kind], **({"fov": view.fov} if kind == "thinlens" else {})
+    )
 
 
 def own_camera(view) -> reference.Camera:

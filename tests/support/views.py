@@ -106,6 +106,12 @@ class View:
             "sampler": {"type": sampler, "sample_count": samples},
         }
 
+    def sensor_like(self, kind: str, **parameters) -> dict:
+        """A sensor of another type at the same place, with the same film."""
+        sensor = self.sensor()
+        kept = {key: sensor[key] for key in ("to_world", "film", "sampler", "near_clip")}
+        return kept | {"type": kind, **parameters}
+
 
 VIEWS = (
     View("unrotated", to_world=pose([0, 0, 1], 0)),
