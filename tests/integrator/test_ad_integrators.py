@@ -219,7 +219,8 @@ def off_centre():
 
 
 def calibrated(**others):
-    return scene(sensor={"type": "calibrated", "fx": 64.0, "fy": 60.0, "lens": "opencv", **others})
+    sensor = {"type": "calibrated", "fx": 64.0, "fy": 60.0, "lens": "opencv"}
+    return scene(sensor=sensor | others)
 
 
 def moving(**shutter):
@@ -245,6 +246,13 @@ def before_an_image(**settings):
         background={"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}, **settings
     )
 
+
+ZEROS = {
+    "opencv": ("k1", "k2", "p1"),
+    "fisheye": ("k1", "k4"),
+    "thin_prism_fisheye": ("k1", "p1", "sx1"),
+}
+"""Coefficients that are given as 0, and can be optimised."""
 
 THIN_LENS = {"type": "thinlens", "fov": 41.0, "aperture_radius": 0.3, "focus_distance": 3.2}
 DISTORTION = {"k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": -0.02}
@@ -278,6 +286,12 @@ OTHERS = {
     "off_centre": off_centre,
     "rolling_shutter": lambda: moving(shutter="rolling"),
     "global_shutter": lambda: moving(shutter_samples=2),
+    **{
+        f"{lens}_of_zeros": lambda lens=lens, names=names: calibrated(
+            lens=lens, **dict.fromkeys(names, 0.0)
+        )
+        for lens, names in ZEROS.items()
+    },
     "placed": placed,
     "merged": merged,
     "hybrid_display": lambda: hybrid(
@@ -412,6 +426,11 @@ PARAMETERS = [
     Parameter("thin_lens", "sensor.focus_distance"),
     *(Parameter("calibrated", f"sensor.{name}") for name in DISTORTION),
     Parameter("rolling_shutter", "sensor.k4"),
+    *(
+        Parameter(f"{lens}_of_zeros", f"sensor.{name}")
+        for lens, names in ZEROS.items()
+        for name in names
+    ),
     *(
         Parameter(scene, "integrator.means", RIGHT)
         for scene in (

@@ -39,15 +39,9 @@ def surfaces():
 
 
 def load(tensors, objects, **settings):
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": SCENE.settings | tensors | settings,
-            "sensor": SCENE.view.sensor(),
-            **objects,
-        },
-        parallel=False,  # kernels of other threads have no history
-    )
+    integrator = SCENE.settings | tensors | settings
+    scene = {"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor(), **objects}
+    return mi.load_dict(scene, parallel=False)  # kernels of other threads have no history
 
 
 def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import pytest
-from support.views import VIEWS, Scene, tensors
+from support.views import VIEWS, Scene
 
 import drgs  # noqa: F401  (registers the plugin)
 
@@ -22,9 +22,8 @@ KINDS = {"splats": {}, "surfaces": {"floor": {"type": "rectangle"}, "sky": {"typ
 
 def load(kind):
     size = {"width": WIDTH, "height": HEIGHT}
-    sensors = {f"sensor_{k}": VIEWS[k].sensor(**size) for k in range(3)}
-    integrator = SCENE.settings | tensors(SCENE.gaussians)
-    return mi.load_dict({"type": "scene", "integrator": integrator, **sensors, **KINDS[kind]})
+    sensors = {f"sensor_{k}": VIEWS[k].sensor(**size) for k in range(2)}
+    return SCENE.load_with(SCENE.view.sensor(**size), sensors | KINDS[kind])
 
 
 def resident() -> int:

@@ -27,6 +27,7 @@ from support.sensors import PIXELS, camera_of, numbers, points_on_rays
 from support.splats_checks import GRADIENTS, IMAGE
 from support.splats_checks import XYZ as TO_XYZ
 from support.views import Scene, View, gradient, image_of, tensors
+from support.wall_scenes import Wall
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -85,38 +86,19 @@ def depths(name, normal, offset) -> np.ndarray:
     return np.mean(found, axis=0)
 
 
-def tilted_plane(camera) -> tuple[np.ndarray, float, np.ndarray]:
-    """A plane before the camera: its normal and offset in the world, and a rectangle's matrix."""
-    normal = np.array([0.2, -0.3, 1.0])
-    normal /= np.linalg.norm(normal)
-    right = np.cross([0, 1, 0], normal)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(normal, right), normal]) @ camera.rotation
-    middle = camera.center + camera.rotation[2] * 5
-    to_world = np.eye(4)
-    to_world[:3] = np.column_stack([*(axes * [[100], [100], [1]]), middle])
-    return axes[2], float(axes[2] @ middle), to_world
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_depth_of_a_plane_matches_rays_for_every_sensor(name):
     """Without a splat in sight."""
     make, camera_at = SENSORS[name]
-    camera = camera_at(0.0)
-    normal, offset, to_world = tilted_plane(camera)
+    camera, plane = camera_at(0.0), Wall(5.0, (-0.2, 0.3), 100.0)
     behind = np.float32(np.tile(camera.center - 50 * camera.rotation[2], (4, 1)))
-    gaussians = replace(Scene(count=4).gaussians, means=behind)
-    loaded = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "splats", **tensors(gaussians), "aovs": "z:depth, a:alpha"},
-            "sensor": make(),
-            "plane": {"type": "rectangle", "to_world": mi.ScalarTransform4f(to_world)},
-            "light": {"type": "constant"},
-        }
-    )
-    image, expected = image_of(loaded), depths(name, normal, offset)
+    scene = Scene(count=4)
+    gaussians = replace(scene.gaussians, means=behind)
+    objects = {"plane": plane.shape(camera)}
+    image = image_of(scene.load_with(make(), objects, gaussians, aovs="z:depth, a:alpha"))
+    normal = plane.axes()[2] @ camera.rotation
+    expected = depths(name, normal, normal @ (camera.center + camera.rotation[2] * plane.z))
     assert np.ptp(expected) > 0.1 and (image[..., 5] == 1).all()
     # Positions of up to 10 units in float32, seen along rays that are 30 degrees off the normal.
     np.testing.assert_allclose(image[..., 4], expected, rtol=2e-5)

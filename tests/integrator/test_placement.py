@@ -85,16 +85,14 @@ def test_moved_object_matches_a_file_saved_after_moving(tmp_path):
     stored.save(tmp_path / "object.ply")
     Similarity.from_matrix(MATRIX, "it").of_gaussians(stored).save(tmp_path / "moved.ply")
 
-    def file(name, **settings):
+    def rendered(name, **settings):
         settings = scene.settings | {"filename": str(tmp_path / name)} | settings
-        return mi.load_dict(
-            {"type": "scene", "integrator": settings, "sensor": scene.view.sensor()}
-        )
+        return image_of(scene.load(), integrator=mi.load_dict(settings))
 
-    expected = image_of(file("moved.ply"))
+    expected = rendered("moved.ply")
     place = mi.ScalarTransform4f(MATRIX)
-    assert_images_agree(image_of(file("object.ply", to_world=place)), expected, 3 * IMAGE)
-    unfiltered = image_of(file("moved.ply", ignore="smoothing"))
+    assert_images_agree(rendered("object.ply", to_world=place), expected, 3 * IMAGE)
+    unfiltered = rendered("moved.ply", ignore="smoothing")
     assert np.abs(unfiltered - expected).max() > 0.02
 
 

@@ -17,9 +17,8 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 def test_a_file_and_tensors_give_the_same_image(degree, tmp_path):
     scene = Scene(degree=degree)
     write_gaussians(tmp_path / "model.ply", scene.gaussians)
-    settings = scene.settings | {"filename": str(tmp_path / "model.ply")}
-    loaded = mi.load_dict({"type": "scene", "integrator": settings, "sensor": scene.view.sensor()})
-    assert np.array_equal(image_of(loaded), fresh_image(scene))
+    integrator = mi.load_dict(scene.settings | {"filename": str(tmp_path / "model.ply")})
+    assert np.array_equal(image_of(scene.load(), integrator=integrator), fresh_image(scene))
 
 
 SCENE_XML = """
@@ -72,11 +71,9 @@ def test_repr_lists_non_default_settings():
 @pytest.mark.parametrize("kind", ["column", "array"])
 def test_logit_opacities_may_be_a_column_or_no_tensor(kind):
     scene = Scene()
-    values = tensors(scene.gaussians)
-    logits = values["logit_opacities"].array
-    values["logit_opacities"] = mi.TensorXf(logits, (40, 1)) if kind == "column" else logits
-    integrator = mi.load_dict(scene.settings | values)
-    assert np.array_equal(image_of(scene.load(), integrator=integrator), fresh_image(scene))
+    logits = tensors(scene.gaussians)["logit_opacities"].array
+    logits = mi.TensorXf(logits, (40, 1)) if kind == "column" else logits
+    assert np.array_equal(image_of(scene.load_with(logit_opacities=logits)), fresh_image(scene))
 
 
 @pytest.mark.parametrize(
@@ -187,11 +184,9 @@ def test_crop_window_is_a_part_of_the_whole_image(crop):
     whole = Scene(View("whole", 53, 41))
     values = tensors(whole.gaussians)
     values["log_scales"] += 1.0
-    integrator = mi.load_dict(whole.settings | values)
     window = replace(whole.view, crop=crop)
     whole_image, window_image = (
-        image_of(mi.load_dict({"type": "scene", "sensor": v.sensor()}), integrator=integrator)
-        for v in (whole.view, window)
+        image_of(whole.load_with(view.sensor(), **values)) for view in (whole.view, window)
     )
     assert_images_agree(window_image, whole_image[window.window])
 

@@ -13,7 +13,6 @@ from support.views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.cameras.fisheye import Fisheye
-from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
@@ -340,11 +339,3 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
             "drgs.integrator.gathering",
         ],
     }
-
-
-def test_plain_sensor_has_no_effect_parameters():
-    kept = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
-    sensor = mi.load_dict({"type": "calibrated", **kept})
-    own = {key for key in mi.traverse(sensor).keys() if not key.startswith(("film.", "shutter_"))}  # noqa: SIM118
-    assert own - {"near_clip", "far_clip"} == {"to_world", "fx", "fy", "cx", "cy"}
-    assert isinstance(sensor.lens, Pinhole) and sensor.to_world_close is None

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.views import VIEWS, Scene, image_of, tensors
+from support.views import VIEWS, Scene, image_of
 
 import drgs  # noqa: F401  (registers the plugin)
 
@@ -33,18 +33,12 @@ def run_in_two_threads(work):
     return results
 
 
-def scene_of(view, **objects):
-    scene = Scene(view)
-    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(4)}
-    integrator = scene.settings | tensors(scene.gaussians)
-    return mi.load_dict({"type": "scene", "integrator": integrator, **sensors, **objects})
-
-
 @pytest.mark.parametrize("shared", [True, False], ids=["one scene", "two scenes"])
 def test_two_threads_render_the_same_images_as_one(shared):
     """From sensors in turn, so that no frame is that of the image before."""
-    first = scene_of(VIEWS[1])
-    scenes = [first, first if shared else scene_of(VIEWS[3])]
+    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(3)}  # besides the scene's own
+    first = Scene(VIEWS[1]).load_with(objects=sensors)
+    scenes = [first, first if shared else Scene(VIEWS[3]).load_with(objects=sensors)]
     expected = [[image_of(scenes[k], sensor=2 * k + s) for s in (0, 1)] for k in (0, 1)]
 
     def work(number):
@@ -72,10 +66,7 @@ def test_integrator_renders_one_image_at_a_time():
             width, height = sensor.film().crop_size()
             return dr.zeros(mi.TensorXf, (height, width, 4))
 
-    scene = Scene(VIEWS[1])
-    integrator = scene.settings | tensors(scene.gaussians) | {"inner": Slow(mi.Properties())}
-    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(2)}
-    floor = {"type": "rectangle"}
-    loaded = mi.load_dict({"type": "scene", "integrator": integrator, "floor": floor, **sensors})
+    objects = {"floor": {"type": "rectangle"}, "other": VIEWS[0].sensor()}
+    loaded = Scene(VIEWS[1]).load_with(objects=objects, inner=Slow(mi.Properties()))
     run_in_two_threads(lambda number: [image_of(loaded, sensor=number) for _ in range(3)])
     assert most == [1] * 6
