@@ -249,7 +249,7 @@ def before_an_image(**settings):
 
 ZEROS = {
     "opencv": ("k1", "k2", "p1"),
-    "fisheye": ("k1", "k4"),
+    "fisheye": ("k1", "k2"),
     "thin_prism_fisheye": ("k1", "p1", "sx1"),
 }
 """Coefficients that are given as 0, and can be optimised."""
@@ -353,6 +353,8 @@ class Parameter:
     def at(self, initial, theta) -> Any:
         if isinstance(initial, mi.AffineTransform4f):
             axis, change = self.along[:3], mi.AffineTransform4f()
+            if self.along is GROWING:
+                return initial @ change.scale(1 + self.along[0] * theta)
             if len(self.along) == 4:
                 return initial @ change.rotate(axis, self.along[3] * theta)
             return initial @ change.translate([theta * a for a in axis])
@@ -368,6 +370,7 @@ class Parameter:
 
 RIGHT, BACK, OBLIQUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, -0.6, 0.5)
 TURN = (0.3, -0.5, 0.8, 0.4)  # of a quaternion
+GROWING = (0.5,)  # of a scale
 AROUND = (0.6, -0.48, 0.64, 10.0)  # an axis, and degrees for each unit of theta
 # Where rays cross into another texel within a step, slopes change. Measured: mean 4e-4, maximum
 # 0.024, of sums 3e-5.
@@ -402,9 +405,13 @@ PARAMETERS = [
             *(("splats", "sensor"), ("aovs", "sensor"), ("thin_lens", "sensor")),
             *(("orthographic", "sensor"), ("calibrated", "sensor"), ("off_centre", "sensor")),
             *(("rolling_shutter", "sensor"), ("global_shutter", "sensor")),
-            ("placed", "integrator"),
         )
         for along in (OBLIQUE, AROUND)
+    ),
+    *(
+        Parameter(scene, "integrator.to_world", along)
+        for scene in ("splats", "placed")  # without a place, and with one
+        for along in (OBLIQUE, AROUND, GROWING)
     ),
     *(
         Parameter(scene, "sensor.to_world_close", along)
@@ -444,6 +451,9 @@ PARAMETERS = [
         for name in ("log_scales", "logit_opacities", "sh0")
     ),
     Parameter("placed", "integrator.quats", TURN),
+    Parameter("placed", "integrator.log_scales"),
+    Parameter("placed", "integrator.logit_opacities"),
+    Parameter("placed", "integrator.sh0"),
     Parameter("placed", "integrator.shN", ((1.0,), (-0.5,), (0.25,))),
     Parameter("aovs", "integrator.logit_opacities"),
     Parameter("hybrid", "integrator.means", RIGHT),

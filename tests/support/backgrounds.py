@@ -12,8 +12,6 @@ from support.views import VIEWS, View, pose, tensors
 # Single precision, of values up to 2: as in test_splats; the conversion to display space multiplies
 # errors of dark pixels by up to 13.
 IMAGE = 2e-5
-
-
 VIEW = VIEWS[1]
 
 
@@ -37,8 +35,6 @@ EMITTERS = {
 
 
 CLOSE = np.array(pose([0.2, -1.0, 0.4], 46, (0.5, -0.65, 1.0)))
-
-
 INTRINSICS = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5}
 
 

@@ -17,11 +17,7 @@ from support.views import VIEWS, View, pose, splats_before, tensors
 
 WINDOW = (13, 7, 29, 18)
 SHUTTER_SAMPLES = 3
-
-
 CLOSE = pose([0.1, -1.0, 0.3], 43, (0.5, -0.65, 1.05))
-
-
 KINDS = {
     Pinhole: "pinhole",
     OpenCV: "opencv",
@@ -114,24 +110,14 @@ def transform(matrix) -> mi.ScalarTransform4f:
 
 
 PINHOLE = Calibrated("pinhole")
-
-
 OPENCV = Calibrated("opencv", LENSES["rational"])
-
-
 FISHEYE = Calibrated("fisheye", LENSES["fisheye"], f=(13.0, 14.5))
-
-
 THIN_PRISM = Calibrated("thin prism", LENSES["thin prism"], f=(13.0, 14.5))
-
-
 FILM = View("", 37, 29)  # without a crop window
 
 
 # A fold within the film.
 BARREL = Calibrated("barrel", LENSES["barrel"], FILM, f=(26.0, 26.0), c=(19.0, 14.0))
-
-
 STATIC_SENSORS = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM]
 
 
@@ -179,8 +165,6 @@ SENSORS = {
 
 
 POSES = {"rotated": VIEWS[1].to_world, "mirrored": VIEWS[3].to_world}
-
-
 SCALED = {
     "scaled": scaled(VIEWS[1].to_world, 3.0, 3.0, 3.0),
     "scaled unevenly": scaled(VIEWS[1].to_world, 2.0, 0.5, 1.0),

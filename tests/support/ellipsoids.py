@@ -18,8 +18,6 @@ from support.views import Scene, gradient, tensors
 # Tolerances of test_splats: single precision, relative to the largest value of an array. Scales
 # and opacities are converted with a relative error of 1e-7 each.
 IMAGE, GRADIENTS = 1e-5, 1e-4
-
-
 SHAPE_ATTRIBUTES = ("data", "opacities", "sh_coeffs")
 
 
@@ -204,8 +202,6 @@ MERGED = (
 
 
 ROTATION = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
-
-
 SCALE, TRANSLATION = 1.5, np.array([0.5, -0.25, 1.0])
 
 
