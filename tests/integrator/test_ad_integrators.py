@@ -434,7 +434,7 @@ PARAMETERS = [
     *(Parameter("calibrated", f"sensor.{name}") for name in DISTORTION),
     Parameter("rolling_shutter", "sensor.k4"),
     *(
-        Parameter(f"{lens}_of_zeros", f"sensor.{name}")
+        Parameter(f"{lens}_of_zeros", f"sensor.{name}", epsilon=0.03)
         for lens, names in ZEROS.items()
         for name in names
     ),

@@ -11,12 +11,12 @@ from support.lit_scenes import (
     along_rays,
     camera,
     gaussians,
-    linear,
     mean_and_error,
     pixel_rays,
     radiance_of,
     scene_of,
 )
+from support.views import to_linear
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
@@ -130,7 +130,7 @@ class Furnace:
         with cos cos / (pi d^2) = 1 / 4 pi, whichever they are, and what a bounce brings is the mean
         over the sphere. That of the lamp's irradiance is its intensity, pi, without fog.
         """
-        fog = (1 - self.path_transmittance) * self.exposure * linear(np.array(self.color))
+        fog = (1 - self.path_transmittance) * self.exposure * to_linear(self.color)
         of_lamp = self.albedo * (1 + self.path_transmittance) / 2
         of_lamp_there = self.albedo * self.path_transmittance / (1 - self.LAMP) ** 2
         seen, mean = [1.0], 1.0

@@ -6,6 +6,7 @@ import numpy as np
 
 from drgs.reference import splatting
 from support.helpers import rows
+from support.views import to_linear
 
 
 def gaussians(means, scale=0.3, opacity=0.9, color=1.0, count=None) -> splatting.Gaussians:
@@ -98,8 +99,4 @@ def radiance_of(seen, is_open=True):
     """Radiance of what the reference's rays pass; is_open: black is behind it, and no radiance."""
     coverage = 1 - seen.transmittances[:, None]
     whole = np.ones_like(coverage) if is_open else np.where(coverage > 0, coverage, 1)
-    return whole * linear(seen.colors / whole)
-
-
-def linear(color):
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    return whole * to_linear(seen.colors / whole)
