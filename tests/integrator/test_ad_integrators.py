@@ -204,10 +204,10 @@ def merged():
     return scene(own, objects={"shape": shape_of(gaussians())}, shapes_to_world_shape=turned)
 
 
-def placed():
+def placed(**settings):
     """Turned about the axis along which the camera looks, so that the order stays."""
     to_world = mi.ScalarTransform4f().translate([0.1, -0.1, 0]).rotate([0, 0, 1], 40).scale(1.2)
-    return scene(to_world=to_world)
+    return scene(to_world=to_world, **settings)
 
 
 def off_centre():
@@ -293,6 +293,7 @@ OTHERS = {
         for lens, names in ZEROS.items()
     },
     "placed": placed,
+    "placed_smoothed": lambda: placed(smoothing=mi.Float(np.geomspace(0.02, 0.4, 24))),
     "merged": merged,
     "hybrid_display": lambda: hybrid(
         srgb_primitives=False, sky={"type": "constant", "radiance": rgb(0.4, 0.6, 0.9)}
@@ -371,6 +372,11 @@ class Parameter:
 RIGHT, BACK, OBLIQUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, -0.6, 0.5)
 TURN = (0.3, -0.5, 0.8, 0.4)  # of a quaternion
 GROWING = (0.5,)  # of a scale
+ALONG = {
+    "means": RIGHT, "quats": TURN, "log_scales": 1.0, "logit_opacities": 1.0, "sh0": 1.0,
+    "shN": ((1.0,), (-0.5,), (0.25,)),
+}  # fmt: skip
+"""Directions of the Gaussians' parameters."""
 AROUND = (0.6, -0.48, 0.64, 10.0)  # an axis, and degrees for each unit of theta
 # Where rays cross into another texel within a step, slopes change. Measured: mean 4e-4, maximum
 # 0.024, of sums 3e-5.
@@ -383,7 +389,7 @@ PARAMETERS = [
     Parameter("splats", "integrator.quats", TURN, row=5),
     Parameter("splats", "integrator.logit_opacities"),
     Parameter("splats", "integrator.sh0", row=5),
-    Parameter("splats", "integrator.shN", ((1.0,), (-0.5,), (0.25,))),
+    Parameter("splats", "integrator.shN", ALONG["shN"]),
     Parameter("splats", "integrator.background"),
     Parameter("default_cutoffs", "integrator.means", RIGHT, epsilon=0.1, thresholds=OF_CUTOFFS),
     Parameter("display_space", "integrator.means", RIGHT),
@@ -410,7 +416,7 @@ PARAMETERS = [
     ),
     *(
         Parameter(scene, "integrator.to_world", along)
-        for scene in ("splats", "placed")  # without a place, and with one
+        for scene in ("splats", "placed", "placed_smoothed")  # without a place, and with one
         for along in (OBLIQUE, AROUND, GROWING)
     ),
     *(
@@ -442,7 +448,6 @@ PARAMETERS = [
         Parameter(scene, "integrator.means", RIGHT)
         for scene in (
             *("thin_lens", "orthographic", "rolling_shutter", "global_shutter", "merged"),
-            *("hybrid_display", "placed"),
         )
     ),
     *(
@@ -450,15 +455,14 @@ PARAMETERS = [
         for scene in ("rolling_shutter", "global_shutter")
         for name in ("log_scales", "logit_opacities", "sh0")
     ),
-    Parameter("placed", "integrator.quats", TURN),
-    Parameter("placed", "integrator.log_scales"),
-    Parameter("placed", "integrator.logit_opacities"),
-    Parameter("placed", "integrator.sh0"),
-    Parameter("placed", "integrator.shN", ((1.0,), (-0.5,), (0.25,))),
+    *(Parameter("placed", f"integrator.{name}", along) for name, along in ALONG.items()),
     Parameter("aovs", "integrator.logit_opacities"),
-    Parameter("hybrid", "integrator.means", RIGHT),
-    Parameter("hybrid", "integrator.logit_opacities"),
-    Parameter("hybrid", "integrator.sh0"),  # also of splats that the ball hides
+    Parameter("aovs", "integrator.log_scales"),
+    *(
+        Parameter(scene, f"integrator.{name}", along)  # also of splats that the ball hides
+        for scene in ("hybrid", "hybrid_display")
+        for name, along in ALONG.items()
+    ),
     Parameter("hybrid", "ball.bsdf.reflectance.value"),
     Parameter("hybrid", "light.emitter.radiance.value"),
     Parameter("point_light", "light.intensity.value"),

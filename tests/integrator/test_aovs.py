@@ -6,22 +6,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import clear
-from support.views import VIEWS, Scene, gradients_of, image_of
+from support.views import VIEWS, Scene, image_of
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
 # Tolerances of test_splats: single precision, relative to the largest value of an array.
-IMAGE, GRADIENTS = 1e-5, 1e-4
-
-STEP = 1e-7
+IMAGE = 1e-5
 
 
-def normals_of(gaussians, camera, log_scales) -> np.ndarray:
-    """(N, 3): the shortest axis by ``log_scales``, towards the camera."""
+def normals_of(gaussians, camera) -> np.ndarray:
+    """(N, 3): the shortest axis, towards the camera."""
     rotations = reference.quat_to_rotation(gaussians.quats)
-    shortest = np.argmin(log_scales, axis=1)
+    shortest = np.argmin(gaussians.log_scales, axis=1)
     normals = rotations[np.arange(len(shortest)), :, shortest]
     away = np.sum(normals * (gaussians.means - camera.center), axis=1) > 0
     return np.where(away[:, None], -normals, normals)
@@ -50,13 +47,12 @@ def with_aovs(scene, aovs="n:normal, f:feature_mine, z:depth, a:alpha", sensor=N
     return scene.load_with(sensor, aovs=aovs, **feature | others)
 
 
-def channels_of(scene, gaussians=None, features=None) -> np.ndarray:
-    """(H, W, 9): normal, features, depth, alpha. Which axis is the shortest does not change."""
-    gaussians, camera = gaussians or scene.gaussians, scene.camera
+def channels_of(scene) -> np.ndarray:
+    """(H, W, 9): normal, features, depth, alpha."""
+    gaussians, camera = scene.gaussians, scene.camera
     depths = reference.project(gaussians, camera).depths[:, None]
-    features = features_of(scene) if features is None else features
-    normals = normals_of(gaussians, camera, scene.gaussians.log_scales)
-    columns = np.concatenate([normals, features, depths, np.ones_like(depths)], axis=1)
+    columns = normals_of(gaussians, camera), features_of(scene), depths, np.ones_like(depths)
+    columns = np.concatenate(columns, axis=1)
     return composited(gaussians, camera, columns)[scene.view.window]
 
 
@@ -112,30 +108,3 @@ def test_unused_channels_cost_nothing():
         mi.render(loaded)
         frames = loaded.integrator().state.cache.kept["frames 0"].value
         assert len(frames[0][0].planes()) == count
-
-
-NAMES = (*PARAMETER_NAMES, "feature_mine")
-
-
-@pytest.mark.slow
-def test_gradients_equal_differences_of_the_reference():
-    """Along a random direction of each parameter, with weights on the extra channels alone."""
-    scene = clear(Scene())
-    rng = np.random.default_rng(5)
-    weights = np.zeros((*scene.weights().shape[:2], 13))
-    weights[..., 4:] = rng.normal(0, 1, (*weights.shape[:2], 9))
-    actual = gradients_of(with_aovs(scene), weights, NAMES)
-    values = vars(scene.gaussians) | {"feature_mine": features_of(scene)}
-    for name in NAMES:
-        direction = rng.normal(0, 1, values[name].shape)
-        both = []
-        for sign in (1, -1):
-            moved = dict(values)
-            moved[name] = values[name] + sign * STEP * direction
-            features = moved.pop("feature_mine")
-            both.append(channels_of(scene, reference.Gaussians(**moved), features))
-        expected = np.sum(weights[..., 4:] * (both[0] - both[1])) / (2 * STEP)
-        terms = actual[name].reshape(direction.shape) * direction
-        assert terms.sum() == pytest.approx(expected, abs=GRADIENTS * np.abs(terms).sum()), name
-        if name not in ("sh0", "shN"):
-            assert np.abs(terms).sum() > 0

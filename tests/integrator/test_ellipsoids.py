@@ -59,16 +59,6 @@ def test_shape_matches_the_reference(kind, degree):
     assert f"  gaussians = 40,\n  sh_degree = {degree}," in str(loaded.integrator())
 
 
-@both_kinds
-@pytest.mark.parametrize("degree", [1, 3])
-def test_file_renders_the_same_through_a_shape(kind, degree, tmp_path):
-    """To what float32 makes of exp, log and the sigmoid."""
-    scene = Scene(degree=degree)
-    path = write_model(tmp_path / "model.ply", scene.gaussians)
-    loaded = EllipsoidsCase().load_with(objects={"shape": {"type": kind, "filename": path}})
-    assert_images_agree(image_of(loaded), image_of(scene.load()))
-
-
 # ----------------------------------------------------------------------------------------------
 # to_world
 # ----------------------------------------------------------------------------------------------

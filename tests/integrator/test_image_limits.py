@@ -81,17 +81,6 @@ def test_films_too_large_for_memory_are_refused(surfaces):
     )
 
 
-def test_available_memory_limits_images(monkeypatch):
-    monkeypatch.setattr("drgs.core.memory.available_memory", lambda: 10**9)
-    scene = load(SCENE.view.sensor(width=4000, height=4000))
-    assert refusal(scene, spp=1) == (
-        "splats: 4000 x 4000 px need about 4 GB of memory, of which 1 GB are available; at most "
-        "4,000,000 pixels fit"
-    )
-    with pytest.raises(ValueError, match=r"^rasterization\(\): .* 4000 x 4000 px need about 4 GB"):
-        rasterized(colors=np.ones((1, 3), np.float32), width=4000, height=4000)
-
-
 @pytest.mark.parametrize(("available", "most"), [(2**50, 2**32 - 1), (2**33, 2**27)])
 def test_nested_samples_beyond_memory_are_refused(monkeypatch, available, most):
     monkeypatch.setattr(checks, "available_memory", lambda: available)

@@ -9,9 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.ellipsoids import GRADIENTS, IMAGE, ROTATION, SCALE, TRANSLATION, assert_images_agree
-from support.helpers import assert_arrays_agree, clear, single
-from support.smoothing import smoothed_reference
+from support.ellipsoids import IMAGE, ROTATION, SCALE, TRANSLATION, assert_images_agree
+from support.helpers import clear, single
 from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -152,60 +151,12 @@ def test_every_light_route_sees_the_moved_object(route):
     assert np.abs(actual - rendered(model)).max() > 0.1
 
 
-STEP = 1e-6
-
-
-def central_difference(loss, step):
-    """Return the derivative of a loss along a change of the matrix."""
-    return (loss(STEP * step) - loss(-STEP * step)) / (2 * STEP)
-
-
-def unit(*cell):
-    step = np.zeros((4, 4))
-    step[cell] = 1
-    return step
-
-
-def test_smoothing_filter_of_a_scaled_object_has_derivatives():
-    """At a fifth of the splats' size, and at five times of it."""
-    scene, model = scene_and_object()
-    filters = single(np.geomspace(0.005, 0.1, len(model.means)))
-    weights = scene.weights()
-
-    def loss(step):
-        matrix = MATRIX @ (np.eye(4) + step)
-        k = Similarity.from_matrix(matrix, "it").scale
-        return np.sum(
-            weights * rendered(scene, smoothed_reference(moved_by(matrix, model), k * filters))
-        )
-
-    smoothing = {"smoothing": mi.TensorXf(filters.astype(np.float32))}
-    found = gradient_of_matrix(load(scene, model, **smoothing), weights)
-    expected = central_difference(loss, np.diag([1, 1, 1, 0.0]))
-    terms = MATRIX[:3, :3] * found[:3, :3]
-    assert terms.sum() == pytest.approx(expected, abs=GRADIENTS * np.abs(terms).max())
-
-
 def gradient_of_matrix(loaded, weights) -> np.ndarray:
     params = mi.traverse(loaded)
     dr.enable_grad(params[KEY])
     image = mi.render(loaded, params)
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
     return np.array(dr.grad(params[KEY]).matrix).astype(np.float64)[:, :, 0]
-
-
-def test_each_matrix_entry_has_the_derivative_of_central_differences():
-    scene, model = scene_and_object()
-    found = gradient_of_matrix(load(scene, model), scene.weights())
-
-    def loss(step):
-        return np.sum(scene.weights() * rendered(scene, moved_by(MATRIX + step, model)))
-
-    expected = [[central_difference(loss, unit(i, j)) for j in range(4)] for i in range(3)]
-    assert_arrays_agree({"to_world": found[:3]}, {"to_world": np.array(expected)}, GRADIENTS)
-    assert not found[3].any()
-    again = gradient_of_matrix(load(scene, model), scene.weights())
-    np.testing.assert_array_equal(again, found)
 
 
 def test_setting_a_matrix_that_is_no_similarity_is_refused():
