@@ -377,6 +377,8 @@ ALONG = {
     "shN": ((1.0,), (-0.5,), (0.25,)),
 }  # fmt: skip
 """Directions of the Gaussians' parameters."""
+SOME = np.linspace(0.5, 1.5, 24)
+"""Factors of 24 Gaussians."""
 AROUND = (0.6, -0.48, 0.64, 10.0)  # an axis, and degrees for each unit of theta
 # Where rays cross into another texel within a step, slopes change. Measured: mean 4e-4, maximum
 # 0.024, of sums 3e-5.
@@ -475,9 +477,9 @@ PARAMETERS = [
         parameter
         for scene in ("shapes", "merged")
         for parameter in (
-            Parameter(scene, "shape.data", np.tile([*RIGHT, 0.1, 0.1, 0.1, *TURN], 24)),
-            Parameter(scene, "shape.opacities"),
-            Parameter(scene, "shape.sh_coeffs"),
+            Parameter(scene, "shape.data", np.outer(SOME, [*RIGHT, 0.1, 0.1, 0.1, *TURN]).ravel()),
+            Parameter(scene, "shape.opacities", SOME),
+            Parameter(scene, "shape.sh_coeffs", np.repeat(SOME, 12)),
         )
     ),
     *(

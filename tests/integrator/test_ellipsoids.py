@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from support.ellipsoids import (
-    GRADIENTS,
-    IMAGE,
     MERGED,
     ROTATION,
     SCALE,
@@ -24,15 +22,14 @@ from support.ellipsoids import (
     EllipsoidsCase,
     Merged,
     assert_held_agree,
-    assert_images_agree,
     gradients_held,
     held_gradients,
     joined,
     scene_with,
     transform,
-    write_model,
 )
 from support.helpers import assert_arrays_agree, clear, single
+from support.splats_checks import GRADIENTS, IMAGE, assert_images_agree, write_gaussians
 from support.views import VIEWS, Scene, gradient, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -77,7 +74,7 @@ def follower(view):
 @pytest.mark.parametrize("names", ["shapes_to_world", "shapes_to_world_shape"])
 def test_moving_integrator_shape_or_camera_gives_the_same_image(kind, names, tmp_path):
     """In single precision: positions of 4 units, rounded to 2e-7, at 40 px to a unit: 1e-5 px."""
-    path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
+    path = write_gaussians(tmp_path / "model.ply", Scene(degree=3).gaussians)
     view = VIEWS[1]
     unmoved = image_of(scene_with({"filename": path}, view))
     moved = {"filename": path, "to_world": transform()}
@@ -92,7 +89,7 @@ def test_moving_integrator_shape_or_camera_gives_the_same_image(kind, names, tmp
 
 
 def test_each_shape_may_have_its_own_to_world(tmp_path):
-    path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
+    path = write_gaussians(tmp_path / "model.ply", Scene(degree=3).gaussians)
     half = mi.ScalarTransform4f().rotate([0, 0, 1], 180).scale(0.5)
     far = mi.ScalarTransform4f().translate([0.25, 0, 0.5])
     placed = {"a": transform(), "b": half, "c": far}

@@ -11,14 +11,13 @@ import pytest
 from support.ellipsoids import (
     EllipsoidsCase,
     Merged,
-    assert_images_agree,
     gradients_held,
     scene_with,
     shape_of,
     transform,
-    write_model,
 )
 from support.helpers import clear
+from support.splats_checks import assert_images_agree, write_gaussians
 from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -83,7 +82,7 @@ def test_the_sign_of_a_standard_deviation_is_ignored():
 
 def test_mirroring_to_world_gives_the_mirror_image(tmp_path):
     """Before a camera that is mirrored with it: of degree 0, the same image."""
-    path = write_model(tmp_path / "model.ply", Scene(degree=0).gaussians)
+    path = write_gaussians(tmp_path / "model.ply", Scene(degree=0).gaussians)
     shape = {"type": "ellipsoids", "filename": path}
     mirror = mi.ScalarTransform4f().scale([-1, 1, 1])
     view = VIEWS[1]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.ellipsoids import joined, write_model
+from support.ellipsoids import joined
+from support.splats_checks import write_gaussians
 from support.views import Scene, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -51,7 +52,7 @@ def test_each_object_has_its_own_to_world(tmp_path):
     place = mi.ScalarTransform4f().translate([0.2, 0, 0.1]).rotate([0, 1, 0], 25)
     later = mi.ScalarTransform4f().translate([-0.1, 0.1, 0])
     files = {
-        name: {"filename": write_model(tmp_path / f"{name}.ply", model)}
+        name: {"filename": write_gaussians(tmp_path / f"{name}.ply", model)}
         for name, model in MODELS.items()
     }
     files["lego"]["to_world"] = place
@@ -73,7 +74,9 @@ def test_each_object_has_its_own_to_world(tmp_path):
 
 
 def test_xml_names_objects_by_their_ids(tmp_path):
-    paths = {name: write_model(tmp_path / f"{name}.ply", model) for name, model in MODELS.items()}
+    paths = {
+        name: write_gaussians(tmp_path / f"{name}.ply", model) for name, model in MODELS.items()
+    }
     objects = "".join(
         f'<integrator type="splats" id="{name}">'
         f'<string name="filename" value="{path}"/></integrator>'

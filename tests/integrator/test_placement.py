@@ -9,8 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.ellipsoids import IMAGE, ROTATION, SCALE, TRANSLATION, assert_images_agree
+from support.ellipsoids import ROTATION, SCALE, TRANSLATION
 from support.helpers import clear, single
+from support.splats_checks import IMAGE, assert_images_agree
 from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)

@@ -11,9 +11,7 @@ from support.views import Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.core.constants import MAX_FEATURES, MAX_INT
-from drgs.core.errors import PluginTypeError
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.sensors import read_sensor
 
 
 @cache
@@ -277,14 +275,6 @@ def test_parameters_that_were_refused_are_not_rendered():
     params[f"integrator.{name}"] = valid()[name]
     params.update()
     np.testing.assert_array_equal(np.array(mi.render(loaded)), expected)
-
-
-def test_unsupported_sensors_are_refused():
-    film = {"type": "hdrfilm", "width": 1, "height": 1}
-    of_a_batch = mi.load_dict({"type": "batch", "one": {"type": "perspective"}})
-    for sensor in (mi.load_dict({"type": "radiancemeter", "film": film}), of_a_batch):
-        with pytest.raises(PluginTypeError, match=r"^splats: the sensor must be of type per"):
-            read_sensor(sensor, 0.01)
 
 
 def test_only_nested_spp_can_be_set():

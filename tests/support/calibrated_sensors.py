@@ -13,7 +13,7 @@ from drgs.reference.effects import Fisheye, OpenCV, Pinhole, ThinPrismFisheye
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES
 from support.motion_checks import rolling_image
-from support.views import VIEWS, View, pose, splats_before, tensors
+from support.views import VIEWS, Scene, View, pose, splats_before
 
 WINDOW = (13, 7, 29, 18)
 SHUTTER_SAMPLES = 3
@@ -132,15 +132,10 @@ def sampled_rays(sensor, time=0.0, count=200, seed=3):
 
 
 def splats_scene(sensor, gaussians, **settings) -> mi.Scene:
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {
-                "type": "splats", "srgb_primitives": False, **tensors(gaussians), **settings
-            },
-            "sensor": sensor.dictionary() if isinstance(sensor, Calibrated) else sensor,
-        }
-    )  # fmt: skip
+    """On black, before a sensor or its dictionary."""
+    scene = Scene(background=(0.0, 0.0, 0.0))
+    sensor = sensor.dictionary() if isinstance(sensor, Calibrated) else sensor
+    return scene.load_with(sensor, gaussians=gaussians, **settings)
 
 
 def clear_gaussians(sensor):

@@ -1,13 +1,11 @@
 """Code that tests of the ``splats`` integrator share: settings, tolerances, files and scenes."""
 
-import mitsuba as mi
 import numpy as np
-import pytest
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from support.helpers import assert_arrays_agree
-from support.views import image_of, tensors
+from support.views import image_of
 
 # Relative to the largest value of an array, in single precision: test_rendering derives 2e-5 and
 # 2e-4 for films up to twice this size. Converting to linear radiance multiplies relative errors by
@@ -17,10 +15,6 @@ IMAGE = 1e-5
 GRADIENTS = 1e-4
 
 ALL_PARAMETERS = (*PARAMETER_NAMES, "background")
-
-both_color_spaces = pytest.mark.parametrize(
-    "srgb_primitives", [False, True], ids=["display space", "linear radiance"]
-)
 
 
 def assert_images_agree(actual, expected, tolerance=IMAGE):
@@ -35,16 +29,13 @@ def fresh_image(scene, **film):
     return image_of(scene.load(**film))
 
 
-def write_gaussians(path, gaussians):
+def write_gaussians(path, gaussians) -> str:
     fields = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
     Gaussians(**fields).save(path)
+    return str(path)
 
 
 # Rec. 709 primaries and white point D65 (Mitsuba's color.h).
 XYZ = np.array(
     [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
-
-
-def fresh_integrator(scene, **settings):
-    return mi.load_dict(scene.settings | tensors(scene.gaussians) | settings)

@@ -321,15 +321,16 @@ def image_of(scene: mi.Scene, **arguments) -> np.ndarray:
     return np.array(mi.render(scene, **arguments)).astype(np.float64)
 
 
-def gradients_of(scene: mi.Scene, weights, names=(*PARAMETER_NAMES, "background")) -> dict:
+def gradients_of(
+    scene: mi.Scene, weights, names=(*PARAMETER_NAMES, "background"), prefix="integrator."
+) -> dict:
     """Gradients of sum(weights * mi.render(scene)) for the parameters ``names``."""
     params = mi.traverse(scene)
-    keys = {name: f"integrator.{name}" for name in names}
-    for key in keys.values():
-        dr.enable_grad(params[key])
+    for name in names:
+        dr.enable_grad(params[prefix + name])
     image = mi.render(scene, params)
     dr.backward(dr.sum(image * mi.TensorXf(np.asarray(weights, np.float32)), axis=None))
-    return {name: gradient(params[key]) for name, key in keys.items()}
+    return {name: gradient(params[prefix + name]) for name in names}
 
 
 def gradient(parameter) -> np.ndarray:
