@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.helpers import FLOAT32, device_gaussians
 from support.kernels import drain_kernels
+from support.splats_checks import ball_lamp_and_sky
 from support.views import Scene, image_of
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -23,19 +24,7 @@ def gaussians():
 
 
 def surfaces():
-    """A ball of metal amid the splats, a lamp and a sky."""
-    camera = SCENE.view.camera
-    center = camera.center + 3 * camera.rotation[2]
-    return {
-        "ball": {
-            "type": "sphere",
-            "center": center.tolist(),
-            "radius": 0.4,
-            "bsdf": {"type": "roughconductor", "alpha": 0.2},
-        },
-        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
-        "sky": {"type": "constant"},
-    }
+    return ball_lamp_and_sky(SCENE.camera, 3, {"type": "roughconductor", "alpha": 0.2})
 
 
 def load(tensors, objects, **settings):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.ellipsoids import ROTATION, SCALE, TRANSLATION
 from support.helpers import clear, single
-from support.splats_checks import IMAGE, assert_images_agree
+from support.splats_checks import IMAGE, assert_images_agree, ball_lamp_and_sky
 from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -112,21 +112,6 @@ def test_identity_transform_costs_nothing(later):
         assert getattr(integrator.gaussians, name) is getattr(integrator.state.own.gaussians, name)
 
 
-def surfaces(scene) -> dict:
-    """A mirror amid the splats, and a lamp and a sky that shade them."""
-    camera = scene.view.camera
-    return {
-        "ball": {
-            "type": "sphere",
-            "center": (camera.center + 2.5 * camera.rotation[2]).tolist(),
-            "radius": 0.4,
-            "bsdf": {"type": "conductor"},
-        },
-        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
-        "sky": {"type": "constant"},
-    }
-
-
 ROUTES = {
     "normals and depths": {"aovs": "n:normal, z:depth, a:alpha"},
     "rays of surfaces": {"light": "rays", "nested_spp": 4},
@@ -139,7 +124,11 @@ def test_every_light_route_sees_the_moved_object(route):
     """The same bytes as of the Gaussians that the integrator says it renders."""
     scene, model = scene_and_object()
     objects = {"sensor": scene.view.sensor()}
-    objects |= {} if "aovs" in ROUTES[route] else surfaces(scene)
+    objects |= (
+        {}
+        if "aovs" in ROUTES[route]
+        else ball_lamp_and_sky(scene.camera, 2.5, {"type": "conductor"})
+    )
     place = {"to_world": mi.ScalarTransform4f(MATRIX)}
     moved = mi.load_dict(scene.settings | tensors(model) | place).gaussians.numpy()
 

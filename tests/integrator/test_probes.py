@@ -220,30 +220,18 @@ def test_mirror_matches_the_mirrored_camera(monkeypatch):
     assert metrics.psnr(found["none"], expected) < 20
 
 
-def calibrated():
-    sensor = camera(EYE, TARGET)
-    del sensor["fov"]
-    numbers = {"fx": 33.0, "fy": 33.0, "cx": 12.0, "cy": 12.0, "k1": 0.1}
-    return sensor | numbers | {"type": "calibrated", "lens": "fisheye"}
-
-
-def orthographic():
-    sensor = camera(EYE, TARGET)
-    del sensor["fov"]
-    to_world = sensor["to_world"] @ mi.ScalarTransform4f().scale(1.2)
-    return sensor | {"type": "orthographic", "to_world": to_world}
-
-
-def cropped():
-    sensor = camera(EYE, TARGET)
-    crop = {"crop_offset_x": 3, "crop_offset_y": 7, "crop_width": 17, "crop_height": 12}
-    return sensor | {"film": sensor["film"] | crop}
+def sensor(to_world=None, film=None, **others) -> dict:
+    """Another one at the camera's place."""
+    own = camera(EYE, TARGET)
+    own |= {"to_world": own["to_world"] @ (to_world or mi.ScalarTransform4f())}
+    return (
+        {k: v for k, v in own.items() if k != "fov"} | others | {"film": own["film"] | (film or {})}
+    )
 
 
 def batch():
     one, other = camera(EYE, TARGET), camera([-1, 1.2, -2.4], TARGET)
-    film = one["film"] | {"width": 48}
-    return {"type": "batch", "one": one, "other": other, "film": film, "sampler": one["sampler"]}
+    return sensor(type="batch", one=one, other=other, film={"width": 48})
 
 
 def pane():
@@ -252,6 +240,8 @@ def pane():
 
 
 LENS = {"aperture_radius": 0.05, "focus_distance": 3.4}
+BENT = {"lens": "fisheye", "fx": 33.0, "fy": 33.0, "cx": 12.0, "cy": 12.0, "k1": 0.1}
+CROP = {"crop_offset_x": 3, "crop_offset_y": 7, "crop_width": 17, "crop_height": 12}
 
 KINDS = {
     "a disk": lambda: {"floor": floor(type="disk")},
@@ -266,10 +256,12 @@ KINDS = {
     "a ball among the splats": lambda: {
         "ball": {"type": "sphere", "center": [0.1, 0.9, 0], "radius": 0.3}
     },
-    "thinlens": lambda: {"sensor": camera(EYE, TARGET) | {"type": "thinlens"} | LENS},
-    "orthographic": lambda: {"sensor": orthographic()},
-    "fisheye": lambda: {"sensor": calibrated()},
-    "crop": lambda: {"sensor": cropped()},
+    "thinlens": lambda: {"sensor": sensor(type="thinlens", fov=40, **LENS)},
+    "orthographic": lambda: {
+        "sensor": sensor(mi.ScalarTransform4f().scale(1.2), type="orthographic")
+    },
+    "fisheye": lambda: {"sensor": sensor(type="calibrated", **BENT)},
+    "crop": lambda: {"sensor": sensor(film=CROP, fov=40)},
     "batch": lambda: {"sensor": batch()},
     "far away": lambda: {
         "splats": cloud(0.9, x=100),

@@ -25,6 +25,16 @@ def assert_gradients_agree(actual, expected, tolerance=GRADIENTS):
     assert_arrays_agree(actual, {name: expected[name] for name in actual}, tolerance)
 
 
+def ball_lamp_and_sky(camera, distance, bsdf) -> dict:
+    """A ball amid the splats that a camera sees, and emitters that shade them."""
+    center = camera.center + distance * camera.rotation[2]
+    return {
+        "ball": {"type": "sphere", "center": center.tolist(), "radius": 0.4, "bsdf": bsdf},
+        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
+        "sky": {"type": "constant"},
+    }
+
+
 def fresh_image(scene, **film):
     return image_of(scene.load(**film))
 
