@@ -28,6 +28,7 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 from support.openexr import read_exr
+from support.views import gradients_of
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.cameras.camera import Camera
@@ -619,18 +620,6 @@ def test_derivatives_equal_differences(parameter):
         assert errors_of_forward(parameter, 1.01 * expected)[0] > thresholds.mean
 
 
-def gradients_of(loaded, *keys, seed=1) -> list[np.ndarray]:
-    """Gradients of a sum of squares."""
-    params = mi.traverse(loaded)
-    for key in keys:
-        dr.enable_grad(params[key])
-    dr.backward(dr.sum(dr.square(mi.render(loaded, params, seed=seed)), axis=None))
-    found = [np.array(dr.grad(params[key])) for key in keys]
-    for key in keys:
-        dr.disable_grad(params[key])
-    return found
-
-
 def test_two_images_have_twice_the_derivatives_of_one():
     """Two passes differentiate the inputs of the sensor's parameters; sums of the same terms."""
     gradients = []
@@ -647,14 +636,13 @@ def test_two_images_have_twice_the_derivatives_of_one():
 
 
 def test_camera_and_gaussian_derivatives_are_the_same_together_and_alone():
-    of_gaussians = [f"integrator.{name}" for name in PARAMETER_NAMES]
-    alone = [
-        *gradients_of(load("splats"), "sensor.x_fov"),
-        *gradients_of(load("splats"), *of_gaussians),
-    ]
-    together = gradients_of(load("splats"), "sensor.x_fov", *of_gaussians)
-    for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(one, other)
+    of_gaussians, of_camera = [f"integrator.{name}" for name in PARAMETER_NAMES], ["sensor.x_fov"]
+    alone, camera, together = (
+        gradients_of(mi.load_dict(scene()), np.ones((HEIGHT, WIDTH, 4)), keys, prefix="")
+        for keys in (of_gaussians, of_camera, of_gaussians + of_camera)
+    )
+    for name, values in (alone | camera).items():
+        np.testing.assert_array_equal(together[name], values, name)
 
 
 @pytest.mark.parametrize("name", ["splats", "rolling_shutter"])
@@ -684,7 +672,7 @@ def test_derivatives_of_detached_cameras_are_not_computed(name, monkeypatch):
     before = kernels_of(plain)
     assert not calls
     key = "sensor.x_fov" if name == "splats" else "sensor.fx"
-    more = kernels_of(lambda: gradients_of(other, key))
+    more = kernels_of(lambda: gradients_of(other, np.ones((HEIGHT, WIDTH, 4)), [key], prefix=""))
     assert calls == [1]
     assert kernels_of(plain) == before
     assert sum(count for _, count in more) > sum(count for _, count in before) + 50

@@ -14,11 +14,6 @@ from drgs.integrator.shadows import GAMMA
 from drgs.reference import splatting
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def scene_of(means, shadows, **objects):
     """Discs that are thin, faint and grey, in the plane of x and y, with some harmonics."""
     n, rng = len(means), np.random.default_rng(0)

@@ -79,10 +79,6 @@ def test_plan_lists_the_setting_of_each_effect():
         "(antialiased, the Gaussians' filter)\n"
         "  not simulated: view dependence, depth of field, surfaces"
     )
-    ignored = plan_of(sensor, **settings, ignore="distortion, motion, smoothing")
-    absent = "view dependence, lens (ignored), depth of field, motion (ignored)"
-    assert f"  not simulated: {absent}, smoothing filter (ignored), surfaces" in ignored
-    assert "3D smoothing" not in ignored
     rendered = {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))}
     blurred = plan_of(pinhole(**moving()), background=rendered)
     assert "  background: an image (the integrator's background)\n" in blurred

@@ -1,7 +1,7 @@
 """Images of one integrator from several threads of a program."""
 
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
 import mitsuba as mi
@@ -12,25 +12,10 @@ from support.views import VIEWS, Scene, image_of
 import drgs  # noqa: F401  (registers the plugin)
 
 
-def run_in_two_threads(work):
-    """Return ``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
-    results = [None, None]
-
-    def run(number):
-        try:
-            results[number] = work(number)
-        except BaseException as error:
-            results[number] = error
-
-    threads = [threading.Thread(target=run, args=(number,)) for number in (0, 1)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for result in results:
-        if isinstance(result, BaseException):
-            raise result
-    return results
+def run_in_two_threads(work) -> list:
+    """``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(work, (0, 1)))
 
 
 @pytest.mark.parametrize("shared", [True, False], ids=["one scene", "two scenes"])
