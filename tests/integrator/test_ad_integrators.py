@@ -202,7 +202,9 @@ def merged():
     turned = mi.ScalarTransform4f().rotate([0, 0, 1], 40)
     own = gaussians(8, farthest=1.0)
     own["means"][:, 2] += np.linspace(1, 0.2, 8)
-    return scene(own, objects={"shape": shape_of(gaussians())}, shapes_to_world_shape=turned)
+    feature = {"aovs": "f:feature_x", "feature_x": tensor(np.sin(np.arange(16.0)).reshape(8, 2))}
+    objects = {"shape": shape_of(gaussians())}
+    return scene(own, objects=objects, shapes_to_world_shape=turned, **feature)
 
 
 def placed(**settings):
@@ -220,8 +222,7 @@ def off_centre():
 
 
 def calibrated(**others):
-    sensor = {"type": "calibrated", "fx": 64.0, "fy": 60.0, "lens": "opencv"}
-    return scene(sensor=sensor | others)
+    return scene(sensor=CALIBRATED | others)
 
 
 def moving(**shutter):
@@ -247,6 +248,13 @@ def before_an_image(**settings):
         background={"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}, **settings
     )
 
+
+CALIBRATED = {"type": "calibrated", "fx": 64.0, "fy": 60.0, "lens": "opencv"}
+LENSES = {
+    "opencv": {"k1": -0.3, "p2": -0.02},
+    "thin_prism_fisheye": {"k1": -0.1, "p2": 0.01, "sy1": 0.02},
+}
+"""Lenses through which a sky is seen, along rays that a search finds."""
 
 ZEROS = {
     "opencv": ("k1", "k2", "p1"),
@@ -302,6 +310,12 @@ OTHERS = {
     "sky": before_a_sky,
     "sky_display": lambda: before_a_sky(srgb_primitives=False),
     "sky_defocused": lambda: before_a_sky(THIN_LENS),
+    **{
+        f"sky_{lens}": lambda lens=lens, values=values: before_a_sky(
+            CALIBRATED | {"lens": lens, **values}
+        )
+        for lens, values in LENSES.items()
+    },
     "image": before_an_image,
     "image_display": lambda: before_an_image(srgb_primitives=False),
 }
@@ -461,6 +475,7 @@ PARAMETERS = [
     *(Parameter("placed", f"integrator.{name}", along) for name, along in ALONG.items()),
     Parameter("aovs", "integrator.logit_opacities"),
     Parameter("aovs", "integrator.log_scales"),
+    Parameter("merged", "integrator.feature_x"),
     *(
         Parameter(scene, f"integrator.{name}", along)  # also of splats that the ball hides
         for scene in ("hybrid", "hybrid_display")
@@ -494,6 +509,11 @@ PARAMETERS = [
     Parameter("sky_defocused", "sky.data"),
     Parameter("sky_defocused", "sensor.aperture_radius", thresholds=TEXELS),
     Parameter("sky_defocused", "sensor.focus_distance", thresholds=TEXELS),
+    *(
+        Parameter(f"sky_{lens}", f"sensor.{name}", size, thresholds=TEXELS)
+        for lens, values in LENSES.items()
+        for name, size in (("fx", 10.0), ("cy", 10.0), *((name, 0.2) for name in values))
+    ),
     Parameter("image", "integrator.background.data"),
     Parameter("image_display", "integrator.background.data"),
 ]

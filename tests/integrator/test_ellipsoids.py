@@ -177,14 +177,6 @@ def test_numbers_that_shapes_do_not_hold_are_zero_there(name, values, settings):
     assert others.shape != expected.shape or np.abs(expected - others).max() > 0.01
 
 
-def test_features_beside_shapes_have_derivatives():
-    feature = mi.TensorXf(np.ones((40, 2), np.float32))
-    loaded = Merged().load_with(feature_mine=feature, aovs="f:feature_mine")
-    weights = np.ones((23, 37, 6))
-    derivative = gradients_of(loaded, weights, ["feature_mine"])["feature_mine"]
-    assert derivative.shape == (40, 2) and np.abs(derivative).max() > 0
-
-
 def test_last_has_a_row_for_each_gaussian():
     loaded = Merged().load()
     gradients_held(loaded, Merged().weights(), "first")

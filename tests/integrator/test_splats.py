@@ -5,9 +5,10 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from support.helpers import clear
 from support.splats_checks import GRADIENTS, assert_images_agree, fresh_image, write_gaussians
-from support.views import VIEWS, Scene, View, image_of, pose, tensors, to_linear
+from support.views import VIEWS, Scene, View, gradients_of, image_of, pose, tensors, to_linear
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -222,3 +223,22 @@ def test_every_way_to_call_gives_the_same_image():
         ):
             np.testing.assert_array_equal(image, expected)
     np.testing.assert_array_equal(own.render(loaded), image_of(loaded))
+
+
+@pytest.mark.parametrize("pixel_format", ["rgb", "rgba"])
+def test_the_minimal_integrator_gives_the_same_bytes(pixel_format, tmp_path):
+    """The readable twin has the images and gradients of ``splats`` with its defaults."""
+    path = write_gaussians(tmp_path / "splats.ply", Scene(degree=3).gaussians)
+    results = []
+    for kind in ("splats", "splats_minimal"):
+        sensor, integrator = VIEWS[1].sensor(pixel_format), {"type": kind, "filename": path}
+        scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+        image = image_of(scene)
+        gradients = gradients_of(scene, 2 * (image - 0.3), PARAMETER_NAMES)
+        assert all(gradient.any() for gradient in gradients.values())
+        results.append([image.tobytes(), *(gradient.tobytes() for gradient in gradients.values())])
+    assert results[0] == results[1]
+
+
+def test_the_minimal_integrator_fits_one_page():
+    assert len((REPOSITORY / "plugins" / "minimal.py").read_text().splitlines()) <= 120

@@ -150,12 +150,9 @@ def test_plan_of_views_covers_all_views():
         "  motion: rolling shutter (1 of 5 cameras)\n"
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)"
     )
-
-
-def test_plan_of_views_lists_ignored_effects():
     state = rich_scene(ignore="distortion, motion, defocus, smoothing").state
-    for views, ignored in ((rich_dataset().train, " (ignored)"), (fits.plain_dataset().train, "")):
-        assert format_effects(summary_of_views(state, views)).splitlines()[-1] == (
+    for others, ignored in ((views, " (ignored)"), (fits.plain_dataset().train, "")):
+        assert format_effects(summary_of_views(state, others)).splitlines()[-1] == (
             f"  not simulated: lens distortion{ignored}, motion{ignored}, antialiasing, "
             "smoothing filter (ignored)"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
@@ -141,7 +141,7 @@ class Merged(Scene):
 
     @property
     def own(self) -> reference.Gaussians:
-        return replace(self._plain, degree=self.own_degree).gaussians
+        return Scene(self.view, self.own_degree, count=self.count, seed=self.seed).gaussians
 
     @property
     def shapes(self) -> list[EllipsoidsCase]:
@@ -158,10 +158,6 @@ class Merged(Scene):
     def rendered_degree(self) -> int:
         highest = max(self.own_degree, *self.degrees)
         return highest if self.sh_degree is None else self.sh_degree
-
-    @property
-    def _plain(self) -> Scene:
-        return Scene(self.view, count=self.count, seed=self.seed)
 
     @property
     def own_tensors(self) -> dict:
