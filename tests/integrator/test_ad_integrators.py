@@ -385,137 +385,108 @@ class Parameter:
 
 
 RIGHT, BACK, OBLIQUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, -0.6, 0.5)
-TURN = (0.3, -0.5, 0.8, 0.4)  # of a quaternion
-GROWING = (0.5,)  # of a scale
-ALONG = {
-    "means": RIGHT, "quats": TURN, "log_scales": 1.0, "logit_opacities": 1.0, "sh0": 1.0,
-    "shN": ((1.0,), (-0.5,), (0.25,)),
-}  # fmt: skip
-"""Directions of the Gaussians' parameters."""
-SOME = np.linspace(0.5, 1.5, 24)
-"""Factors of 24 Gaussians."""
 AROUND = (0.6, -0.48, 0.64, 10.0)  # an axis, and degrees for each unit of theta
+GROWING = (0.5,)  # of a scale
+TURN = (0.3, -0.5, 0.8, 0.4)  # of a quaternion
+SOME = np.linspace(0.5, 1.5, 24)  # factors of 24 Gaussians
+ALONG = {
+    "means": RIGHT,
+    "quats": TURN,
+    "shN": ((1.0,), (-0.5,), (0.25,)),
+    "data": np.outer(SOME, [*RIGHT, 0.1, 0.1, 0.1, *TURN]).ravel(),
+    "opacities": SOME,
+    "sh_coeffs": np.repeat(SOME, 12),
+}
+"""Directions of parameters, by the ends of their keys; others change by theta."""
+
 # Where rays cross into another texel within a step, slopes change. Measured: mean 4e-4, maximum
 # 0.024, of sums 3e-5.
 TEXELS = Thresholds(1e-3, 0.05, 2e-4)
 
 
+def keys_of(owner: str, names: str) -> list[str]:
+    return [f"{owner}.{name}" for name in names.split()]
+
+
+def pairs(scenes: str, keys: list[str], *along, **options) -> list[Parameter]:
+    """Each of the parameters, along each of the directions, in each of the scenes."""
+    return [
+        Parameter(scene, key, direction, **options)
+        for scene in scenes.split()
+        for key in keys
+        for direction in along or (ALONG.get(key.rpartition(".")[2], 1.0),)
+    ]
+
+
+OWN = keys_of("integrator", "means log_scales quats logit_opacities sh0 shN")
+SHAPE = keys_of("shape", "data opacities sh_coeffs")
+
 PARAMETERS = [
-    Parameter("splats", "integrator.means", RIGHT),
-    Parameter("splats", "integrator.log_scales", row=5),
-    Parameter("splats", "integrator.quats", TURN, row=5),
-    Parameter("splats", "integrator.logit_opacities"),
-    Parameter("splats", "integrator.sh0", row=5),
-    Parameter("splats", "integrator.shN", ALONG["shN"]),
-    Parameter("splats", "integrator.background"),
-    Parameter("default_cutoffs", "integrator.means", RIGHT, epsilon=0.1, thresholds=OF_CUTOFFS),
-    Parameter("display_space", "integrator.means", RIGHT),
-    Parameter("aovs", "integrator.feature_mark"),
-    Parameter("aovs", "integrator.means", BACK),
-    Parameter("aovs", "integrator.quats", TURN),
-    Parameter("antialiased", "integrator.log_scales"),
-    Parameter("unscented", "integrator.means", RIGHT),
-    Parameter("exact", "integrator.means", RIGHT),
-    Parameter("exact", "integrator.log_scales", row=3),
-    Parameter("exact", "integrator.quats", TURN, row=3),
-    Parameter("sampled", "integrator.means", RIGHT),
-    Parameter("crop_window", "integrator.means", RIGHT),
-    Parameter("batch", "integrator.means", RIGHT),
-    Parameter("batch", "sensor.left.to_world", OBLIQUE),
-    *(
-        Parameter(scene, f"{owner}.to_world", along)
-        for scene, owner in (
-            *(("splats", "sensor"), ("aovs", "sensor"), ("thin_lens", "sensor")),
-            *(("orthographic", "sensor"), ("calibrated", "sensor"), ("off_centre", "sensor")),
-            *(("rolling_shutter", "sensor"), ("global_shutter", "sensor")),
-        )
-        for along in (OBLIQUE, AROUND)
+    # Gaussians
+    *pairs("splats", keys_of("integrator", "means logit_opacities shN background")),
+    *pairs("splats", keys_of("integrator", "log_scales quats sh0"), row=5),
+    *pairs("default_cutoffs", OWN[:1], epsilon=0.1, thresholds=OF_CUTOFFS),
+    *pairs("aovs", keys_of("integrator", "feature_mark quats logit_opacities log_scales")),
+    *pairs("aovs", OWN[:1], BACK),
+    *pairs("antialiased", keys_of("integrator", "log_scales")),
+    *pairs("display_space unscented exact sampled crop_window batch thin_lens", OWN[:1]),
+    *pairs("exact", keys_of("integrator", "log_scales quats"), row=3),
+    *pairs("orthographic merged constant_emitter", OWN[:1]),
+    *pairs("rolling_shutter global_shutter", keys_of("integrator", "means log_scales sh0")),
+    *pairs("rolling_shutter global_shutter", keys_of("integrator", "logit_opacities")),
+    *pairs("placed hybrid hybrid_display", OWN),  # also of splats that the ball hides
+    *pairs(
+        "sky sky_display image image_display", keys_of("integrator", "means sh0 logit_opacities")
     ),
-    *(
-        Parameter(scene, "integrator.to_world", along)
-        for scene in ("splats", "placed", "placed_smoothed")  # without a place, and with one
-        for along in (OBLIQUE, AROUND, GROWING)
+    *pairs("merged", keys_of("integrator", "feature_x")),
+    *pairs("merged", SHAPE),
+    *pairs("shapes", SHAPE),
+    # Places: of objects without one and with one, and of cameras
+    *pairs(
+        "splats placed placed_smoothed", keys_of("integrator", "to_world"), OBLIQUE, AROUND, GROWING
     ),
-    *(
-        Parameter(scene, "sensor.to_world_close", along)
-        for scene in ("rolling_shutter", "global_shutter")
-        for along in (OBLIQUE, AROUND)
+    *pairs("batch", keys_of("sensor", "left.to_world"), OBLIQUE),
+    *pairs("splats aovs thin_lens orthographic", keys_of("sensor", "to_world"), OBLIQUE, AROUND),
+    *pairs("calibrated off_centre", keys_of("sensor", "to_world"), OBLIQUE, AROUND),
+    *pairs(
+        "rolling_shutter global_shutter",
+        keys_of("sensor", "to_world to_world_close"),
+        *(OBLIQUE, AROUND),
     ),
-    *(
-        Parameter(scene, "sensor.x_fov", epsilon=0.4)  # degrees
-        for scene in ("splats", "crop_window", "off_centre", "thin_lens")
+    *pairs("sky", keys_of("sensor", "to_world"), AROUND, thresholds=TEXELS),
+    # Lenses: degrees, pixels, scene units and coefficients
+    *pairs("splats crop_window off_centre thin_lens", keys_of("sensor", "x_fov"), epsilon=0.4),
+    *pairs(
+        "calibrated rolling_shutter global_shutter", keys_of("sensor", "fx fy cx cy"), epsilon=0.2
     ),
-    *(
-        Parameter(scene, f"sensor.{name}", epsilon=0.2)  # px
-        for scene in ("calibrated", "rolling_shutter", "global_shutter")
-        for name in ("fx", "fy", "cx", "cy")
+    *pairs(
+        "off_centre",
+        keys_of("sensor", "principal_point_offset_x principal_point_offset_y"),
+        epsilon=2e-3,
     ),
-    Parameter("off_centre", "sensor.principal_point_offset_x", epsilon=2e-3),
-    Parameter("off_centre", "sensor.principal_point_offset_y", epsilon=2e-3),
-    Parameter("thin_lens", "sensor.aperture_radius"),
-    Parameter("thin_lens", "sensor.focus_distance"),
-    *(Parameter("calibrated", f"sensor.{name}") for name in DISTORTION),
-    Parameter("rolling_shutter", "sensor.k4"),
-    *(
-        Parameter(f"{lens}_of_zeros", f"sensor.{name}", epsilon=0.03)
-        for lens, names in ZEROS.items()
-        for name in names
-    ),
-    *(
-        Parameter(scene, "integrator.means", RIGHT)
-        for scene in (
-            *("thin_lens", "orthographic", "rolling_shutter", "global_shutter", "merged"),
-        )
-    ),
-    *(
-        Parameter(scene, f"integrator.{name}")
-        for scene in ("rolling_shutter", "global_shutter")
-        for name in ("log_scales", "logit_opacities", "sh0")
-    ),
-    *(Parameter("placed", f"integrator.{name}", along) for name, along in ALONG.items()),
-    Parameter("aovs", "integrator.logit_opacities"),
-    Parameter("aovs", "integrator.log_scales"),
-    Parameter("merged", "integrator.feature_x"),
-    *(
-        Parameter(scene, f"integrator.{name}", along)  # also of splats that the ball hides
-        for scene in ("hybrid", "hybrid_display")
-        for name, along in ALONG.items()
-    ),
-    Parameter("hybrid", "ball.bsdf.reflectance.value"),
-    Parameter("hybrid", "light.emitter.radiance.value"),
-    Parameter("point_light", "light.intensity.value"),
-    Parameter("constant_emitter", "integrator.means", RIGHT),
-    Parameter("constant_emitter", "light.radiance.value"),
-    Parameter("hidden_emitters", "light.emitter.radiance.value"),
-    Parameter("hybrid_display", "light.emitter.radiance.value"),
-    Parameter("hybrid_display", "sky.radiance.value"),
+    *pairs("thin_lens", keys_of("sensor", "aperture_radius focus_distance")),
+    *pairs("sky_defocused", keys_of("sensor", "aperture_radius focus_distance"), thresholds=TEXELS),
+    *pairs("calibrated", keys_of("sensor", " ".join(DISTORTION))),
+    *pairs("rolling_shutter", keys_of("sensor", "k4")),
     *(
         parameter
-        for scene in ("shapes", "merged")
-        for parameter in (
-            Parameter(scene, "shape.data", np.outer(SOME, [*RIGHT, 0.1, 0.1, 0.1, *TURN]).ravel()),
-            Parameter(scene, "shape.opacities", SOME),
-            Parameter(scene, "shape.sh_coeffs", np.repeat(SOME, 12)),
-        )
+        for lens, names in ZEROS.items()
+        for parameter in pairs(f"{lens}_of_zeros", keys_of("sensor", " ".join(names)), epsilon=0.03)
     ),
     *(
-        Parameter(scene, f"integrator.{name}", RIGHT if name == "means" else 1.0)
-        for scene in ("sky", "sky_display", "image", "image_display")
-        for name in ("means", "sh0", "logit_opacities")
-    ),
-    Parameter("sky", "sky.data"),
-    Parameter("sky", "sensor.to_world", AROUND, thresholds=TEXELS),
-    Parameter("sky_display", "sky.data"),
-    Parameter("sky_defocused", "sky.data"),
-    Parameter("sky_defocused", "sensor.aperture_radius", thresholds=TEXELS),
-    Parameter("sky_defocused", "sensor.focus_distance", thresholds=TEXELS),
-    *(
-        Parameter(f"sky_{lens}", f"sensor.{name}", size, thresholds=TEXELS)
+        parameter
         for lens, values in LENSES.items()
-        for name, size in (("fx", 10.0), ("cy", 10.0), *((name, 0.2) for name in values))
+        for names, size in (("fx cy", 10.0), (" ".join(values), 0.2))
+        for parameter in pairs(f"sky_{lens}", keys_of("sensor", names), size, thresholds=TEXELS)
     ),
-    Parameter("image", "integrator.background.data"),
-    Parameter("image_display", "integrator.background.data"),
+    # Surfaces and lights
+    Parameter("hybrid", "ball.bsdf.reflectance.value"),
+    *pairs("hybrid hidden_emitters hybrid_display", ["light.emitter.radiance.value"]),
+    Parameter("point_light", "light.intensity.value"),
+    Parameter("constant_emitter", "light.radiance.value"),
+    Parameter("hybrid_display", "sky.radiance.value"),
+    *(Parameter(scene, "sky.data") for scene in ("sky", "sky_display", "sky_defocused")),
+    *(Parameter(scene, "integrator.background.data") for scene in ("image", "image_display")),
 ]
 
 
