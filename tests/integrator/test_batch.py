@@ -68,7 +68,7 @@ def gradients(sensor, weights, keys=None) -> list[np.ndarray]:
 
 
 def test_gradients_of_a_batch_are_sums_over_its_sensors():
-    """Those of a sensor come from its part of the film."""
+    """Gradients for a sensor come from its part of the film."""
     weights = weights_of()
     found = gradients(batch(), weights)
     actual, of_sensors = found[: -len(SENSORS)], found[-len(SENSORS) :]

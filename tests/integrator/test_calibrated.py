@@ -68,7 +68,7 @@ def test_pinhole_rays_match_perspective(view):
     ids=lambda value: getattr(value, "name", str(value)),
 )
 def test_points_on_rays_project_to_their_pixels(sensor, time, exposed, shutter):
-    """By the reference's camera at the time of the exposure, or of the row."""
+    """The reference's camera is that at the time of the exposure, or of the row."""
     ray, weight, sample = sampled_rays(sensor.load(**shutter), time)
     assert (weight == 1).all() and (np.array(ray.time) == time).all()
     distances = np.random.default_rng(4).uniform(1, 8, dr.width(ray.o))
