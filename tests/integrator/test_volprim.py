@@ -103,13 +103,10 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_splats_differ_from_volprim(name):
-    with pytest.raises(AssertionError, match="worst at"):
-        check_difference(*WRONG[name])
+APPROXIMATIONS = {"low-pass": {"low_pass": 0.3}, "projected at the mean": {"projection": "ewa"}}
 
 
-@pytest.mark.parametrize("settings", [{"low_pass": 0.3}, {"projection": "ewa"}], ids=str)
-def test_approximations_differ_from_volprim(settings):
+@pytest.mark.parametrize("name", [*WRONG, *APPROXIMATIONS])
+def test_wrong_splats_and_approximations_differ_from_volprim(name):
     with pytest.raises(AssertionError, match="worst at"):
-        check_difference(SMALL, **settings)
+        check_difference(*WRONG.get(name, (SMALL,)), **APPROXIMATIONS.get(name, {}))

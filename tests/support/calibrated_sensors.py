@@ -115,11 +115,9 @@ FISHEYE = Calibrated("fisheye", LENSES["fisheye"], f=(13.0, 14.5))
 THIN_PRISM = Calibrated("thin prism", LENSES["thin prism"], f=(13.0, 14.5))
 FILM = View("", 37, 29)  # without a crop window
 
-
 # A fold within the film.
 BARREL = Calibrated("barrel", LENSES["barrel"], FILM, f=(26.0, 26.0), c=(19.0, 14.0))
 STATIC_SENSORS = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM]
-
 
 by_name = {"ids": lambda sensor: sensor.name}
 
@@ -157,7 +155,6 @@ SENSORS = {
     "thinlens": {"aperture_radius": 0.125, "focus_distance": 3.0},
     "orthographic": {},
 }
-
 
 POSES = {"rotated": VIEWS[1].to_world, "mirrored": VIEWS[3].to_world}
 SCALED = {

@@ -41,9 +41,8 @@ def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **ot
         **({} if nested is None else {"nested": {"type": nested, "max_depth": max_depth}}),
         **tensors,
         **settings,
+        **({} if light is None else {"light": light}),
     }
-    if light is not None:
-        integrator["light"] = light
     return mi.load_dict({"type": "scene", "integrator": integrator, **others})
 
 
@@ -86,13 +85,10 @@ def along_rays(scene, origins, directions):
     mi.render(scene)  # it gets to know the splats
     nested, sampler = scene.integrator().state.nested, mi.load_dict({"type": "independent"})
     sampler.seed(0, len(origins))
-    ray = mi.Ray3f(mi.Point3f(*_columns(origins)), mi.Vector3f(*_columns(directions)))
+    origins, directions = (np.ascontiguousarray(v.T, np.float32) for v in (origins, directions))
+    ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions))
     radiance, *_ = nested.sample(dr.ADMode.Primal, scene, sampler, ray, mi.Bool(True), δL=None)
     return rows(radiance)
-
-
-def _columns(values):
-    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in values.T]
 
 
 def radiance_of(seen, is_open=True):
