@@ -200,12 +200,6 @@ def test_background_shows_where_there_are_no_splats():
     assert (image[..., 3] == 0).all()
 
 
-def test_film_border_does_not_change_the_image():
-    scene = Scene(VIEWS[-1])
-    image = fresh_image(scene, rfilter="box", samples=1, sample_border=True)
-    assert np.array_equal(image, fresh_image(scene, rfilter="box", samples=1))
-
-
 def test_every_way_to_call_gives_the_same_image():
     views = VIEWS[1], VIEWS[-1]
     scene = Scene(views[0])

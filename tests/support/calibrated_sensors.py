@@ -151,11 +151,6 @@ def scaled(matrix, *factors) -> tuple:
     return tuple(map(tuple, np.array(matrix) @ np.diag([*factors, 1.0])))
 
 
-SENSORS = {
-    "thinlens": {"aperture_radius": 0.125, "focus_distance": 3.0},
-    "orthographic": {},
-}
-
 POSES = {"rotated": VIEWS[1].to_world, "mirrored": VIEWS[3].to_world}
 SCALED = {
     "scaled": scaled(VIEWS[1].to_world, 3.0, 3.0, 3.0),
@@ -165,9 +160,8 @@ SCALED = {
 
 
 def own_sensor(kind, view) -> dict:
-    return view.sensor_like(
-        kind, **SENSORS[kind], **({"fov": view.fov} if kind == "thinlens" else {})
-    )
+    aperture = {"fov": view.fov, "aperture_radius": 0.125, "focus_distance": 3.0}
+    return view.sensor_like(kind, **(aperture if kind == "thinlens" else {}))
 
 
 def own_camera(view) -> reference.Camera:

@@ -9,7 +9,7 @@ from support.helpers import rows
 from support.views import to_linear
 
 
-def gaussians(means, scale=0.3, opacity=0.9, color=1.0, count=None) -> splatting.Gaussians:
+def gaussians(means, scale=0.3, opacity=0.9, color=1.0) -> splatting.Gaussians:
     """Balls of one size and colour."""
     means = np.atleast_2d(np.asarray(means, np.float32))
     n = len(means)
