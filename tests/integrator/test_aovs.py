@@ -2,32 +2,23 @@
 
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import clear
-from support.views import VIEWS, Scene, gradients_of, image_of, tensors
+from support.views import VIEWS, Scene, image_of
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 
 # Tolerances of test_splats: single precision, relative to the largest value of an array.
-IMAGE, GRADIENTS = 1e-5, 1e-4
-
-STEP = 1e-7
+IMAGE = 1e-5
 
 
-# ----------------------------------------------------------------------------------------------
-# The reference
-# ----------------------------------------------------------------------------------------------
-
-
-def normals_of(gaussians, camera, log_scales) -> np.ndarray:
-    """(N, 3): the shortest axis by ``log_scales``, towards the camera."""
+def normals_of(gaussians, camera) -> np.ndarray:
+    """(N, 3): the shortest axis, towards the camera."""
     rotations = reference.quat_to_rotation(gaussians.quats)
-    shortest = np.argmin(log_scales, axis=1)
+    shortest = np.argmin(gaussians.log_scales, axis=1)
     normals = rotations[np.arange(len(shortest)), :, shortest]
     away = np.sum(normals * (gaussians.means - camera.center), axis=1) > 0
     return np.where(away[:, None], -normals, normals)
@@ -51,44 +42,37 @@ def features_of(scene, channels=4) -> np.ndarray:
     return rng.normal(0, 1, (scene.count, channels)).astype(np.float32).astype(np.float64)
 
 
-def load(scene, aovs, sensor=None, **others):
-    integrator = scene.settings | tensors(scene.gaussians) | {"aovs": aovs} | others
-    sensor = sensor or scene.view.sensor()
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+def with_aovs(scene, aovs="n:normal, f:feature_mine, z:depth, a:alpha", sensor=None, **others):
+    feature = {} if "feature" not in aovs else {"feature_mine": mi.TensorXf(features_of(scene))}
+    return scene.load_with(sensor, aovs=aovs, **feature | others)
 
 
-def with_features(scene, aovs="n:normal, f:feature_mine, z:depth", **others):
-    return load(scene, aovs, feature_mine=mi.TensorXf(features_of(scene)), **others)
-
-
-def channels_of(scene, gaussians=None, features=None) -> np.ndarray:
-    """(H, W, 8): normal, features, depth. Which axis is the shortest does not change."""
-    gaussians, camera = gaussians or scene.gaussians, scene.camera
+def channels_of(scene) -> np.ndarray:
+    """(H, W, 9): normal, features, depth, alpha."""
+    gaussians, camera = scene.gaussians, scene.camera
     depths = reference.project(gaussians, camera).depths[:, None]
-    features = features_of(scene) if features is None else features
-    normals = normals_of(gaussians, camera, scene.gaussians.log_scales)
-    columns = np.concatenate([normals, features, depths], axis=1)
+    columns = normals_of(gaussians, camera), features_of(scene), depths, np.ones_like(depths)
+    columns = np.concatenate(columns, axis=1)
     return composited(gaussians, camera, columns)[scene.view.window]
 
 
-# ----------------------------------------------------------------------------------------------
-# Images
-# ----------------------------------------------------------------------------------------------
-
-
+@pytest.mark.parametrize("pixel_format", ["rgb", "rgba"])
 @pytest.mark.parametrize("view", [VIEWS[1], VIEWS[3], VIEWS[13]], ids=lambda view: view.name)
 @pytest.mark.parametrize("srgb_primitives", [False, True])
-def test_normals_and_features_are_composited_without_colour_conversion(view, srgb_primitives):
-    """Not converted as colours are; under Mitsuba's names."""
+def test_channels_are_composited_behind_the_colors(view, srgb_primitives, pixel_format):
+    """Not converted as colours are; as they are listed, under Mitsuba's names."""
     scene = clear(Scene(view, srgb_primitives=srgb_primitives))
-    loaded = with_features(scene)
-    image = image_of(loaded)
+    loaded = with_aovs(scene, sensor=view.sensor(pixel_format))
+    (*image,) = np.moveaxis(image_of(loaded), -1, 0)
+    colors, channels = image[: len(pixel_format)], np.stack(image[len(pixel_format) :], axis=-1)
+    plain = image_of(scene.load(pixel_format=pixel_format))
+    np.testing.assert_array_equal(np.stack(colors, axis=-1), plain)
     expected = channels_of(scene)
-    np.testing.assert_allclose(image[..., 4:], expected, atol=IMAGE * np.abs(expected).max())
-    names = ["n.X", "n.Y", "n.Z", "f.0", "f.1", "f.2", "f.3", "z.T"]
+    np.testing.assert_allclose(channels, expected, atol=IMAGE * np.abs(expected).max())
+    names = ["n.X", "n.Y", "n.Z", "f.0", "f.1", "f.2", "f.3", "z.T", "a.I"]
     assert loaded.integrator().aov_names() == names
     film = loaded.sensors()[0].film()
-    assert [c.name for c in film.bitmap().struct_()] == [*"RGBA", *names]
+    assert [c.name for c in film.bitmap().struct_()] == [*pixel_format.upper(), *names]
 
 
 def test_gaussian_with_nonfinite_feature_is_not_drawn():
@@ -97,8 +81,7 @@ def test_gaussian_with_nonfinite_feature_is_not_drawn():
     spoiled = features_of(scene)
     row = int(np.argmax(np.abs(scene.gradients(scene.weights())["logit_opacities"])))
     spoiled[row, 1] = np.nan
-    loaded = load(scene, "f:feature_mine", feature_mine=mi.TensorXf(spoiled))
-    image = image_of(loaded)
+    image = image_of(with_aovs(scene, "f:feature_mine", feature_mine=mi.TensorXf(spoiled)))
     hidden = scene.gaussians.logit_opacities.copy()
     hidden[row] = -30
     gone = replace(scene.gaussians, logit_opacities=hidden)
@@ -106,71 +89,22 @@ def test_gaussian_with_nonfinite_feature_is_not_drawn():
     np.testing.assert_allclose(image[..., 4:], expected, atol=IMAGE * np.abs(expected).max())
 
 
-# ----------------------------------------------------------------------------------------------
-# Derivatives
-# ----------------------------------------------------------------------------------------------
-
-NAMES = (*PARAMETER_NAMES, "feature_mine")
-
-
-@pytest.mark.slow
-def test_gradients_equal_differences_of_the_reference():
-    """Along a random direction of each parameter, with weights on the extra channels alone."""
-    scene = clear(Scene())
-    rng = np.random.default_rng(5)
-    weights = np.zeros((*scene.weights().shape[:2], 12))
-    weights[..., 4:] = rng.normal(0, 1, (*weights.shape[:2], 8))
-    actual = gradients_of(with_features(scene), weights, NAMES)
-    values = vars(scene.gaussians) | {"feature_mine": features_of(scene)}
-    for name in NAMES:
-        direction = rng.normal(0, 1, values[name].shape)
-        both = []
-        for sign in (1, -1):
-            moved = dict(values)
-            moved[name] = values[name] + sign * STEP * direction
-            features = moved.pop("feature_mine")
-            both.append(channels_of(scene, reference.Gaussians(**moved), features))
-        expected = np.sum(weights[..., 4:] * (both[0] - both[1])) / (2 * STEP)
-        terms = actual[name].reshape(direction.shape) * direction
-        assert terms.sum() == pytest.approx(expected, abs=GRADIENTS * np.abs(terms).sum()), name
-        if name not in ("sh0", "shN"):
-            assert np.abs(terms).sum() > 0
+def test_several_samples_average_the_channels():
+    """Depth and alpha of each sample; the alpha of the film is the same number."""
+    scene = Scene()
+    sampled, alone = (
+        image_of(with_aovs(scene, "z:depth, a:alpha", scene.view.sensor(samples=n)), seed=2)
+        for n in (4, 1)
+    )
+    # The mean of the samples' transmittances, subtracted from one before or after.
+    np.testing.assert_allclose(sampled[..., 5], sampled[..., 3], atol=1e-6)
+    assert np.abs(sampled - alone)[..., 4].max() > 0.01
 
 
-def test_forward_mode_is_the_transpose_of_the_gradients():
-    scene = clear(Scene())
-    rng = np.random.default_rng(7)
-    weights = rng.normal(0, 1, (*scene.weights().shape[:2], 12))
-    gradients = gradients_of(with_features(scene), weights, NAMES)
-    loaded = with_features(scene)
-    params = mi.traverse(loaded)
-    total = size = 0.0
-    for name in NAMES:
-        value = params[f"integrator.{name}"]
-        direction = rng.normal(0, 1, value.shape).astype(np.float32)
-        dr.enable_grad(value)
-        dr.set_grad(value, type(value)(direction))
-        terms = gradients[name].reshape(direction.shape) * direction
-        total, size = total + terms.sum(), size + np.abs(terms).sum()
-    tangent = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-    assert np.sum(tangent * weights) == pytest.approx(total, abs=GRADIENTS * size)
-
-
-# ----------------------------------------------------------------------------------------------
-# Errors
-# ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("aovs", "shape", "message"),
-    [
-        ("f:feature_other", (40, 2), "types of depth, alpha, normal, feature_mine, got"),
-        ("f:feature_mine", (39, 2), r"feature_mine must have the shape \(N, C\), with N = 40"),
-        ("f:feature_mine", (40,), r"got \(40,\)"),
-        ("f:feature_mine", (40, 2, 2), r"got \(40, 2, 2\)"),
-    ],
-)
-def test_wrong_features_are_refused(aovs, shape, message):
-    tensor = mi.TensorXf(np.zeros(shape, np.float32))
-    with pytest.raises((ValueError, RuntimeError), match=message):
-        load(Scene(), aovs, feature_mine=tensor)
+def test_unused_channels_cost_nothing():
+    """The planes of the frame are those of the features."""
+    for aovs, count in (("", 4), ("a:alpha", 4), ("z:depth", 5)):
+        loaded = with_aovs(Scene(), aovs)
+        mi.render(loaded)
+        frames = loaded.integrator().state.cache.kept["frames 0"].value
+        assert len(frames[0][0].planes()) == count

@@ -3,7 +3,6 @@
 import re
 
 import annotated_types
-import mitsuba as mi
 import pytest
 from conftest import REPOSITORY
 from support.viewer_rendering import VIEWER_RENDERING
@@ -14,11 +13,6 @@ from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 
 KINDS = {bool: "bool", int: "int", float: "float", str: "string"}
-
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
 
 
 def row(name) -> str:

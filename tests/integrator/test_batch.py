@@ -1,11 +1,10 @@
 """Sensors of type ``batch``: images side by side, each as if its sensor were alone."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import bitwise, clear
-from support.views import VIEWS, Scene, gradient, image_of, tensors
+from support.views import VIEWS, Scene, gradients_of, image_of
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -19,13 +18,11 @@ GRADIENTS = 1e-4
 
 def load(sensor, wall=False, **others):
     scene = clear(SCENE)
-    objects = {"integrator": scene.settings | tensors(scene.gaussians) | others, "sensor": sensor}
-    if wall:
-        emitter = {"type": "area", "radiance": 0.5}
-        position = scene.camera.rotation.T @ [0, 0, 2] + scene.camera.center
-        place = mi.ScalarTransform4f().translate(position)
-        objects["wall"] = {"type": "sphere", "radius": 0.5, "to_world": place, "emitter": emitter}
-    return mi.load_dict({"type": "scene", **objects})
+    position = scene.camera.rotation.T @ [0, 0, 2] + scene.camera.center
+    place = mi.ScalarTransform4f().translate(position)
+    emitter = {"type": "area", "radiance": 0.5}
+    ball = {"type": "sphere", "radius": 0.5, "to_world": place, "emitter": emitter}
+    return scene.load_with(sensor, {"wall": ball} if wall else None, **others)
 
 
 def batch(samples=1, rfilter="box", pixel_format="rgba", **film):
@@ -58,70 +55,47 @@ def test_images_are_side_by_side(wall, pixel_format):
         assert differs.mean() <= (0.1 if wall else 0)
 
 
+def fovs_of(loaded) -> list[str]:
+    params = mi.traverse(loaded)
+    return [key for key in params.keys() if key.endswith(".x_fov")]  # noqa: SIM118
+
+
+def gradients(sensor, weights, keys=None) -> list[np.ndarray]:
+    """Gradients for the Gaussians, and for the fields of view of the sensors."""
+    loaded = load(sensor)
+    of_gaussians = [f"integrator.{name}" for name in (*PARAMETER_NAMES, "background")]
+    return list(gradients_of(loaded, weights, keys or of_gaussians + fovs_of(loaded), "").values())
+
+
 def test_gradients_of_a_batch_are_sums_over_its_sensors():
+    """Gradients for a sensor come from its part of the film."""
     weights = weights_of()
-
-    def gradients(sensor, weights):
-        loaded = load(sensor)
-        params = mi.traverse(loaded)
-        keys = [f"integrator.{name}" for name in (*PARAMETER_NAMES, "background")]
-        for key in keys:
-            dr.enable_grad(params[key])
-        image = mi.render(loaded, params)
-        dr.backward(dr.sum(image * mi.TensorXf(np.ascontiguousarray(weights)), axis=None))
-        return [gradient(params[key]) for key in keys]
-
-    actual = gradients(batch(), weights)
+    found = gradients(batch(), weights)
+    actual, of_sensors = found[: -len(SENSORS)], found[-len(SENSORS) :]
     of_each = [
         gradients(view.sensor(), part) for view, part in zip(SENSORS, parts(weights), strict=True)
     ]
-    for value, *terms in zip(actual, *of_each, strict=True):
+    for value, *terms in zip(actual, *(one[:-1] for one in of_each), strict=True):
         size = sum(np.abs(term).max() for term in terms)
         np.testing.assert_allclose(value, sum(terms), rtol=0, atol=1e-5 * size)
-    assert bitwise(actual) == bitwise(gradients(batch(), weights))
-
-
-def test_gradient_of_a_sensor_comes_from_its_part_of_the_film():
-    weights = weights_of()
-    loaded = load(batch())
-    params = mi.traverse(loaded)
-    keys = [key for key in params.keys() if key.endswith(".x_fov")]  # noqa: SIM118
-    assert len(keys) == len(SENSORS)
-    for key in keys:
-        dr.enable_grad(params[key])
-    dr.backward(dr.sum(mi.render(loaded, params) * mi.TensorXf(weights), axis=None))
-    for key, view, part in zip(keys, SENSORS, parts(weights), strict=True):
-        alone = load(view.sensor())
-        own = mi.traverse(alone)
-        name = next(k for k in own.keys() if k.endswith(".x_fov"))  # noqa: SIM118
-        dr.enable_grad(own[name])
-        part = mi.TensorXf(np.ascontiguousarray(part))
-        dr.backward(dr.sum(mi.render(alone, own) * part, axis=None))
-        assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
+    for of_sensor, (*_, alone) in zip(of_sensors, of_each, strict=True):
+        assert of_sensor == pytest.approx(alone, rel=1e-4) and alone != 0
+    assert bitwise(actual) == bitwise(gradients(batch(), weights)[: -len(SENSORS)])
 
 
 def test_a_batch_may_contain_a_sensor_twice():
-    """Its gradient is the sum of those of both parts."""
+    """Its gradient is the sum of those of both parts; its name is that of its last place."""
     weights, view = weights_of(), SENSORS[0]
     twice = mi.load_dict(view.sensor())
-    loaded = load(batch() | {"view_0": twice, "view_2": twice})
-    params = mi.traverse(loaded)
-    fovs = [key for key in params.keys() if key.endswith(".x_fov")]  # noqa: SIM118
-    assert len(fovs) == 2  # its name is that of its last place
-    (key,) = set(fovs) - {"sensor.view_1.x_fov"}
-    dr.enable_grad(params[key])
-    image = mi.render(loaded, params)
-    order = (SENSORS[0], SENSORS[1], SENSORS[0])
-    for part, one in zip(parts(np.array(image)), order, strict=True):
+    sensor = batch() | {"view_0": twice, "view_2": twice}
+    loaded = load(sensor)
+    fovs = fovs_of(loaded)
+    assert len(fovs) == 2
+    (found,) = gradients(sensor, weights, sorted({*fovs} - {"sensor.view_1.x_fov"}))
+    for part, one in zip(parts(image_of(loaded)), (view, SENSORS[1], view), strict=True):
         np.testing.assert_array_equal(part, image_of(load(one.sensor())))
-    dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
-    alone = load(view.sensor())
-    own = mi.traverse(alone)
-    name = next(k for k in own.keys() if k.endswith(".x_fov"))  # noqa: SIM118
-    dr.enable_grad(own[name])
-    both = sum(parts(weights)[::2])
-    dr.backward(dr.sum(mi.render(alone, own) * mi.TensorXf(np.ascontiguousarray(both)), axis=None))
-    assert gradient(params[key]) == pytest.approx(gradient(own[name]), rel=1e-4)
+    *_, expected = gradients(view.sensor(), sum(parts(weights)[::2]))
+    assert found == pytest.approx(expected, rel=1e-4)
 
 
 def test_a_crop_window_is_refused():

@@ -19,36 +19,20 @@ from support.calibrated_sensors import (
     OPENCV,
     PINHOLE,
     STATIC_SENSORS,
-    THIN_PRISM,
     Calibrated,
     by_name,
     clear_gaussians,
     sampled_rays,
     splats_scene,
 )
-from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES, points_at
 from support.sensors import PIXELS
-from support.views import VIEWS, image_of
+from support.views import VIEWS, gradients_of, image_of
 
-from drgs.reference import effects
+from drgs.gaussians.parameters import PARAMETER_NAMES
 
 MOVING = [replace(s, close=CLOSE) for s in (PINHOLE, OPENCV, FISHEYE)]
 ROLLING = [replace(s, shutter="rolling") for s in MOVING]
-
-
-def assert_rays_project_to_samples(rays, sensor, times) -> None:
-    """Compare samples with points on rays, projected by the reference's camera at each time."""
-    ray, weight, sample = rays
-    assert (weight == 1).all()
-    distances = np.random.default_rng(4).uniform(1, 8, dr.width(ray.o))
-    world = np.array(ray(mi.Float(distances))).T.astype(np.float64)
-    expected = sample * sensor.size + sensor.corner
-    for point, place, time in zip(world, expected, np.broadcast_to(times, 200), strict=True):
-        camera = sensor.camera_at(time)
-        points = (point[None] - camera.center) @ camera.rotation.T
-        assert sensor.lens.is_seen(camera, points).all()
-        assert np.abs(sensor.lens.film_points(camera, points) - place).max() < PIXELS
 
 
 def row_times(sensor, sample) -> np.ndarray:
@@ -72,40 +56,30 @@ def test_pinhole_rays_match_perspective(view):
     np.testing.assert_array_equal(np.array(ray.time), np.array(expected.time))
 
 
-@pytest.mark.parametrize("sensor", STATIC_SENSORS, **by_name)
-def test_points_on_rays_project_to_their_pixels(sensor):
-    assert_rays_project_to_samples(sampled_rays(sensor.load()), sensor, 0)
-
-
-@pytest.mark.parametrize("sensor", MOVING, **by_name)
-@pytest.mark.parametrize("time", [0.0, 0.375, 1.0])
-def test_global_shutter_uses_the_pose_at_the_ray_time(sensor, time):
-    rays = sampled_rays(sensor.load(), time)
-    assert_rays_project_to_samples(rays, sensor, time)
-    np.testing.assert_array_equal(np.array(rays[0].time), time)
-
-
-@pytest.mark.parametrize("sensor", ROLLING, **by_name)
-def test_rolling_shutter_uses_the_pose_at_the_row_time(sensor):
-    """Whatever the ray's time."""
-    rays = sampled_rays(sensor.load(), time=0.75)
-    assert_rays_project_to_samples(rays, sensor, row_times(sensor, rays[2]))
-
-
 @pytest.mark.parametrize(
-    ("close", "time", "expected"), [(4.0, 2.5, 0.25), (2.0, 2.0, 0)], ids=["late", "instant"]
+    ("sensor", "time", "exposed", "shutter"),
+    [
+        *((sensor, 0.0, 0.0, {}) for sensor in STATIC_SENSORS),
+        *((sensor, time, time, {}) for sensor in MOVING for time in (0.0, 0.375, 1.0)),
+        (MOVING[0], 2.5, 0.25, {"shutter_open": 2.0, "shutter_close": 4.0}),
+        (MOVING[0], 2.0, 0.0, {"shutter_open": 2.0, "shutter_close": 2.0}),
+        *((sensor, 0.75, None, {}) for sensor in ROLLING),  # whatever the ray's time
+    ],
+    ids=lambda value: getattr(value, "name", str(value)),
 )
-def test_ray_times_are_within_the_exposure(close, time, expected):
-    loaded = MOVING[0].load(shutter_open=2.0, shutter_close=close)
-    rays = sampled_rays(loaded, time=time)
-    assert_rays_project_to_samples(rays, MOVING[0], expected)
-    assert (np.array(rays[0].time) == time).all()
-
-
-def test_moving_camera_is_open_from_0_to_1_by_default():
-    loaded = MOVING[0].load()
-    assert (loaded.shutter_open(), loaded.shutter_open_time()) == (0, 1)
-    assert PINHOLE.load().shutter_open_time() == 0
+def test_points_on_rays_project_to_their_pixels(sensor, time, exposed, shutter):
+    """The reference's camera is that at the time of the exposure, or of the row."""
+    ray, weight, sample = sampled_rays(sensor.load(**shutter), time)
+    assert (weight == 1).all() and (np.array(ray.time) == time).all()
+    distances = np.random.default_rng(4).uniform(1, 8, dr.width(ray.o))
+    world = np.array(ray(mi.Float(distances))).T.astype(np.float64)
+    expected = sample * sensor.size + sensor.corner
+    times = row_times(sensor, sample) if exposed is None else np.full(200, exposed)
+    for point, place, at in zip(world, expected, times, strict=True):
+        camera = sensor.camera_at(at)
+        points = (point[None] - camera.center) @ camera.rotation.T
+        assert sensor.lens.is_seen(camera, points).all()
+        assert np.abs(sensor.lens.film_points(camera, points) - place).max() < PIXELS
 
 
 # Its image is a circle of a radius of 16 px.
@@ -160,47 +134,40 @@ def test_rays_end_at_the_far_plane(sensor):
             assert sensor.lens.depths(camera, point[None])[0] == pytest.approx(depth, rel=2e-6)
 
 
+SPLATS_SENSORS = [
+    replace(sensor, view=replace(FILM, crop=(5, 4, 26, 21)), close=CLOSE, shutter=shutter)
+    for sensor in (PINHOLE, OPENCV, FISHEYE)
+    for shutter in ("global", "rolling")
+]
+
+
 @pytest.mark.parametrize(
-    ("sensor", "name"),
-    [(OPENCV, name) for name in ("fx", "cy", "k1", "p2")]
-    + [(THIN_PRISM, name) for name in ("fx", "k1", "p2", "sy1")],
-    ids=lambda value: getattr(value, "name", value),
+    "sensor",
+    [*STATIC_SENSORS, BARREL, *(pytest.param(s, marks=pytest.mark.slow) for s in SPLATS_SENSORS)],
+    ids=lambda s: f"{s.name}, {s.shutter if s.close else 'static'}",
 )
-def test_rays_are_differentiable_in_the_calibration(sensor, name):
-    """Against central differences, in single precision; the search for a ray is not unrolled."""
-    loaded = sensor.load()
-    params = mi.traverse(loaded)
-    value = float(params[name][0])
-    sample = mi.Point2f(np.random.default_rng(0).uniform(size=(2, 20)).astype(np.float32))
-
-    def directions(value) -> mi.Vector3f:
-        params[name] = value
-        params.update()
-        return loaded.sample_ray(0.0, 0.5, sample, mi.Point2f(0.5))[0].d
-
-    step = 2.0**-6 if name in ("fx", "cy") else 2.0**-10
-    after, before = (np.array(directions(mi.Float(value + s)), float) for s in (step, -step))
-    expected = (after - before) / (2 * step)
-    attached = mi.Float(value)
-    dr.enable_grad(attached)
-    d = directions(attached)
-    dr.forward(attached, flags=dr.ADFlag.ClearEdges)
-    # Differences: 1e-7 / step of rounding, step^2 times a third derivative.
-    size = np.abs(expected).max()
-    np.testing.assert_allclose(np.array(dr.grad(d)), expected, rtol=0, atol=3e-3 * size)
-
-
-@pytest.mark.parametrize("sensor", [*STATIC_SENSORS, BARREL], **by_name)
 def test_splats_through_the_sensor_match_the_reference(sensor):
-    camera = replace(sensor.camera, near=0.01)
-    gaussians, rendered = clear_gaussians(
-        sensor,
-        lambda gaussians: effects.render(
-            gaussians, camera, sensor.lens, threshold_width=NEAR_THRESHOLD
-        ),
-    )
+    gaussians, rendered = clear_gaussians(sensor)
     image = image_of(splats_scene(sensor, gaussians))
     expected = np.concatenate([rendered.image, rendered.alpha[..., None]], axis=-1)
+    expected = expected[sensor.view.window]
     # Tolerance of test_rendering in float32; Mitsuba's numbers are float32 too.
-    np.testing.assert_allclose(image, expected[sensor.view.window], rtol=0, atol=5e-5)
+    np.testing.assert_allclose(image, expected, rtol=0, atol=5e-5)
     assert image[..., 3].max() > 0.8
+    if sensor.close:
+        still = image_of(splats_scene(replace(sensor, close=None), gaussians))
+        assert np.abs(still - expected).max() > 0.02
+
+
+def test_sharing_kernels_among_poses_changes_no_byte(monkeypatch):
+    """More poses than :data:`PASSES_PER_KERNEL` are compiled in parts."""
+    gaussians, _ = clear_gaussians(SPLATS_SENSORS[0])
+    sensor = SPLATS_SENSORS[0].dictionary(shutter_samples=5)
+    weights = np.random.default_rng(1).normal(0, 1, (21, 26, 4))
+    results = []
+    for poses in (16, 2):
+        monkeypatch.setattr("drgs.integrator.sensor_render.PASSES_PER_KERNEL", poses)
+        gradients = gradients_of(splats_scene(sensor, gaussians), weights, PARAMETER_NAMES)
+        results.append({"image": image_of(splats_scene(sensor, gaussians)), **gradients})
+    for name, expected in results[0].items():
+        np.testing.assert_array_equal(results[1][name], expected, err_msg=name)

@@ -24,18 +24,15 @@ from support.lit_scenes import camera, gaussians
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
 
+SPLATPATH = {"nested": {"type": "splatpath", "max_depth": 3}}
 ROUTES = {
     "no surfaces": {},
     "`path`": {"nested": {"type": "path", "max_depth": 3}},
     "`prb`": {"nested": {"type": "prb", "max_depth": 3}},
-    "`splatpath`": {"nested": {"type": "splatpath", "max_depth": 3}},
-    "`rays`": {"light": "rays", "nested": {"type": "splatpath", "max_depth": 3}},
-    "`probe`": {
-        "light": "probe",
-        "probes": "panel",
-        "nested": {"type": "splatpath", "max_depth": 3},
-    },
-    "`shadows`": {"shadows": "panel", "nested": {"type": "splatpath", "max_depth": 3}},
+    "`splatpath`": SPLATPATH,
+    "`rays`": {"light": "rays", **SPLATPATH},
+    "`probe`": {"light": "probe", "probes": "panel", **SPLATPATH},
+    "`shadows`": {"shadows": "panel", **SPLATPATH},
 }
 """Settings of the integrator, by the heading of their column."""
 
@@ -255,59 +252,45 @@ def load(case: Case, route: str) -> mi.Scene:
         **splats(),
         **ROUTES[route],
     }
-    clean = {
-        key: {k: v for k, v in value.items() if v is not None} if isinstance(value, dict) else value
-        for key, value in objects.items()
-        if value is not None
-    }
-    return mi.load_dict({"type": "scene", **clean})
+    objects = {name: value for name, value in objects.items() if value is not None}
+    return mi.load_dict({"type": "scene", **objects})
 
 
-class Derivative:
-    """The derivative of an image's weighted mean with respect to theta, by a route."""
+class Loss:
+    """An image's weighted mean by a route, as a function of theta."""
 
     def __init__(self, case: Case, route: str) -> None:
         self.case, self.scene = case, load(case, route)
         self.params = mi.traverse(self.scene)
         base = dr.detach(self.params[case.key])
         self.base = type(base)(base)
-        height, width = 8, 8
-        y, x = np.mgrid[:height, :width]
+        y, x = np.mgrid[:8, :8]
         weights = 1 + 0.5 * np.sin(0.7 * x + 0.4 * y)
         self.weights = mi.TensorXf(np.repeat(weights[..., None], 3, axis=2).astype(np.float32))
 
-    def put(self, theta) -> None:
+    def at(self, theta, **seeds):
         self.params[self.case.key] = self.case.move(self.base, theta)
         self.params.update()
-
-    def loss(self, image):
+        image = mi.render(self.scene, self.params, spp=1, **seeds)
         return dr.mean(image * self.weights, axis=None)
 
-    def attached(self):
+    def derivative(self, is_forward=False) -> float:
         theta = mi.Float(0)
         dr.enable_grad(theta)
-        self.put(theta)
-        image = mi.render(self.scene, self.params, seed=5, seed_grad=6, spp=1)
-        return theta, self.loss(image)
-
-    def backward(self) -> float:
-        theta, loss = self.attached()
+        loss = self.at(theta, seed=5, seed_grad=6)
+        if is_forward:
+            dr.set_grad(theta, 1.0)
+            return float(np.array(dr.forward_to(loss)).ravel()[0])
         dr.backward(loss)
         return float(dr.grad(theta)[0])
 
-    def forward(self) -> float:
-        theta, loss = self.attached()
-        dr.set_grad(theta, 1.0)
-        return float(np.array(dr.forward_to(loss)).ravel()[0])
-
-    def difference(self, seeds=2) -> float:
-        """The same paths on both sides."""
-        means = []
-        for sign in (1, -1):
-            self.put(dr.opaque(mi.Float, sign * self.case.step))
-            losses = [self.loss(mi.render(self.scene, seed=s, spp=1)) for s in range(seeds)]
-            means.append(np.mean([np.array(loss).ravel()[0] for loss in losses]))
-        return (means[0] - means[1]) / (2 * self.case.step)
+    def difference(self) -> float:
+        """The same paths on both sides, the mean of two seeds."""
+        above, below = (
+            np.mean([np.array(self.at(dr.opaque(mi.Float, s), seed=k)).ravel()[0] for k in (0, 1)])
+            for s in (self.case.step, -self.case.step)
+        )
+        return (above - below) / (2 * self.case.step)
 
 
 @dataclass(frozen=True)
@@ -335,16 +318,16 @@ class Found:
 
 
 def measure(case: Case, route: str) -> Found:
-    one = Derivative(case, route)
+    loss = Loss(case, route)
     try:
-        backward = one.backward()
+        backward = loss.derivative()
     except UnsupportedError as error:
         is_named = case.key in str(error) or "the Gaussians are not" in str(error)
         assert str(error).startswith("splats: ") and is_named, error
         return Found(is_refused=True)
-    difference = one.difference()
+    difference = loss.difference()
     try:
-        forward = Derivative(case, route).forward()
+        forward = Loss(case, route).derivative(is_forward=True)
     except UnsupportedError as refused:
         assert "forward mode" in str(refused) and case.key in str(refused), refused
         forward = backward

@@ -7,28 +7,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import drjit as dr
 import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
 from support.ellipsoids import (
-    GRADIENTS,
-    IMAGE,
+    MERGED,
     ROTATION,
     SCALE,
+    SHAPE_ATTRIBUTES,
     TRANSLATION,
     EllipsoidsCase,
-    assert_images_agree,
+    Merged,
+    assert_held_agree,
     gradients_held,
+    held_gradients,
     joined,
     scene_with,
-    shape_of,
     transform,
-    write_model,
 )
 from support.helpers import assert_arrays_agree, clear, single
-from support.views import VIEWS, Scene, image_of, tensors
+from support.splats_checks import GRADIENTS, IMAGE, assert_images_agree, write_gaussians
+from support.views import VIEWS, Scene, gradient, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -54,58 +56,6 @@ def test_shape_matches_the_reference(kind, degree):
     assert f"  gaussians = 40,\n  sh_degree = {degree}," in str(loaded.integrator())
 
 
-@both_kinds
-@pytest.mark.parametrize("degree", [1, 3])
-def test_file_renders_the_same_through_a_shape(kind, degree, tmp_path):
-    """To what float32 makes of exp, log and the sigmoid."""
-    scene = Scene(degree=degree)
-    path = write_model(tmp_path / "model.ply", scene.gaussians)
-    loaded = EllipsoidsCase().load(shape={"type": kind, "filename": path})
-    assert_images_agree(image_of(loaded), image_of(scene.load()))
-
-
-# With these approximations what is left is that volprim_rf_basic composites in the order in which a
-# ray enters the ellipsoids, passes over those entered within 1e-4 behind another, and does not draw
-# those that contain the camera: test_volprim.py measures each where it is alone. Of the mean
-# of this image they make 0.025. A tenth less of all opacities makes 0.07, quaternions read
-# otherwise 0.2, coefficients in another order 0.5.
-VOLPRIM = 0.04
-
-
-VOLPRIM_APPROXIMATIONS = {
-    "projection": "exact", "order": "pixel", "sh_direction": "pixel", "low_pass": 0.0,
-    "extent": 3.0, "alpha_max": 0.9999, "alpha_cut": 0.0, "transmittance_stop": 0.01,
-}  # fmt: skip
-
-
-@both_kinds
-def test_shapes_match_volprim_rf_basic(kind):
-    scene = EllipsoidsCase(degree=2, count=60)
-    held = scene.held
-    held["data"][:, 6:] /= np.linalg.norm(held["data"][:, 6:], axis=1, keepdims=True)
-
-    def rendered(held, integrator, **settings):
-        loaded = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": integrator, "srgb_primitives": False, **settings},
-                "sensor": scene.view.sensor(pixel_format="rgb"),
-                "shape": shape_of(held, kind),
-            }
-        )
-        return image_of(loaded, spp=16)
-
-    expected = rendered(held, "volprim_rf_basic", max_depth=256)
-
-    def error(**changes):
-        actual = rendered(held | changes, "splats", **VOLPRIM_APPROXIMATIONS)
-        return np.abs(actual - expected).mean() / expected.mean()
-
-    assert error() < VOLPRIM
-    assert error(opacities=0.9 * held["opacities"]) > 1.5 * VOLPRIM
-    assert error(data=held["data"] * np.repeat([1, -1, 1], [6, 3, 1])) > 4 * VOLPRIM
-
-
 # ----------------------------------------------------------------------------------------------
 # to_world
 # ----------------------------------------------------------------------------------------------
@@ -124,7 +74,7 @@ def follower(view):
 @pytest.mark.parametrize("names", ["shapes_to_world", "shapes_to_world_shape"])
 def test_moving_integrator_shape_or_camera_gives_the_same_image(kind, names, tmp_path):
     """In single precision: positions of 4 units, rounded to 2e-7, at 40 px to a unit: 1e-5 px."""
-    path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
+    path = write_gaussians(tmp_path / "model.ply", Scene(degree=3).gaussians)
     view = VIEWS[1]
     unmoved = image_of(scene_with({"filename": path}, view))
     moved = {"filename": path, "to_world": transform()}
@@ -139,7 +89,7 @@ def test_moving_integrator_shape_or_camera_gives_the_same_image(kind, names, tmp
 
 
 def test_each_shape_may_have_its_own_to_world(tmp_path):
-    path = write_model(tmp_path / "model.ply", Scene(degree=3).gaussians)
+    path = write_gaussians(tmp_path / "model.ply", Scene(degree=3).gaussians)
     half = mi.ScalarTransform4f().rotate([0, 0, 1], 180).scale(0.5)
     far = mi.ScalarTransform4f().translate([0.25, 0, 0.5])
     placed = {"a": transform(), "b": half, "c": far}
@@ -158,34 +108,80 @@ def test_each_shape_may_have_its_own_to_world(tmp_path):
     assert_images_agree(actual, expected, 3 * IMAGE)
 
 
-def test_tensors_are_moved_like_a_file(tmp_path):
-    scene = Scene(degree=2)
-    path = write_model(tmp_path / "model.ply", scene.gaussians)
-    from_file = mi.load_dict({"type": "splats", "filename": path, "to_world": transform()})
-    from_tensors = mi.load_dict(
-        {"type": "splats", **tensors(scene.gaussians), "to_world": transform()}
-    )
-    moved, same = from_file.gaussians.numpy(), from_tensors.gaussians.numpy()
+# ----------------------------------------------------------------------------------------------
+# Several shapes, and the integrator's own Gaussians
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [*MERGED, Merged(sh_degree=1)],
+    ids=["1, 2, 0", "3, 2, 0", "0, 0, 3", "0, 0, 0", "at most 1"],
+)
+def test_several_shapes_and_tensors_merge(scene):
+    scene = clear(scene)
+    loaded = scene.load()
+    assert [shape.id() for shape in loaded.shapes()] == ["first", "second"]
+    assert_images_agree(image_of(loaded), scene.image())
+    gaussians = loaded.integrator().gaussians
+    assert gaussians.num_gaussians == 75
+    expected = scene.gaussians
     for name in PARAMETER_NAMES:
-        np.testing.assert_array_equal(getattr(moved, name), getattr(same, name))
-    assert not np.array_equal(moved.shN, np.float32(scene.gaussians.shN))
+        np.testing.assert_allclose(
+            np.array(getattr(gaussians, name)), getattr(expected, name), rtol=1e-5, atol=1e-5
+        )
 
 
-def test_gradients_of_rotated_sh_match_unrotated_sh_with_a_rotated_camera(
-    tmp_path,
-):
-    """The images are the same functions of the coefficients."""
-    scene = Scene(degree=3)
-    path = write_model(tmp_path / "model.ply", scene.gaussians)
-    shape = {"type": "ellipsoids", "filename": path}
-    view = VIEWS[1]
-    expected = gradients_held(scene_with({}, view, shape=shape), scene.weights())
-    moved = scene_with(
-        {"shapes_to_world": transform()}, follower(view), shape=shape | {"to_world": transform()}
-    )
-    actual = gradients_held(moved, scene.weights())
-    for name in ("sh_coeffs", "opacities"):
-        assert_arrays_agree({name: actual[name]}, {name: expected[name]}, GRADIENTS)
+def test_gradients_of_merged_gaussians_reach_their_sources():
+    scene = clear(Merged())
+    weights = scene.weights()
+    loaded = scene.load()
+    params = mi.traverse(loaded)
+    keys = [f"{shape}.{name}" for shape in ("first", "second") for name in SHAPE_ATTRIBUTES]
+    for key in keys:
+        dr.enable_grad(params[key])
+    own = gradients_of(loaded, weights)
+    expected = scene.gradients(weights)
+    rows = np.split(np.arange(75), [40, 52])
+    for_own = {name: expected[name][rows[0]] for name in PARAMETER_NAMES}
+    for_own |= {"shN": for_own["shN"][:, :3], "background": expected["background"]}
+    assert_arrays_agree(own, for_own, GRADIENTS)
+    for prefix, shape, part in zip(("first", "second"), scene.shapes, rows[1:], strict=True):
+        of_gaussians = {name: expected[name][part] for name in PARAMETER_NAMES}
+        of_gaussians["shN"] = of_gaussians["shN"][:, : shape.gaussians.shN.shape[1]]
+        actual = {name: gradient(params[f"{prefix}.{name}"]) for name in SHAPE_ATTRIBUTES}
+        assert_held_agree(actual, held_gradients(shape.held, of_gaussians))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "settings"),
+    [
+        ("feature_mine", np.linspace(-1, 1, 80).reshape(40, 2), {"aovs": "f:feature_mine"}),
+        ("smoothing", np.full(40, 0.05), {}),
+    ],
+    ids=["features", "smoothing"],
+)
+def test_numbers_that_shapes_do_not_hold_are_zero_there(name, values, settings):
+    """A smoothing filter of 0 is none."""
+    scene = Merged()
+    settings["srgb_primitives"] = False
+    kind = mi.Float if values.ndim == 1 else mi.TensorXf
+    values = values.astype(np.float32)
+    padded = np.concatenate([values, np.zeros_like(values[:35])])
+    loaded = scene.load_with(**{name: kind(values)}, **settings)
+    own = scene.settings | tensors(scene.gaussians) | settings | {name: kind(padded)}
+    alone = mi.load_dict({"type": "scene", "sensor": scene.view.sensor()})
+    expected = image_of(alone, integrator=mi.load_dict(own))
+    assert_images_agree(image_of(loaded), expected)
+    others = image_of(scene.load())
+    assert others.shape != expected.shape or np.abs(expected - others).max() > 0.01
+
+
+def test_last_has_a_row_for_each_gaussian():
+    loaded = Merged().load()
+    gradients_held(loaded, Merged().weights(), "first")
+    last = loaded.integrator().last
+    assert last.means2d_grad.shape == (75, 2) and dr.width(last.visible) == 75
 
 
 # ----------------------------------------------------------------------------------------------

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.ellipsoids import (
-    GRADIENTS,
-    MERGED,
     SHAPE_ATTRIBUTES,
     EllipsoidsCase,
     Merged,
     assert_held_agree,
-    assert_images_agree,
-    gaussians_of,
     gradients_held,
     held_gradients,
     shape_of,
-    transform,
 )
 from support.helpers import clear, single
 from support.kernels import float_reductions
@@ -28,7 +22,6 @@ from support.views import image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.integrator import gathering
-from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
 # ----------------------------------------------------------------------------------------------
@@ -49,70 +42,6 @@ def test_gradients_match_the_reference(scene):
     scene = clear(scene)
     expected = held_gradients(scene.held, scene.gradients(scene.weights()))
     assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
-
-
-def test_gradients_reach_the_inputs_of_shape_parameters():
-    scene = clear(EllipsoidsCase())
-    loaded = scene.load()
-    params = mi.traverse(loaded)
-    factor = mi.Float(1.0)
-    dr.enable_grad(factor)
-    params["shape.sh_coeffs"] = params["shape.sh_coeffs"] * factor
-    params.update()
-    image = mi.render(loaded, params)
-    dr.backward(dr.sum(image * mi.TensorXf(scene.weights().astype(np.float32)), axis=None))
-    expected = held_gradients(scene.held, scene.gradients(scene.weights()))
-    terms = expected["sh_coeffs"] * scene.held["sh_coeffs"]
-    assert dr.grad(factor)[0] == pytest.approx(terms.sum(), abs=GRADIENTS * np.abs(terms).max())
-
-
-STEP = 1e-7
-
-
-def directions_of(held) -> dict[str, np.ndarray]:
-    """Return steps: opacities stay within 0..1; those of scales and others are relative."""
-    rng = np.random.default_rng(7)
-    directions = {name: rng.normal(0, 1, v.shape) * np.abs(v) for name, v in held.items()}
-    directions["opacities"] *= 1 - held["opacities"]
-    return {name: single(values) for name, values in directions.items()}
-
-
-def forward_image(loaded, directions, prefix="shape") -> np.ndarray:
-    params = mi.traverse(loaded)
-    for name, direction in directions.items():
-        parameter = params[f"{prefix}.{name}"]
-        dr.enable_grad(parameter)
-        dr.set_grad(parameter, mi.Float(direction.ravel().astype(np.float32)))
-    return np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-
-
-@pytest.mark.parametrize(
-    "names", [*((name,) for name in SHAPE_ATTRIBUTES), SHAPE_ATTRIBUTES], ids="+".join
-)
-def test_forward_mode_equals_central_differences(names):
-    """STEP: as in test_splats."""
-    scene = clear(EllipsoidsCase(degree=2))
-    directions = {name: directions_of(scene.held)[name] for name in names}
-
-    def moved(step):
-        changed = {name: scene.held[name] + step * v for name, v in directions.items()}
-        gaussians = gaussians_of(scene.held | changed)
-        return scene.image(reference.render(gaussians, scene.camera, np.zeros(3), 2))
-
-    expected = (moved(STEP) - moved(-STEP)) / (2 * STEP)
-    assert_images_agree(forward_image(scene.load(), directions), expected, GRADIENTS)
-
-
-@pytest.mark.parametrize("scene", [MERGED[0], MERGED[3]], ids=["1, 2, 0", "0, 0, 0"])
-def test_forward_and_backward_mode_are_transposed_for_merged_gaussians(scene):
-    """<J v, w> = <v, J^T w>, for a shape that was turned and one with Gaussians before it."""
-    settings = {"shapes_to_world_first": transform()}
-    directions = directions_of(scene.shapes[0].held)
-    image = forward_image(scene.load(**settings), directions, "first")
-    gradients = gradients_held(scene.load(**settings), scene.weights(), "first")
-    terms = [np.sum(directions[name].ravel() * gradients[name]) for name in SHAPE_ATTRIBUTES]
-    forward = np.sum(image * scene.weights())
-    assert forward == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
 
 
 def test_backward_passes_give_the_same_bytes_without_float_atomics():
@@ -173,7 +102,9 @@ def test_a_changed_parameter_is_rendered_again(name, counted):
     after = image_of(loaded)
     assert sorted(counted) == ["gaussians"] * 2 + ["render"] * 2
     assert np.abs(after - before).max() > 0.01
-    np.testing.assert_array_equal(after, image_of(scene.load(shape=shape_of(held))))
+    np.testing.assert_array_equal(
+        after, image_of(scene.load_with(objects={"shape": shape_of(held)}))
+    )
 
 
 def test_changed_integrator_parameter_is_rendered_again():
@@ -184,7 +115,7 @@ def test_changed_integrator_parameter_is_rendered_again():
     params["integrator.means"] = params["integrator.means"] + 0.25
     params.update()
     moved = replace(scene.own, means=single(scene.own.means + 0.25))
-    np.testing.assert_array_equal(image_of(loaded), image_of(scene.load(**tensors(moved))))
+    np.testing.assert_array_equal(image_of(loaded), image_of(scene.load_with(**tensors(moved))))
 
 
 def test_integrator_renders_the_shapes_of_the_current_scene():

@@ -14,11 +14,6 @@ HEADER = {"antialiased": True, "low_pass": 0.1}
 SCENE = Scene()
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.fixture
 def file(tmp_path):
     """A file of Gaussians with these settings in its header."""
@@ -37,24 +32,23 @@ def scene_of(gaussians, **settings):
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor()})
 
 
-def test_a_file_is_rendered_with_the_approximations_of_its_header(file):
-    by_file = image_of(scene_of({"filename": str(file)}))
-    given = image_of(scene_of(tensors(SCENE.gaussians), **HEADER))
-    plain = image_of(scene_of(tensors(SCENE.gaussians)))
-    assert np.array_equal(by_file, given) and not np.array_equal(by_file, plain)
-
-
-def test_a_property_overrides_only_its_header_entry(file):
-    by_file = image_of(scene_of({"filename": str(file)}, low_pass=0.3))
-    given = image_of(scene_of(tensors(SCENE.gaussians), antialiased=True, low_pass=0.3))
-    assert np.array_equal(by_file, given)
-    integrator = scene_of({"filename": str(file)}, low_pass=0.3).integrator()
-    assert tuple(integrator.state.header) == ("antialiased",)
-
-
-def test_a_property_with_the_default_overrides_the_header(file):
-    by_file = image_of(scene_of({"filename": str(file)}, low_pass=0.3, antialiased=False))
-    assert np.array_equal(by_file, image_of(scene_of(tensors(SCENE.gaussians))))
+@pytest.mark.parametrize(
+    ("properties", "expected", "from_header"),
+    [
+        ({}, HEADER, {"antialiased", "low_pass"}),
+        ({"low_pass": 0.3}, {"antialiased": True}, {"antialiased"}),
+        ({"low_pass": 0.3, "antialiased": False}, {}, set()),  # the defaults
+    ],
+)
+def test_a_file_is_rendered_with_its_header_unless_a_property_overrides_an_entry(
+    file, properties, expected, from_header
+):
+    scene = scene_of({"filename": str(file)}, **properties)
+    given = scene_of(tensors(SCENE.gaussians), **expected)
+    image, plain = image_of(scene), image_of(scene_of(tensors(SCENE.gaussians)))
+    np.testing.assert_array_equal(image, image_of(given))
+    assert np.array_equal(image, plain) == (not expected)
+    assert set(scene.integrator().state.header) == from_header
 
 
 def test_moved_gaussians_are_rendered_with_the_header(file):

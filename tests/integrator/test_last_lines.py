@@ -63,10 +63,6 @@ PROGRAMS = {
         "mi.load_file(path)",
         "splatpath: there is no parameter rr_dept; did you mean rr_depth?",
     ),
-    "splatpath's name": (
-        "mi.load_dict({'type': 'splatpath', 'max_dept': 3})",
-        "splatpath: there is no parameter max_dept; did you mean max_depth?",
-    ),
     "splatpath's type": (
         "mi.load_dict({'type': 'splatpath', 'max_depth': 'a'})",
         "splatpath: max_depth must be an integer from -1 to 2147483647, got 'a'",

@@ -1,31 +1,16 @@
 """A scene that asks for no light between splats and surfaces has nothing of it."""
 
-import json
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import TESTS
 from support.helpers import FLOAT32, device_gaussians
 from support.kernels import drain_kernels
+from support.splats_checks import ball_lamp_and_sky
 from support.views import Scene, image_of
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
-
-MODULES = (
-    "drgs.integrator.splat_transport",
-    "drgs.integrator.shadows",
-    "drgs.integrator.gathering",
-    "drgs.gaussians.similarity",
-    "drgs.gaussians.rotation",
-)
-"""Modules used only for light between splats and surfaces, like all of ``PACKAGE``, and for
-Gaussians of shapes or with a ``to_world``."""
-
-PACKAGE = ["drgs", "light"]
-
 
 SCENE = Scene(degree=3, srgb_primitives=True)
 
@@ -39,31 +24,13 @@ def gaussians():
 
 
 def surfaces():
-    """A ball of metal amid the splats, a lamp and a sky."""
-    camera = SCENE.view.camera
-    center = camera.center + 3 * camera.rotation[2]
-    return {
-        "ball": {
-            "type": "sphere",
-            "center": center.tolist(),
-            "radius": 0.4,
-            "bsdf": {"type": "roughconductor", "alpha": 0.2},
-        },
-        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
-        "sky": {"type": "constant"},
-    }
+    return ball_lamp_and_sky(SCENE.camera, 3, {"type": "roughconductor", "alpha": 0.2})
 
 
 def load(tensors, objects, **settings):
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": SCENE.settings | tensors | settings,
-            "sensor": SCENE.view.sensor(),
-            **objects,
-        },
-        parallel=False,  # kernels of other threads have no history
-    )
+    integrator = SCENE.settings | tensors | settings
+    scene = {"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor(), **objects}
+    return mi.load_dict(scene, parallel=False)  # kernels of other threads have no history
 
 
 def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
@@ -118,48 +85,3 @@ def test_nested_integrator_forgets_the_transport_of_its_previous_owner():
     assert np.abs(lit - dark).max() > 0.1
     np.testing.assert_array_equal(rendered(shared, light="none"), dark)
     np.testing.assert_array_equal(rendered(shared, light="rays"), lit)
-
-
-IMPORTS = """
-import json, sys
-sys.path.insert(0, {tests!r})
-import drgs, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-from support.views import Scene, tensors
-
-scene = Scene()
-camera = scene.view.camera
-middle = (camera.center + 3 * camera.rotation[2]).tolist()
-ball = {{"type": "sphere", "center": middle, "radius": 0.4}}
-found = []
-for surfaces, settings in {scenes!r}:
-    objects = {{"ball": ball, "sky": {{"type": "constant"}}}} if surfaces else {{}}
-    integrator = scene.settings | tensors(scene.gaussians) | settings
-    mi.render(
-        mi.load_dict(
-            {{"type": "scene", "integrator": integrator, "sensor": scene.view.sensor(), **objects}}
-        )
-    )
-    found.append([m for m in sys.modules if m in {modules!r} or m.split(".")[:2] == {package!r}])
-print(json.dumps(found))
-"""
-
-
-def imported_for(run_python, scenes) -> list[list[str]]:
-    """Modules of light that a new process has imported after each of the scenes."""
-    program = IMPORTS.format(tests=TESTS, scenes=scenes, modules=MODULES, package=PACKAGE)
-    result = run_python(program)
-    assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
-
-
-@pytest.mark.slow
-def test_light_package_is_imported_only_if_a_scene_uses_it(run_python):
-    nested = {"nested": {"type": "path"}}
-    plain = [(s, light) for s in (False, True) for light in ({}, {"light": "none"})]
-    plain += [(True, nested), (True, {"nested": {"type": "splatpath"}}), (False, {"light": "rays"})]
-    lit = [(True, {"light": "rays"}), (True, {"shadows": "ball"})]
-    *before, rays, shadows = imported_for(run_python, plain + lit)
-    assert before == [[]] * len(plain)
-    assert {"drgs.integrator.splat_transport", "drgs.light.grid", "drgs.light.walk"} <= set(rays)
-    assert "drgs.integrator.shadows" in shadows

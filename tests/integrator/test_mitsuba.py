@@ -16,15 +16,18 @@ from support.calibrated_sensors import (
     PINHOLE,
     POSES,
     SCALED,
+    SHUTTER_SAMPLES,
     WINDOW,
     own_camera,
     own_sensor,
 )
 from support.helpers import clear
 from support.openexr import read_exr
-from support.splats_checks import ALL_PARAMETERS, GRADIENTS, IMAGE
+from support.sensors import PIXELS, camera_of, numbers, points_on_rays
+from support.splats_checks import GRADIENTS, IMAGE
 from support.splats_checks import XYZ as TO_XYZ
-from support.views import VIEWS, Scene, View, gradient, image_of, tensors
+from support.views import Scene, View, gradient, image_of, tensors
+from support.wall_scenes import Wall
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -33,7 +36,6 @@ from drgs.io.scenes import openexr_threads
 VIEW = View("", 53, 41, crop=WINDOW)
 OWN_VIEWS = {name: replace(VIEW, to_world=to_world) for name, to_world in (POSES | SCALED).items()}
 ROLLING, BLURRED = (replace(OPENCV, close=CLOSE, shutter=s) for s in ("rolling", "global"))
-TIMES = 3
 
 SENSORS = {
     "perspective": (VIEW.sensor, lambda _: VIEW.camera),
@@ -46,7 +48,7 @@ SENSORS = {
         for name, view in OWN_VIEWS.items()
     },
     **{
-        name: (lambda sensor=sensor: sensor.dictionary(shutter_samples=TIMES), sensor.camera_at)
+        name: (lambda sensor=sensor: sensor.dictionary(), sensor.camera_at)
         for name, sensor in {
             "calibrated": PINHOLE,
             "opencv": OPENCV,
@@ -67,7 +69,7 @@ def depths(name, normal, offset) -> np.ndarray:
     height, width = rows.stop - rows.start, columns.stop - columns.start
     y, x = (np.mgrid[:height, :width] + 0.5) / np.array([height, width])[:, None, None]
     found = []
-    for time in (np.arange(TIMES) + 0.5) / TIMES:
+    for time in (np.arange(SHUTTER_SAMPLES) + 0.5) / SHUTTER_SAMPLES:
         place = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
         ray, _ = sensor.sample_ray(float(time), 0.5, place, mi.Point2f(0.5))
         start, towards = (np.array(v, np.float64).T for v in (ray.o, ray.d))
@@ -84,41 +86,64 @@ def depths(name, normal, offset) -> np.ndarray:
     return np.mean(found, axis=0)
 
 
-def tilted_plane(camera) -> tuple[np.ndarray, float, np.ndarray]:
-    """A plane before the camera: its normal and offset in the world, and a rectangle's matrix."""
-    normal = np.array([0.2, -0.3, 1.0])
-    normal /= np.linalg.norm(normal)
-    right = np.cross([0, 1, 0], normal)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(normal, right), normal]) @ camera.rotation
-    middle = camera.center + camera.rotation[2] * 5
-    to_world = np.eye(4)
-    to_world[:3] = np.column_stack([*(axes * [[100], [100], [1]]), middle])
-    return axes[2], float(axes[2] @ middle), to_world
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_depth_of_a_plane_matches_rays_for_every_sensor(name):
     """Without a splat in sight."""
     make, camera_at = SENSORS[name]
-    camera = camera_at(0.0)
-    normal, offset, to_world = tilted_plane(camera)
+    camera, plane = camera_at(0.0), Wall(5.0, (-0.2, 0.3), 100.0)
     behind = np.float32(np.tile(camera.center - 50 * camera.rotation[2], (4, 1)))
-    gaussians = replace(Scene(count=4).gaussians, means=behind)
-    loaded = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "splats", **tensors(gaussians), "aovs": "z:depth, a:alpha"},
-            "sensor": make(),
-            "plane": {"type": "rectangle", "to_world": mi.ScalarTransform4f(to_world)},
-            "light": {"type": "constant"},
-        }
-    )
-    image, expected = image_of(loaded), depths(name, normal, offset)
+    scene = Scene(count=4)
+    gaussians = replace(scene.gaussians, means=behind)
+    objects = {"plane": plane.shape(camera)}
+    image = image_of(scene.load_with(make(), objects, gaussians, aovs="z:depth, a:alpha"))
+    normal = plane.axes()[2] @ camera.rotation
+    expected = depths(name, normal, normal @ (camera.center + camera.rotation[2] * plane.z))
     assert np.ptp(expected) > 0.1 and (image[..., 5] == 1).all()
     # Positions of up to 10 units in float32, seen along rays that are 30 degrees off the normal.
     np.testing.assert_allclose(image[..., 4], expected, rtol=2e-5)
+
+
+@pytest.mark.parametrize("crop", [None, WINDOW])
+@pytest.mark.parametrize(
+    ("kind", "to_world"),
+    [("thinlens", m) for m in POSES.values()]
+    + [("orthographic", m) for m in (POSES | SCALED).values()],
+    ids=[f"thinlens, {n}" for n in POSES] + [f"orthographic, {n}" for n in POSES | SCALED],
+)
+def test_points_on_rays_project_to_their_pixels(kind, to_world, crop):
+    """Rays go through the middle of the aperture."""
+    sensor = mi.load_dict(own_sensor(kind, View("", 53, 41, crop=crop, to_world=to_world)))
+    points, expected = points_on_rays(sensor)
+    c = numbers(camera_of(sensor))
+    x, y, z = c["rotation"] @ (points - c["center"]).T
+    film = np.stack([x, y], axis=-1) / (z[:, None] if kind == "thinlens" else 1)
+    assert (z > 0).all()
+    assert np.abs(film * c["focal"] + c["principal"] - expected).max() < PIXELS
+
+
+@pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
+def test_thin_lens_rays_start_on_the_aperture_and_meet_in_focus(to_world):
+    """Rays of one place on the film."""
+    view = View("", 53, 41, to_world=to_world)
+    sensor = mi.load_dict(own_sensor("thinlens", view))
+    camera = camera_of(sensor)
+    sample = np.random.default_rng(0).uniform(size=(2, 1000)).astype(np.float32)
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.3, 0.7), mi.Point2f(sample))
+    c = numbers(camera)
+    origins, directions = (
+        c["rotation"] @ (np.array(v).astype(np.float64) - shift)
+        for v, shift in ((ray.o, c["center"][:, None]), (ray.d, 0))
+    )
+    on_aperture = origins - directions * origins[2] / directions[2]
+    radius, focus_distance = (
+        float(v[0]) for v in (camera.aperture.radius, camera.aperture.focus_distance)
+    )
+    assert np.linalg.norm(on_aperture, axis=0).max() == pytest.approx(radius, rel=0.01)
+    in_focus = on_aperture + directions * focus_distance / directions[2]
+    # Positions of up to 10 units in float32.
+    assert np.ptp(in_focus, axis=1).max() < 1e-5 * focus_distance
+    assert (radius, focus_distance) == pytest.approx((0.125, 3.0), rel=1e-6)
 
 
 COLORS = {"luminance": TO_XYZ[1:2], "xyz": TO_XYZ, "rgb": np.eye(3)}
@@ -160,51 +185,6 @@ def test_develop_false_leaves_images_in_the_film(film):
     developed = np.array(loaded.sensors()[0].film().develop())
     # Other filters than a box are added up in an order that varies.
     np.testing.assert_allclose(developed, image_of(loaded, seed=2), rtol=0, atol=1e-6)
-
-
-def batch() -> dict:
-    whole = VIEW.sensor()
-    film = {"type": "hdrfilm", "width": 74, "height": 23, "rfilter": {"type": "box"}}
-    views = {f"view_{k}": VIEWS[k].sensor() for k in (1, 2)}
-    return {"type": "batch", "film": film | {"pixel_format": "rgba"}, **views} | {
-        "sampler": whole["sampler"]
-    }
-
-
-DIFFERENTIATED = {
-    "crop window": VIEW.sensor,
-    "linear radiance": VIEW.sensor,
-    "batch": batch,
-    **{
-        name: SENSORS[name][0]
-        for name in ("orthographic, rotated", "thinlens", "rolling shutter", "global shutter")
-    },
-}
-
-
-@pytest.mark.parametrize("name", DIFFERENTIATED)
-def test_forward_mode_is_the_transpose_of_the_gradients(name):
-    """<w, J d> = <J^T w, d>, with all parameters at once; terms are summed in float64."""
-    scene = Scene(VIEW, srgb_primitives=name == "linear radiance")
-    integrator = scene.settings | tensors(scene.gaussians)
-    sensor = DIFFERENTIATED[name]()
-    loaded = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
-    params, rng = mi.traverse(loaded), np.random.default_rng(0)
-    values = [params[f"integrator.{name}"] for name in ALL_PARAMETERS]
-    directions = [rng.normal(size=np.array(v).shape).astype(np.float32) for v in values]
-    for value, direction in zip(values, directions, strict=True):
-        dr.enable_grad(value)
-        dr.set_grad(value, type(value)(direction))
-    tangent = np.array(loaded.integrator().render_forward(loaded, params)).astype(np.float64)
-    weights = rng.normal(size=tangent.shape).astype(np.float32)
-    dr.clear_grad(values)
-    loaded.integrator().render_backward(loaded, params, mi.TensorXf(weights))
-    terms = [
-        np.array(dr.grad(v)).astype(np.float64) * d for v, d in zip(values, directions, strict=True)
-    ]
-    left, right = np.sum(weights * tangent), sum(t.sum() for t in terms)
-    size = np.abs(weights * tangent).sum() + sum(np.abs(t).sum() for t in terms)
-    assert all(t.any() for t in terms) and abs(left - right) < 1e-5 * size
 
 
 def test_two_renders_are_both_differentiated_at_the_current_parameters():

@@ -5,7 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.ellipsoids import joined, write_model
+from support.ellipsoids import joined
+from support.splats_checks import write_gaussians
 from support.views import Scene, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -17,34 +18,29 @@ MODELS = {
 }
 
 
-def load(objects, own=None, **others) -> mi.Scene:
-    integrator = SCENE.settings | (tensors(own) if own else {})
-    integrator |= {name: {"type": "splats"} | settings for name, settings in objects.items()}
-    return mi.load_dict(
-        {"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor(), **others}
-    )
+def load(objects, *own, **settings) -> mi.Scene:
+    """Nested objects, and Gaussians of the integrator's own."""
+    integrator = SCENE.settings | (tensors(joined(*own)) if own else {}) | settings
+    integrator |= {name: {"type": "splats"} | each for name, each in objects.items()}
+    sensor = SCENE.view.sensor()
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
 
 def nested(**others) -> dict:
     return {name: tensors(model) | others.get(name, {}) for name, model in MODELS.items()}
 
 
-def concatenated(*models) -> mi.Scene:
-    settings = SCENE.settings | tensors(joined(*models))
-    return mi.load_dict({"type": "scene", "integrator": settings, "sensor": SCENE.view.sensor()})
-
-
 @pytest.mark.parametrize("own", [None, SCENE.gaussians], ids=["objects alone", "own besides"])
 def test_objects_are_sorted_together(own):
     """The same bytes as of one file with all Gaussians, and the same derivatives."""
-    models = ([own] if own else []) + list(MODELS.values())
-    together, apart = load(nested(), own), concatenated(*models)
+    own = [own] if own else []
+    together, apart = load(nested(), *own), load({}, *own, *MODELS.values())
     np.testing.assert_array_equal(image_of(together), image_of(apart))
     assert together.integrator().sh_degree == 2
     names = [f"{name}.{p}" for name in MODELS for p in PARAMETER_NAMES if p != "shN"]
     found = gradients_of(together, SCENE.weights(), names)
     expected = gradients_of(apart, SCENE.weights(), PARAMETER_NAMES)
-    start = len(own.means) if own else 0
+    start = len(own[0].means) if own else 0
     for name, model in MODELS.items():
         end = start + len(model.means)
         for p in PARAMETER_NAMES[:-1]:
@@ -54,9 +50,9 @@ def test_objects_are_sorted_together(own):
 
 def test_each_object_has_its_own_to_world(tmp_path):
     place = mi.ScalarTransform4f().translate([0.2, 0, 0.1]).rotate([0, 1, 0], 25)
-    later = mi.Transform4f().translate([-0.1, 0.1, 0])
+    later = mi.ScalarTransform4f().translate([-0.1, 0.1, 0])
     files = {
-        name: {"filename": write_model(tmp_path / f"{name}.ply", model)}
+        name: {"filename": write_gaussians(tmp_path / f"{name}.ply", model)}
         for name, model in MODELS.items()
     }
     files["lego"]["to_world"] = place
@@ -67,20 +63,20 @@ def test_each_object_has_its_own_to_world(tmp_path):
         params.keys()
     )
     assert "integrator.lego.background" not in params and "integrator.to_world" not in params
-    params["integrator.fox.to_world"] = later
+    params["integrator.fox.to_world"] = mi.Transform4f(later)
     params.update()
-    alone = [load({}, MODELS[name]) for name in MODELS]
-    for one, to_world in zip(alone, (mi.Transform4f(place), later), strict=True):
-        values = mi.traverse(one)
-        values["integrator.to_world"] = to_world
-        values.update()
-    parts = [one.integrator().gaussians.numpy() for one in alone]
-    np.testing.assert_array_equal(image_of(scene), image_of(concatenated(*parts)))
+    parts = [
+        load({}, model, to_world=to_world).integrator().gaussians.numpy()
+        for model, to_world in zip(MODELS.values(), (place, later), strict=True)
+    ]
+    np.testing.assert_array_equal(image_of(scene), image_of(load({}, *parts)))
     assert "objects = lego, fox" in str(scene.integrator())
 
 
 def test_xml_names_objects_by_their_ids(tmp_path):
-    paths = {name: write_model(tmp_path / f"{name}.ply", model) for name, model in MODELS.items()}
+    paths = {
+        name: write_gaussians(tmp_path / f"{name}.ply", model) for name, model in MODELS.items()
+    }
     objects = "".join(
         f'<integrator type="splats" id="{name}">'
         f'<string name="filename" value="{path}"/></integrator>'
@@ -94,19 +90,10 @@ def test_xml_names_objects_by_their_ids(tmp_path):
 
 
 def test_missing_features_of_objects_are_zero():
-    values = mi.TensorXf(np.random.default_rng(2).normal(0, 1, (22, 2)).astype(np.float32))
-    feature = {"feature_x": values}
-    objects = nested(lego=feature)
-    integrator = SCENE.settings | {"aovs": "x:feature_x"}
-    integrator |= {name: {"type": "splats"} | one for name, one in objects.items()}
-    sensor = SCENE.view.sensor()
-    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
-    whole = np.pad(np.array(values), [(0, 20), (0, 0)])
-    own = tensors(joined(*MODELS.values())) | {
-        "feature_x": mi.TensorXf(whole),
-        "aovs": "x:feature_x",
-    }
-    expected = mi.load_dict({"type": "scene", "integrator": SCENE.settings | own, "sensor": sensor})
+    values = np.random.default_rng(2).normal(0, 1, (22, 2)).astype(np.float32)
+    scene = load(nested(lego={"feature_x": mi.TensorXf(values)}), aovs="x:feature_x")
+    whole = mi.TensorXf(np.pad(values, [(0, 20), (0, 0)]))
+    expected = load({}, *MODELS.values(), feature_x=whole, aovs="x:feature_x")
     np.testing.assert_array_equal(image_of(scene), image_of(expected))
 
 
@@ -187,7 +174,7 @@ def test_object_used_twice_receives_both_derivatives():
     lego = mi.load_dict({"type": "splats"} | tensors(MODELS["lego"]))
     integrator = SCENE.settings | {"a": lego, "b": lego}
     twice = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": SCENE.view.sensor()})
-    apart = concatenated(MODELS["lego"], MODELS["lego"])
+    apart = load({}, MODELS["lego"], MODELS["lego"])
     np.testing.assert_array_equal(image_of(twice), image_of(apart))
     found = gradients_of(twice, SCENE.weights(), ["a.means"])["a.means"]
     both = gradients_of(apart, SCENE.weights(), ["means"])["means"]

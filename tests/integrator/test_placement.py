@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.ellipsoids import GRADIENTS, IMAGE, ROTATION, SCALE, TRANSLATION, assert_images_agree
-from support.helpers import assert_arrays_agree, clear, single
-from support.smoothing import smoothed_reference
-from support.views import Scene, gradients_of, image_of, tensors
+from support.ellipsoids import ROTATION, SCALE, TRANSLATION
+from support.helpers import clear, single
+from support.splats_checks import IMAGE, assert_images_agree, ball_lamp_and_sky
+from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -51,10 +51,9 @@ def scene_and_object(**settings) -> tuple[Scene, reference.Gaussians]:
 
 
 def load(scene, model, matrix=MATRIX, **settings) -> mi.Scene:
-    settings = scene.settings | tensors(model) | settings
     if matrix is not None:
         settings["to_world"] = mi.ScalarTransform4f(matrix)
-    return mi.load_dict({"type": "scene", "integrator": settings, "sensor": scene.view.sensor()})
+    return scene.load_with(gaussians=model, **settings)
 
 
 def rendered(scene, gaussians) -> np.ndarray:
@@ -86,16 +85,14 @@ def test_moved_object_matches_a_file_saved_after_moving(tmp_path):
     stored.save(tmp_path / "object.ply")
     Similarity.from_matrix(MATRIX, "it").of_gaussians(stored).save(tmp_path / "moved.ply")
 
-    def file(name, **settings):
+    def rendered(name, **settings):
         settings = scene.settings | {"filename": str(tmp_path / name)} | settings
-        return mi.load_dict(
-            {"type": "scene", "integrator": settings, "sensor": scene.view.sensor()}
-        )
+        return image_of(scene.load(), integrator=mi.load_dict(settings))
 
-    expected = image_of(file("moved.ply"))
+    expected = rendered("moved.ply")
     place = mi.ScalarTransform4f(MATRIX)
-    assert_images_agree(image_of(file("object.ply", to_world=place)), expected, 3 * IMAGE)
-    unfiltered = image_of(file("moved.ply", ignore="smoothing"))
+    assert_images_agree(rendered("object.ply", to_world=place), expected, 3 * IMAGE)
+    unfiltered = rendered("moved.ply", ignore="smoothing")
     assert np.abs(unfiltered - expected).max() > 0.02
 
 
@@ -115,21 +112,6 @@ def test_identity_transform_costs_nothing(later):
         assert getattr(integrator.gaussians, name) is getattr(integrator.state.own.gaussians, name)
 
 
-def surfaces(scene) -> dict:
-    """A mirror amid the splats, and a lamp and a sky that shade them."""
-    camera = scene.view.camera
-    return {
-        "ball": {
-            "type": "sphere",
-            "center": (camera.center + 2.5 * camera.rotation[2]).tolist(),
-            "radius": 0.4,
-            "bsdf": {"type": "conductor"},
-        },
-        "lamp": {"type": "point", "position": np.add(camera.center, [0, 0, 1]).tolist()},
-        "sky": {"type": "constant"},
-    }
-
-
 ROUTES = {
     "normals and depths": {"aovs": "n:normal, z:depth, a:alpha"},
     "rays of surfaces": {"light": "rays", "nested_spp": 4},
@@ -142,7 +124,11 @@ def test_every_light_route_sees_the_moved_object(route):
     """The same bytes as of the Gaussians that the integrator says it renders."""
     scene, model = scene_and_object()
     objects = {"sensor": scene.view.sensor()}
-    objects |= {} if "aovs" in ROUTES[route] else surfaces(scene)
+    objects |= (
+        {}
+        if "aovs" in ROUTES[route]
+        else ball_lamp_and_sky(scene.camera, 2.5, {"type": "conductor"})
+    )
     place = {"to_world": mi.ScalarTransform4f(MATRIX)}
     moved = mi.load_dict(scene.settings | tensors(model) | place).gaussians.numpy()
 
@@ -155,123 +141,12 @@ def test_every_light_route_sees_the_moved_object(route):
     assert np.abs(actual - rendered(model)).max() > 0.1
 
 
-STEP = 1e-6
-
-
-def central_difference(loss, step):
-    """Return the derivative of a loss along a change of the matrix."""
-    return (loss(STEP * step) - loss(-STEP * step)) / (2 * STEP)
-
-
-def unit(*cell):
-    step = np.zeros((4, 4))
-    step[cell] = 1
-    return step
-
-
-def test_smoothing_filter_of_a_scaled_object_has_derivatives():
-    """At a fifth of the splats' size, and at five times of it."""
-    scene, model = scene_and_object()
-    filters = single(np.geomspace(0.005, 0.1, len(model.means)))
-    weights = scene.weights()
-
-    def loss(step):
-        matrix = MATRIX @ (np.eye(4) + step)
-        k = Similarity.from_matrix(matrix, "it").scale
-        return np.sum(
-            weights * rendered(scene, smoothed_reference(moved_by(matrix, model), k * filters))
-        )
-
-    smoothing = {"smoothing": mi.TensorXf(filters.astype(np.float32))}
-    found = gradient_of_matrix(load(scene, model, **smoothing), weights)
-    expected = central_difference(loss, np.diag([1, 1, 1, 0.0]))
-    terms = MATRIX[:3, :3] * found[:3, :3]
-    assert terms.sum() == pytest.approx(expected, abs=GRADIENTS * np.abs(terms).max())
-
-
 def gradient_of_matrix(loaded, weights) -> np.ndarray:
     params = mi.traverse(loaded)
     dr.enable_grad(params[KEY])
     image = mi.render(loaded, params)
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
     return np.array(dr.grad(params[KEY]).matrix).astype(np.float64)[:, :, 0]
-
-
-def test_each_matrix_entry_has_the_derivative_of_central_differences():
-    scene, model = scene_and_object()
-    found = gradient_of_matrix(load(scene, model), scene.weights())
-
-    def loss(step):
-        return np.sum(scene.weights() * rendered(scene, moved_by(MATRIX + step, model)))
-
-    expected = [[central_difference(loss, unit(i, j)) for j in range(4)] for i in range(3)]
-    assert_arrays_agree({"to_world": found[:3]}, {"to_world": np.array(expected)}, GRADIENTS)
-    assert not found[3].any()
-    again = gradient_of_matrix(load(scene, model), scene.weights())
-    np.testing.assert_array_equal(again, found)
-
-
-def test_unmoved_object_has_the_same_derivatives():
-    """Moving an object in place: by the chain rule, the derivatives above times MATRIX^-1."""
-    scene, _ = scene_and_object()
-    unmoved = load(scene, scene.gaussians, matrix=None)
-    before = image_of(unmoved)
-    found = gradient_of_matrix(unmoved, scene.weights())
-    np.testing.assert_array_equal(image_of(unmoved), before)
-    weights, world = scene.weights(), scene.gaussians
-
-    def loss(step):
-        return np.sum(weights * rendered(scene, moved_by(np.eye(4) + step, world)))
-
-    for cell in [(0, 1), (1, 3), (2, 2)]:
-        expected = central_difference(loss, unit(*cell))
-        assert found[cell] == pytest.approx(expected, abs=GRADIENTS * np.abs(found).max())
-
-
-def test_raw_parameters_have_derivatives_in_the_objects_space():
-    """Turned back: of quaternions by their product, of harmonics by their rotation."""
-    scene, model = scene_and_object()
-    world = reference.render_gradients(moved_by(MATRIX, model), *_cotangents(scene), None, 3, False)
-    found = gradients_of(load(scene, model), scene.weights(), PARAMETER_NAMES)
-    back = Similarity.from_matrix(np.linalg.inv(MATRIX), "it")
-    means, quats, shN = rotate_gaussians(
-        world["means"], world["quats"], world["shN"], back.rotation
-    )
-    expected = world | {"means": SCALE * means, "quats": quats, "shN": shN}
-    expected = {name: expected[name] for name in PARAMETER_NAMES}
-    assert_arrays_agree(found, expected, GRADIENTS)
-
-
-def _cotangents(scene):
-    weights = np.zeros((scene.view.height, scene.view.width, 4))
-    weights[scene.view.window] = scene.weights()
-    d_image = weights[..., :3]
-    d_alpha = weights[..., 3] - d_image @ np.array(scene.background)
-    return scene.camera, np.zeros(3), d_image, d_alpha
-
-
-def test_forward_and_backward_mode_are_transposed():
-    """<J v, w> = <v, J^T w>, along the matrix and along raw parameters."""
-    scene, model = scene_and_object()
-    rng = np.random.default_rng(3)
-    direction = rng.normal(0, 1, (4, 4)) * (np.arange(4) < 3)[:, None]
-    loaded = load(scene, model)
-    params = mi.traverse(loaded)
-    dr.enable_grad(params[KEY])
-    moved = mi.Transform4f()
-    moved.matrix = mi.Matrix4f(direction)
-    dr.set_grad(params[KEY], moved)
-    d_raw = {n: rng.normal(0, 0.1, getattr(model, n).shape) for n in PARAMETER_NAMES}
-    for name, values in d_raw.items():
-        parameter = params[f"integrator.{name}"]
-        dr.enable_grad(parameter)
-        dr.set_grad(parameter, type(parameter)(values.astype(np.float32)))
-    d_image = np.array(dr.forward_to(mi.render(loaded, params))).astype(np.float64)
-    weights = scene.weights()
-    of_raw = gradients_of(load(scene, model), weights, PARAMETER_NAMES)
-    of_matrix = gradient_of_matrix(load(scene, model), weights)
-    terms = [np.sum(direction * of_matrix), *(np.sum(d_raw[n] * of_raw[n]) for n in d_raw)]
-    assert np.sum(d_image * weights) == pytest.approx(sum(terms), abs=1e-5 * np.abs(terms).max())
 
 
 def test_setting_a_matrix_that_is_no_similarity_is_refused():

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.helpers import NEAR_THRESHOLD, clear
+from support.helpers import clear
 from support.splats_checks import ALL_PARAMETERS, XYZ, assert_gradients_agree, assert_images_agree
 from support.views import VIEWS, Scene, View, gradient, gradients_of, image_of, pose, tensors
 
@@ -124,33 +124,16 @@ ASIDE_VIEW = View("aside", 31, 27, to_world=pose([0.3, -1.0, 0.5], 16, (0.6, -0.
 """Sees 26 of the 40 Gaussians before ``VIEWS[1]``."""
 
 
-def reference_gradients_from(view, scene, weights) -> dict[str, np.ndarray]:
-    """Gradients for the Gaussians of ``scene``, seen from ``view``."""
-    background = np.array(scene.background)
-    rendered = reference.render(
-        scene.gaussians, view.camera, background, threshold_width=NEAR_THRESHOLD
-    )
-    assert not rendered.near_threshold.any(), "choose another view"
-    return reference.render_gradients(
-        scene.gaussians, view.camera, background, weights[..., :3], weights[..., 3]
-    )
-
-
 def test_last_provides_inputs_of_density_control():
     scene = clear(Scene())
-    loaded = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": scene.settings | tensors(scene.gaussians),
-            "sensor": ASIDE_VIEW.sensor(),
-        }
-    )
+    loaded = scene.load_with(ASIDE_VIEW.sensor())
     assert loaded.integrator().last is None
     weights = np.random.default_rng(2).normal(0, 1, (27, 31, 4))
     gradients_of(loaded, weights, ["means"])
     last = loaded.integrator().last
     actual = {"means2d": np.array(last.means2d_grad).astype(np.float64)}
-    assert_gradients_agree(actual, reference_gradients_from(ASIDE_VIEW, scene, weights))
+    aside = replace(scene, view=ASIDE_VIEW)
+    assert_gradients_agree(actual, aside.gradients(weights, scene.gaussians))
 
     # Visible: the box around the ellipse alpha = 1/255 holds a pixel's centre.
     splats = reference.project(scene.gaussians, ASIDE_VIEW.camera)

@@ -13,7 +13,6 @@ from support.views import VIEWS, Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.cameras.fisheye import Fisheye
-from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
@@ -27,9 +26,10 @@ MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.radial_tangential",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
-    "effects.smoothing", "integrator.splat_transport", "integrator.shadows",
+    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.gathering",
+    "integrator.splat_transport", "integrator.shadows",
     "integrator.surfaces",
-    "light.grid", "light.walk",
+    "light", "light.grid", "light.probe", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
     "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
     "training.effects.view_parameters",
@@ -150,12 +150,9 @@ def test_plan_of_views_covers_all_views():
         "  motion: rolling shutter (1 of 5 cameras)\n"
         "  antialiasing: 3D smoothing filter (the Gaussians' filter)"
     )
-
-
-def test_plan_of_views_lists_ignored_effects():
     state = rich_scene(ignore="distortion, motion, defocus, smoothing").state
-    for views, ignored in ((rich_dataset().train, " (ignored)"), (fits.plain_dataset().train, "")):
-        assert format_effects(summary_of_views(state, views)).splitlines()[-1] == (
+    for others, ignored in ((views, " (ignored)"), (fits.plain_dataset().train, "")):
+        assert format_effects(summary_of_views(state, others)).splitlines()[-1] == (
             f"  not simulated: lens distortion{ignored}, motion{ignored}, antialiasing, "
             "smoothing filter (ignored)"
         )
@@ -273,18 +270,25 @@ def sensor(**settings):
     return {{"film": film, **settings}}
 
 capture.blobs().save({ply!r})
-for name, scene in (
-    ("calibrated", {{"sensor": sensor(type="calibrated")}}),
-    ("perspective", {{"sensor": sensor(type="perspective")}}),
-    ("environment", {{"sensor": sensor(type="perspective"), "sky": {{"type": "constant"}}}}),
-    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}),
-    ("thin lens", {{"sensor": sensor(type="thinlens", aperture_radius=0.1, focus_distance=2.0)}}),
-    ("orthographic", {{"sensor": sensor(type="orthographic")}}),
-    ("surface", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
-    ("light", {{"sensor": sensor(type="perspective"), "ball": {{"type": "sphere"}}}}),
+aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
+plain, ball = {{"sensor": sensor(type="perspective")}}, {{"ball": {{"type": "sphere"}}}}
+lit = {{"sky": {{"type": "constant"}}, **ball}}
+for name, scene, settings in (
+    ("calibrated", {{"sensor": sensor(type="calibrated")}}, {{}}),
+    ("perspective", plain, {{"light": "none"}}),
+    ("light without surfaces", plain, {{"light": "rays"}}),
+    ("environment", plain | {{"sky": {{"type": "constant"}}}}, {{}}),
+    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}, {{}}),
+    ("thin lens", {{"sensor": sensor(type="thinlens", **aperture)}}, {{}}),
+    ("orthographic", {{"sensor": sensor(type="orthographic")}}, {{}}),
+    ("surface", plain | lit, {{"light": "none"}}),
+    ("path", plain | lit, {{"nested": {{"type": "path"}}}}),
+    ("splatpath", plain | lit, {{"nested": {{"type": "splatpath"}}}}),
+    ("light", plain | lit, {{"light": "rays"}}),
+    ("shadows", plain | lit, {{"shadows": "ball"}}),
+    ("object in its place", plain, {{"to_world": mi.ScalarTransform4f().scale(2)}}),
 ):
-    integrator = {{"type": "splats", "filename": {ply!r}}}
-    integrator |= {{"light": "rays"}} if name == "light" else {{}}
+    integrator = {{"type": "splats", "filename": {ply!r}, **settings}}
     mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
     now = set(sys.modules) & set({modules!r})
     found[name] = sorted(now - known)
@@ -310,18 +314,25 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
         "perspective": [],
+        "light without surfaces": [],
         "environment": [],
         "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
         "thin lens": ["drgs.effects.defocus"],
         "orthographic": ["drgs.cameras.orthographic"],
         "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
-        "light": ["drgs.integrator.splat_transport", "drgs.light.grid", "drgs.light.walk"],
+        "path": [],
+        "splatpath": [],
+        "light": [
+            "drgs.integrator.splat_transport",
+            "drgs.light",
+            "drgs.light.grid",
+            "drgs.light.probe",
+            "drgs.light.walk",
+        ],
+        "shadows": ["drgs.integrator.shadows"],
+        "object in its place": [
+            "drgs.gaussians.rotation",
+            "drgs.gaussians.similarity",
+            "drgs.integrator.gathering",
+        ],
     }
-
-
-def test_plain_sensor_has_no_effect_parameters():
-    kept = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
-    sensor = mi.load_dict({"type": "calibrated", **kept})
-    own = {key for key in mi.traverse(sensor).keys() if not key.startswith(("film.", "shutter_"))}  # noqa: SIM118
-    assert own - {"near_clip", "far_clip"} == {"to_world", "fx", "fy", "cx", "cy"}
-    assert isinstance(sensor.lens, Pinhole) and sensor.to_world_close is None

@@ -1,14 +1,18 @@
 """Surfaces that Mitsuba renders, between splats: against the float64 reference and differences."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.helpers import bitwise
 from support.splats_checks import XYZ
-from support.views import VIEWS, Scene, gradient, image_of, tensors
+from support.views import VIEWS, Scene, gradient, gradients_of, image_of, tensors
 from support.wall_scenes import (
+    GRADIENTS,
     IMAGE,
     RADIANCE,
     SCENE,
@@ -24,6 +28,8 @@ from support.wall_scenes import (
 )
 
 import drgs  # noqa: F401  (registers the plugins)
+from drgs.core.errors import UnsupportedError
+from drgs.gaussians.parameters import PARAMETER_NAMES
 
 CROPPED = Scene(VIEWS[12])
 
@@ -186,16 +192,6 @@ def masked(opacity) -> dict:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bsdf", [{"type": "null"}, masked(0.0)], ids=["null", "mask"])
-def test_fully_transparent_surfaces_are_invisible(bsdf):
-    scene = apart(SCENE)
-    image = image_of(load(scene, shapes={"pane": pane(1.7, bsdf)}, aovs="z:depth,n:normal"))
-    expected = image_of(load(scene, aovs="z:depth,n:normal"))
-    # Mitsuba moves the rays that go on from a surface by 1e-4, along its normal.
-    np.testing.assert_allclose(image, expected, rtol=0, atol=4e-4)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("nested", ["path", "prb"])
 @pytest.mark.parametrize("srgb_primitives", [True, False])
 def test_splats_between_windows_and_a_wall_are_visible(srgb_primitives, nested):
@@ -314,8 +310,141 @@ def test_changed_host_values_are_noticed():
     assert np.abs(after - before).max() > 0.01
 
 
-def test_display_space_on_a_film_without_rgb_is_refused():
-    scene = replace(SCENE, srgb_primitives=False)
-    loaded = load(scene, scene.view.sensor("luminance"))
-    with pytest.raises(ValueError, match="pixel_format must be rgb or rgba"):
-        loaded.integrator().render(loaded)
+# ----------------------------------------------------------------------------------------------
+# Derivatives, and what runs and stays
+# ----------------------------------------------------------------------------------------------
+
+
+RADIANCE_KEY = "wall.emitter.radiance.value"
+
+
+PERSPECTIVE = {"type": "perspective"}
+OF_CAMERAS = {
+    "perspective": (PERSPECTIVE, ("to_world", "x_fov", "principal_point_offset_x")),
+    "thinlens": (
+        {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0},
+        ("to_world", "aperture_radius", "focus_distance"),
+    ),
+    "orthographic": ({"type": "orthographic"}, ("to_world",)),
+    "calibrated": (
+        {"type": "calibrated", "fx": 8.0, "lens": "opencv", "k1": 0.01},
+        ("to_world", "fx", "cx", "k1"),
+    ),
+    "batch": (
+        {"type": "batch", "left": PERSPECTIVE, "right": {"type": "perspective", "fov": 50}},
+        ("left.to_world", "right.x_fov"),
+    ),
+}
+"""Sensors, and parameters that have derivatives without surfaces."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [dr.backward, dr.forward_to])
+@pytest.mark.parametrize("name", OF_CAMERAS)
+def test_camera_derivatives_with_surfaces_are_refused_by_name(name, derivative):
+    """Whatever renders the surfaces: see the table of docs/mitsuba.md."""
+    sensor, keys = OF_CAMERAS[name]
+    film = {"type": "hdrfilm", "width": 8, "height": 4, "rfilter": {"type": "box"}}
+    loaded = load(SCENE)
+    for key in keys:
+        eye = mi.load_dict({**sensor, "film": film, "id": "eye"})
+        params = mi.traverse(eye)
+        dr.enable_grad(params[key])
+        image = mi.render(loaded, params, sensor=eye)
+        with pytest.raises(UnsupportedError, match=rf"^splats: eye\.{key} is not differentiated"):
+            derivative(image)
+
+
+def test_gradients_are_the_same_to_the_last_bit():
+    scene = apart(SCENE)
+    runs = [gradients_of(load(scene), scene.weights(), PARAMETER_NAMES) for _ in range(2)]
+    assert bitwise(list(runs[0].values())) == bitwise(list(runs[1].values()))
+
+
+def test_a_scene_without_surfaces_never_runs_the_nested_integrator():
+    counts, path = [], mi.load_dict({"type": "path"})
+
+    class Counting(mi.SamplingIntegrator):
+        def render(self, *arguments, **named):
+            counts.append(1)
+            return path.render(*arguments, **named)
+
+    nested = Counting(mi.Properties())
+    image_of(load(SCENE, wall=None, sky=True, nested=nested))
+    assert not counts
+    image_of(load(SCENE, nested=nested))
+    assert counts == [1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("use", ["an image", "a gradient", "an image with gradients"])
+@pytest.mark.parametrize("with_shapes", [False, True])
+def test_unreferenced_scene_is_freed(use, with_shapes):
+    """Though its integrator keeps what it saw of it."""
+    loaded = load(SCENE, sky=True, shapes={"blob": blob([0, 0, 0])} if with_shapes else {})
+    params = mi.traverse(loaded)
+    if use != "an image":
+        dr.enable_grad(params["integrator.means"], params[RADIANCE_KEY])
+    image = mi.render(loaded, params)
+    if use == "a gradient":
+        dr.backward(dr.mean(image, axis=None))
+    integrator = weakref.ref(loaded.integrator())
+    del loaded, params, image
+    gc.collect()
+    assert integrator() is None
+
+
+@pytest.mark.parametrize("spp", [0, 4], ids=["its sampler's", "given"])
+def test_nested_samples_are_independent_of_the_splats(spp):
+    """Whatever the nested integrator and its derivatives write into the sensor's sampler."""
+    loaded = load(apart(SCENE), wall=Wall(half=0.5), nested_spp=16)
+    first = image_of(loaded, spp=spp, seed=3)
+    loaded.integrator().state.cache.forget("frames")
+    np.testing.assert_array_equal(image_of(loaded, spp=spp, seed=3), first)
+    params = mi.traverse(loaded)
+    for derivative in (dr.backward, dr.forward_to):
+        dr.enable_grad(params[RADIANCE_KEY])
+        dr.set_grad(params[RADIANCE_KEY], 1)
+        derivative(mi.render(loaded, params))
+        assert loaded.sensors()[0].sampler().sample_count() == 1
+
+
+def test_nested_integrator_can_be_set():
+    """``direct`` does not see a light by way of another surface."""
+    scene = load(apart(SCENE), nested=mi.load_dict({"type": "direct"}))
+    np.testing.assert_allclose(
+        image_of(scene), image_of(load(apart(SCENE))), rtol=0, atol=IMAGE * 2
+    )
+    assert "nested = " in str(scene.integrator())
+
+
+def test_gradients_match_the_image_for_any_nested_samples():
+    """Splats at the centres of pixels, before a wall that covers the film and has no noise."""
+    scene, weights = apart(SCENE), SCENE.weights()
+    alone = gradients_of(load(scene), weights, ["means"])["means"]
+    with_more = gradients_of(load(scene, nested_spp=16), weights, ["means"])["means"]
+    np.testing.assert_allclose(with_more, alone, rtol=0, atol=GRADIENTS * np.abs(alone).max())
+
+
+def test_moved_wall_is_rendered_at_its_new_place():
+    scene = apart(SCENE)
+    loaded = load(scene)
+    image_of(loaded)
+    params = mi.traverse(loaded)
+    other = mi.load_dict(Wall(z=2.9).shape(scene.camera))
+    params["wall.to_world"] = mi.traverse(other)["to_world"]
+    params.update()
+    np.testing.assert_array_equal(image_of(loaded), image_of(load(scene, wall=Wall(z=2.9))))
+
+
+def test_rendering_another_image_keeps_gradients():
+    scene, weights = apart(SCENE), SCENE.weights()
+    loaded = load(scene)
+    expected = gradients_of(loaded, weights, ["means"])["means"]
+    loaded, other = load(scene), load(scene, wall=Wall(z=2.9))
+    params = mi.traverse(loaded)
+    dr.enable_grad(params["integrator.means"])
+    image = mi.render(loaded, params)
+    mi.render(other, integrator=loaded.integrator())
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    np.testing.assert_array_equal(gradient(params["integrator.means"]), expected)

@@ -1,50 +1,29 @@
 """Images of one integrator from several threads of a program."""
 
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.views import VIEWS, Scene, image_of, tensors
+from support.views import VIEWS, Scene, image_of
 
 import drgs  # noqa: F401  (registers the plugin)
 
 
-def run_in_two_threads(work):
-    """Return ``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
-    results = [None, None]
-
-    def run(number):
-        try:
-            results[number] = work(number)
-        except BaseException as error:
-            results[number] = error
-
-    threads = [threading.Thread(target=run, args=(number,)) for number in (0, 1)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for result in results:
-        if isinstance(result, BaseException):
-            raise result
-    return results
-
-
-def scene_of(view, **objects):
-    scene = Scene(view)
-    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(4)}
-    integrator = scene.settings | tensors(scene.gaussians)
-    return mi.load_dict({"type": "scene", "integrator": integrator, **sensors, **objects})
+def run_in_two_threads(work) -> list:
+    """``work(0)`` and ``work(1)``, run at once; their exceptions are raised here."""
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(work, (0, 1)))
 
 
 @pytest.mark.parametrize("shared", [True, False], ids=["one scene", "two scenes"])
 def test_two_threads_render_the_same_images_as_one(shared):
     """From sensors in turn, so that no frame is that of the image before."""
-    first = scene_of(VIEWS[1])
-    scenes = [first, first if shared else scene_of(VIEWS[3])]
+    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(3)}  # besides the scene's own
+    first = Scene(VIEWS[1]).load_with(objects=sensors)
+    scenes = [first, first if shared else Scene(VIEWS[3]).load_with(objects=sensors)]
     expected = [[image_of(scenes[k], sensor=2 * k + s) for s in (0, 1)] for k in (0, 1)]
 
     def work(number):
@@ -72,10 +51,7 @@ def test_integrator_renders_one_image_at_a_time():
             width, height = sensor.film().crop_size()
             return dr.zeros(mi.TensorXf, (height, width, 4))
 
-    scene = Scene(VIEWS[1])
-    integrator = scene.settings | tensors(scene.gaussians) | {"inner": Slow(mi.Properties())}
-    sensors = {f"sensor_{k}": VIEWS[k].sensor() for k in range(2)}
-    floor = {"type": "rectangle"}
-    loaded = mi.load_dict({"type": "scene", "integrator": integrator, "floor": floor, **sensors})
+    objects = {"floor": {"type": "rectangle"}, "other": VIEWS[0].sensor()}
+    loaded = Scene(VIEWS[1]).load_with(objects=objects, inner=Slow(mi.Properties()))
     run_in_two_threads(lambda number: [image_of(loaded, sensor=number) for _ in range(3)])
     assert most == [1] * 6

@@ -1,77 +1,62 @@
 """Isolated splats as drawn by drgs and by Mitsuba's own ``volprim_rf_basic``.
 
-The two do not compute the same. drgs projects a Gaussian with the affine approximation at its mean
-(EWA), adds a low-pass, takes its colour in the direction of the mean, draws nothing below
-ALPHA_CUT and orders by the depth of the means. volprim takes the Gaussian's peak along each pixel's
-ray and the colour in the ray's direction, and orders by where the ray enters the splats' shells: in
-these scenes the same order. What this makes of the images is subtracted, and only rounding is left.
-
-In camera axes let u = (x/z, y/z) be the slope of a pixel's ray, u0 that of the mean, d = u - u0, z
-the mean's depth, S the covariance, and A(u) = [I | -u], the 2x3 projection along the ray onto a
-plane parallel to the film. With C(u) = A(u) S A(u)^T / z^2,
-
-    volprim: alpha = o exp(-d^T C(u)^-1 d / 2)        EWA: alpha = o exp(-d^T C(u0)^-1 d / 2)
-
-since the Mahalanobis distance of a point from a line is that of their projections along the line.
-The low-pass is undone by giving volprim the Gaussian widened in the directions parallel to the
-film: C(u0) then is drgs's covariance on the film.
+With the right approximations the two compute the same: a Gaussian's peak along each pixel's ray and
+the colour in the ray's direction, with no low-pass and no cut. volprim orders by where the ray
+enters the splats' shells: in these scenes the same order. Only rounding is left.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from support.views import image_of, tensors
 from support.volprim import (
     LONG,
     SCENES,
     TWO,
     Splats,
     assert_within,
-    axes_of,
-    covariances,
-    drgs_image,
     footprints,
     opacities_of,
-    propagated,
     volprim_image,
-    widened,
 )
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.core.constants import ALPHA_CUT
 from drgs.reference import splatting as reference
 
+SPLATS = {
+    "type": "splats", "srgb_primitives": False, "projection": "exact", "order": "pixel",
+    "sh_direction": "pixel", "low_pass": 0.0, "extent": 6.0, "alpha_max": 0.9999, "alpha_cut": 0.0,
+    "transmittance_stop": 0.0,
+}  # fmt: skip
 
-def check_difference(splats, change=None, covariance_of=widened):
-    """Check volprim's image less that of drgs; ``change`` is made to drgs's Gaussians."""
+
+def check_difference(splats, change=lambda gaussians, _: gaussians, **settings):
+    """Check volprim's image less that of drgs, by a shape and by tensors; ``change`` is made to
+    drgs's Gaussians."""
     gaussians, view = splats.gaussians, splats.view
-    covariance = covariance_of(gaussians, view.camera)
-    changed = gaussians if change is None else change(gaussians, view.camera)
-    difference = volprim_image(gaussians, view, *axes_of(covariance)) - drgs_image(changed, view)
 
-    on_film = footprints(gaussians, view.camera, covariance)
-    depths = (gaussians.means - view.camera.center) @ view.camera.rotation[2]
-    drawn = np.where(on_film.alpha_by_mean >= ALPHA_CUT, on_film.alpha_by_mean, 0)
-    colors = np.broadcast_to(on_film.color_by_mean, on_film.color_by_ray.shape)
-    derived = composite(on_film.alpha_by_ray, on_film.color_by_ray, depths)
-    derived -= composite(drawn, colors, depths)
-    d_alpha = on_film.alpha_rounding + np.where(on_film.near_cut, on_film.alpha_by_mean, 0)
-    assert_within(difference - derived, propagated(on_film, d_alpha, on_film.color_rounding))
+    def by_shape(gaussians, *integrator):
+        quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+        scales = np.exp(gaussians.log_scales)
+        return volprim_image(gaussians, view, scales, quats[:, [1, 2, 3, 0]], *integrator)
 
-
-def composite(alphas, colors, depths) -> np.ndarray:
-    """(H, W, 3) from alphas (N, H, W) and colours (N, H, W, 3), front to back."""
-    image, transmittance = np.zeros(colors.shape[1:]), np.ones(alphas.shape[1:])
-    for i in np.argsort(depths):
-        image += (transmittance * alphas[i])[..., None] * colors[i]
-        transmittance *= 1 - alphas[i]
-    return image
+    changed, integrator = change(gaussians, view.camera), SPLATS | settings
+    sensor = view.sensor(pixel_format="rgb")
+    by_tensors = mi.load_dict(
+        {"type": "scene", "integrator": integrator | tensors(changed), "sensor": sensor}
+    )
+    allowed, expected = footprints(gaussians, view.camera).image_rounding, by_shape(gaussians)
+    assert expected.max() > 1000 * allowed.max()
+    for image in (by_shape(changed, integrator), image_of(by_tensors)):
+        assert_within(image - expected, allowed)
 
 
 @pytest.mark.parametrize("splats", SCENES.values(), ids=SCENES.keys())
-def test_difference_from_volprim_is_the_derived_one(splats):
+def test_images_equal_those_of_volprim(splats):
     check_difference(splats)
 
 
@@ -118,12 +103,10 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_splats_violate_the_difference(name):
-    with pytest.raises(AssertionError, match="worst at"):
-        check_difference(*WRONG[name])
+APPROXIMATIONS = {"low-pass": {"low_pass": 0.3}, "projected at the mean": {"projection": "ewa"}}
 
 
-def test_splats_without_the_low_pass_violate_the_difference():
+@pytest.mark.parametrize("name", [*WRONG, *APPROXIMATIONS])
+def test_wrong_splats_and_approximations_differ_from_volprim(name):
     with pytest.raises(AssertionError, match="worst at"):
-        check_difference(SMALL, covariance_of=lambda gaussians, _: covariances(gaussians))
+        check_difference(*WRONG.get(name, (SMALL,)), **APPROXIMATIONS.get(name, {}))

@@ -3,20 +3,15 @@
 from dataclasses import dataclass, field
 from functools import cache
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugins)
-from drgs.reference import splatting as reference
-from support.helpers import single
-from support.views import VIEWS, View, image_of, tensors
+from support.views import VIEWS, View, pose, tensors
 
 # Single precision, of values up to 2: as in test_splats; the conversion to display space multiplies
 # errors of dark pixels by up to 13.
 IMAGE = 2e-5
-
-
 VIEW = VIEWS[1]
 
 
@@ -39,23 +34,7 @@ EMITTERS = {
 }  # fmt: skip
 
 
-def turned(to_world, axis, degrees) -> np.ndarray:
-    """A pose, turned in its own axes."""
-    half = np.radians(degrees) / 2
-    quat = np.array([[np.cos(half), *(np.sin(half) * np.asarray(axis) / np.linalg.norm(axis))]])
-    change = np.eye(4)
-    change[:3, :3] = reference.quat_to_rotation(quat)[0]
-    return single(np.array(to_world) @ change)
-
-
-_MOVED = single(
-    np.array(VIEW.to_world) @ np.array([*np.eye(3, 4), [0, 0, 0, 1]])
-    + np.array([[0, 0, 0, 0.1], [0, 0, 0, 0.05], [0, 0, 0, -0.1], [0, 0, 0, 0]])
-)
-
-CLOSE = turned(_MOVED, (0.3, 1, 0.2), 8)
-
-
+CLOSE = np.array(pose([0.2, -1.0, 0.4], 46, (0.5, -0.65, 1.0)))
 INTRINSICS = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5}
 
 
@@ -66,12 +45,15 @@ class Camera:
     view: View = VIEW
     changes: dict = field(default_factory=dict)
 
-    def dictionary(self, samples=1, **others) -> dict:
-        sensor = self.view.sensor(samples=samples)
-        if self.changes:
-            kept = {k: sensor[k] for k in ("to_world", "film", "sampler", "near_clip")}
-            sensor = kept | {k: v() if callable(v) else v for k, v in self.changes.items()}
-        return sensor | others
+    def dictionary(self) -> dict:
+        if not self.changes:
+            return self.view.sensor()
+        return self.view.sensor_like(
+            **{
+                "kind" if k == "type" else k: v() if callable(v) else v
+                for k, v in self.changes.items()
+            }
+        )
 
 
 def calibrated(**changes) -> Camera:
@@ -86,25 +68,8 @@ def load(sensor, integrator, **objects):
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
 
 
-def splats_alone(sensor, gaussians, **settings) -> np.ndarray:
-    """On black, display space, with alpha."""
-    settings = {"background": 0.0, "srgb_primitives": False, **settings}
-    return image_of(load(sensor, integrator_of(gaussians, **settings)))
-
-
 def rendered(values, **changes) -> dict:
     return {
         "type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "filter_type": "nearest",
         **changes,
     }  # fmt: skip
-
-
-def attached(loaded, *keys):
-    """The parameters, and what those of ``keys`` are now computed from: a scene changes its own."""
-    params, leaves = mi.traverse(loaded), {}
-    for key in keys:
-        leaves[key] = type(params[key])(params[key])
-        dr.enable_grad(leaves[key])
-        params[key] = leaves[key]
-    params.update()
-    return params, leaves

@@ -10,15 +10,14 @@ import numpy as np
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.reference.effects import Fisheye, OpenCV, Pinhole, ThinPrismFisheye
+from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES
-from support.views import VIEWS, View, pose, splats_before, tensors
+from support.motion_checks import rolling_image
+from support.views import VIEWS, Scene, View, pose, splats_before
 
 WINDOW = (13, 7, 29, 18)
-
-
+SHUTTER_SAMPLES = 3
 CLOSE = pose([0.1, -1.0, 0.3], 43, (0.5, -0.65, 1.05))
-
-
 KINDS = {
     Pinhole: "pinhole",
     OpenCV: "opencv",
@@ -56,6 +55,7 @@ class Calibrated:
             **{name: common[name] for name in ("near_clip", "to_world", "film", "sampler")},
             **moves,
             "shutter": self.shutter,
+            "shutter_samples": SHUTTER_SAMPLES,
             **others,
         }
 
@@ -77,6 +77,22 @@ class Calibrated:
     def camera_at(self, time: float) -> reference.Camera:
         return effects.camera_at(self.camera, self.close_camera, time)
 
+    # What rolling_image expects of a case
+    width = property(lambda self: self.camera.width)
+    height = property(lambda self: self.camera.height)
+    rendered_degree, background = 1, (0.0, 0.0, 0.0)
+
+    def rendered(self, gaussians) -> reference.RenderedImage:
+        """The whole film by the reference, on black; motion with SHUTTER_SAMPLES."""
+        if self.close is None:
+            return effects.render(gaussians, self.camera, self.lens, threshold_width=NEAR_THRESHOLD)
+        if self.shutter == "rolling":
+            return rolling_image(self, gaussians, NEAR_THRESHOLD)
+        return effects.render_motion_blur(
+            gaussians, self.camera, self.close_camera, SHUTTER_SAMPLES, np.zeros(3), self.lens,
+            NEAR_THRESHOLD,
+        )  # fmt: skip
+
     @property
     def corner(self) -> np.ndarray:
         """The corner of the crop window in the film, px."""
@@ -94,26 +110,14 @@ def transform(matrix) -> mi.ScalarTransform4f:
 
 
 PINHOLE = Calibrated("pinhole")
-
-
 OPENCV = Calibrated("opencv", LENSES["rational"])
-
-
 FISHEYE = Calibrated("fisheye", LENSES["fisheye"], f=(13.0, 14.5))
-
-
 THIN_PRISM = Calibrated("thin prism", LENSES["thin prism"], f=(13.0, 14.5))
-
-
 FILM = View("", 37, 29)  # without a crop window
-
 
 # A fold within the film.
 BARREL = Calibrated("barrel", LENSES["barrel"], FILM, f=(26.0, 26.0), c=(19.0, 14.0))
-
-
 STATIC_SENSORS = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM]
-
 
 by_name = {"ids": lambda sensor: sensor.name}
 
@@ -126,22 +130,17 @@ def sampled_rays(sensor, time=0.0, count=200, seed=3):
 
 
 def splats_scene(sensor, gaussians, **settings) -> mi.Scene:
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {
-                "type": "splats", "srgb_primitives": False, **tensors(gaussians), **settings
-            },
-            "sensor": sensor.dictionary() if isinstance(sensor, Calibrated) else sensor,
-        }
-    )  # fmt: skip
+    """On black, before a sensor or its dictionary."""
+    scene = Scene(background=(0.0, 0.0, 0.0))
+    sensor = sensor.dictionary() if isinstance(sensor, Calibrated) else sensor
+    return scene.load_with(sensor, gaussians=gaussians, **settings)
 
 
-def clear_gaussians(sensor, render, view=None):
+def clear_gaussians(sensor):
     """Gaussians before the view, and their image, which no threshold is near to."""
     for seed in range(100):
-        gaussians = splats_before(view or sensor.view, 1, 40, seed)
-        rendered = render(gaussians)
+        gaussians = splats_before(sensor.view, 1, 40, seed)
+        rendered = sensor.rendered(gaussians)
         if not rendered.near_threshold[sensor.view.window].any():
             return gaussians, rendered
     raise AssertionError(f"{sensor.name}: no clear seed among 100")
@@ -152,15 +151,7 @@ def scaled(matrix, *factors) -> tuple:
     return tuple(map(tuple, np.array(matrix) @ np.diag([*factors, 1.0])))
 
 
-SENSORS = {
-    "thinlens": {"aperture_radius": 0.125, "focus_distance": 3.0},
-    "orthographic": {},
-}
-
-
 POSES = {"rotated": VIEWS[1].to_world, "mirrored": VIEWS[3].to_world}
-
-
 SCALED = {
     "scaled": scaled(VIEWS[1].to_world, 3.0, 3.0, 3.0),
     "scaled unevenly": scaled(VIEWS[1].to_world, 2.0, 0.5, 1.0),
@@ -169,11 +160,8 @@ SCALED = {
 
 
 def own_sensor(kind, view) -> dict:
-    dictionary = view.sensor()
-    others = {name: dictionary[name] for name in ("to_world", "film", "sampler", "near_clip")}
-    if kind == "thinlens":
-        others["fov"] = view.fov
-    return {"type": kind, **others, **SENSORS[kind]}
+    aperture = {"fov": view.fov, "aperture_radius": 0.125, "focus_distance": 3.0}
+    return view.sensor_like(kind, **(aperture if kind == "thinlens" else {}))
 
 
 def own_camera(view) -> reference.Camera:

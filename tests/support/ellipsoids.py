@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from support.helpers import assert_arrays_agree, single
-from support.views import Scene, gradient, tensors
-
-# Tolerances of test_splats: single precision, relative to the largest value of an array. Scales
-# and opacities are converted with a relative error of 1e-7 each.
-IMAGE, GRADIENTS = 1e-5, 1e-4
-
+from support.splats_checks import GRADIENTS
+from support.views import Scene, gradients_of, tensors
 
 SHAPE_ATTRIBUTES = ("data", "opacities", "sh_coeffs")
 
@@ -75,11 +70,13 @@ class EllipsoidsCase(Scene):
     def shape(self) -> dict:
         return shape_of(self.held, self.kind)
 
-    def load(self, settings=None, **shapes) -> mi.Scene:
-        shapes = shapes or {"shape": self.shape}
-        sensor = self.view.sensor()
-        integrator = self.settings | (settings or {})
-        return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **shapes})
+    @property
+    def own_tensors(self) -> dict:
+        return {}
+
+    @property
+    def objects(self) -> dict:
+        return {"shape": self.shape}
 
 
 def held_gradients(held, of_gaussians) -> dict[str, np.ndarray]:
@@ -109,13 +106,7 @@ def held_gradients(held, of_gaussians) -> dict[str, np.ndarray]:
 
 def gradients_held(loaded, weights, prefix="shape") -> dict[str, np.ndarray]:
     """Gradients of sum(weights * image) for what a shape holds, flat."""
-    params = mi.traverse(loaded)
-    keys = {name: f"{prefix}.{name}" for name in SHAPE_ATTRIBUTES}
-    for key in keys.values():
-        dr.enable_grad(params[key])
-    image = mi.render(loaded, params)
-    dr.backward(dr.sum(image * mi.TensorXf(np.asarray(weights, np.float32)), axis=None))
-    return {name: gradient(params[key]) for name, key in keys.items()}
+    return gradients_of(loaded, weights, SHAPE_ATTRIBUTES, f"{prefix}.")
 
 
 def apart(arrays) -> dict[str, np.ndarray]:
@@ -127,16 +118,6 @@ def apart(arrays) -> dict[str, np.ndarray]:
 
 def assert_held_agree(actual, expected):
     assert_arrays_agree(apart(actual), apart(expected), GRADIENTS)
-
-
-def assert_images_agree(actual, expected, tolerance=IMAGE):
-    assert_arrays_agree({"image": actual}, {"image": expected}, tolerance)
-
-
-def write_model(path, gaussians):
-    fields = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    Gaussians(**fields).save(path)
-    return str(path)
 
 
 def joined(*parts) -> reference.Gaussians:
@@ -160,7 +141,7 @@ class Merged(Scene):
 
     @property
     def own(self) -> reference.Gaussians:
-        return replace(self._plain, degree=self.own_degree).gaussians
+        return Scene(self.view, self.own_degree, count=self.count, seed=self.seed).gaussians
 
     @property
     def shapes(self) -> list[EllipsoidsCase]:
@@ -179,22 +160,14 @@ class Merged(Scene):
         return highest if self.sh_degree is None else self.sh_degree
 
     @property
-    def _plain(self) -> Scene:
-        return Scene(self.view, count=self.count, seed=self.seed)
+    def own_tensors(self) -> dict:
+        return tensors(self.own)
 
-    def load(self, **settings) -> mi.Scene:
-        """One shape of each kind, in the order in which Mitsuba lists them, then a mesh."""
+    @property
+    def objects(self) -> dict:
+        """One shape of each kind, in the order in which Mitsuba lists them."""
         first, second = self.shapes
-        integrator = self.settings | tensors(self.own) | settings
-        return mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": integrator,
-                "sensor": self.view.sensor(),
-                "first": shape_of(first.held),
-                "second": shape_of(second.held, "ellipsoidsmesh"),
-            }
-        )
+        return {"first": first.shape, "second": shape_of(second.held, "ellipsoidsmesh")}
 
 
 MERGED = (
@@ -206,8 +179,6 @@ MERGED = (
 
 
 ROTATION = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
-
-
 SCALE, TRANSLATION = 1.5, np.array([0.5, -0.25, 1.0])
 
 
@@ -218,7 +189,6 @@ def transform() -> mi.ScalarTransform4f:
 
 
 def scene_with(integrator, view, **others) -> mi.Scene:
-    settings = {"type": "splats", "srgb_primitives": False, **integrator}
-    return mi.load_dict(
-        {"type": "scene", "integrator": settings, "sensor": view.sensor(), **others}
-    )
+    """A scene on black, of shapes or of Gaussians of the integrator."""
+    scene = EllipsoidsCase(view, background=(0.0, 0.0, 0.0))
+    return scene.load_with(objects=others, **integrator)

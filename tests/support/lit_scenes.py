@@ -6,9 +6,10 @@ import numpy as np
 
 from drgs.reference import splatting
 from support.helpers import rows
+from support.views import to_linear
 
 
-def gaussians(means, scale=0.3, opacity=0.9, color=1.0, count=None) -> splatting.Gaussians:
+def gaussians(means, scale=0.3, opacity=0.9, color=1.0) -> splatting.Gaussians:
     """Balls of one size and colour."""
     means = np.atleast_2d(np.asarray(means, np.float32))
     n = len(means)
@@ -40,9 +41,8 @@ def scene_of(splats, light="rays", max_depth=8, nested="splatpath", spp=64, **ot
         **({} if nested is None else {"nested": {"type": nested, "max_depth": max_depth}}),
         **tensors,
         **settings,
+        **({} if light is None else {"light": light}),
     }
-    if light is not None:
-        integrator["light"] = light
     return mi.load_dict({"type": "scene", "integrator": integrator, **others})
 
 
@@ -85,21 +85,14 @@ def along_rays(scene, origins, directions):
     mi.render(scene)  # it gets to know the splats
     nested, sampler = scene.integrator().state.nested, mi.load_dict({"type": "independent"})
     sampler.seed(0, len(origins))
-    ray = mi.Ray3f(mi.Point3f(*_columns(origins)), mi.Vector3f(*_columns(directions)))
+    origins, directions = (np.ascontiguousarray(v.T, np.float32) for v in (origins, directions))
+    ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions))
     radiance, *_ = nested.sample(dr.ADMode.Primal, scene, sampler, ray, mi.Bool(True), δL=None)
     return rows(radiance)
-
-
-def _columns(values):
-    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in values.T]
 
 
 def radiance_of(seen, is_open=True):
     """Radiance of what the reference's rays pass; is_open: black is behind it, and no radiance."""
     coverage = 1 - seen.transmittances[:, None]
     whole = np.ones_like(coverage) if is_open else np.where(coverage > 0, coverage, 1)
-    return whole * linear(seen.colors / whole)
-
-
-def linear(color):
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    return whole * to_linear(seen.colors / whole)

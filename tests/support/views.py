@@ -106,6 +106,12 @@ class View:
             "sampler": {"type": sampler, "sample_count": samples},
         }
 
+    def sensor_like(self, kind: str, **parameters) -> dict:
+        """A sensor of another type at the same place, with the same film."""
+        sensor = self.sensor()
+        kept = {key: sensor[key] for key in ("to_world", "film", "sampler", "near_clip")}
+        return kept | {"type": kind, **parameters}
+
 
 VIEWS = (
     View("unrotated", to_world=pose([0, 0, 1], 0)),
@@ -216,13 +222,29 @@ class Scene:
 
     def load(self, **film) -> mi.Scene:
         """A new Mitsuba scene; film: see ``View.sensor``."""
+        return self.load_with(self.view.sensor(**film))
+
+    def load_with(self, sensor=None, objects=None, gaussians=None, **settings) -> mi.Scene:
+        """A new scene with other objects or Gaussians, and more settings of the integrator."""
+        own = self.own_tensors if gaussians is None else tensors(gaussians)
         return mi.load_dict(
             {
                 "type": "scene",
-                "integrator": self.settings | tensors(self.gaussians),
-                "sensor": self.view.sensor(**film),
+                "integrator": self.settings | own | settings,
+                "sensor": sensor or self.view.sensor(),
+                **(self.objects if objects is None else objects),
             }
         )
+
+    @property
+    def own_tensors(self) -> dict:
+        """Gaussians that the integrator is given."""
+        return tensors(self.gaussians)
+
+    @property
+    def objects(self) -> dict:
+        """Shapes and emitters."""
+        return {}
 
     @property
     def camera(self) -> reference.Camera:
@@ -244,7 +266,7 @@ class Scene:
         color = decode(rendered.image + rendered.transmittance[..., None] * self.background)
         return np.concatenate([color, rendered.alpha[..., None]], axis=-1)[self.view.window]
 
-    def gradients(self, weights) -> dict[str, np.ndarray]:
+    def gradients(self, weights, gaussians=None) -> dict[str, np.ndarray]:
         """Gradients of sum(weights * image()), weights (H, W, 4), by the reference.
 
         With P the premultiplied image, D the decoding and B the background, the image is
@@ -260,7 +282,7 @@ class Scene:
         d_background = np.einsum("hw,hwc->c", transmittance, d_image)
         d_alpha = d_alpha - d_image @ background
         gradients = reference.render_gradients(
-            self.gaussians, self.camera, np.zeros(3), d_image, d_alpha, None,
+            gaussians or self.gaussians, self.camera, np.zeros(3), d_image, d_alpha, None,
             self.rendered_degree, self.antialiased,
         )  # fmt: skip
         return gradients | {"background": d_background}
@@ -290,15 +312,16 @@ def image_of(scene: mi.Scene, **arguments) -> np.ndarray:
     return np.array(mi.render(scene, **arguments)).astype(np.float64)
 
 
-def gradients_of(scene: mi.Scene, weights, names=(*PARAMETER_NAMES, "background")) -> dict:
+def gradients_of(
+    scene: mi.Scene, weights, names=(*PARAMETER_NAMES, "background"), prefix="integrator."
+) -> dict:
     """Gradients of sum(weights * mi.render(scene)) for the parameters ``names``."""
     params = mi.traverse(scene)
-    keys = {name: f"integrator.{name}" for name in names}
-    for key in keys.values():
-        dr.enable_grad(params[key])
+    for name in names:
+        dr.enable_grad(params[prefix + name])
     image = mi.render(scene, params)
     dr.backward(dr.sum(image * mi.TensorXf(np.asarray(weights, np.float32)), axis=None))
-    return {name: gradient(params[key]) for name, key in keys.items()}
+    return {name: gradient(params[prefix + name]) for name in names}
 
 
 def gradient(parameter) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Isolated splats, and their images by ``volprim_rf_basic``, by drgs and by closed forms."""
+"""Isolated splats, and their images by ``volprim_rf_basic``, with bounds of rounding."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.core.constants import ALPHA_CUT, LOW_PASS
 from drgs.reference import splatting as reference
-from support.helpers import NEAR_THRESHOLD, single
-from support.views import View, image_of, pose, tensors
+from support.helpers import single
+from support.views import View, image_of, pose
 
 FILM = 64
 """Width and height of the film, px."""
@@ -37,6 +36,8 @@ UNIT = 2.0**-24
 ROUNDING = 16 * UNIT
 """Relative. Each side takes a mean or a ray through about 8 operations (offset, rotation,
 division, focal length, principal point, distance in the splat's axes), each rounded by UNIT."""
+
+VOLPRIM = {"type": "volprim_rf_basic", "srgb_primitives": False}
 
 STRAIGHT = pose([0, 0, 1], 0)
 TURNED = pose([0.3, -1.0, 0.5], 40, (0.4, -0.7, 1.1))
@@ -134,25 +135,7 @@ def covariances(gaussians) -> np.ndarray:
     return axes @ axes.transpose(0, 2, 1)
 
 
-def widened(gaussians, camera) -> np.ndarray:
-    """Covariances (N, 3, 3) world that contain drgs's low-pass."""
-    forward = camera.rotation[2]
-    pixel = (gaussians.means - camera.center) @ forward / camera.fx  # world units at the mean
-    parallel = np.eye(3) - np.outer(forward, forward)
-    return covariances(gaussians) + LOW_PASS * pixel[:, None, None] ** 2 * parallel
-
-
-def axes_of(covariance) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations (N, 3) and quaternions xyzw (N, 4) of covariances (N, 3, 3)."""
-    variances, axes = np.linalg.eigh(covariance)
-    axes = axes * np.sign(np.linalg.det(axes))[:, None, None]
-    entries = [
-        [llvm.Float64(np.ascontiguousarray(axes[:, i, j])) for j in range(3)] for i in range(3)
-    ]
-    return np.sqrt(variances), np.array(dr.matrix_to_quat(llvm.Matrix3f64(entries))).T
-
-
-def volprim_image(gaussians, view, scales, quats_xyzw) -> np.ndarray:
+def volprim_image(gaussians, view, scales, quats_xyzw, integrator=VOLPRIM) -> np.ndarray:
     """(H, W, 3) by volprim: the Gaussians with other standard deviations and orientations."""
     distances = np.linalg.norm(gaussians.means - view.camera.center, axis=1)
     # The wider its shells, the more precisely volprim intersects them. But one that contains the
@@ -174,29 +157,9 @@ def volprim_image(gaussians, view, scales, quats_xyzw) -> np.ndarray:
     }
     # One sample in the middle of each pixel, where drgs evaluates.
     sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
-    return image_of(
-        mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": "volprim_rf_basic", "srgb_primitives": False},
-                "sensor": view.sensor(pixel_format="rgb") | {"sampler": sampler},
-                "shapes": shapes,
-            }
-        )
-    )
-
-
-def drgs_image(gaussians, view) -> np.ndarray:
-    """(H, W, 3) by drgs."""
-    return image_of(
-        mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": "splats", "srgb_primitives": False} | tensors(gaussians),
-                "sensor": view.sensor(pixel_format="rgb"),
-            }
-        )
-    )
+    sensor = view.sensor(pixel_format="rgb") | {"sampler": sampler}
+    scene = {"type": "scene", "integrator": integrator, "sensor": sensor, "shapes": shapes}
+    return image_of(mi.load_dict(scene))
 
 
 def opacities_of(gaussians) -> np.ndarray:
@@ -206,74 +169,55 @@ def opacities_of(gaussians) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Footprints:
-    """N splats on the film, and the two models of their alphas and colours."""
+    """N splats on the film: alphas and colours along the pixels' rays, and their rounding."""
 
-    alpha_by_mean: np.ndarray  # (N, H, W)
-    alpha_by_ray: np.ndarray  # (N, H, W)
-    color_by_mean: np.ndarray  # (N, 1, 1, 3)
-    color_by_ray: np.ndarray  # (N, H, W, 3)
+    alphas: np.ndarray  # (N, H, W)
+    colors: np.ndarray  # (N, H, W, 3)
     alpha_rounding: np.ndarray  # (N, H, W), single precision
 
     @property
-    def color_rounding(self) -> np.ndarray:
-        """(N, 1, 1, 3), single precision: of the sum, before and after 0.5 is added."""
-        return ROUNDING * (1 + self.color_by_mean)
+    def image_rounding(self) -> np.ndarray:
+        """(H, W, 3): errors of an image from those of alphas and colours.
 
-    @property
-    def near_cut(self) -> np.ndarray:
-        """(N, H, W): single precision may decide otherwise."""
-        return np.abs(self.alpha_by_mean - ALPHA_CUT) < ALPHA_CUT * NEAR_THRESHOLD
+        An image is linear in each alpha, with the slope T (color - the image behind), which is at
+        most the largest color; and the weight of a color is at most its alpha. Colors are rounded
+        as sums, before and after 0.5 is added.
+        """
+        d_colors = ROUNDING * (1 + self.colors)
+        colors, weights = self.colors + d_colors, self.alphas + self.alpha_rounding
+        terms = self.alpha_rounding[..., None] * colors.max(axis=0) + weights[..., None] * d_colors
+        return terms.sum(axis=0)
 
 
-def footprints(gaussians, camera, covariance) -> Footprints:
-    """Return footprints of Gaussians with other covariances (N, 3, 3) world."""
+def footprints(gaussians, camera) -> Footprints:
+    """Return the footprints of Gaussians.
+
+    In camera axes let u = (x/z, y/z) be the slope of a pixel's ray, u0 that of the mean, z the
+    mean's depth, S the covariance, and A(u) = [I | -u], the 2x3 projection along the ray onto a
+    plane parallel to the film. With d = u - u0 and C(u) = A(u) S A(u)^T / z^2, the peak along the
+    ray is o exp(-d^T C(u)^-1 d / 2), since the Mahalanobis distance of a point from a line is that
+    of their projections along the line.
+    """
+    covariance = covariances(gaussians)
     means = (gaussians.means - camera.center) @ camera.rotation.T
     z = means[:, 2]
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     slopes = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy], axis=-1)
     offsets = slopes - (means[:, :2] / z[:, None])[:, None, None]
-
     relative = camera.rotation @ covariance @ camera.rotation.T / z[:, None, None] ** 2
-    at_mean = _projection(means[:, :2] / z[:, None])
-    at_pixels = _projection(slopes)
-    by_mean = at_mean @ relative @ at_mean.transpose(0, 2, 1)
-    by_ray = at_pixels @ relative[:, None, None] @ np.swapaxes(at_pixels, -1, -2)
-    rho = np.sqrt(_mahalanobis(offsets, by_mean[:, None, None]))
-    rho_by_ray = np.sqrt(_mahalanobis(offsets, by_ray))
-    opacities = opacities_of(gaussians)[:, None, None]
-    alpha = opacities * np.exp(-0.5 * rho**2)
-    alpha_by_ray = opacities * np.exp(-0.5 * rho_by_ray**2)
-
+    identity = np.broadcast_to(np.eye(2), (*slopes.shape[:-1], 2, 2))
+    along = np.concatenate([identity, -slopes[..., None]], axis=-1)
+    on_film = along @ relative[:, None, None] @ np.swapaxes(along, -1, -2)
+    rho = np.sqrt(np.einsum("...i,...ij,...j", offsets, np.linalg.inv(on_film), offsets))
+    alphas = opacities_of(gaussians)[:, None, None] * np.exp(-0.5 * rho**2)
     # Positions are rounded relative to the distance from the camera. What this makes of rho is
     # largest along the smallest axis, and d alpha / d rho = -rho alpha. The exponential is
     # rounded, and the transmittance, as 1 - alpha, absolutely.
     smallest = np.sqrt(np.linalg.eigvalsh(covariance)[:, 0])
     d_rho = ROUNDING * (np.linalg.norm(means, axis=1) / smallest)[:, None, None]
-    alpha_rounding = (
-        np.maximum(rho * alpha, rho_by_ray * alpha_by_ray) * d_rho
-        + ROUNDING * np.maximum(alpha, alpha_by_ray)
-        + UNIT
-    )
-
     rays = np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=-1) @ camera.rotation
-    return Footprints(
-        alpha_by_mean=alpha,
-        alpha_by_ray=alpha_by_ray,
-        color_by_mean=reference.sh_colors(gaussians, camera, gaussians.sh_degree)[:, None, None],
-        color_by_ray=_colors_along(gaussians, rays),
-        alpha_rounding=alpha_rounding,
-    )
-
-
-def _projection(slopes) -> np.ndarray:
-    """A(u) (..., 2, 3) for slopes u (..., 2)."""
-    identity = np.broadcast_to(np.eye(2), (*slopes.shape[:-1], 2, 2))
-    return np.concatenate([identity, -slopes[..., None]], axis=-1)
-
-
-def _mahalanobis(vectors, covariance) -> np.ndarray:
-    """v^T C^-1 v for v (..., 2) and C (..., 2, 2)."""
-    return np.einsum("...i,...ij,...j", vectors, np.linalg.inv(covariance), vectors)
+    alpha_rounding = rho * alphas * d_rho + ROUNDING * alphas + UNIT
+    return Footprints(alphas, _colors_along(gaussians, rays), alpha_rounding)
 
 
 def _colors_along(gaussians, rays) -> np.ndarray:
@@ -282,17 +226,6 @@ def _colors_along(gaussians, rays) -> np.ndarray:
     basis = reference.sh_basis(directions, gaussians.sh_degree).reshape(*rays.shape[:2], -1)
     coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
     return np.maximum(np.einsum("hwk,nkc->nhwc", basis, coefficients) + 0.5, 0)
-
-
-def propagated(on_film, d_alpha, d_colors) -> np.ndarray:
-    """(H, W, 3): what errors of alphas (N, H, W) and colours (N, H, W, 3) make of an image.
-
-    An image is linear in each alpha, with the slope T (color - the image behind), which is at
-    most the largest color; and the weight of a color is at most its alpha.
-    """
-    colors = np.maximum(on_film.color_by_mean, on_film.color_by_ray) + d_colors
-    weights = np.maximum(on_film.alpha_by_mean, on_film.alpha_by_ray) + d_alpha
-    return (d_alpha[..., None] * colors.max(axis=0) + weights[..., None] * d_colors).sum(axis=0)
 
 
 def assert_within(difference, allowed) -> None:

@@ -10,7 +10,7 @@ import drgs  # noqa: F401  (registers the plugins)
 from drgs.reference import splatting as reference
 from drgs.reference.effects import render_with_surfaces
 from support.helpers import clear
-from support.views import VIEWS, Scene, decode, tensors
+from support.views import VIEWS, Scene, decode
 
 # Tolerances of test_splats: single precision, relative to the largest value of an array.
 # Conversions to display space multiply errors of dark pixels by up to 13.
@@ -65,10 +65,7 @@ def load(scene, sensor=None, wall=WALL, sky=False, shapes=None, **others):
     if sky:
         radiance = {"type": "rgb", "value": list(SKY)}
         objects["sky"] = {"type": "constant", "radiance": radiance}
-    integrator = scene.settings | tensors(scene.gaussians) | others
-    sensor = sensor or scene.view.sensor()
-    objects |= {"integrator": integrator, "sensor": sensor, **(shapes or {})}
-    return mi.load_dict({"type": "scene", **objects})
+    return scene.load_with(sensor, objects | (shapes or {}), **others)
 
 
 @cache
