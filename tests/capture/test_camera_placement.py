@@ -7,8 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from drgs.capture.camera_placement import hemisphere, settings_for, views_around, views_of
-from drgs.capture.path_tracing import CaptureCamera, CaptureSettings
+from drgs.capture.camera_placement import (
+    hemisphere,
+    perspective_sensors,
+    settings_for,
+    views_around,
+    views_of,
+)
+from drgs.capture.path_tracing import CaptureCamera, CaptureSettings, bounding_box
 from drgs.core.errors import UserError
 
 TWO_SIDED = {"type": "twosided", "bsdf": {"type": "diffuse"}}
@@ -212,3 +218,24 @@ def test_splits_and_seeds_have_different_cameras():
     centers = np.array([view.pose[:3, 3] for view in views])
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     assert distances[~np.eye(len(centers), dtype=bool)].min() > 0.01
+
+
+def test_sensors_of_other_types_are_no_cameras():
+    scene = loaded(a=sensor((0, 0, 4), (0, 0, 0)), b={"type": "orthographic"})
+    assert len(perspective_sensors(scene)) == 1
+
+
+def test_scene_of_lamps_alone_is_refused():
+    with pytest.raises(UserError, match="no surfaces that cameras could see"):
+        bounding_box(loaded(lamp=LAMP))
+
+
+def test_light_that_is_not_finite_is_refused_with_its_pixel(monkeypatch):
+    scene = loaded(ball=BALL, sky=SKY)
+    settings = derived(scene)
+    light = np.ones((8, 8, 4))
+    light[2, 5] = np.inf
+    monkeypatch.setattr(CaptureCamera, "linear", lambda *_: light)
+    view = views_of(scene, settings)[0]
+    with pytest.raises(UserError, match="the light at pixel x 5, y 2 is not finite"):
+        CaptureCamera(scene, settings).image(view)

@@ -5,18 +5,20 @@ directions: nothing shades it and nothing is reflected onto it twice. Rooms, sce
 scenes with splats follow.
 """
 
+import errno
 import json
 import math
 import shlex
 import sys
 from itertools import product
+from unittest.mock import Mock
 
 import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-from support.commands import assert_ends_well, assert_refused
+from support.commands import assert_ends_well, assert_refused, run_in_process
 from support.folders import contents, visible
 from support.render_command import write_scene
 
@@ -473,3 +475,16 @@ def test_captured_image_of_another_size_is_refused(ball, tmp_path):
     path.unlink()
     run(ball, tmp_path / "out", *LEAST)
     assert contents(tmp_path / "out") == captured
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (OSError(errno.ENOSPC, "full", "r_0.png"), 2, "error: r_0.png: full; free some space"),
+        (KeyboardInterrupt(), 130, "the same command continues"),
+    ],
+)
+def test_stopped_capture_gives_the_reason(ball, tmp_path, monkeypatch, error, status, message):
+    monkeypatch.setattr(path_tracing.CaptureCamera, "image", Mock(side_effect=error))
+    outcome = run_in_process(capture.main, ball, *LEAST, "--out", tmp_path / "out")
+    assert outcome.returncode == status and message in outcome.stderr

@@ -120,6 +120,11 @@ def test_ray_differentials_are_rays_of_neighbouring_pixels(sensor):
         np.testing.assert_allclose(np.array(o), np.array(beside.o), rtol=0, atol=1e-6)
 
 
+def test_text_of_a_sensor_contains_lens_and_focal_length():
+    text = str(mi.load_dict({"type": "calibrated", "lens": "fisheye", "fx": 30.5, "k1": 0.25}))
+    assert "Fisheye, k1" in text and "fx = [30.5]" in text
+
+
 @pytest.mark.parametrize("sensor", [*STATIC_SENSORS, ROLLING[1]], **by_name)
 def test_rays_end_at_the_far_plane(sensor):
     """From depth ``near_clip`` to ``far_clip``: z, with a fisheye the distance."""
