@@ -3,6 +3,7 @@
 import argparse
 import io
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -93,6 +94,8 @@ def test_home_folders_are_expanded_or_refused(monkeypatch):
     assert file_or_folder("~/out") == Path("/home/somebody/out")
     with pytest.raises(argparse.ArgumentTypeError, match=r"home directory.*: ~no-such-user/out"):
         file_or_folder("~no-such-user/out")
+    with pytest.raises(argparse.ArgumentTypeError, match="no zero byte"):
+        file_or_folder("a\0b")
 
 
 @pytest.mark.parametrize(
@@ -199,6 +202,22 @@ def test_help_shows_the_command_with_an_example(main, words, called):
     assert outcome.stdout.startswith(f"usage: {called} ")
     assert f"  {called} " in outcome.stdout.partition("\nexample")[2]
     assert "%(prog)s" not in outcome.stdout and str(REPOSITORY) not in outcome.stdout
+
+
+@pytest.mark.parametrize(
+    ("module", "file"),
+    [
+        *((name, f"{name}.__main__") for name in ("drgs", "drgs.capture")),
+        *((name, name) for name in ("drgs.fit", "drgs.render", "drgs.export", "drgs.view")),
+    ],
+)
+def test_modules_run_as_commands(module, file, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [module, "--help"])
+    monkeypatch.delitem(sys.modules, file, raising=False)  # as if it had not been imported
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module(module, run_name="__main__")
+    assert end.value.code == 0
+    assert f"usage: python -m {module} " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,9 @@ def test_orbit_is_around_the_focus_of_the_photographs_or_the_gaussians(fit, tmp_
     cameras = orbit_of_views(make_dataset().train, blobs()).viewpoints(5, WIDTH, HEIGHT, fov)
     for name, camera in zip(names, cameras, strict=True):
         assert_shows(tmp_path / name, camera, WHITE)
+    first = (tmp_path / "orbit_000.png").read_bytes()
+    run(fit, "--orbit", "1", "--set", "data.background=white", "--out", tmp_path / "set")
+    assert (tmp_path / "set" / "orbit_000.png").read_bytes() == first
     arguments = ("--orbit", "3", "--size", "30", "20", "--background", "black", "--fov", "60")
     run(fit / "point_cloud.ply", *arguments, "--out", tmp_path)
     orbit = orbit_of_gaussians(blobs(), np.array([0, 0, 1]), 60)

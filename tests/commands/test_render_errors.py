@@ -4,6 +4,7 @@ import json
 import os
 
 import pytest
+from conftest import REPOSITORY
 from PIL import Image
 from support.commands import assert_ends_well, assert_refused
 from support.folders import visible
@@ -34,6 +35,8 @@ def refused(tmp_path, *words, message):
 PLY = "point_cloud.ply"
 CAMERA = ("--origin", 3, 0, 0)
 MOST_PIXELS = 8 * 10**9 // memory.IMAGE_BYTES
+
+SKY = REPOSITORY / "scenes" / "images" / "tiles.png"
 
 WRONG_WORDS = [
     (("nowhere.ply",), "there is no such file or folder"),
@@ -69,6 +72,7 @@ WRONG_WORDS = [
     (("", *CAMERA, "--size", 0, 9), "--size: must be a whole"),
     (("", "--background", "pink"), "or an image's file, got pink"),
     (("", "--background", 0, 0, 1.5), "got 0 0 1.5"),
+    (("", "--background", SKY), "an image is not what the photographs were composited over"),
     (("", "--camera", "nowhere.json", "--size", 8, 8), "nowhere.json: cannot read"),
     (("", "--data", "nowhere"), "data.path: there is no folder"),
     (("", "--set", "data.imagesize=3"), "did you mean data.image_size?"),

@@ -1,5 +1,7 @@
 """OpenEXR files on one thread, and scenes that Mitsuba would not survive."""
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -8,6 +10,7 @@ from support.formats import refusal
 from support.openexr import read_exr
 
 from drgs.capture.path_tracing import load_scene
+from drgs.core.errors import UserError
 from drgs.io.images import write_exr
 from drgs.io.scenes import load_scene_file, openexr_threads
 
@@ -68,3 +71,9 @@ def test_a_sampler_without_samples_is_refused(sky, sampler):
     # Parameters may be named like options of Mitsuba's parser.
     scene = load_scene_file(sky, sampler=sampler, count="4", filename="3")
     assert "max_depth = 3" in str(scene)
+
+
+def test_names_that_are_not_utf8_are_refused():
+    """They would crash Mitsuba."""
+    with pytest.raises(UserError, match=r"takes names in UTF-8 only, got .*; rename it"):
+        load_scene_file(Path("a\udca9.xml"))
