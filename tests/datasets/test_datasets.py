@@ -145,7 +145,8 @@ def test_every_eighth_view_by_file_name_is_test(photographs):
         i = int(view.name)
         np.testing.assert_allclose(view.image, 20 * i / 255, rtol=1e-6)
         np.testing.assert_allclose(view.center, (4 * math.cos(i), 4 * math.sin(i), 1))
-    assert [view.name for view in load(photographs, test_every=5).test] == ["00", "05"]
+    dataset = load(photographs, test_every=5, background="white")
+    assert [view.name for view in dataset.test] == ["00", "05"]
 
 
 def test_a_frame_overrides_the_intrinsics_at_the_top(photographs):

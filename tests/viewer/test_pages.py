@@ -110,6 +110,7 @@ def test_browser_camera_becomes_a_request(page):
     assert request.approximations == FITTED
     request = requested(page, width=300, height=200)
     assert (request.width, request.height) == (300, 200)
+    page.refuse(-1, "of a client that has left: nothing to show")
 
 
 def test_every_control_is_in_the_request(page, server):
