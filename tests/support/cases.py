@@ -271,8 +271,8 @@ SCENES = {
     "no opacity": Case("", scene=no_opacity, width=18, height=9, focal=12.0, count=10),
     "needles": Case("", scene=needles, width=40, height=23, focal=20.0, count=8),
 }
-"""Scenes by name, with the size of film and the numbers of Gaussians that they have. With these seeds
-no pixel crosses a threshold while a step of the camera is taken."""
+"""Scenes by name, with the size of film and the numbers of Gaussians that they have. With these
+seeds no pixel crosses a threshold while a step of the camera is taken."""
 
 OF_SCENES = {
     "default": (by_effects, {}),
