@@ -29,8 +29,8 @@ from support.differentiable_scenes import (
     DISTORTION,
     HEIGHT,
     LENSES,
-    OTHERS,
     SCENES,
+    UNSTORED_SCENES,
     WIDTH,
     ZEROS,
     load,
@@ -107,14 +107,14 @@ RIGHT, BACK, OBLIQUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, -0.6, 0.5)
 AROUND = (0.6, -0.48, 0.64, 10.0)  # an axis, and degrees for each unit of theta
 GROWING = (0.5,)  # of a scale
 TURN = (0.3, -0.5, 0.8, 0.4)  # of a quaternion
-SOME = np.linspace(0.5, 1.5, 24)  # factors of 24 Gaussians
+FACTORS = np.linspace(0.5, 1.5, 24)  # factors of 24 Gaussians
 ALONG = {
     "means": RIGHT,
     "quats": TURN,
     "shN": ((1.0,), (-0.5,), (0.25,)),
-    "data": np.outer(SOME, [*RIGHT, 0.1, 0.1, 0.1, *TURN]).ravel(),
-    "opacities": SOME,
-    "sh_coeffs": np.repeat(SOME, 12),
+    "data": np.outer(FACTORS, [*RIGHT, 0.1, 0.1, 0.1, *TURN]).ravel(),
+    "opacities": FACTORS,
+    "sh_coeffs": np.repeat(FACTORS, 12),
 }
 """Directions of parameters, by the ends of their keys; others change by theta."""
 
@@ -359,7 +359,7 @@ def test_camera_and_gaussian_derivatives_are_the_same_together_and_alone():
 def test_derivatives_of_detached_cameras_are_not_computed(name, monkeypatch):
     """Kernels of the Gaussians' derivatives are the same before and after a camera's were wanted;
     nothing is stored for each lane."""
-    loaded, other = (mi.load_dict((SCENES | OTHERS)[name]()) for _ in range(2))
+    loaded, other = (mi.load_dict((SCENES | UNSTORED_SCENES)[name]()) for _ in range(2))
     params = mi.traverse(loaded)
     dr.enable_grad(params["integrator.means"])
 
@@ -408,7 +408,7 @@ def test_pixel_sh_direction_refuses_camera_derivatives():
     ],
 )
 def test_ignored_effect_has_no_derivative(name, ignored, key):
-    description = (SCENES | OTHERS)[name]()
+    description = (SCENES | UNSTORED_SCENES)[name]()
     description["integrator"]["ignore"] = ignored
     params = mi.traverse(loaded := mi.load_dict(description))
     for changed in (key, "sensor.to_world"):

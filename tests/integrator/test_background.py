@@ -16,7 +16,7 @@ from support.backgrounds import (
     rendered,
     texels,
 )
-from support.views import VIEWS, Scene, decode, image_of, to_linear
+from support.views import VIEWS, Scene, decode, gradients_of, image_of, to_linear
 from support.wall_scenes import to_display
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -293,6 +293,17 @@ def test_gradients_reach_the_inputs_of_the_radiance(way, kind):
     # Sums of 3404 terms of one sign, in single precision; of pixels in a curved display space and
     # of what reflects the sky, a step leaves its square.
     assert dr.grad(factor)[0] == pytest.approx((both[0] - both[1]) / (2 * step), rel=3e-3)
+
+
+def test_derivatives_of_constant_radiance_have_the_same_bytes_in_two_runs():
+    """Derivatives of texels are added in any order: they, alone, may differ by rounding."""
+    runs, weights = [], np.random.default_rng(1).normal(size=(VIEW.height, VIEW.width, 4))
+    for _ in range(2):
+        integrator = integrator_of(Scene().gaussians)
+        loaded = load(Camera().dictionary(), integrator, sky=EMITTERS["constant"]())
+        runs.append(gradients_of(loaded, weights, [KEYS["constant"]], prefix="")[KEYS["constant"]])
+    np.testing.assert_array_equal(*runs)
+    assert runs[0].all()
 
 
 def test_a_changed_environment_needs_no_new_frame_and_no_new_kernel():

@@ -12,9 +12,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 SCENE = Scene(VIEWS[1])
 SENSORS = (VIEWS[1], VIEWS[2], VIEWS[10])
 
-# Tolerance of test_splats.
-GRADIENTS = 1e-4
-
 
 def load(sensor, wall=False, **others):
     scene = clear(SCENE)

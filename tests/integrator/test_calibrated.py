@@ -19,6 +19,7 @@ from support.calibrated_sensors import (
     OPENCV,
     PINHOLE,
     STATIC_SENSORS,
+    THIN_PRISM,
     Calibrated,
     by_name,
     clear_gaussians,
@@ -137,6 +138,36 @@ def test_rays_end_at_the_far_plane(sensor):
             camera = sensor.camera_at(time)
             point = (place - camera.center) @ camera.rotation.T
             assert sensor.lens.depths(camera, point[None])[0] == pytest.approx(depth, rel=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "name"),
+    [(OPENCV, name) for name in ("fx", "cy", "k1", "p2")]
+    + [(THIN_PRISM, name) for name in ("fx", "k1", "p2", "sy1")],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_rays_are_differentiable_in_the_calibration(sensor, name):
+    """Against central differences, in single precision; the search for a ray is not unrolled."""
+    loaded = sensor.load()
+    params = mi.traverse(loaded)
+    value = float(params[name][0])
+    sample = mi.Point2f(np.random.default_rng(0).uniform(size=(2, 20)).astype(np.float32))
+
+    def directions(value) -> mi.Vector3f:
+        params[name] = value
+        params.update()
+        return loaded.sample_ray(0.0, 0.5, sample, mi.Point2f(0.5))[0].d
+
+    step = 2.0**-6 if name in ("fx", "cy") else 2.0**-10
+    after, before = (np.array(directions(mi.Float(value + s)), float) for s in (step, -step))
+    expected = (after - before) / (2 * step)
+    attached = mi.Float(value)
+    dr.enable_grad(attached)
+    d = directions(attached)
+    dr.forward(attached, flags=dr.ADFlag.ClearEdges)
+    # Differences: 1e-7 / step of rounding, step^2 times a third derivative.
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(np.array(dr.grad(d)), expected, rtol=0, atol=3e-3 * size)
 
 
 SPLATS_SENSORS = [

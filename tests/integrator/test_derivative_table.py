@@ -322,7 +322,11 @@ def measure(case: Case, route: str) -> Found:
     try:
         backward = loss.derivative()
     except UnsupportedError as error:
-        is_named = case.key in str(error) or "the Gaussians are not" in str(error)
+        lit = {"light": "none", "shadows": ""} | ROUTES[route]
+        of_all = (
+            f"with light '{lit['light']}' and shadows '{lit['shadows']}', the Gaussians are not"
+        )
+        is_named = case.key in str(error) or of_all in str(error)
         assert str(error).startswith("splats: ") and is_named, error
         return Found(is_refused=True)
     difference = loss.difference()

@@ -87,10 +87,12 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     if has_sky:
         mirror["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.0}}
     origins, directions = pixel_rays(mi.load_dict(mirror["sensor"]))
-    rendered = along_rays(scene_of(splats, light_samples=0, **mirror), origins, directions)
+    cutoffs = {"alpha_max": 0.6, "alpha_cut": 0.05}
+    scene = scene_of(splats, light_samples=0, **cutoffs, **mirror)
+    rendered = along_rays(scene, origins, directions)
     mirrored = replace(splats, means=np.float32(means * [1, 1, -1]))
     seen = reference.composite_segments(
-        mirrored, origins, directions, np.full(len(origins), np.inf)
+        mirrored, origins, directions, np.full(len(origins), np.inf), **cutoffs
     )
     expected = radiance_of(seen, is_open=not has_sky)
     np.testing.assert_allclose(rendered, expected, atol=2e-4)

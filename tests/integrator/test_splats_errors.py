@@ -44,7 +44,7 @@ REFUSED = [
         {**NONE, "filename": "nowhere.ply"},
         "UserError: nowhere.ply: cannot read the file: No such file or directory",
     ),
-    ({"means": "abc"}, "means must be a tensor, got str"),
+    ({"means": "abc"}, "PluginTypeError: splats: means must be a tensor, got str"),
     (
         {"means": lambda: mi.TensorXf(3.0)},
         "means must have the shape (N, 3), with N = 1 the rows of means, got ()",
@@ -79,14 +79,18 @@ REFUSED = [
     ({"nested_spp": 1.5}, "nested_spp must be an integer from 0 to"),
     ({"nested_spp": 2**32}, f"nested_spp must be an integer from 0 to {MAX_INT}, got 4294967296"),
     ({"light": "beams"}, "light must be one of none, probe, rays, got 'beams'"),
-    ({"near": 0.0}, "near must be a positive number, got 0.0"),
+    ({"near": 0.0}, "PluginError: splats: near must be a positive number, got 0.0"),
     ({"near": "far"}, "got 'far'"),
     ({"near": True}, "near must be a positive number, got True"),
     ({"near": float("nan")}, "got nan"),
     ({"near": 1e-300}, "a positive number, got 1e-300"),
     ({"near": 1e300}, "a positive number, got 1e+300"),
     ({"background": [0.0, float("nan"), 0.0]}, "background must be finite numbers, got "),
-    ({"background": "white"}, "background must be an RGB colour"),
+    (
+        {"background": "white"},
+        "background must be an RGB colour, such as [1, 1, 1] or <rgb value='1, 1, 1'/>, or a "
+        "texture, got str",
+    ),
     (
         {"background": {"type": "spectrum", "value": 0.5}},
         "background must be an RGB colour, such as ",
@@ -123,7 +127,7 @@ REFUSED = [
         "aovs can have at most 64 channels together, got 2,003 (n 3, f 2,000); render "
         "them in parts, which share a kernel",
     ),
-    ({"antialiased": "no"}, "antialiased must be true or false, got 'no'"),
+    ({"antialiased": "no"}, "PluginTypeError: splats: antialiased must be true or false, got 'no'"),
     ({"order_window": 3.5}, "order_window must be from 1 to 64, got 3.5"),
     (
         {"projection": "affine"},

@@ -310,6 +310,13 @@ def test_changed_host_values_are_noticed():
     assert np.abs(after - before).max() > 0.01
 
 
+def test_display_space_on_a_film_without_rgb_is_refused():
+    scene = replace(SCENE, srgb_primitives=False)
+    loaded = load(scene, scene.view.sensor("luminance"))
+    with pytest.raises(ValueError, match="pixel_format must be rgb or rgba"):
+        loaded.integrator().render(loaded)
+
+
 # ----------------------------------------------------------------------------------------------
 # Derivatives, and what runs and stays
 # ----------------------------------------------------------------------------------------------

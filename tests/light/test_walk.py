@@ -1,6 +1,7 @@
 """Splats along rays, against a reference that visits every splat, and one that projects them."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from support.views import VIEWS, splats_before
 from drgs.reference import light as reference
 from drgs.reference import rays as image_reference
 from drgs.reference import splatting
+from drgs.splatting.cutoffs import Cutoffs
 
 
 def random_gaussians(count, seed=0, spread=1.0, size=0.1, degree=3) -> splatting.Gaussians:
@@ -78,22 +80,26 @@ times as much."""
 @pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize(
-    ("count", "spread", "size"), [(1, 1, 0.5), (30, 1, 0.5), (1000, 1, 0.05), (3000, 0.3, 0.1)]
+    ("count", "spread", "size", "cutoffs"),
+    [
+        *((1, 1, 0.5, Cutoffs()), (30, 1, 0.5, Cutoffs()), (1000, 1, 0.05, Cutoffs())),
+        *((3000, 0.3, 0.1, Cutoffs()), (300, 1, 0.2, Cutoffs(0.9, 0.05, 0.01))),
+    ],
 )
-def test_composited_rays_match_the_reference(precision, count, spread, size):
+def test_composited_rays_match_the_reference(precision, count, spread, size, cutoffs):
     gaussians, rays = random_gaussians(count, count, spread, size), random_rays(600)
     close = 0 if precision.dtype == np.float64 else 1e-4
-    exact = reference.composite_segments(
-        gaussians, rays.origins, rays.directions, rays.far, close=close
-    )
-    color, T, alone = passed(splats_of(gaussians, precision), rays, precision)
+    alphas = {"alpha_max": cutoffs.alpha_max, "alpha_cut": cutoffs.alpha_cut}
+    composite = partial(reference.composite_segments, gaussians, *vars(rays).values(), **alphas)
+    exact = composite(stop=cutoffs.transmittance_stop, close=close)
+    color, T, alone = passed(splats_of(gaussians, precision, cutoffs), rays, precision)
     sure = ~exact.is_close
     assert sure.mean() > (0.99 if close == 0 else 0.3) and exact.counts.max() > min(count, 2) - 1
     tolerance = TOLERANCE[precision.dtype]
     np.testing.assert_allclose(color[sure], exact.colors[sure], atol=tolerance * 3)
     np.testing.assert_allclose(T[sure], exact.transmittances[sure], atol=tolerance)
     # Asked alone, it is that of all, down to where nothing shows.
-    ends = reference.composite_segments(gaussians, rays.origins, rays.directions, rays.far, stop=0)
+    ends = composite(stop=0)
     np.testing.assert_allclose(alone[sure], ends.transmittances[sure], atol=tolerance + 1e-4)
 
 

@@ -48,12 +48,8 @@ class Camera:
     def dictionary(self) -> dict:
         if not self.changes:
             return self.view.sensor()
-        return self.view.sensor_like(
-            **{
-                "kind" if k == "type" else k: v() if callable(v) else v
-                for k, v in self.changes.items()
-            }
-        )
+        changes = {k: v() if callable(v) else v for k, v in self.changes.items()}
+        return self.view.sensor_like(changes.pop("type"), **changes)
 
 
 def calibrated(**changes) -> Camera:

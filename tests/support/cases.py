@@ -304,6 +304,7 @@ CASES = [
         for lens in ALL_LENSES
         if (effect, lens) not in HOLES
     ),
+    with_lens("rational", "edges", by_effects, scene=edges),
     *(
         Case(f"{name}, pinhole", approximations=options, reference=by_rays)
         for name, options in APPROXIMATIONS.items()

@@ -263,7 +263,7 @@ SCENES = {
 }
 """By the names of stored images."""
 
-OTHERS = {
+UNSTORED_SCENES = {
     "off_centre": off_centre,
     "rolling_shutter": lambda: moving(shutter="rolling"),
     "global_shutter": lambda: moving(shutter_samples=2),
@@ -274,7 +274,10 @@ OTHERS = {
         for lens, names in ZEROS.items()
     },
     "placed": placed,
-    "placed_smoothed": lambda: placed(smoothing=mi.Float(np.geomspace(0.02, 0.4, 24))),
+    "placed_smoothed": lambda: placed(
+        smoothing=mi.Float(np.geomspace(0.02, 0.4, 24)),
+        shN=tensor(np.random.RandomState(5).uniform(-0.05, 0.05, (24, 15, 3))),
+    ),
     "merged": merged,
     "hybrid_display": lambda: hybrid(
         srgb_primitives=False, sky={"type": "constant", "radiance": rgb(0.4, 0.6, 0.9)}
@@ -297,4 +300,4 @@ OTHERS = {
 @cache
 def load(name: str) -> mi.Scene:
     """One for all parameters: Mitsuba compiles light paths anew for each scene."""
-    return mi.load_dict((SCENES | OTHERS)[name]())
+    return mi.load_dict((SCENES | UNSTORED_SCENES)[name]())
