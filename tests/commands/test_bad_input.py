@@ -86,6 +86,7 @@ def save_image(mode, size):
 
 
 ALIASES = b"a: &a [1,1]\nb: &b [*a,*a]\nc: &c [*b,*b]\n"
+MODE = "r_1.png: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's mode CMYK"
 NOT_READ = "r_1.png: cannot read the image: Image size ("
 WRONG_INPUTS = {
     "a.yml: data is missing: ": edit(CONFIG, lambda _: ALIASES),
@@ -93,9 +94,11 @@ WRONG_INPUTS = {
     "r_1.png: must have at most 67,108,864 p": save_image("L", ((1 << 26) + 1, 1)),
     f"{NOT_READ}1000000000000 pixels)": edit(IMAGE, lambda png: declare_size(png, 10**6)),
     NOT_READ: edit(IMAGE, lambda png: declare_size(png, 2**31 - 1)),
-    "r_1.png: must be a grey, RGB or RGBA": save_image("CMYK", (32, 24)),
+    MODE: save_image("CMYK", (32, 24)),
     "of view r_1 (opencv: k1), got exact; or set data.ign": exact_projection_with_distortion,
-    "properties z are": edit(POINTS, lambda ply: ply.replace(b"float z\n", b"float v\n")),
+    "not a PLY of points: properties z are": edit(
+        POINTS, lambda ply: ply.replace(b" z\n", b" v\n")
+    ),
 }
 
 

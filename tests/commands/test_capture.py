@@ -147,6 +147,14 @@ def test_images_show_a_disc_of_the_encoded_radiance(captured):
         assert rgba[edge, :3].mean(axis=0) == pytest.approx(color, abs=3)
 
 
+def test_known_pixels_are_encoded():
+    half = 0.2145  # linear value of display 0.5005
+    pixels = [[0, 0, 0, 0], [half, 0, 2, 1], [half / 2, 0, 0.5, 0.5], [1e-4, 0, 0, 1e-3]]
+    encoded = path_tracing.encode(np.array([pixels]))
+    expected = [[0, 0, 0, 0], [128, 0, 255, 255], [128, 0, 255, 128], [0, 0, 0, 0]]
+    assert encoded[0].tolist() == expected
+
+
 def test_lamps_are_invisible_and_outside_the_bounding_box(tmp_path, ball, captured):
     lit = write(tmp_path, "lit.xml", BALL.format(extra=LAMP))
     run(lit, tmp_path / "out", *SMALL)
@@ -277,6 +285,13 @@ def test_output_ends_with_the_command_to_fit_the_result(inside):
 def test_mostly_black_or_empty_images_give_a_one_line_warning(cornell, tmp_path, options, message):
     (line,) = run(cornell, tmp_path / "out", *TINY, *options).stderr.splitlines()
     assert line.startswith("warning: ") and message in line
+
+
+def test_first_images_are_spread_over_all_views():
+    """Else those near the horizon would decide whether a warning is due."""
+    assert dataset.spread_first(list(range(125)))[:10] == list(range(0, 120, 12))
+    for count in (0, 1, 9, 10, 11, 19, 125):
+        assert sorted(dataset.spread_first(list(range(count)))) == list(range(count))
 
 
 def test_sensors_of_the_scene_are_used_if_requested(cornell, tmp_path):
@@ -457,6 +472,8 @@ def test_foreign_folders_are_left_alone(ball, tmp_path):
         (["--spp", 17], "spp is 1, requested is 17"),
         (["--size", 4, 8], "size is [4, 4], requested is [4, 8]"),
         (["--fov", 50], "fov is 39.5978, requested is 50.0"),
+        (["--azimuth", -25, 30], "azimuth is null, requested is [-25.0, 30.0]"),
+        (["--elevation", -15, 20], "elevation is null, requested is [-15.0, 20.0]"),
     ):
         refused(ball, out, *options, folder=out, message=message)
     other = tmp_path / "ball.xml"

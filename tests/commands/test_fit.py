@@ -18,7 +18,7 @@ from conftest import REPOSITORY
 from support.fit_command import assert_fits, run_fit, without_images, write_project
 from support.folders import visible
 from support.small_capture import write_dataset
-from support.small_fits import config_of, plain_dataset, true_blobs
+from support.small_fits import config_of, make_trainer, plain_dataset, steps, true_blobs
 from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.config.changes import with_changes
@@ -142,6 +142,15 @@ def test_the_resolved_configuration_gives_the_same_bytes_on_any_number_of_thread
         assert (again / name).read_bytes() == (first / name).read_bytes(), name
     page = (first / "viewer.html").read_text().replace("<title>first:", "<title>again:")
     assert (again / "viewer.html").read_text() == page
+
+
+@pytest.mark.slow
+def test_seed_decides_the_order_of_the_views():
+    def order(seed):
+        trainer = make_trainer(plain_dataset(), seed=seed)
+        return [steps(trainer, 1).last_step.views[-1].view.index for _ in range(8)]
+
+    assert order(0) == order(0) != order(1)
 
 
 @pytest.mark.slow

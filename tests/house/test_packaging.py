@@ -51,6 +51,20 @@ def installed(tmp_path):
     return site_packages(copy_checkout(checkout), tmp_path / "installed", "build_wheel")
 
 
+def test_every_file_is_installed_and_the_plugins_are_found(run_python, tmp_path, installed):
+    def files(folder):
+        paths = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+        return {path.as_posix() for path in paths if "__pycache__" not in path.parts}
+
+    expected = files(REPOSITORY / "drgs")
+    expected |= {f"plugins/{name}" for name in files(REPOSITORY / "plugins")}
+    assert {"results/page.html", "training/training_curves.csv", "__init__.py"} <= expected
+    assert files(installed / "drgs") == expected
+    result = run_python(PRINT_PLUGINS_PATH, cwd=tmp_path, PYTHONPATH=str(installed))
+    plugins = installed / "drgs" / "plugins" / "__init__.py"
+    assert result.stdout.strip() == str(plugins), result.stderr
+
+
 def test_checkout_finds_its_plugins(run_python, tmp_path, installed):
     """In its folder, from another, and if it shadows an installed package."""
     other_folder = {"cwd": tmp_path, "PYTHONPATH": str(REPOSITORY)}

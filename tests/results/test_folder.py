@@ -77,10 +77,12 @@ def test_configuration_before_defaults_matches_those_that_the_data_decided(tmp_p
     assert not is_open(config) and is_open(load_config(photos))
     given = FitConfig(data={"path": tmp_path})
     decided = with_changes(given, {"data.background": "black", "model.near": 0.3})
-    claim_output_folder(tmp_path / "out", decided)
-    (tmp_path / "out" / METRICS).write_text("{}")
-    assert is_finished(tmp_path / "out", given)
-    assert not is_finished(tmp_path / "out", with_changes(given, {"model.near": 0.2}))
+    out = tmp_path / "new" / "out"
+    claim_output_folder(out, decided)
+    assert load_run_config(out) == decided
+    (out / METRICS).write_text("{}")
+    assert is_finished(out, given)
+    assert not is_finished(out, with_changes(given, {"model.near": 0.2}))
 
 
 def test_temporary_files_of_a_killed_run_are_removed(finished, config):
@@ -99,6 +101,10 @@ def test_other_runs_and_foreign_files_are_refused_and_kept(tmp_path, finished, c
     )
     other = FitConfig(data=config.data, seed=7, **changes)
     assert_refused(message, claim_output_folder, finished, other)
+    (finished / METRICS).write_text("{}")
+    (finished / "notes.txt").write_text("mine")
+    message = "must hold nothing but a run to be replaced, got notes.txt; move that away"
+    assert_refused(message, remove_run, finished)
     (finished / "config.yml").write_text("[")
     message = "holds another run, with a config.yml that is not readable; choose"
     assert_refused(message, claim_output_folder, finished, config)
@@ -107,17 +113,20 @@ def test_other_runs_and_foreign_files_are_refused_and_kept(tmp_path, finished, c
     (finished / "config.yml").unlink()
     message = "is not the output folder of a fit: it has no config.yml"
     assert_refused(message, remove_run, finished)
-    message = f"{tmp_path}/none: is not the output folder of a fit: it does not exist, and so has "
+    message = (
+        "/none: is not the output folder of a fit: it does not exist, and so has no config.yml"
+    )
     assert_refused(message, load_run_config, tmp_path / "none")
     mine = tmp_path / "mine"
     mine.mkdir()
     for name in "dbca":
-        (mine / name).write_text("")
+        (mine / name).write_text("mine")
     message = "must be new or empty, got one that holds a, b, c and 1 more; choose"
     assert_refused(message, claim_output_folder, mine, config)
     for folder, reason in (("a", "File exists"), ("a/deeper", "Not a directory")):
         message = f"{reason}; choose another folder: a part of this path is a file"
         assert_refused(message, claim_output_folder, mine / folder, config)
+    assert contents(mine) == dict.fromkeys("abcd", b"mine")
 
 
 def test_removing_a_run_deletes_every_result(tmp_path, config):

@@ -204,6 +204,8 @@ def test_page_has_no_external_references_and_its_images_are_complete(page, out):
                 assert image.format.lower() == kind[1]
     assert (out / "orbit.webp").read_bytes() in contents
     assert '<input type="checkbox" id="orbit">' in page.source  # pauses it
+    reduced = page.source.partition("prefers-reduced-motion: reduce")[2].partition("\n}\n")[0]
+    assert ".orbit .moving, .orbit .pause" in reduced.partition("display: none")[0]
 
 
 def test_page_contains_the_metrics_and_the_best_median_and_worst_view(page, dataset, images):

@@ -11,6 +11,7 @@ from importlib import resources
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 from support.html_page import HtmlPage
 from support.small_capture import FOCUS, RADIUS, blobs, make_dataset, pose_around
 
@@ -112,6 +113,15 @@ def test_first_camera_is_nearest_to_the_orbit_start():
     distances = [np.linalg.norm(view.center - start) for view in views]
     assert found.camera is views[int(np.argmin(distances))]
     np.testing.assert_allclose(found.target, FOCUS, atol=1e-6)
+
+
+def test_view_without_cameras_shows_all_gaussians():
+    up = Rotation.from_euler("xyz", [30, 50, 0], degrees=True).apply([0, 0, 1])
+    camera = InitialView.from_gaussians(blobs(), up).camera
+    seen = (blobs().means - camera.center) @ camera.camera_to_world[:3, :3]
+    tangents = np.abs(seen[:, :2] / seen[:, 2:])
+    assert (tangents < np.tan(np.radians(40) / 2)).mean() > 0.95
+    assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-9)
 
 
 def test_page_of_numbers_it_cannot_show_or_that_is_too_large_is_not_written(

@@ -41,20 +41,23 @@ EVERYTHING = {
 """Settings of a fit with effects, density control and a growing SH degree."""
 
 
-def run(trainer, queue=None, dataset=None, before=lambda iteration: None, **options):
-    """A whole fit, watched if there are queue; before: is called before those are served.
+def run(trainer, queue=None, dataset=None, before=lambda _: None, stops=lambda: False, show=None):
+    """A whole fit, watched if there is a queue; before: is called before its requests are served.
 
     Returns the screen, a mock, and the history. show: what the screen does with an image.
     """
-    screen, length, history = Mock(), StopCriterion(), History()
-    screen.show.side_effect = options.get("show")
+    screen, length, history = Mock(progress=[]), StopCriterion(), History()
+    screen.show.side_effect = show
+    screen.show_progress.side_effect = lambda trainer, _, total: screen.progress.append(
+        (trainer.iteration, total)
+    )
     if queue is not None:
         length = EarlyStop(length, queue)
         watching = TrainingViewer(queue, screen, dataset, length)
     for done in iterations(trainer, history, length):
         if queue is not None:
             before(done.report.iteration)
-            watching.after_iteration(trainer, history, done, options.get("stops", lambda: False))
+            watching.after_iteration(trainer, history, done, stops)
     screen.refuse.assert_not_called()
     return screen, history
 
@@ -65,8 +68,7 @@ def frames_of(screen):
 
 def assert_told(screen, iterations, total):
     """The last progress, and the end."""
-    trainer, _, told = screen.show_progress.call_args.args
-    assert (trainer.iteration, told) == (iterations, total)
+    assert screen.progress[-1] == (iterations, total)
     screen.show_end.assert_called_once_with(iterations)
 
 
