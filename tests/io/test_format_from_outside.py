@@ -89,7 +89,8 @@ def test_errors_of_the_format_are_reported_with_its_name(installed, tmp_path, co
     [
         ("return content.getvalue()", "return 1 / 0", r'"npz" \(npz_format\): ZeroDivisionError'),
         (
-            *('suffix = ".npz"', 'suffix = "npz"'),
+            'suffix = ".npz"',
+            'suffix = "npz"',
             r'load the extension "npz" of the package drgs-npz \(npz_format\): TypeError: Npz\.suff'
             "ix must be a suffix in small",
         ),

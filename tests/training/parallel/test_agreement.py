@@ -18,8 +18,13 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.images import write_png
 
 SETTINGS = (
-    *("iterations=8", "init.num_points=40", "init.half_extent=0.5", "densify.budget.gaussians=60"),
-    *("optimizer.views_per_step=2", "output.report=false", "output.save_renders=false"),
+    "iterations=8",
+    "init.num_points=40",
+    "init.half_extent=0.5",
+    "densify.budget.gaussians=60",
+    "optimizer.views_per_step=2",
+    "output.report=false",
+    "output.save_renders=false",
 )
 
 
