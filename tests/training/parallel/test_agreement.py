@@ -64,7 +64,7 @@ def fitted(copies, out, size=2):
 
 @pytest.mark.slow
 def test_photographs_may_differ_only_where_another_process_reads_them(copies, tmp_path):
-    """Test photographs, which rank 0 reads, are such as well."""
+    """Rank 0 alone reads test photographs."""
     for name in ("train/r_0.png", "train/r_2.png", "test/r_0.png", "test/r_1.png"):
         shutil.copy(copies[1] / "train" / "r_1.png", copies[1] / name)
     status, _, errors = fitted(copies, tmp_path / "two")
