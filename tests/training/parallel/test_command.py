@@ -81,7 +81,7 @@ def test_error_is_reported_once(config, tmp_path, size, words, message):
     command = ["-m", f"drgs.{name}", *files, *words, "--out", out]
     status, _, errors = parallel_processes.run(size, command)
     assert (status, errors.count("error: ")) == (2, 1), errors
-    assert message in errors and not out.is_file()
+    assert message in errors and (name == "fit" or not out.exists())
 
 
 @pytest.mark.slow
