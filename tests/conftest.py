@@ -45,16 +45,6 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-@pytest.fixture
-def lego_folder():
-    return _shared("nerf_synthetic", "lego")
-
-
-@pytest.fixture
-def fox_folder():
-    return _shared("fox")
-
-
 @pytest.fixture(scope="module")
 def gsplat():
     """10,000 Gaussians, their camera, and gsplat's float32 image, cotangent and gradients."""

@@ -89,7 +89,8 @@ def test_tested_versions_pass_silently(machine, monkeypatch, version):
 def test_17_and_18_warn_as_untested(machine, monkeypatch):
     monkeypatch.setattr(llvm, "loaded_version", lambda: (18, 0, 6))
     message = (
-        r"^drgs: libLLVM 18\.0\.6 is untested; 19 or newer is recommended: apt-get install lib"
+        r"^drgs: libLLVM 18\.0\.6 is untested; 19 or newer is recommended: "
+        "apt-get install libllvm19$"
     )
     with pytest.warns(UserWarning, match=message):
         llvm.ensure_usable_llvm()

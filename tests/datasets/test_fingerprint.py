@@ -38,12 +38,11 @@ def test_moved_data_has_the_same_fingerprint(folder, tmp_path):
 
 
 FRAME_CHANGES = [
-    *(
-        ("transform_matrix 1 3", 9, "camera"),
-        ("k2", 0.5, "camera"),
-        ("shutter", "rolling", "camera"),
-    ),
-    *(("transform_matrix_close", None, "camera"), ("mask_path", None, "mask")),
+    ("transform_matrix 1 3", 9, "camera"),
+    ("k2", 0.5, "camera"),
+    ("shutter", "rolling", "camera"),
+    ("transform_matrix_close", None, "camera"),
+    ("mask_path", None, "mask"),
     ("depth_file_path", None, "depth"),
 ]
 

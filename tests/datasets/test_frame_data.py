@@ -102,9 +102,8 @@ def test_missing_masks_drop_their_photographs_and_missing_depths_do_not(photogra
     give(photographs, "03.png", depth_file_path="gone.npy")
     dataset, notes = load_noting(photographs)
     assert [view.name for view in dataset.train] == ["01", "03", "04", "05", "06", "07", "08"]
-    assert (
-        views_by_name(dataset)["03"].mask is not None and views_by_name(dataset)["03"].depth is None
-    )
+    view = views_by_name(dataset)["03"]
+    assert view.mask is not None and view.depth is None
     path = photographs / "transforms.json"
     assert notes == [
         f"{path}: not there: 1 of 4 masks (gone.png); their photographs are left out",

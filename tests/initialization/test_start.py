@@ -202,7 +202,7 @@ def test_box_that_cameras_do_not_determine_or_show_is_refused(views, half_extent
 
 def test_cloud_in_another_coordinate_system_is_refused(cloud):
     dataset = dataset_of(views_from((30, 30, 30)))
-    with pytest.raises(UserError, match=r"the cameras .* only 0 of 4 have any of its 50 points"):
+    with pytest.raises(UserError, match=rf"^{cloud}: .* only 0 of 4 have any of its 50 points in"):
         gaussians_of(dataset, init={"point_cloud": cloud})
 
 

@@ -94,6 +94,12 @@ def test_masks_are_carved_within_the_given_box():
     assert len(start.means) > 100 and np.abs(start.means).max() <= 0.7
 
 
+def test_unknown_box_is_derived_from_the_cameras():
+    start = start_of(config(), replace(BALL, start_half_extent=None))
+    assert len(start.means) > 150
+    assert np.abs(np.linalg.norm(start.means, axis=1) - 0.8).max() < 0.25
+
+
 FEW_MASKS = replace(OPAQUE, train=(*BALL.train[:2], *OPAQUE.train[2:]))
 
 

@@ -11,7 +11,7 @@ from support.colmap_models import PARAMETERS, WRITERS, some_model, write_binary,
 from support.formats import refusal
 
 from drgs.core.errors import UserError
-from drgs.io.colmap import MODELS, read_model, read_points3d
+from drgs.io.colmap import MODELS, ColmapCamera, read_model, read_points3d
 
 MUTATIONS = 500  # of each format
 
@@ -27,6 +27,21 @@ def model():
 
 def read(folder):
     return read_points3d(read_model(folder).points_file)
+
+
+@each_format
+def test_written_models_are_read_back(tmp_path, model, write):
+    found = read_model(write(tmp_path, model))
+    for number, name, width, height, values in model.cameras:
+        parameters = dict(zip(MODELS[name][1], values, strict=True))
+        assert found.cameras[number] == ColmapCamera(number, name, width, height, parameters)
+    for image, (name, camera, pose) in zip(found.images, model.images, strict=True):
+        assert (image.name, image.camera) == (name, camera)
+        # Numbers up to 4, written as a quaternion: a few roundings.
+        np.testing.assert_allclose(image.camera_to_world, pose, atol=1e-14)
+    columns = zip(*model.points, strict=True)
+    for values, expected in zip(vars(read(tmp_path)).values(), columns, strict=True):
+        assert values.tolist() == np.array(expected).tolist()
 
 
 @each_format

@@ -87,13 +87,18 @@ def test_errors_of_the_format_are_reported_with_its_name(installed, tmp_path, co
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("return content.getvalue()", "return 1 / 0", r'"npz" \(npz_format\): ZeroDivisionError'),
         (
-            *('suffix = ".npz"', 'suffix = "npz"'),
-            r'load the extension "npz" of the package drgs-npz \(npz_format\): TypeError: Npz\.suff'
-            "ix must be a suffix in small",
+            "return content.getvalue()",
+            "return 1 / 0",
+            r'file format "npz" \(npz_format\): ZeroDivisionError: division by zero',
         ),
-        ("import io", "import no_such_module", 'load the extension "npz" .*no_such_module'),
+        (
+            'suffix = ".npz"',
+            'suffix = "npz"',
+            r'cannot load the extension "npz" of the package drgs-npz \(npz_format\): TypeError: '
+            r"Npz\.suffix must be a suffix in small",
+        ),
+        ("import io", "import no_such_module", 'cannot load the extension "npz" .*no_such_module'),
     ],
 )
 def test_errors_of_the_package_are_reported_with_its_name(installed, tmp_path, old, new, message):

@@ -192,3 +192,14 @@ def test_a_number_out_of_range_is_refused_by_its_row(tmp_path, parts, attribute,
     changed = binary[:at] + struct.pack("<f", value) + binary[at + 4 :]
     text = refused(tmp_path / "a.glb", document, changed)
     assert text.startswith("byte ") and f", row 5: {NAME}:{attribute} {message}" in text
+
+
+def test_zero_scales_and_opacities_are_clamped_before_the_logarithm(tmp_path):
+    gaussians = gaussians_within_ranges(3, degree=0)
+    gaussians.log_scales[1] = -300
+    gaussians.logit_opacities[:] = [-300, 0, 300]
+    gaussians.save(tmp_path / "a.glb")
+    found = Gaussians.load(tmp_path / "a.glb")
+    tiny = np.finfo(np.float32).tiny
+    assert (found.scales[1] <= 2 * tiny).all() and np.isfinite(found.log_scales).all()
+    assert found.opacities[0] <= 8 * tiny and 1 - 2.0**-22 < found.opacities[2] < 1

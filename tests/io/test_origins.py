@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from support.formats import refusal
+from scipy.spatial.transform import Rotation
+from support.formats import distance_of_ellipsoids, refusal
 from support.small_capture import blobs
 
 from drgs.core.errors import UserNote
@@ -101,8 +102,11 @@ def test_origin_must_be_three_numbers(tmp_path, x):
     assert refusal(tmp_path / "a.ply").startswith(message)
 
 
-def test_rotation_applies_to_the_origin():
+def test_rotation_applies_to_origin_means_and_quats():
     far = replace(blobs(), origin=EARTH)
     turned = rotation_towards(far, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
     rotation = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # -y becomes z
     np.testing.assert_allclose(world(turned), world(far) @ rotation.T, atol=1e-5)
+    before = Rotation.from_quat(far.quats, scalar_first=True)
+    expected = (Rotation.from_matrix(rotation) * before).as_quat(scalar_first=True)
+    assert distance_of_ellipsoids(expected, turned.quats).max() < 1e-6

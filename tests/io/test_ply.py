@@ -311,8 +311,12 @@ print(read_points({str(tmp_path / "b.ply")!r})[0].shape)
 # Settings that a header records
 
 VALUES = {
-    **{"antialiased": True, "low_pass": 0.1, "order_window": 8, "projection": "exact"},
-    **{"alpha_cut": 1 / 255, "extent": np.inf},
+    "antialiased": True,
+    "low_pass": 0.1,
+    "order_window": 8,
+    "projection": "exact",
+    "alpha_cut": 1 / 255,
+    "extent": np.inf,
 }
 LINES = [
     b"comment drgs antialiased true",

@@ -51,7 +51,10 @@ assert_fit_refused = partial(assert_refused, fit.main)
 
 def without_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report that takes no time: an empty page."""
-    write_page = lambda out, *_: (out / "report.html").write_text("")  # noqa: E731
+
+    def write_page(out: Path, *_: object) -> None:
+        (out / "report.html").write_text("")
+
     monkeypatch.setattr(fit_folder, "write_results", write_page)
 
 

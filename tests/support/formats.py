@@ -146,9 +146,9 @@ def assert_within(precision: Precision, expected: Gaussians, found: Gaussians) -
 
 
 def refusal(path, read=Gaussians.load) -> str:
-    """Return the line that refuses a file, without the file's name."""
+    """Return the line that refuses a file, and contains its path, without the path at its start."""
     with pytest.raises(UserError) as error:
         read(path)
     (line,) = str(error.value).splitlines()
-    assert len(line) < 400
+    assert str(path) in line and len(line) < 400
     return line.removeprefix(f"{path}: ")

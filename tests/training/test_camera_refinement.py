@@ -89,9 +89,10 @@ def test_first_steps_equal_the_rates():
     trainer.step()
     extent, decay = fits.plain_dataset().extent, 0.01
     rates = {"turns": 1e-3, "moves": 2e-3 * extent, "log_focals": 3e-3, "shifts": 4e-3}
-    for name, numbers in effect_of(trainer).numpy().items():
-        (moved_row,) = numbers[numbers.any(axis=1)]
-        np.testing.assert_allclose(np.abs(moved_row), decay * rates[name], rtol=1e-4)
+    numbers = effect_of(trainer).numpy()
+    for name, rate in rates.items():
+        (moved_row,) = numbers[name][numbers[name].any(axis=1)]
+        np.testing.assert_allclose(np.abs(moved_row), decay * rate, rtol=1e-4)
 
 
 def test_cameras_are_unchanged_before_the_start():
@@ -239,7 +240,8 @@ def test_disturbed_camera_is_recovered_with_true_gaussians(change, rates, iterat
 
 
 LENSES = (
-    *(None, None),
+    None,
+    None,
     RadialTangential.from_coefficients(k1=0.1, p2=-0.02),
     RadialTangential.from_coefficients(k1=0.1, k4=0.25),
     Fisheye.from_coefficients(k1=0.05, k2=-0.01),

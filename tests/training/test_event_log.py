@@ -103,5 +103,6 @@ def test_resumed_fit_continues_the_curve_and_another_fit_replaces_it(
 def test_missing_extra_is_reported_with_what_to_install(tmp_path, monkeypatch):
     config = write_project(tmp_path)
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    message = "needs tensorboardX, which is not installed; pip install 'drgs[tensorboard]'"
+    message = "--tensorboard: needs tensorboardX, which is not installed; "
+    message += "pip install 'drgs[tensorboard]'"
     assert_fit_refused(config, "--tensorboard", folder=tmp_path, message=message)

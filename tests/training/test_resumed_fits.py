@@ -91,7 +91,9 @@ EFFECTS = {
     "masks": (masked, {}),
     "depth": (fits.true_dataset, DEPTH),
     "random background": (transparent, RANDOM),
-    **{"cameras": (plain, CAMERAS), "colors": (plain, COLORS), "smoothing": (plain, SMOOTHING)},
+    "cameras": (plain, CAMERAS),
+    "colors": (plain, COLORS),
+    "smoothing": (plain, SMOOTHING),
 }
 
 

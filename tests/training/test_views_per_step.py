@@ -39,7 +39,9 @@ def test_each_place_of_a_step_has_its_own_views_in_shuffled_rounds(num_views, vi
         own = np.arange(place % num_views, num_views, views_per_step)
         rounds = views[: 60 // len(own) * len(own)].reshape(-1, len(own))
         assert np.array_equal(np.sort(rounds, axis=1), np.tile(own, (len(rounds), 1)))
-        assert len(own) == 1 or len({tuple(r) for r in rounds}) > 1
+        num_orders = len({tuple(r) for r in rounds})
+        assert num_orders > 1 or len(own) == 1
+        assert num_orders == len(rounds) or len(own) < 10
     assert set(drawn) == set(range(num_views))
 
 

@@ -155,6 +155,7 @@ def test_random_populations_follow_rules_and_cap(seed):
     assert report.num_gaussians <= max(config.max_gaussians, len(kept))
     assert (report.cloned, report.split) == (len(cloned), len(split))
     assert report.pruned == num - len(kept) - len(split)
+    assert report.num_added == report.num_gaussians - num + report.pruned
     same = len(kept) + len(cloned)
     for name in PARAMETER_NAMES:
         is_sampled = name in ("means", "log_scales")

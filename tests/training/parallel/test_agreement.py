@@ -18,8 +18,13 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.images import write_png
 
 SETTINGS = (
-    *("iterations=8", "init.num_points=40", "init.half_extent=0.5", "densify.budget.gaussians=60"),
-    *("optimizer.views_per_step=2", "output.report=false", "output.save_renders=false"),
+    "iterations=8",
+    "init.num_points=40",
+    "init.half_extent=0.5",
+    "densify.budget.gaussians=60",
+    "optimizer.views_per_step=2",
+    "output.report=false",
+    "output.save_renders=false",
 )
 
 
@@ -59,7 +64,7 @@ def fitted(copies, out, size=2):
 
 @pytest.mark.slow
 def test_photographs_may_differ_only_where_another_process_reads_them(copies, tmp_path):
-    """Test photographs, which rank 0 reads, are such as well."""
+    """Rank 0 alone reads test photographs."""
     for name in ("train/r_0.png", "train/r_2.png", "test/r_0.png", "test/r_1.png"):
         shutil.copy(copies[1] / "train" / "r_1.png", copies[1] / name)
     status, _, errors = fitted(copies, tmp_path / "two")
