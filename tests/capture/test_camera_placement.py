@@ -225,9 +225,13 @@ def test_sensors_of_other_types_are_no_cameras():
     assert len(perspective_sensors(scene)) == 1
 
 
-def test_scene_of_lamps_alone_is_refused():
-    with pytest.raises(UserError, match="no surfaces that cameras could see"):
-        bounding_box(loaded(lamp=LAMP))
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [(LAMP, "no surfaces that cameras could see"), ({"type": "sphere", "radius": 0.0}, "a size")],
+)
+def test_scene_without_extent_is_refused(shape, message):
+    with pytest.raises(UserError, match=message):
+        bounding_box(loaded(shape=shape))
 
 
 def test_light_that_is_not_finite_is_refused_with_its_pixel(monkeypatch):

@@ -505,3 +505,11 @@ def test_stopped_capture_gives_the_reason(ball, tmp_path, monkeypatch, error, st
     monkeypatch.setattr(path_tracing.CaptureCamera, "image", Mock(side_effect=error))
     outcome = run_in_process(capture.main, ball, *LEAST, "--out", tmp_path / "out")
     assert outcome.returncode == status and message in outcome.stderr
+
+
+def test_transparent_images_give_no_points(ball, tmp_path, monkeypatch):
+    empty = np.zeros((4, 4, 4), np.uint8)
+    monkeypatch.setattr(path_tracing.CaptureCamera, "image", lambda *_: empty)
+    outcome = run(ball, tmp_path / "out", *LEAST)
+    assert "no points: the images to train on show no surface" in outcome.stdout
+    assert not (tmp_path / "out" / dataset.POINTS).exists()

@@ -125,3 +125,12 @@ def test_names_are_shortened_between_characters():
     assert shorten_stem("a" * 201) == "a" * 200
     assert shorten_stem("a" + "\u4e2d" * 90) == "a" + "\u4e2d" * 66
     assert shorten_stem(os.fsdecode(b"\xff") * 9) == os.fsdecode(b"\xff") * 9
+
+
+def test_file_on_a_broken_disk_is_named(tmp_path, monkeypatch):
+    path = tmp_path / "a.yml"
+    path.write_text("a")
+    broken = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+    monkeypatch.setattr("drgs.core.files.require_memory", broken)  # called before reading
+    with pytest.raises(UserError, match=r"a\.yml: cannot read the \w+: Input/output error"):
+        read_bytes(path, "configuration", 100)
