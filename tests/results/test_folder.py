@@ -15,6 +15,7 @@ from drgs.results import files
 from drgs.results.files import METRICS, RESULTS
 from drgs.results.folder import (
     FOLDERS,
+    check_output_folder,
     claim_output_folder,
     image_names,
     is_finished,
@@ -126,6 +127,8 @@ def test_other_runs_and_foreign_files_are_refused_and_kept(tmp_path, finished, c
     for folder, reason in (("a", "File exists"), ("a/deeper", "Not a directory")):
         message = f"{reason}; choose another folder: a part of this path is a file"
         assert_refused(message, claim_output_folder, mine / folder, config)
+    message = "a: cannot be the output folder: Not a directory; choose another folder"
+    assert_refused(message, check_output_folder, mine / "a", config)
     assert contents(mine) == dict.fromkeys("abcd", b"mine")
 
 
