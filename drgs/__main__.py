@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
+
+from typing_extensions import override
 
 import drgs
 from drgs.cli.commands import CommandParser, Subcommand, run_command
+from drgs.core.environment import describe_installation
 
 COMMANDS = {
     "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit"),
@@ -31,8 +35,21 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s render out/lego --orbit 60 --out out/lego_orbit",
         "%(prog)s COMMAND --help",
     )
-    parser.add_argument("--version", action="version", version=f"drgs {drgs.__version__}")
+    parser.add_argument(
+        "--version",
+        action=ShowVersion,
+        nargs=0,
+        help="show the versions of drgs and of what it runs on, for a report, and exit",
+    )
     parser.add_commands(COMMANDS, metavar="COMMAND")
+
+
+class ShowVersion(argparse.Action):
+    """Print the versions and exit."""
+
+    @override
+    def __call__(self, parser: argparse.ArgumentParser, *arguments: object) -> None:
+        parser.exit(message=f"drgs {drgs.__version__}\n{describe_installation()}\n")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,9 @@
 """Fixtures for more than one test file."""
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+
+# isort: split
+
 import json
 import math
 import os
@@ -12,8 +16,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
-
-import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 
 pytest.register_assert_rewrite("support")
 

@@ -49,6 +49,26 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
+def describe_installation() -> str:
+    """Return Mitsuba, Dr.Jit, LLVM with its file, Python and the machine, in lines."""
+    import drjit
+    import mitsuba
+
+    from drgs.core import llvm, private
+
+    version = llvm.loaded_version()
+    name = "none" if version is None else llvm.format_version(version)
+    width = private.llvm_vector_width() if version else 0
+    return "\n".join(
+        (
+            f"Mitsuba {mitsuba.__version__}, Dr.Jit {drjit.__version__}",
+            f"LLVM {name} ({llvm.library_file() or 'no file'}), vectors of {width} floats, "
+            f"{drjit.thread_count()} threads",
+            f"Python {platform.python_version()}, {platform.platform()}, {processor()}",
+        )
+    )
+
+
 _FLUSH_BITS = 0x8040  # FTZ and DAZ of x86's MXCSR (Intel, Software Developer's Manual 1, 10.2.3)
 
 

@@ -17,12 +17,15 @@ import platform
 import re
 import sys
 import warnings
+from contextlib import suppress
 from glob import glob
 from pathlib import Path
 
 MINIMUM_VERSION = 17  # first major version that compiles every kernel
 
 TESTED_VERSION = 19  # first major version that drgs is tested with; earlier ones give a warning
+
+ENVIRONMENT_FOLDER = os.path.join(sys.prefix, "lib")  # of libraries that pip and conda install
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
@@ -37,9 +40,10 @@ class LLVMVersionError(ImportError, RuntimeError):
 
 
 def select_newest_llvm() -> None:
-    """Set ``DRJIT_LIBLLVM_PATH`` to the newest usable libLLVM, for this process and its children.
+    """Set ``DRJIT_LIBLLVM_PATH`` to the best usable libLLVM, for this process and its children.
 
-    Without effect if the variable is set, Dr.Jit is imported, or no usable library is found.
+    A tested version of the system comes first, then that of the Python environment. Without effect
+    if the variable is set, Dr.Jit is imported, or no usable library is found.
     """
     if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
         return
@@ -56,8 +60,8 @@ def ensure_usable_llvm() -> None:
         raise LLVMVersionError(_refusal(version))
     if version[0] < TESTED_VERSION:
         warnings.warn(
-            f"drgs: libLLVM {_format_version(version)} is untested; {TESTED_VERSION} or newer is "
-            f"recommended: {_install_command()}",
+            f"drgs: libLLVM {format_version(version)} is untested; {TESTED_VERSION} or newer is "
+            f"recommended: {_install_commands()}",
             stacklevel=2,
         )
 
@@ -80,8 +84,9 @@ def loaded_version() -> Version | None:
 
 
 def installed_libraries() -> list[tuple[Version, str]]:
-    """Return (version, path) of every libLLVM in the usual places, the newest first.
+    """Return (version, path) of every libLLVM in the usual places, the best first.
 
+    Tested versions come before others, the system's before the environment's, newer before older.
     Versions come from file names: loading is slow, and two libLLVM in one process conflict.
     """
     found = set()
@@ -90,7 +95,24 @@ def installed_libraries() -> list[tuple[Version, str]]:
             version = version_from_name(name)
             if version is not None and os.path.isfile(name):
                 found.add((version, name))
-    return sorted(found, key=lambda item: (item[0], len(item[1])), reverse=True)
+
+    def rank(item: tuple[Version, str]) -> tuple:
+        (major, *_), path = item
+        is_of_system = not path.startswith(ENVIRONMENT_FOLDER)
+        return major >= TESTED_VERSION, is_of_system, item[0], len(path)
+
+    return sorted(found, key=rank, reverse=True)
+
+
+def library_file() -> str | None:
+    """Return the file of the libLLVM in use; None if it is unknown."""
+    import psutil
+
+    with suppress(AttributeError, psutil.Error):  # macOS has no list of mapped files
+        for mapped in psutil.Process().memory_maps():
+            if version_from_name(mapped.path) is not None:
+                return mapped.path
+    return os.environ.get(PATH_VARIABLE)
 
 
 def version_from_name(path: str | Path) -> Version | None:
@@ -126,7 +148,7 @@ class _VariantCheck:
 def _library_folders() -> list[str]:
     return [
         *filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)),
-        os.path.join(sys.prefix, "lib"),  # conda environments
+        ENVIRONMENT_FOLDER,
         f"/usr/lib/{platform.machine()}-linux-gnu",
         "/usr/lib64",
         "/usr/local/lib",
@@ -138,24 +160,29 @@ def _library_folders() -> list[str]:
 
 
 def _refusal(version: Version | None) -> str:
-    found = "none that Dr.Jit can load" if version is None else _format_version(version)
+    found = "none that Dr.Jit can load" if version is None else format_version(version)
     if version is None and (named := os.environ.get(PATH_VARIABLE)):
         found += f" ({PATH_VARIABLE}={named})"
     message = (
         f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed ({TESTED_VERSION} is tested), found "
-        f"{found}. Install one with '{_install_command()}', or name its file in the environment "
+        f"{found}. Install one with {_install_commands()}, or name its file in the environment "
         f"variable {PATH_VARIABLE}"
     )
     usable = [path for version, path in installed_libraries() if version[0] >= MINIMUM_VERSION]
     if usable:
         message += f"; here {PATH_VARIABLE}={usable[0]} would do"
+        message += ", or 'import drgs' before drjit and mitsuba"
     return message + "."
 
 
-def _install_command() -> str:
-    is_mac = sys.platform == "darwin"
-    return "brew install llvm" if is_mac else f"apt-get install libllvm{TESTED_VERSION}"
+def _install_commands() -> str:
+    if sys.platform == "darwin":
+        return "'brew install llvm'"
+    system = f"'apt-get install libllvm{TESTED_VERSION}'"
+    has_wheel = sys.platform == "linux" and platform.machine() == "x86_64"
+    return f"\"pip install 'drgs[llvm]'\" or {system}" if has_wheel else system
 
 
-def _format_version(version: Version) -> str:
+def format_version(version: Version) -> str:
+    """Return a version as text, such as ``19.1.7``."""
     return ".".join(str(part) for part in version)

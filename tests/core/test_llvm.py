@@ -1,4 +1,5 @@
 import os
+import platform
 import sys
 import warnings
 from glob import glob
@@ -16,10 +17,14 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.delenv(llvm.PATH_VARIABLE)
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setattr(llvm, "_library_folders", lambda: [str(tmp_path)])
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(llvm, "ENVIRONMENT_FOLDER", str(tmp_path / "environment"))
+    folders = [str(tmp_path), llvm.ENVIRONMENT_FOLDER]
+    monkeypatch.setattr(llvm, "_library_folders", lambda: folders)
 
     def install(*names):
         for name in names:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
             (tmp_path / name).touch()
         return tmp_path
 
@@ -63,6 +68,14 @@ def test_the_newest_library_is_selected_even_if_it_is_a_link(machine):
     assert os.environ[llvm.PATH_VARIABLE] == str(folder / "libLLVM.so.100.1")
 
 
+def test_library_of_the_environment_comes_after_a_tested_one_of_the_system(machine):
+    folder = machine("environment/libLLVM.so.22.1", "libLLVM.so.18.1", "libLLVM.so.17.0")
+    names = [os.path.relpath(path, folder) for _, path in llvm.installed_libraries()]
+    assert names == ["environment/libLLVM.so.22.1", "libLLVM.so.18.1", "libLLVM.so.17.0"]
+    machine("libLLVM.so.19.1")
+    assert llvm.installed_libraries()[0] == ((19, 1), str(folder / "libLLVM.so.19.1"))
+
+
 def test_nothing_is_selected_where_the_choice_is_made(machine, monkeypatch):
     """No library is usable; the user has chosen one; Dr.Jit has loaded one."""
     machine("libLLVM-15.so.1", "libLLVM-16.so.1")
@@ -90,7 +103,7 @@ def test_17_and_18_warn_as_untested(machine, monkeypatch):
     monkeypatch.setattr(llvm, "loaded_version", lambda: (18, 0, 6))
     message = (
         r"^drgs: libLLVM 18\.0\.6 is untested; 19 or newer is recommended: "
-        "apt-get install libllvm19$"
+        "\"pip install 'drgs\\[llvm\\]'\" or 'apt-get install libllvm19'$"
     )
     with pytest.warns(UserWarning, match=message):
         llvm.ensure_usable_llvm()
@@ -98,9 +111,11 @@ def test_17_and_18_warn_as_untested(machine, monkeypatch):
 
 NONE = "found none that Dr.Jit can load"
 REFUSALS = [
-    ((16, 0, 6), [], {}, "found 16.0.6. Install one with 'apt-get install libllvm19', or name its"),
+    ((16, 0, 6), [], {}, "found 16.0.6. Install one with \"pip install 'drgs[llvm]'\" or 'apt-get"),
+    ((16, 0, 6), [], {}, "install libllvm19', or name its file in the environment variable DRJIT_"),
     ((16, 0, 6), [], {"platform": "darwin"}, "Install one with 'brew install llvm', or name"),
-    ((15, 0, 6), ["libLLVM.so.19.1"], {}, "; here DRJIT_LIBLLVM_PATH={}/libLLVM.so.19.1 would do."),
+    ((15, 0, 6), ["libLLVM.so.19.1"], {}, "; here DRJIT_LIBLLVM_PATH={}/libLLVM.so.19.1 would do,"),
+    ((15, 0, 6), ["libLLVM.so.19.1"], {}, " or 'import drgs' before drjit and mitsuba."),
     (None, [], {}, f"{NONE}. Install one"),
     (None, ["libLLVM-14.so.1"], {}, f"{NONE}. Install one"),
     (None, [], {"variable": "/none.so"}, f"{NONE} (DRJIT_LIBLLVM_PATH=/none.so). Install one"),
@@ -118,6 +133,10 @@ def test_unusable_libraries_are_refused(machine, monkeypatch, version, names, mo
         llvm.ensure_usable_llvm()
     assert str(error.value).startswith("drgs: libLLVM 17 or newer is needed (19 is tested), found ")
     assert message.format(folder) in str(error.value)
+
+
+def test_the_file_in_use_is_known():
+    assert llvm.version_from_name(llvm.library_file())[0] == llvm.loaded_version()[0]
 
 
 SET_VARIANT = """
