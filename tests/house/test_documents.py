@@ -59,8 +59,9 @@ def test_readme_is_short():
 
 def test_readme_has_two_commands_each_on_its_own_line():
     assert [block.strip() for block in fenced("README.md", "sh")] == [
-        "bash .ci/setup python -m drgs.fit scenes/lego.yml",
-        "bash .ci/setup python -m pytest",
+        "python3 -m venv .venv && . .venv/bin/activate && pip install -e '.[llvm]' && "
+        "python -m drgs.fit scenes/lego.yml",
+        "pip install -e '.[llvm,test]' && python -m pytest",
     ]
 
 
