@@ -11,10 +11,13 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise, product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from plyfile import PlyData, PlyElement
 from scipy.spatial import ConvexHull
 
 PLATE = 0.4  # studs
@@ -244,15 +247,15 @@ def material(name: str) -> dict[str, Any]:
 
 
 def mesh(name: str, soup: np.ndarray) -> mi.Mesh:
-    """A mesh of triangles (N, 3, 2, 3): corner, position and normal."""
-    corners = soup.reshape(-1, 2, 3)
-    normals = corners[:, 1] / np.linalg.norm(corners[:, 1], axis=1, keepdims=True)
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(material(name))
-    shape = mi.Mesh(name, len(corners), len(soup), has_vertex_normals=True, props=props)
-    values = mi.traverse(shape)
-    values["vertex_positions"] = corners[:, 0].ravel().astype(np.float32)
-    values["vertex_normals"] = normals.ravel().astype(np.float32)
-    values["faces"] = np.arange(len(corners), dtype=np.uint32)
-    values.update()
-    return shape
+    """A mesh of triangles (N, 3, 2, 3): corner, position and normal; read back from a PLY file."""
+    corners = soup.reshape(-1, 6).astype(np.float64)
+    corners[:, 3:] /= np.linalg.norm(corners[:, 3:], axis=1, keepdims=True)
+    columns = [(column, "f4") for column in ("x", "y", "z", "nx", "ny", "nz")]
+    vertices = np.array([tuple(corner) for corner in corners], columns)
+    faces = np.empty(len(soup), [("vertex_indices", "i4", (3,))])
+    faces["vertex_indices"] = np.arange(len(corners)).reshape(-1, 3)
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    with TemporaryDirectory() as folder:
+        path = Path(folder, f"{name}.ply")
+        PlyData(elements).write(str(path))
+        return mi.load_dict({"type": "ply", "filename": str(path), "bsdf": material(name)})
