@@ -1,4 +1,11 @@
-"""All calls of undocumented functions of Dr.Jit (1.5.0) and Mitsuba (3.9.1)."""
+"""What depends on the release of Dr.Jit (1.5) or Mitsuba (3.9), so that it is in one place.
+
+To recheck with Dr.Jit 1.6 and Mitsuba 3.10, which are not released yet:
+
+- each function below: it calls what is undocumented, and says what it relies on;
+- ``dr.freeze`` for the iterations of a fit: ``docs/tried.md`` has what 1.5 lacks;
+- :mod:`drgs._registration`, next to Mitsuba's own discovery by entry points.
+"""
 
 from __future__ import annotations
 

@@ -109,7 +109,8 @@ class FlatMirror:
 def _points(shape: mi.Shape) -> np.ndarray:
     """Return points (N, 3) of a shape, world, on its plane if it is flat; none if it cannot be."""
     if isinstance(shape, mi.Mesh):
-        return np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+        vertices = dr.arange(mi.UInt32, shape.vertex_count())
+        return np.array(shape.vertex_position(vertices), np.float64).T
     if shape.class_name() != "Disk":
         return np.zeros((0, 3))
     to_world = mi.traverse(shape)["to_world"]

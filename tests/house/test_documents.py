@@ -146,7 +146,7 @@ def commands(page) -> list[list[str]]:
     lines = [line for block in fenced(page, "sh") for line in block.splitlines()]
     found = []
     for line in [*lines, *inline_code(page)]:
-        match = re.search(r"python -m drgs[. ](.*)|^drgs (.*)", line)
+        match = re.search(r"python -m drgs[. ](\w.*)|^drgs (\w.*)", line)
         if match:
             found.append(shlex.split(match[1] or match[2], comments=True))
     return found
