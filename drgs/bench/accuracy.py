@@ -45,6 +45,7 @@ from drgs.splatting.footprint import PixelCenters, SamplePositions
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PLOTS = ("accuracy.png", "accuracy_stress.png")  # of the given scene, and of the stress scene
 ROUNDS, QUICK_ROUNDS = 9, 3
 SLOW_S, SLOW_ROUNDS = 1.0, 2  # slower rungs are timed in SLOW_ROUNDS
 FILM_SIZE_PX = 400  # film of scenes without cameras
@@ -129,7 +130,7 @@ class AccuracyMeasurement:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s out/lego")
-    add_out(parser, run, "accuracy.csv", "accuracy.png")
+    add_out(parser, run, "accuracy.csv", *PLOTS)
     add_scene(parser)
     parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
     parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
@@ -147,7 +148,7 @@ def add_scene(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure both scenes; write table, CSV and plot."""
+    """Measure both scenes; write table, CSV and plots."""
     subjects = [
         load_subject(Path(args.scene), 1 if args.quick else args.views),
         Subject("stress", *stress_scene(FILM_SIZE_PX), [], (0.0, 0.0, 0.0)),
@@ -167,7 +168,8 @@ def run(args: argparse.Namespace) -> None:
         results += found
         print(table(found), flush=True)
     write_rows(args.out / "accuracy.csv", AccuracyMeasurement, results)
-    write_figure(args.out / "accuracy.png", plot(results))
+    for subject, name in zip(subjects, PLOTS, strict=True):
+        write_figure(args.out / name, plot([m for m in results if m.scene == subject.name]))
 
 
 def load_subject(path: Path, num_views: int) -> Subject:
@@ -382,26 +384,43 @@ def table(results: Sequence[AccuracyMeasurement]) -> str:
 
 
 def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
-    """Plot error over time for each scene, the Pareto front as a line."""
-    scenes = list(dict.fromkeys(m.scene for m in results))
-    figure = new_figure(4.6 * len(scenes) + 2.6, 4.6)
-    axes_of = dict(zip(scenes, figure.subplots(1, len(scenes), squeeze=False)[0], strict=True))
-    for scene, axes in axes_of.items():
-        here = [m for m in results if m.scene == scene and m.is_approximation]
-        front = pareto_front(here)
-        axes.plot(
-            [m.milliseconds for m in front], [m.root_mean_square for m in front], "-", color="0.8"
+    """Plot error over time of a scene; only the default and the Pareto front have names."""
+    from matplotlib.ticker import NullLocator
+
+    approximations = [m for m in results if m.is_approximation]
+    default, front = approximations[0], pareto_front(approximations)
+    figure = new_figure(7.6, 4.2)
+    axes = figure.subplots()
+
+    def point(m: AccuracyMeasurement) -> tuple[float, float]:
+        return m.milliseconds / default.milliseconds, 255 * m.root_mean_square
+
+    times, errors = zip(*map(point, approximations), strict=True)
+    axes.set(
+        xscale="log", xlim=(min(times) / 4, max(times) * 1.5), xticks=(1, 10, 100),
+        xlabel="time of a frame: times that of the default",
+        yscale="log", ylim=(min(errors) / 1.3, max(errors) * 1.3), yticks=(0.5, 1, 2, 5, 10),
+        ylabel="error: steps of 8-bit colour",
+    )  # fmt: skip
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(NullLocator())
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.plot(times, errors, "o", color="0.8", markersize=5)
+    axes.plot(*zip(*map(point, front), strict=True), "o-", color="C0", markersize=8, alpha=0.6)
+    axes.plot(*point(default), "o", color="C3", markersize=12)
+    style = {"textcoords": "offset points", "fontsize": 10, "va": "center"}
+    names = [
+        axes.annotate(
+            "default", point(default), (-12, -3), ha="right", color="C3", weight="bold", **style
         )
-        for k, m in enumerate(here):
-            axes.plot(
-                m.milliseconds, m.root_mean_square, "o" if m in front else "s", color=f"C{k % 10}",
-                markersize=8 if m in front else 5, alpha=0.8,
-                markeredgecolor="k" if k >= 10 else "none", label=m.rung,
-            )  # fmt: skip
-        axes.set(
-            xscale="log", yscale="log", xlabel="ms, forward", title=scene,
-            ylabel="root mean square error",
-        )  # fmt: skip
-        axes.grid(alpha=0.3)
-    axes_of[scenes[-1]].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1))
+    ]
+    for m in front:
+        if m is not default:
+            name = axes.annotate(m.rung, point(m), (10, 5), color="C0", **style)
+            here = name.get_window_extent()
+            if any(here.overlaps(other.get_window_extent()) for other in names):
+                name.remove()
+            else:
+                names.append(name)
     return figure

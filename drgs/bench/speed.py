@@ -77,7 +77,7 @@ class IterationReport:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --trained out/lego/point_cloud.ply")
-    add_out(parser, run, "speed.csv", "speed.json", "speed.png")
+    add_out(parser, run, "speed.csv", "speed.json", "speed.png", "stages.png")
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
     parser.add_argument(
         "--without-avx512",
@@ -94,7 +94,7 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure all scenes; write tables, CSV, JSON and a plot."""
+    """Measure all scenes; write tables, CSV, JSON and plots."""
     mi.set_variant("llvm_ad_rgb")
     if args.without_avx512:
         disable_avx512()
@@ -121,7 +121,9 @@ def run(args: argparse.Namespace) -> None:
     }
     with atomic_path(args.out / "speed.json") as temporary:
         temporary.write_text(json.dumps(values, indent=2) + "\n")
-    write_figure(args.out / "speed.png", plot(timings, reports))
+    *_, largest = (timing.scene for timing in timings if "trained" not in timing.scene)
+    write_figure(args.out / "speed.png", plot([t for t in timings if t.scene == largest]))
+    write_figure(args.out / "stages.png", plot_stages(reports))
 
 
 def make_scenes(trained: Path, quick: bool) -> list[Scene]:
@@ -322,29 +324,42 @@ def stage_table(report: IterationReport) -> str:
     return markdown_table(["stage", "time", "kernels"], rows)
 
 
-def plot(timings: list[Timing], reports: list[IterationReport]) -> Figure:
-    """Draw times of all implementations, and the stages of an iteration."""
-    figure = new_figure(11, 4.5)
-    left, right = figure.subplots(1, 2)
-    scenes = list(dict.fromkeys(timing.scene for timing in timings))
-    names = list(dict.fromkeys(timing.renderer for timing in timings))
-    labels = [scene.replace(", ", "\n") for scene in scenes]
-    for k, name in enumerate(names):
-        values = [t.forward_backward for t in timings if t.renderer == name]
-        places = np.arange(len(values)) + 0.8 * k / len(names)
-        bars = left.barh(places, values, 0.8 / len(names), label=name)
-        left.bar_label(bars, [_milliseconds(value) for value in values], padding=3, fontsize=7)
-    fastest, slowest = (f(t.forward_backward for t in timings) for f in (min, max))
-    left.set_yticks(np.arange(len(scenes)) + 0.3, labels)
-    left.set(xscale="log", xlim=(fastest / 3, slowest * 5), xlabel="s", title="forward + backward")
-    left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+def plot(timings: list[Timing]) -> Figure:
+    """Draw the time of an image with its derivatives, for the first renderers of a scene."""
+    names = {timing.renderer: timing.forward_backward for timing in timings}
+    ours = names["drgs"]
+    shown = {
+        "drgs": ours,
+        "Mitsuba's volprim_rf_basic": min(v for k, v in names.items() if "volprim" in k),
+        "drgs's numpy reference": names["numpy reference, float64"],
+    }
+    figure = new_figure(7.6, 2.4)
+    axes = figure.subplots()
+    bars = axes.barh(list(shown), list(shown.values()), 0.7, color=["C3", "0.7", "0.7"])
+    labels = [
+        _milliseconds(v) if v == ours else f"{_milliseconds(v)}: {v / ours:.0f}x"
+        for v in shown.values()
+    ]
+    axes.bar_label(bars, labels, padding=5, fontsize=12)
+    axes.tick_params(axis="y", labelsize=12, length=0)
+    axes.set(xticks=[], xlim=(0, 1.3 * max(shown.values())))
+    axes.invert_yaxis()
+    axes.spines[:].set_visible(False)
+    return figure
+
+
+def plot_stages(reports: list[IterationReport]) -> Figure:
+    """Draw the stages of a training iteration, for each scene."""
+    figure = new_figure(7.6, 4)
+    axes = figure.subplots()
+    labels = [report.scene.replace(", ", "\n") for report in reports]
     bottoms = np.zeros(len(reports))
     for stage in STAGES:
         values = np.array([report.stage_ms[stage] for report in reports])
-        right.bar(labels, values, bottom=bottoms, label=stage)
+        axes.bar(labels, values, bottom=bottoms, label=stage)
         bottoms += values
     rest = [max(report.rest_ms, 0) for report in reports]
-    right.bar(labels, rest, bottom=bottoms, label="rest of wall time", color="0.8")
-    right.set(ylabel="ms", title="a training iteration")
-    right.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1))
+    axes.bar(labels, rest, bottom=bottoms, label="rest of wall time", color="0.8")
+    axes.set(ylabel="ms", title="a training iteration")
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1))
     return figure
