@@ -16,6 +16,7 @@ and for every later one. Public names are imported when they are first used.
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs import _registration
@@ -29,7 +30,10 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["Gaussians", "load_dataset", "rasterization", "train"]
+EXAMPLE = Path(__file__).with_name("brick_crane.compressed.ply")
+"""File of a fitted crane truck, for a first look: ``drgs.Gaussians.load(drgs.EXAMPLE)``."""
+
+__all__ = ["EXAMPLE", "Gaussians", "load_dataset", "rasterization", "train"]
 
 # Dr.Jit loads its libLLVM while it is being imported: this comes before anything that does.
 llvm.select_newest_llvm()

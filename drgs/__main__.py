@@ -49,7 +49,8 @@ class ShowVersion(argparse.Action):
 
     @override
     def __call__(self, parser: argparse.ArgumentParser, *arguments: object) -> None:
-        parser.exit(message=f"drgs {drgs.__version__}\n{describe_installation()}\n")
+        print(f"drgs {drgs.__version__}\n{describe_installation()}")
+        parser.exit()
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""``python -m drgs.view WHAT``: look at Gaussians in a browser, rendered by our own kernels.
+"""``python -m drgs.view [WHAT]``: look at Gaussians in a browser, rendered by our own kernels.
 
-``WHAT`` is a file of Gaussians or the output folder of a fit. The page has lenses, depths, normals,
-opacities, approximations and rendering times; its resolution adapts while the camera moves.
+``WHAT`` is a file of Gaussians or the output folder of a fit; without it, a shipped crane truck.
+The page has lenses, depths, normals, opacities, approximations and rendering times; its resolution
+adapts while the camera moves.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+import drgs
 from drgs.cli.commands import (
     MAX_PORT,
     CommandParser,
@@ -27,7 +29,7 @@ from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import FIELD_OF_VIEW
 from drgs.render import UP, add_background, parse_background
-from drgs.results.model import Model, load_model
+from drgs.results.model import Background, Model, load_model
 from drgs.results.refined_cameras import training_cameras
 from drgs.viewer.frames import LiveScene
 from drgs.viewer.page import Page, StartView
@@ -44,12 +46,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = "View Gaussians in a browser, rendered live on this machine."
-    parser.show_examples("%(prog)s out/lego", "%(prog)s model.ply --background white")
+    parser.show_examples("%(prog)s", "%(prog)s out/lego", "%(prog)s model.ply --background white")
     parser.add_argument(
         "what",
+        nargs="?",
+        default=drgs.EXAMPLE,
         type=file_or_folder,
         metavar="MODEL|OUT_DIR",
-        help="file of Gaussians, or output folder of a fit",
+        help="file of Gaussians, or output folder of a fit (default: a crane truck)",
     )
     add_background(parser)
     parser.add_argument(
@@ -84,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
         raise UserError(f"{args.what}: there is no such file or folder")
     with execution_settings(args.threads, args.debug):
         select_variant(args.variant)
-        model = load_model(args.what, background=parse_background(args.background))
+        model = load_model(args.what, background=background_of(args))
         views = cameras_of(args, model)
         scene = LiveScene(model.gaussians, model.settings, model.background)
         requests, start = RenderRequests(), start_of(args, model, views)
@@ -100,6 +104,12 @@ def run(args: argparse.Namespace) -> None:
                 while not stop.requested:
                     if not scheduler.serve(lambda: scene):
                         requests.wait(IDLE_SECONDS)
+
+
+def background_of(args: argparse.Namespace) -> Background | None:
+    """Return the background of the command line; the shipped truck was fitted before white."""
+    is_example = args.what == drgs.EXAMPLE
+    return parse_background(args.background or (["white"] if is_example else None))
 
 
 def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:

@@ -13,11 +13,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import drgs  # noqa: F401  (registers the plugin)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
-import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import machine
 from drgs.cli.commands import bounded_int
 from drgs.cli.ending import exit_on_user_error

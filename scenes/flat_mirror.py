@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import argparse
 
+import drgs  # noqa: F401  (registers the plugins)
 import mitsuba as mi
 import numpy as np
-
-import drgs  # noqa: F401  (registers the plugins)
 from drgs.bench.output import markdown_table
 from drgs.cli.commands import bounded_int
 from drgs.reference import light as reference

@@ -11,10 +11,9 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
+from scipy.spatial.transform import Rotation
 
 DEGREE = 2
 SIZE, TUBE = 0.36, 0.2  # scene units: of the knot's centre line, whose radius is 3; of the tube

@@ -51,12 +51,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
+import drgs  # noqa: F401  (registers the plugin)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial.transform import Rotation
-
-import drgs  # noqa: F401  (registers the plugin)
 from drgs.bench.output import markdown_table
 from drgs.cli.ending import exit_on_user_error
 from drgs.config.approximations import from_ply_header
@@ -70,6 +68,7 @@ from drgs.gaussians.similarity import Similarity
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.images import write_animation, write_png
 from drgs.reference import splatting as reference
+from scipy.spatial.transform import Rotation
 
 
 class Unknowns:

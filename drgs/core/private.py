@@ -1,4 +1,4 @@
-"""What depends on the release of Dr.Jit (1.5) or Mitsuba (3.9), so that it is in one place.
+"""Functions that depend on the release of Dr.Jit (1.5) or Mitsuba (3.9), in one place.
 
 To recheck with Dr.Jit 1.6 and Mitsuba 3.10, which are not released yet:
 

@@ -15,13 +15,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import drgs  # noqa: F401  (registers the integrator)
 import mitsuba as mi
 import numpy as np
-from fits import SCENES
-from recipes import LEGO, PAPERS, config_of
-from scipy.spatial.transform import Rotation
-
-import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.capture.path_tracing import first_hits, load_scene
 from drgs.config.changes import with_changes, with_iterations
@@ -35,6 +31,9 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.io.images import to_uint8
 from drgs.results.metrics import mean_quality
 from drgs.training.trainer import Trainer
+from fits import SCENES
+from recipes import LEGO, PAPERS, config_of
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,10 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import drgs  # noqa: F401  (registers the integrator)
 import mitsuba as mi
 import numpy as np
-
-import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig

@@ -10,10 +10,9 @@ from __future__ import annotations
 import argparse
 import statistics
 
+import drgs  # noqa: F401  (registers the integrator)
 import drjit as dr
 import mitsuba as mi
-
-import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.scenes import bench_camera, bench_gaussians, mitsuba_sensor
 from drgs.bench.timing import seconds

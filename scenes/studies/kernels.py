@@ -22,13 +22,11 @@ from functools import partial
 from typing import Any
 from unittest.mock import patch
 
+import drgs  # noqa: F401  (registers the integrator)
 import drjit as dr
 import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
-from machine_code import MachineCodeError, assembly, count_operations, innermost_loop
-
-import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of
 from drgs.bench.timing import (
@@ -44,6 +42,7 @@ from drgs.bench.timing import (
 )
 from drgs.core.private import disable_avx512
 from drgs.splatting.grid import PIXELS
+from machine_code import MachineCodeError, assembly, count_operations, innermost_loop
 
 ROUNDS = 15
 

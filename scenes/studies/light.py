@@ -17,12 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import drgs  # noqa: F401  (registers the integrator)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from fits import SCENES
-
-import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.accuracy import add_scene
 from drgs.bench.output import machine, markdown_table
 from drgs.gaussians.parameters import Gaussians
@@ -30,6 +28,7 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.io.scenes import load_scene_file
 from drgs.results import metrics
 from drgs.results.files import GAUSSIANS
+from fits import SCENES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,10 +21,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
-from fits import add_case_option, fit_words, make_parser
-
 import drgs  # noqa: F401  (registers the integrator)
+import mitsuba as mi
 from drgs.bench.output import machine, markdown_table
 from drgs.config.schema import FitConfig
 from drgs.core.environment import require_module
@@ -40,6 +38,7 @@ from drgs.results.files import GAUSSIANS
 from drgs.results.folder import load_run_config
 from drgs.results.metrics import mean_of
 from drgs.results.report import score
+from fits import add_case_option, fit_words, make_parser
 
 JPEG_QUALITY = 95
 """Quality of the images that undistorting writes."""

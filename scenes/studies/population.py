@@ -20,9 +20,6 @@ from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
-from fits import SCENES, add_case_option, make_parser, read_metrics, write_curves
-from scipy.special import expit
-
 from drgs import fit
 from drgs.bench.output import markdown_table
 from drgs.capture import __main__ as capture
@@ -32,6 +29,8 @@ from drgs.datasets import load_dataset
 from drgs.results.files import HISTORY
 from drgs.training.density.adc import AdaptiveDensityControl
 from drgs.training.density.strategy import DensityReport, Population
+from fits import SCENES, add_case_option, make_parser, read_metrics, write_curves
+from scipy.special import expit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

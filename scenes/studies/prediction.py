@@ -26,11 +26,10 @@ import math
 from dataclasses import dataclass, replace
 from functools import partial
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from kernels import Launch, counted_launches, vector_trips, vector_width
-
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.scenes import (
     BENCH_FIELD_OF_VIEW,
@@ -46,6 +45,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.reference.splatting import Camera
 from drgs.splatting.rendering import on_film
 from drgs.training.trainer import Trainer
+from kernels import Launch, counted_launches, vector_trips, vector_width
 
 ROUNDS = 6
 

@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.timing import seconds, steps
 from drgs.config.changes import with_changes

@@ -18,15 +18,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fits import SCENES as SCENES_FOLDER
-from fits import add_case_option, fit, make_parser
-
 from drgs.bench.output import machine, markdown_table
 from drgs.config.changes import with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.history import write_csv
+from fits import SCENES as SCENES_FOLDER
+from fits import add_case_option, fit, make_parser
 
 Values = Mapping[str, object]
 """Values of a configuration, by names such as ``densify.every``."""

@@ -17,10 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import mitsuba as mi
-from fits import SCENES, add_case_option, fit, fit_words, make_parser, write_curves
-
 import drgs  # noqa: F401  (registers the integrator)
+import mitsuba as mi
 from drgs.bench.output import machine, markdown_table, write_rows
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.load import load_config
@@ -29,6 +27,7 @@ from drgs.datasets import load_dataset
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import initial_gaussians
 from drgs.training.budget import STRATEGIES, Strategy, rehearse
+from fits import SCENES, add_case_option, fit, fit_words, make_parser, write_curves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

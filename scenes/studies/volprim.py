@@ -18,10 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import drgs  # noqa: F401  (registers the integrator)
 import mitsuba as mi
 import numpy as np
-
-import drgs  # noqa: F401  (registers the integrator)
 from drgs.bench.accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table
 from drgs.bench.scenes import mitsuba_sensor

@@ -3,12 +3,14 @@
 import argparse
 import io
 import os
+import re
 import runpy
 import signal
 import subprocess
 import sys
 import warnings
 from contextlib import redirect_stderr, redirect_stdout
+from importlib import metadata
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -18,6 +20,7 @@ from conftest import REPOSITORY
 from PIL import Image
 from support.commands import run_in_process
 
+import drgs
 from drgs import __main__ as commands
 from drgs import fit
 from drgs.bench import __main__ as bench
@@ -251,6 +254,21 @@ except SystemExit:
     print(sorted({'mitsuba', 'drjit', 'matplotlib', 'drgs.fit', 'drgs.bench'} & set(sys.modules)))
 """
     assert run_python(program).stdout.splitlines()[-1] == "[]"
+
+
+def test_version_describes_the_installation(capsys):
+    with pytest.raises(SystemExit) as end:
+        commands.main(["--version"])
+    printed = capsys.readouterr().out.splitlines()
+    assert end.value.code == 0 and printed[0] == f"drgs {drgs.__version__}"
+    packages = f"Mitsuba {metadata.version('mitsuba')}, Dr.Jit {metadata.version('drjit')}"
+    assert printed[1] == packages
+    name, file, width, threads = re.fullmatch(
+        r"LLVM ([\d.]+) \((.+)\), vectors of (\d+) floats, (\d+) threads", printed[2]
+    ).groups()
+    assert "libLLVM" in file and Path(file).is_file()
+    assert name.split(".")[0] in Path(file).name
+    assert int(width) in (4, 8, 16) and int(threads) >= 1
 
 
 def test_parser_adds_arguments_of_a_command_once():

@@ -9,10 +9,10 @@ import yaml
 from support.commands import assert_refused
 from support.small_capture import FOCUS, RADIUS, make_dataset
 
+import drgs
 from drgs import view
 from drgs.cli.commands import CommandParser
 from drgs.core.errors import UserError
-from drgs.render import parse_background
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.model import load_model
 from drgs.results.refined_cameras import write_views
@@ -24,7 +24,7 @@ def opened(*arguments):
     parser = CommandParser()
     view.add_arguments(parser)
     args = parser.parse_args([str(argument) for argument in arguments])
-    model = load_model(args.what, background=parse_background(args.background))
+    model = load_model(args.what, background=view.background_of(args))
     return args, model, view.cameras_of(args, model)
 
 
@@ -52,6 +52,13 @@ def test_single_file_is_viewed_as_a_whole(fit):
     middle = np.median(model.gaussians.numpy().means, axis=0)
     distance = StartView.from_views([camera], middle).camera.distance
     assert distance == pytest.approx(np.linalg.norm(camera.center - middle), rel=0.2)
+
+
+def test_without_a_model_the_shipped_truck_is_viewed():
+    args, model, (camera,) = opened()
+    assert args.what == drgs.EXAMPLE and model.background == (1.0, 1.0, 1.0)
+    assert model.gaussians.num_gaussians > 10_000
+    assert 1 < np.linalg.norm(camera.center) < 10
 
 
 @pytest.mark.parametrize("name", ["", "point_cloud.ply"])
