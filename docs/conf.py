@@ -31,7 +31,7 @@ exclude_patterns = ["_build"]
 nitpicky = False
 
 myst_enable_extensions = ["dollarmath"]
-myst_heading_anchors = 3  # links such as results.md#speed work here as on a code host
+myst_heading_anchors = 3  # links such as results/speed.md#speed work here as on a code host
 
 autodoc_default_options = {"exclude-members": "model_config"}
 autodoc_member_order = "bysource"
