@@ -5,7 +5,7 @@ The tables are made from the schema, ``drgs.config.schema.FitConfig``, when the 
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from docutils import nodes
@@ -70,7 +70,7 @@ def _table(rows: list[list[str]]) -> nodes.table:
     return nodes.table("", group)
 
 
-def _row(*cells: list[nodes.Node]) -> nodes.row:
+def _row(*cells: Sequence[nodes.Node]) -> nodes.row:
     return nodes.row("", *(nodes.entry("", nodes.paragraph("", "", *cell)) for cell in cells))
 
 
