@@ -12,7 +12,7 @@ from typing import get_args
 from pydantic import BaseModel
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_ext")]
 
 import mitsuba as mi  # noqa: E402
 
@@ -26,12 +26,12 @@ author = "The drgs authors"
 copyright = author
 release = version = drgs.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "configuration"]
 exclude_patterns = ["_build"]
 nitpicky = False
 
 myst_enable_extensions = ["dollarmath"]
-myst_heading_anchors = 3  # links such as results.md#speed work here as on a code host
+myst_heading_anchors = 3  # links such as results/speed.md#speed work here as on a code host
 
 autodoc_default_options = {"exclude-members": "model_config"}
 autodoc_member_order = "bysource"

@@ -17,6 +17,7 @@ from pydantic import (
     PlainSerializer,
     PlainValidator,
     ValidationInfo,
+    WithJsonSchema,
     create_model,
     field_validator,
     model_validator,
@@ -54,6 +55,7 @@ ColorField = Annotated[
     Color | None,
     PlainValidator(_color),
     PlainSerializer(lambda color: list(color) if isinstance(color, tuple) else color),
+    WithJsonSchema({"format": "color"}),
 ]
 PathField = Annotated[Path, Field(strict=False)]
 

@@ -36,7 +36,7 @@ NAMES = {
 
 MARKERS = ("transforms_train.json", "transforms.json")  # of NeRF-synthetic and nerfstudio
 
-GUIDE = 'docs/guide.md, "From photographs to a dataset"'
+GUIDE = "docs/guide/photographs.md"
 
 
 def find_reader(

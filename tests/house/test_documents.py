@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import io
+import os
 import re
 import shlex
 import subprocess
@@ -21,7 +22,11 @@ PAGES = (
     "README.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
-    *(f"docs/{path.name}" for path in sorted((REPOSITORY / "docs").glob("*.md"))),
+    *sorted(
+        path.relative_to(REPOSITORY).as_posix()
+        for path in (REPOSITORY / "docs").rglob("*.md")
+        if "_build" not in path.parts
+    ),
 )
 
 STUDIES = sorted(
@@ -65,10 +70,23 @@ def test_readme_has_two_commands_each_on_its_own_line():
     ]
 
 
-def test_readme_links_to_every_page():
+def linked_pages(page) -> set[str]:
+    targets = re.findall(r"\]\(([^):#]+\.md)[)#]", text_of(page))
+    return {os.path.normpath(Path(page).parent / target) for target in targets}
+
+
+def test_readme_links_to_every_page_outside_of_folders():
     for page in PAGES:
-        if page not in ("README.md", "docs/index.md"):
-            assert f"]({page})" in text_of("README.md")
+        if Path(page).parent in (Path(), Path("docs")):
+            assert page in {"README.md", "docs/index.md", *linked_pages("README.md")}, page
+
+
+def test_readme_leads_to_every_page():
+    reached, found = set(), {"README.md"}
+    while found:
+        reached |= found
+        found = {target for page in found for target in linked_pages(page)} - reached
+    assert set(PAGES) - reached <= {"docs/index.md"}
 
 
 # ----------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ def section(page, heading):
     return text.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/guide.md", "docs/how_it_works.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/how_it_works.md"])
 def test_reading_guide_begins_with_the_reference(page):
     first = re.search(r"\]\((.*?)\)", section(page, "Reading the code"))[1]
     assert first.removeprefix("../") == REFERENCE
