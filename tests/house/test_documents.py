@@ -64,8 +64,8 @@ def test_readme_is_short():
 
 def test_readme_has_two_commands_each_on_its_own_line():
     assert [block.strip() for block in fenced("README.md", "sh")] == [
-        "python3 -m venv .venv && . .venv/bin/activate && pip install -e '.[llvm]' && "
-        "python -m drgs.fit scenes/lego.yml",
+        "python3 -m venv .venv && . .venv/bin/activate && "
+        "pip install -e '.[llvm,viewer]' && python -m drgs.fit scenes/lego.yml",
         "pip install -e '.[llvm,test]' && python -m pytest",
     ]
 
