@@ -26,10 +26,17 @@ author = "The drgs authors"
 copyright = author
 release = version = drgs.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "configuration"]
-exclude_patterns = ["_build"]
+extensions = [
+    "configuration",
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx_design",
+]
+exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 nitpicky = False
 
+nb_execution_mode = "off"  # notebooks are shown with their stored outputs
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3  # links such as results/speed.md#speed work here as on a code host
 

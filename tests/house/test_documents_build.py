@@ -18,7 +18,7 @@ ALL_PAGES = {
 
 @pytest.mark.parametrize("folder, settings", [("docs", {}), (".", ALL_PAGES)])
 def test_sphinx_builds_the_pages_without_a_warning(folder, settings, tmp_path):
-    for module in ("sphinx", "myst_parser", "furo"):
+    for module in ("sphinx", "myst_nb", "sphinx_design", "furo"):
         pytest.importorskip(module)
     command = ["-W", "--keep-going", "-b", "html", "-c", "docs", "-d", str(tmp_path / "trees")]
     command += [f"-D{name}={value}" for name, value in settings.items()]
