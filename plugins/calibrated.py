@@ -55,19 +55,58 @@ KNOWN = (
 
 
 class CalibratedSensor(mi.Sensor):
-    """Camera with the parameters of calibration tools; details are in ``docs/mitsuba.md``.
+    """Camera with the parameters of calibration tools.
 
-    - ``to_world``: pose, in the axes of Mitsuba's ``perspective``. (Default: the identity)
-    - ``fx``, ``fy``: focal lengths, px of the whole film. (Default: the film's width; ``fx``)
-    - ``cx``, ``cy``: principal point, px from the upper left corner. (Default: the film's centre)
-    - ``lens``: ``pinhole``, ``opencv``, ``fisheye``, ``thin_prism_fisheye``. (Default: ``pinhole``)
-    - ``k1``, ``k2``, ``k3``, ``k4``, ``k5``, ``k6``, ``p1``, ``p2``, ``sx1``, ``sy1``: coefficients
-      of the lens, exposed if they are given. (Default: 0)
-    - ``near_clip``, ``far_clip``: depths of the near and far plane. (Default: 0.01, 10000)
-    - ``to_world_close``: pose when the shutter closes. (Default: none)
-    - ``shutter_open``, ``shutter_close``: times of the two poses. (Default: 0, and 1 if it moves)
-    - ``shutter``: ``global``, which blurs, or ``rolling``, row by row. (Default: ``global``)
-    - ``shutter_samples``: times that ``splats`` renders of a global shutter. (Default: 8)
+    .. pluginparameters::
+
+     * - to_world
+       - |transform|
+       - Pose, in the axes of Mitsuba's ``perspective``: x to the left, y up, z forward. (Default:
+         the identity)
+       - |exposed|, |differentiable|
+     * - fx, fy
+       - |float|
+       - Focal lengths, px of the whole film. (Default: the film's width, ``fx``)
+       - |exposed|, |differentiable|
+     * - cx, cy
+       - |float|
+       - Principal point, px from the upper left corner of the whole film; the middle of the first
+         pixel is at (0.5, 0.5). (Default: the film's centre)
+       - |exposed|, |differentiable|
+     * - lens
+       - |string|
+       - ``pinhole``; ``opencv``: radial and tangential distortion; ``fisheye``: by the angle from
+         the axis (Kannala and Brandt 2006); ``thin_prism_fisheye``: COLMAP's THIN_PRISM_FISHEYE; or
+         a lens that another package registers, whose coefficients are parameters as well. (Default:
+         ``pinhole``)
+     * - k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1
+       - |float|
+       - Coefficients of the lens as OpenCV and COLMAP define them. ``opencv`` has ``k1`` to ``k6``,
+         ``p1`` and ``p2``; ``fisheye`` has ``k1`` to ``k4``; ``thin_prism_fisheye`` also has
+         ``p1``, ``p2``, ``sx1`` and ``sy1``. Given ones, also 0, are exposed; others are not
+         computed. (Default: 0)
+       - |exposed|, |differentiable|
+     * - near_clip, far_clip
+       - |float|
+       - Depths (with fisheyes: distances) of the near and far plane. ``splats`` ignores
+         ``far_clip``. (Default: 0.01, 10000)
+     * - to_world_close
+       - |transform|
+       - Pose when the shutter closes, of a camera that moves by less than half a turn. (Default:
+         none, it does not move)
+       - |exposed|
+     * - shutter_open, shutter_close
+       - |float|
+       - Times of the two poses, between which rays have theirs. (Default: 0 and, if the camera
+         moves, 1)
+     * - shutter
+       - |string|
+       - Shutter of a moving camera. ``global``: the whole film is exposed all the time, which
+         blurs; ``rolling``: rows are read from the first to the last. (Default: ``global``)
+     * - shutter_samples
+       - |int|
+       - Number of times at which ``splats`` renders a ``global`` shutter, at most 1000. It averages
+         radiance or, if ``srgb_primitives`` is false, display values. (Default: 8)
 
     Not differentiated: ``to_world_close``, and where the lens model ends.
     """

@@ -23,8 +23,16 @@ from drgs.splatting.tiles import TileBins, bin_footprints, footprints_of
 class MinimalSplatsIntegrator(mi.CppADIntegrator):
     """3D Gaussian splatting alone over black, for a ``perspective`` sensor and a box filter.
 
-    - ``filename``: file of Gaussians, such as a PLY file of the 3DGS reference implementation.
-    - ``means``, ``quats``, ``log_scales``, ``logit_opacities``, ``sh0``, ``shN``: exposed.
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - File of the Gaussians, in a format that ``splats`` reads.
+     * - means, quats, log_scales, logit_opacities, sh0, shN
+       - |tensor|
+       - Parameters of the Gaussians, as of ``splats``; not properties of a scene description.
+         (Default: those of ``filename``)
+       - |exposed|, |differentiable|
 
     Each pixel has one sample, at its centre; ``seed`` and ``spp`` make no difference. Not
     differentiated: the sensor, visibility, the order of the splats.

@@ -38,9 +38,18 @@ MAX_SURVIVAL_PROBABILITY = 0.95  # largest probability of Russian roulette, as i
 class SplatPathIntegrator(RBIntegrator):
     """Path tracer whose paths pass splats: to be nested in ``splats`` that set ``light``.
 
-    - ``max_depth``: longest path; 1 shows emitters only. (Default: -1, no limit)
-    - ``rr_depth``: depth from which on Russian roulette ends paths. (Default: 5)
-    - ``hide_emitters``: hide directly visible emitters. (Default: false)
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path depth: 1 shows emitters only, 2 adds direct illumination, and so on; -1: no
+         limit. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth from which on Russian roulette ends paths. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
 
     The first segment of a path passes no splats: ``splats`` renders those. Surfaces that light
     passes straight on (``null``, ``mask``, ``thindielectric``) are no vertices. Derivatives by path

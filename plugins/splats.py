@@ -30,32 +30,107 @@ from drgs.splatting.rendering import ProjectionStage
 class SplatsIntegrator(mi.CppADIntegrator):
     """3D Gaussian splatting, composited front to back over each pixel (Kerbl et al. 2023).
 
-    Details of the parameters are in ``docs/mitsuba.md``; "Default: none" is off.
+    .. pluginparameters::
 
-    - ``filename`` (string): PLY, compressed PLY, SPZ, ``.glb`` or ``.splat`` with the Gaussians.
-    - ``means``, ``quats``, ``log_scales``, ``logit_opacities``, ``sh0``, ``shN`` (tensor): instead.
-    - ``feature_...`` (tensor): numbers (N, C) of the Gaussians under your name, for ``aovs``.
-    - ``smoothing`` (tensor): deviations (N,) of the 3D smoothing filter. (Default: the file's)
-    - ``to_world`` (transform): similarity that places the Gaussians. (Default: none)
-    - ``shapes_to_world``, ``shapes_to_world_...`` (transform): turn shapes' SH. (Default: none)
-    - ``sh_degree`` (int): highest degree that is evaluated, 0 to 3. (Default: the Gaussians')
-    - ``background`` (rgb or texture): in display space, behind the splats. (Default: black)
-    - ``hide_emitters`` (bool): hide an environment behind the splats. (Default: false)
-    - a nested integrator: renders surfaces; of type ``splats``: a splat object. (Default: ``path``)
-    - ``nested_spp`` (int): samples of the nested integrator. (Default: as many as of the splats)
-    - ``light`` (string): ``none``, ``probe``, ``rays``: how splats light surfaces. (Default: none)
-    - ``probes`` (string): ids of shapes and emitters that have a probe. (Default: none)
-    - ``unseen`` (string): ``none``, ``rays``: beyond the sight of probes. (Default: ``none``)
-    - ``light_samples`` (int): splats that a ray draws; 0: it composites all. (Default: 4)
-    - ``exposure`` (float): radiance of white splats where surfaces see them. (Default: 1)
-    - ``shadows`` (string): ids of shapes that shade splats. (Default: none)
-    - ``near`` (float): near plane, scene units. (Default: 0.01)
-    - ``srgb_primitives`` (bool): linear radiance, or false for display space. (Default: true)
-    - ``aovs`` (string): ``name:depth``, ``:alpha``, ``:normal``, ``:feature_...``. (Default: none)
-    - ``ignore`` (string): ``distortion``, ``defocus``, ``motion``, ``smoothing``. (Default: none)
-    - ``projection``, ``falloff``, ``order``, ``order_window``, ``sh_direction``, ``alpha_max``,
-      ``alpha_cut``, ``transmittance_stop``, ``extent``, ``low_pass``, ``antialiased``: see
-      :class:`drgs.config.approximations.Approximations`.
+     * - filename
+       - |string|
+       - File of the Gaussians: a PLY file in the layout of the 3DGS reference implementation,
+         compressed PLY, SPZ, glTF (``.glb``) or ``.splat``. Where a format has y up, z is up in the
+         scene. Without it, the tensors below are the Gaussians. Those of the scene's shapes of type
+         ``ellipsoids`` and ``ellipsoidsmesh`` are rendered as well. (Default: none)
+     * - means, quats, log_scales, logit_opacities, sh0, shN
+       - |tensor|
+       - The N Gaussians, before ``to_world``: centres (N, 3); quaternions wxyz (N, 4), of any norm;
+         natural logarithms of the standard deviations (N, 3); opacities before the sigmoid (N);
+         spherical harmonics coefficients of degree 0 (N, 1, 3) and above (N, K - 1, 3). (Default:
+         those of ``filename``)
+       - |exposed|, |differentiable|
+     * - feature_...
+       - |tensor|
+       - Numbers of the Gaussians under a name of your own, (N, C), for ``aovs``. (Default: none)
+       - |exposed|, |differentiable|
+     * - smoothing
+       - |tensor|
+       - Standard deviation of the 3D smoothing filter of each Gaussian (N), scene units. (Default:
+         the file's ``filter_3D``)
+     * - to_world
+       - |transform|
+       - Rotation, uniform scale and translation of the Gaussians, with their harmonics. Their own
+         parameters, such as ``means``, stay as they are given. Its derivatives are those of the
+         nearest such transform. (Default: none)
+       - |exposed|, |differentiable|
+     * - shapes_to_world, shapes_to_world_...
+       - |transform|
+       - The ``to_world`` of the scene's ellipsoids, or of those with the id that the name ends
+         with. Mitsuba applies it to centres and quaternions; this integrator then rotates the
+         harmonics. (Default: none)
+     * - sh_degree
+       - |int|
+       - Highest spherical harmonics degree that is evaluated, 0 to 3. (Default: the Gaussians')
+     * - background
+       - |rgb| or |texture|
+       - Background of the splats: a colour in display space (sRGB-encoded), or a texture that is
+         stretched over the film and, as all textures are, linear. (Default: black)
+       - |exposed|, |differentiable|
+     * - hide_emitters
+       - |bool|
+       - Show the background instead of an environment emitter of the scene. (Default: false)
+     * - (Nested plugin)
+       - |integrator|
+       - Of type ``splats``, any number: an object with its own Gaussians and ``to_world``, rendered
+         with the settings of this integrator. One of another type: renders the scene's surfaces,
+         and should have the same ``hide_emitters``. (Default: ``path``; ``splatpath`` if ``light``
+         is set, or something transmits light straight on)
+       - |exposed|, |differentiable|
+     * - nested_spp
+       - |int|
+       - Samples per pixel of the nested integrator. (Default: as many as of the splats)
+     * - light
+       - |string|
+       - Light between splats and surfaces. ``none``: there is none; ``rays``: rays of the nested
+         ``splatpath`` pass through the splats from the first surface on; ``probe``: rays from and
+         to the objects in ``probes`` look splats up in images from the objects. (Default:
+         ``none``)
+     * - probes
+       - |string|
+       - Ids of shapes and emitters that have a probe, separated by commas. (Default: none)
+     * - unseen
+       - |string|
+       - Rays that pass behind something that is visible from a probe's centre. ``none``: they meet
+         no splats; ``rays``: they are traced as with ``light`` ``rays``. (Default: ``none``)
+     * - light_samples
+       - |int|
+       - Number of splats that a traced ray draws: 3 (also for 1 and 2) to 4096; 0: it composites
+         all. (Default: 4)
+     * - exposure
+       - |float|
+       - Radiance of a splat of colour 1 in reflections and transmission. (Default: 1)
+     * - shadows
+       - |string|
+       - Ids of shapes that cast shadows on splats, separated by commas. (Default: none)
+     * - near
+       - |float|
+       - Depth of the near plane, scene units: Gaussians with a closer centre are culled. The larger
+         of this and the sensor's ``near_clip`` applies. (Default: 0.01)
+     * - srgb_primitives
+       - |bool|
+       - Whether the image is linear radiance, as Mitsuba's films expect, or is left in display
+         space, the space of the splats' colours. (Default: true)
+     * - aovs
+       - |string|
+       - Channels after colour, a list of ``name:type``, at most 64 besides alphas: ``depth``
+         (``name.T``: z in the camera; with a fisheye lens, the distance), ``alpha`` (``name.I``),
+         ``normal`` (``name.X``, ``.Y``, ``.Z``: surfaces' normals and splats' shortest axes, unit
+         vectors in the world that point to the camera), or the name of a parameter ``feature_...``
+         (``name.0``, ``.1``, ...). (Default: none)
+     * - ignore
+       - |string|
+       - Effects that are not simulated: a list of ``distortion``, ``defocus``, ``motion`` and
+         ``smoothing``. (Default: none)
+     * - projection, falloff, order, order_window, sh_direction, alpha_max, alpha_cut,
+         transmittance_stop, extent, low_pass, antialiased
+       - |string|, |int|, |float| or |bool|
+       - See :class:`drgs.config.approximations.Approximations`.
 
     After a backward pass, ``last`` holds a :class:`drgs.integrator.state.BackwardResult`.
 

@@ -208,12 +208,12 @@ Offsets = Callable[[Float, Float], tuple[list, list]]
 @FALLOFFS.register("gaussian")
 @dataclass(frozen=True)
 class GaussianFalloff:
-    """The projected Gaussian is a Gaussian in the image: alpha = o exp(-|U d|^2 / 2).
+    """The projected Gaussian is a Gaussian in the image: ``alpha = o exp(-|U d|^2 / 2)``.
 
     The base of all falloffs. The *geometry* of a splat are the numbers that alpha depends on: mean
-    x, y (px); then p, r, s of U and log2_opacity, scaled such that log2_alpha = log2_opacity -
-    |U d|^2; subclasses may add more. *Moments* are sums over pixels, weighted by
-    d loss / d ln(alpha), from which :meth:`derivatives` follow.
+    x, y (px); then p, r, s of U and log2_opacity, scaled such that
+    ``log2_alpha = log2_opacity - |U d|^2``; subclasses may add more. *Moments* are sums over
+    pixels, weighted by d loss / d ln(alpha), from which :meth:`derivatives` follow.
     """
 
     @property
@@ -245,13 +245,13 @@ class GaussianFalloff:
     ) -> tuple[Array2f, Array2f]:
         """Return centre and half sizes (Array2f, px) of the visible part's bounding box.
 
-        reach: the largest log2_opacity - log2_alpha; here, the largest |U d|^2.
+        reach: the largest log2_opacity - log2_alpha; here, the largest ``|U d|^2``.
         """
         del geometry
         return splats.means2d, dr.sqrt(2 * math.log(2) * reach * splats.variances)
 
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
-        """Return mean x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that contains the splat."""
+        """Return mean x, y, p, r, s of an ellipse ``|U d|^2 <= reach`` that contains the splat."""
         del reach
         return geometry[:5]
 

@@ -2,20 +2,21 @@
 
 import re
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from fractions import Fraction
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from drgs.plugins import PLUGINS
+from plugin_parameters import parameters_of
 from support.views import Scene, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.config.approximations import Approximations
-from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.properties import KNOWN
 
 # ----------------------------------------------------------------------------------------------
@@ -23,48 +24,11 @@ from drgs.integrator.properties import KNOWN
 # ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Row:
-    """One row of a table in Mitsuba's format; it may have several names."""
-
-    names: tuple[str, ...]
-    kind: str
-    text: str
-    flags: frozenset[str]
-
-    @property
-    def defaults(self) -> dict[str, str]:
-        """Return defaults as written, by name; one for all names, or one each."""
-        found = re.search(r"\(Default: ([^)]*)\)", self.text)
-        words = found[1].split(", ") if found else []
-        words = words * len(self.names) if len(words) == 1 else words
-        return dict(zip(self.names, words, strict=False))
-
-
-def source(plugin) -> str:
-    return (REPOSITORY / "plugins" / f"{plugin}.py").read_text()
-
-
-def table(plugin) -> list[Row]:
-    """The plugin's table in the section "Parameters" of docs/mitsuba.md."""
-    page = (REPOSITORY / "docs" / "mitsuba.md").read_text().partition("\n## Parameters\n")[2]
-    section = page.partition(f"\n### `{plugin}`\n")[2].partition("\n### ")[0]
-    rows = []
-    for line in section.splitlines():
-        if line.startswith(("| `", "| (")):
-            names, kind, text = (cell.strip() for cell in line.strip("|").split(" | "))
-            kind, *flags = kind.split(", ")
-            flags = {"exposed", *flags} if flags else ()
-            rows.append(
-                Row(tuple(names.replace("`", "").split(", ")), kind, text, frozenset(flags))
-            )
-    return rows
-
-
-def names_in_docstring(plugin) -> set[str]:
-    documentation = source(plugin).split('    """')[1]
-    items = re.findall(r"^    - ((?:``[\w.]+``,?\s*)+)(?: ?\([\w ]+\))?: ", documentation, re.M)
-    return {name for item in items for name in re.findall(r"``([\w.]+)``", item)}
+def defaults(row) -> dict[str, str]:
+    """Return defaults as written, by name; one for all names, or one each."""
+    words = row.default.split(", ") if row.default else []
+    words = words * len(row.names) if len(words) == 1 else words
+    return dict(zip(row.names, words, strict=False))
 
 
 NESTED = "(Nested plugin)"
@@ -83,10 +47,20 @@ def known(plugin) -> set[str]:
 
 
 @pytest.mark.parametrize("plugin", ["splats", "splatpath", "calibrated"])
-def test_table_and_docstring_list_every_property(plugin):
-    listed = [name for row in table(plugin) for name in row.names]
+def test_table_lists_every_property(plugin):
+    listed = [name for row in parameters_of(plugin) for name in row.names]
     assert len(listed) == len(set(listed))
-    assert set(listed) - {NESTED} == known(plugin) == names_in_docstring(plugin)
+    assert set(listed) - {NESTED} == known(plugin)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_every_plugin_has_a_page_with_its_table(plugin):
+    assert parameters_of(plugin)
+    source = (REPOSITORY / "plugins" / f"{plugin}.py").read_text()
+    registered = re.search(r'mi\.register_\w+\("(\w+)"', source)[1]
+    page = (REPOSITORY / "docs" / "plugins" / f"{registered}.md").read_text()
+    assert f"```{{plugin-parameters}} {plugin}\n```" in page
+    assert f"(`{registered}`)" in page.splitlines()[0]
 
 
 def loaded(plugin) -> list[mi.Object]:
@@ -139,7 +113,8 @@ def test_table_marks_exposed_and_differentiable_parameters(plugin):
         )
         for name, flags in ((k, getattr(v, "value", v)) for k, v in found.items())
     }
-    actual = {name: row.flags for row in table(plugin) for name in row.names if row.flags}
+    rows = [row for row in parameters_of(plugin) if row.flags]
+    actual = {name: frozenset(row.flags) for row in rows for name in row.names}
     assert actual == expected
 
 
@@ -174,24 +149,18 @@ def written(text):
 @both_plugins
 def test_defaults_and_types_match_the_table(plugin):
     checked = set()
-    for row in table(plugin):
+    for row in parameters_of(plugin):
         for name in row.names:
             value = default_of(plugin, name)
             if value is None:
                 continue
-            assert row.kind == KINDS[type(value)], name
+            assert row.type == KINDS[type(value)], name
             if name != "nested_spp":  # in words: as many as of the splats
-                assert written(row.defaults[name]) == pytest.approx(value), name
+                assert written(defaults(row)[name]) == pytest.approx(value), name
             checked.add(name)
     assert len(checked) == {"splats": 14, "calibrated": 5}[plugin]
 
 
-def test_every_property_has_a_default_except_sources_of_gaussians():
-    without = {name for p in ("splats", "calibrated") for r in table(p) for name in r.names}
-    without -= {name for p in ("splats", "calibrated") for r in table(p) for name in r.defaults}
-    ways = {"filename", *PARAMETER_NAMES, "feature_..."}
-    assert {name for name in without if "(Default" not in row_text(name)} == ways
-
-
-def row_text(name) -> str:
-    return next(row.text for p in ("splats", "calibrated") for row in table(p) if name in row.names)
+def test_every_property_has_a_default():
+    rows = [row for plugin in PLUGINS for row in parameters_of(plugin)]
+    assert [row.names for row in rows if not row.default] == [("filename",)]  # of splats_minimal

@@ -1,10 +1,8 @@
 """The approximations are declared once, and whoever lists them agrees with that."""
 
-import re
-
 import annotated_types
 import pytest
-from conftest import REPOSITORY
+from plugin_parameters import parameters_of
 from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.config.approximations import DECLARED, Approximations
@@ -15,20 +13,14 @@ from drgs.core.errors import UserError
 KINDS = {bool: "bool", int: "int", float: "float", str: "string"}
 
 
-def row(name) -> str:
-    """The kind and the text of the property ``name`` in the table of docs/mitsuba.md."""
-    page = (REPOSITORY / "docs" / "mitsuba.md").read_text()
-    (found,) = re.findall(rf"^\| `{name}` \| (.*) \|$", page, re.MULTILINE)
-    return found
-
-
 @pytest.mark.parametrize("name", DECLARED)
 def test_splats_page_documents_declared_properties(name):
+    (row,) = (row for row in parameters_of("splats") if name in row.names)
     declared = DECLARED[name]
-    text = row(name).replace("`", "")
-    assert text.startswith(f"{KINDS[declared.kind]} | {declared.description} (Default: ")
+    assert row.type == KINDS[declared.kind]
+    assert row.description.replace("`", "") == declared.description
     for word in declared.words:
-        assert f"`{word}`:" in row(name)
+        assert f"``{word}``:" in row.description
 
 
 @pytest.mark.parametrize("name", DECLARED)

@@ -1,4 +1,4 @@
-"""The table of docs/mitsuba.md that tells what is differentiated, cell by cell.
+"""The table docs/derivatives.csv of what is differentiated, cell by cell.
 
 Scenes are continuous in the parameter: no silhouette or edge of a shadow moves in the image.
 
@@ -9,6 +9,8 @@ prints it anew.
 
 from __future__ import annotations
 
+import csv
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -339,27 +341,21 @@ def measure(case: Case, route: str) -> Found:
     return Found(False, abs(backward - difference) / scale, abs(backward - forward) / scale)
 
 
-def read_table(text: str) -> dict[str, dict[str, str]]:
-    """Cells of the page's table, by row and by column."""
-    lines = text[text.index("| parameter | " + ALONE) :].split("\n\n")[0].splitlines()
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    head, _, *rows = cells
-    return {name: dict(zip(head[1:], others, strict=True)) for name, *others in rows}
-
-
-def written_table() -> str:
-    """The table as the page has it, measured."""
-    lines = [f"| parameter | {' | '.join(ROUTES)} |", "| --- |" + " --- |" * len(ROUTES)]
+def measured_rows() -> list[list[str]]:
+    """The rows of the table as the page has them, measured."""
+    rows = [["parameter", *ROUTES]]
     for name, case in cases().items():
         cells = [
             "" if route == ALONE and not case.is_seen_alone else measure(case, route).text
             for route in ROUTES
         ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([name, *cells])
+    return rows
 
 
-TABLE = read_table((REPOSITORY / "docs" / "mitsuba.md").read_text())
+with (REPOSITORY / "docs" / "derivatives.csv").open(newline="") as file:
+    TABLE = {row.pop("parameter"): row for row in csv.DictReader(file)}
+"""Cells by row and by column."""
 
 CELLS = [(row, route) for row, of_row in TABLE.items() for route, cell in of_row.items() if cell]
 
@@ -404,4 +400,4 @@ def test_hair_is_rendered_despite_a_parameter_without_value():
 
 if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
-    print(written_table())
+    csv.writer(sys.stdout, lineterminator="\n").writerows(measured_rows())
