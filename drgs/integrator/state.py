@@ -116,7 +116,7 @@ class SplatObject:
 
 @dataclass
 class SplatsState:
-    """Gaussians, settings as ``docs/mitsuba.md`` describes them, and a cache."""
+    """Gaussians, settings as ``docs/plugins/splats.md`` describes them, and a cache."""
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
