@@ -6,10 +6,8 @@ import sys
 from dataclasses import is_dataclass
 from pathlib import Path
 
-from pydantic import BaseModel
-
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "docs"), str(ROOT / "docs" / "_ext")]
+sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_ext")]
 
 import drgs  # noqa: E402, I001  (selects LLVM before Mitsuba is imported)
 import mitsuba as mi  # noqa: E402
@@ -51,27 +49,21 @@ html_title = "drgs"
 
 
 def add_fields(app, what, name, obj, options, lines):
-    """List the fields of a configuration's section, or of a dataclass, below its docstring."""
+    """List the fields of a dataclass, which have comments, below its docstring."""
     del app, what, name, options
-    if inspect.isclass(obj) and issubclass(obj, BaseModel):
-        fields = {name: _described(field) for name, field in obj.model_fields.items()}
-    elif inspect.isclass(obj) and is_dataclass(obj):
+    if inspect.isclass(obj) and is_dataclass(obj):
         comment = r"^    (\w+): [^#\n]*  # (.*?)(?:  # noqa.*)?$"
-        fields = dict(re.findall(comment, inspect.getsource(obj), re.MULTILINE))
-    else:
-        return
-    items = (f"- ``{name}``: {text}".rstrip(": ") for name, text in fields.items())
-    lines += ["", *(item.replace("*", r"\*") for item in items), ""]
+        fields = re.findall(comment, inspect.getsource(obj), re.MULTILINE)
+        lines += ["", *(f"- ``{name}``: {text}" for name, text in fields), ""]
 
 
-def _described(field):
-    """Return the description and the default of a field."""
-    default = "" if field.default_factory else f"default ``{field.get_default()!r}``"
-    if field.is_required():
-        default = "required"
-    return " ".join(filter(None, [field.description, default and f"({default})"]))
+def shorten_defaults(app, what, name, obj, options, signature, returns):
+    """Make signatures of dataclasses Python, so that Sphinx sets them in lines."""
+    del app, what, name, obj, options
+    return signature and signature.replace("<factory>", "..."), returns
 
 
 def setup(app):
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", add_fields)
+    app.connect("autodoc-process-signature", shorten_defaults)

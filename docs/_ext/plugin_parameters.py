@@ -12,11 +12,13 @@ from typing import NamedTuple
 
 from drgs.config.approximations import DECLARED, Declared
 
-PLUGINS = Path(__file__).resolve().parents[1] / "plugins"
+PLUGINS = Path(__file__).resolve().parents[2] / "plugins"
 
 TYPES = {bool: "bool", int: "int", float: "float", str: "string"}
 
 SYMBOLS = {"exposed": "**P**", "differentiable": "**∂**"}
+
+LEGEND = "**P**: exposed by `mi.traverse`; **∂**: differentiable."
 
 
 class Parameter(NamedTuple):
@@ -69,8 +71,10 @@ def markdown(plugin: str) -> str:
     lines = ["| Parameter | Type | | Default | Description |", "| --- " * 5 + "|"]
     for row in parameters_of(plugin):
         names = ", ".join(n if n.startswith("(") else f"`{n}`" for n in row.names)
-        flags = ", ".join(SYMBOLS[flag] for flag in row.flags)
+        flags = "\u00a0".join(SYMBOLS[flag] for flag in row.flags)
         lines.append(f"| {names} | {row.type} | {flags} | {row.default} | {row.description} |")
+    if any(row.flags for row in parameters_of(plugin)):
+        lines += ["", LEGEND]
     return "\n".join(lines)
 
 
