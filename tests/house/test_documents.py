@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY
 
+import drgs
 from drgs.bench import __main__ as bench
 from drgs.config.load import known_keys
 from drgs.config.schema import FitConfig
@@ -142,6 +143,11 @@ def test_mentioned_configuration_keys_exist(page):
         match = re.fullmatch(r"((\w+)(\.\w+)+)(=.*)?", code)
         if match and match[3] != ".json" and match[2] in FitConfig.model_fields:
             assert match[1] in known_keys(), code
+
+
+def test_the_api_lists_every_name_of_the_package():
+    for name in drgs.__all__:
+        assert f"\n   drgs.{name}\n" in text_of("docs/api.md"), name
 
 
 # ----------------------------------------------------------------------------------------------
