@@ -8,6 +8,7 @@
 
 :class:`Gaussians` is a scene, :func:`load_dataset` reads photographs with their cameras,
 :func:`train` fits Gaussians to them, and :func:`rasterization` renders differentiably.
+:data:`EXAMPLE` is the file of a fitted crane truck.
 
 Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
 and for every later one. Public names are imported when they are first used.

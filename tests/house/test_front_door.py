@@ -20,7 +20,8 @@ assert "{name}" in vars(drgs)
 
 
 def test_public_names_are_listed():
-    assert set(drgs.__all__) == PUBLIC
+    assert set(drgs.__all__) == PUBLIC | {"EXAMPLE"}
+    assert "EXAMPLE" in drgs.__doc__ and drgs.EXAMPLE.is_file()
     assert set(dir(drgs)) >= PUBLIC | {"__version__"}
 
 
