@@ -3,6 +3,10 @@
 ``python -m pytest -p support.pages -n 0 -m '' README.md docs``
 """
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
+
+# isort: split
+
 import importlib.util
 import os
 import tempfile
