@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 # Pages outside of docs/ are read too: their links, and the links to them.
 ALL_PAGES = {
-    "include_patterns": "*.md,docs/**.md,docs/generated/*.rst,scenes/studies/*.md",
+    "include_patterns": "*.md,docs/**.md,docs/generated/*.rst,docs/**.ipynb,scenes/studies/*.md",
     "root_doc": "README",
     "suppress_warnings": "toc.not_included,myst.header,ref.python",
 }
