@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 PLOTS = ("accuracy.png", "accuracy_stress.png")  # of the given scene, and of the stress scene
 ROUNDS, QUICK_ROUNDS = 9, 3
+MARKER_PX = 15  # of the plot's marker of the default
 SLOW_S, SLOW_ROUNDS = 1.0, 2  # slower rungs are timed in SLOW_ROUNDS
 FILM_SIZE_PX = 400  # film of scenes without cameras
 CROP_SIZE_PX = 8  # side of the crops on which every pixel evaluates every splat
@@ -416,7 +417,8 @@ def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
         )
     ]
     for m in front:
-        if m is not default:
+        pixels = np.subtract(*axes.transData.transform([point(m), point(default)]))
+        if np.hypot(*pixels) > MARKER_PX:
             name = axes.annotate(m.rung, point(m), (10, 5), color="C0", **style)
             here = name.get_window_extent()
             if any(here.overlaps(other.get_window_extent()) for other in names):
