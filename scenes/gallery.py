@@ -1,6 +1,6 @@
 """Render the shipped crane truck in the ways that the gallery shows.
 
-    python scenes/gallery.py --out out/gallery
+    python scenes/gallery.py
 
 Writes ``depth.jpg``, ``normals.jpg``, ``fisheye.jpg``, ``defocus.jpg`` and ``popping.jpg``.
 """
@@ -29,7 +29,13 @@ SPLATS = {
 def main() -> None:
     """Render all images."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/gallery"),
+        metavar="DIR",
+        help="output folder (default: out/gallery)",
+    )
     out = parser.parse_args().out
     mi.set_variant("llvm_ad_rgb")
     out.mkdir(parents=True, exist_ok=True)

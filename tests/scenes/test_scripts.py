@@ -21,6 +21,10 @@ SCRIPTS = {
     "draw_tiles": ((), {"out/tiles.png"}),
     "flat_mirror": (("--size", 8, "--splats", 20), set()),
     "among_surfaces": ((), set()),
+    "gallery": (
+        (),
+        {f"out/gallery/{n}.jpg" for n in ("defocus", "depth", "fisheye", "normals", "popping")},
+    ),
     "relight": ((KNOT,), {"out/relight/target.png"}),
 }
 """Arguments, and the files that are written to the current folder."""
