@@ -83,7 +83,7 @@ def test_script_writes_to_the_current_folder(load_script, monkeypatch, tmp_path,
     before = files_of_the_checkout()
     module.main()
     assert files_of_the_checkout() == before
-    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.p*")} == written
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")} == written
     assert written or capsys.readouterr().out.count("\n") >= 4
 
 
