@@ -163,9 +163,13 @@ def _absolute(folder: Path, text: str, where: str) -> str:
     try:
         path = str((folder / Path(text).expanduser()).resolve())
         path.encode()  # config.yml is UTF-8
-    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: no such user
+    except ValueError:
         raise UserError(
-            f"{where} must be a path in UTF-8, got {format_value(text)} ({one_line(error, 100)})"
+            f"{where} must be a path in UTF-8 without zero bytes, got {format_value(text)}"
+        ) from None
+    except (OSError, RuntimeError) as error:  # RuntimeError: no such user
+        raise UserError(
+            f"{where} must be a path, got {format_value(text)} ({one_line(error, 100)})"
         ) from None
     return path
 

@@ -119,12 +119,12 @@ WRONG_VALUES = [
     ("seed: 3000000000", "seed must be <= 2147483647, got 3000000000"),
     (
         "output: {dir: ~not-a-user/x}",
-        "output.dir must be a path in UTF-8, got '~not-a-user/x' (Could not determine home "
+        "output.dir must be a path, got '~not-a-user/x' (Could not determine home "
         "directory.)",
     ),
     (
         'output: {dir: "\\0"}',
-        "output.dir must be a path in UTF-8, got '\\x00' (embedded null byte)",
+        "output.dir must be a path in UTF-8 without zero bytes, got '\\x00'",
     ),
     ("loss: {sigma: big}", "loss.sigma must be a number, got 'big'"),
     ("loss: {sigma: .inf}", "loss.sigma must be a finite number, got .inf"),
