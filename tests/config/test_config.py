@@ -119,8 +119,7 @@ WRONG_VALUES = [
     ("seed: 3000000000", "seed must be <= 2147483647, got 3000000000"),
     (
         "output: {dir: ~not-a-user/x}",
-        "output.dir must be a path, got '~not-a-user/x' (Could not determine home "
-        "directory.)",
+        "output.dir must be a path, got '~not-a-user/x' (Could not determine home directory.)",
     ),
     (
         'output: {dir: "\\0"}',
