@@ -57,11 +57,12 @@ def describe_installation() -> str:
     from drgs.core import llvm, private
 
     version = llvm.loaded_version()
+    drjit_version = drjit.__version__  # pyright: ignore[reportAttributeAccessIssue]
     name = "none" if version is None else llvm.format_version(version)
     width = private.llvm_vector_width() if version else 0
     return "\n".join(
         (
-            f"Mitsuba {mitsuba.__version__}, Dr.Jit {drjit.__version__}",
+            f"Mitsuba {mitsuba.__version__}, Dr.Jit {drjit_version}",
             f"LLVM {name} ({llvm.library_file() or 'no file'}), vectors of {width} floats, "
             f"{drjit.thread_count()} threads",
             f"Python {platform.python_version()}, {platform.platform()}, {processor()}",
