@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def background_of(args: argparse.Namespace) -> Background | None:
-    """Return the background of the command line; the shipped truck was fitted before white."""
+    """Return the background of the command line; white behind the shipped truck by default."""
     is_example = args.what == drgs.EXAMPLE
     return parse_background(args.background or (["white"] if is_example else None))
 

@@ -222,11 +222,15 @@ def test_fit_ends_in_its_budget_and_its_plan_gives_the_same_bytes(tmp_path, monk
     sections = {"init": {"num_points": 300, "half_extent": 1.0}}
     sections |= {"densify": {"every": 50, "max_gaussians": 600}}
     scene = write_scene(tmp_path, test=2, train=6, **sections)
-    out, again, start = tmp_path / "out", tmp_path / "again", time.perf_counter()
+    again = tmp_path / "again"
     monkeypatch.setattr(fit, "LOADING_SECONDS", 0.0)  # modules are loaded
-    assert_fits(scene, "--out", out, "--budget", "30")
-    # A fit that shares the machine with other tests is planned with care.
-    assert 24 < time.perf_counter() - start < 33
+    for attempt in ("first", "second"):  # other tests on the machine may end during a fit
+        out, start = tmp_path / attempt, time.perf_counter()
+        assert_fits(scene, "--out", out, "--budget", "30")
+        seconds = time.perf_counter() - start
+        if seconds == pytest.approx(30, rel=0.1):
+            break
+    assert seconds == pytest.approx(30, rel=0.1)
     text, config = (out / "plan.txt").read_text(), load_config(out / "config.yml")
     assert text.startswith("--budget 30s\n") and "(chosen)" in text
     assert f"Planned: {config.optimizer.means_lr_aims[0].end:,} iterations" in text
