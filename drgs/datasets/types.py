@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from drgs.cameras.lens import Lens
 
 
+T = TypeVar("T")
+
+
 @dataclass(frozen=True, eq=False)
 class LazyImage:
     """An image that is converted to floats at each access: by ``np.asarray`` or an index."""
@@ -42,6 +45,12 @@ class LazyImage:
 
 
 Pixels = np.ndarray | LazyImage  # an image of a view; ``np.asarray`` makes an array of either
+
+
+def evenly_spaced(items: Sequence[T], most: int) -> tuple[T, ...]:
+    """Return at most so many of the items, the first and the last among them, in order."""
+    chosen = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
+    return tuple(items[index] for index in chosen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,8 @@ FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange w
 
 INVERSE_ORIENTATIONS = {6: 8, 8: 6}  # other orientations are their own inverses
 
+PNG_LEVEL = 2  # of zlib: a tenth larger than with its 6, in half of the time
+
 MAX_WEBP_SIDE = 16_383  # px: the largest width and height that the format can express
 
 MAX_FRAMES_BYTES = 2 << 30  # all frames of an animation, which are held until it is written
@@ -268,6 +270,8 @@ def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
 
 def encode(image: np.ndarray, suffix: str, **options: Any) -> bytes:
     """Return a PNG or WebP file of an image or the frames of an animation, by Pillow's options."""
+    if suffix == "png":
+        options = {"compress_level": PNG_LEVEL, **options}
     pixels = image if image.dtype == np.uint8 else to_uint8(image)
     return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
 

@@ -76,23 +76,20 @@ def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
     K2 = 0.03, L = 1. mask: (H, W), 1 where a pixel counts; the others are black in both.
     """
     x, y = _prepare("ssim()", image, target)
-    similarity = np.empty_like(x)
-    for channel in range(3):  # one at a time: temporaries take memory
-        similarity[:, :, channel] = _ssim_map(x[:, :, channel], y[:, :, channel], mask)
-    return float(_mean(similarity, mask))
+    channels = zip(np.moveaxis(x, 2, 0), np.moveaxis(y, 2, 0), strict=True)
+    # One channel at a time: temporaries take memory.
+    return float(np.mean([_mean(_ssim_map(*channel, mask), mask) for channel in channels]))
 
 
 def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarray:
-    if mask is not None:
-        counts = np.asarray(mask)
-        x, y = x * counts, y * counts
+    counts = 1.0 if mask is None else np.asarray(mask)
+    x, y = x * counts, y * counts  # contiguous
     mu_x, mu_y = _filter_window(x), _filter_window(y)
-    var_x = _filter_window(x * x) - mu_x**2
-    var_y = _filter_window(y * y) - mu_y**2
-    cov_xy = _filter_window(x * y) - mu_x * mu_y
-    luminance = (2 * mu_x * mu_y + 0.01**2) / (mu_x**2 + mu_y**2 + 0.01**2)
-    contrast_structure = (2 * cov_xy + 0.03**2) / (var_x + var_y + 0.03**2)
-    return luminance * contrast_structure
+    mu_xy, mu_squares = mu_x * mu_y, mu_x**2 + mu_y**2
+    cov_xy = _filter_window(x * y) - mu_xy
+    variances = _filter_window(x * x + y * y) - mu_squares  # their sum
+    numerator = (2 * mu_xy + 0.01**2) * (2 * cov_xy + 0.03**2)
+    return numerator / ((mu_squares + 0.01**2) * (variances + 0.03**2))
 
 
 def mean_quality(

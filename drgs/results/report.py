@@ -8,7 +8,7 @@ import io
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib import resources
 from itertools import pairwise
@@ -24,7 +24,7 @@ from PIL import Image
 from drgs.core.files import atomic_path
 from drgs.datasets.images import downscale
 from drgs.datasets.orbits import orbit_of_views, orbit_size
-from drgs.datasets.types import Dataset, View
+from drgs.datasets.types import Dataset, View, evenly_spaced
 from drgs.datasets.viewpoints import field_of_view
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
@@ -44,6 +44,9 @@ from drgs.results.files import (
 from drgs.results.history import FitHistory, summarize_density
 from drgs.results.metrics import FitMetrics, psnr, ssim
 from drgs.results.viewer import DisplaySettings, seconds_of_page, write_viewer
+
+MAX_PICTURES = 25
+"""Test views, at most, whose images are written; ``python -m drgs.render`` writes all."""
 
 DIFFERENCE_GAIN = 5.0
 """Gain of difference images, 0.5 + gain (fitted - truth): they saturate at 10 % of the range."""
@@ -74,10 +77,12 @@ def write_images(
 ) -> list[Score]:
     """Score the test views, and write ``renders/`` and ``side_by_side/`` if requested."""
     scores, split = [], dataset.test_split
+    pictured = {view.name for view in evenly_spaced(dataset.test, MAX_PICTURES)}
     for view, image in zip(dataset.test, render(dataset.test), strict=True):
-        if with_renders:
+        view = replace(view, image=np.asarray(view.image))  # converted once
+        if with_renders and view.name in pictured:
             write_png(out / RENDERS / split / f"{view.name}.png", image)
-        if with_comparisons:
+        if with_comparisons and view.name in pictured:
             write_png(out / SIDE_BY_SIDE / split / f"{view.name}.png", side_by_side(image, view))
         scores.append(score(image, view))
     return scores
@@ -135,12 +140,12 @@ def seconds_of_results(
     while sum(map(sum, tried)) < MIN_TRIAL_SECONDS:
         tried.append(_seconds_of_view(scene, dataset.test[0]))
     rendered, scored, written, compared, encoded = np.median(tried, axis=0).tolist()
-    views = len(dataset.test)
+    views, pictures = len(dataset.test), min(MAX_PICTURES, len(dataset.test))
     return Seconds(
         measuring=FILES_SECONDS + views * (rendered + scored),
-        renders=views * written,
+        renders=pictures * written,
         report=seconds_of_page(num_gaussians, sh_degree)
-        + views * compared
+        + pictures * compared
         + len(choose_views(range(views))) * (rendered + 3 * encoded)
         + ORBIT_FRAMES * (2 * rendered + encoded),
     )

@@ -19,13 +19,13 @@ from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.files import atomic_path
 from drgs.core.folders import sole_writer
-from drgs.datasets.types import Dataset
+from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import files, folder
 from drgs.results.history import write_density, write_history
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
-from drgs.results.report import FitImages, write_images, write_results
+from drgs.results.report import MAX_PICTURES, FitImages, write_images, write_results
 from drgs.results.viewer import DisplaySettings, shows_as_fitted
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.training.loop import History
@@ -126,7 +126,8 @@ class FitFolder:
         if for_viewers is not None:
             other = for_viewers.gaussians
             other.save(out / files.GAUSSIANS_FOR_VIEWERS)
-            images = zip(for_viewers.images(dataset.test), dataset.test, strict=True)
+            views = evenly_spaced(dataset.test, MAX_PICTURES)
+            images = zip(for_viewers.images(views), views, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
         if output.report:

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from typing_extensions import override
 
-from drgs.datasets.types import View
+from drgs.datasets.types import View, evenly_spaced
 from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, FitHistory, HistoryRow
 from drgs.results.metrics import psnr
 from drgs.training.parallel.communicator import Communicator
@@ -199,9 +199,7 @@ class HeldOutQuality(Observer):
 
 def measured_views(views: Sequence[View]) -> tuple[View, ...]:
     """Return at most :data:`MAX_MEASURED_VIEWS` of the views, evenly spread."""
-    count = min(MAX_MEASURED_VIEWS, len(views))
-    chosen = np.linspace(0, len(views) - 1, count).round().astype(int)
-    return tuple(views[index] for index in chosen)
+    return evenly_spaced(views, MAX_MEASURED_VIEWS)
 
 
 def measurement_is_due(rows: Sequence[HistoryRow], iterations: int) -> bool:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.core.errors import UserError, one_line
 from drgs.datasets.orbits import up_of
-from drgs.datasets.types import Viewpoint
+from drgs.datasets.types import Viewpoint, evenly_spaced
 from drgs.datasets.viewpoints import focus_of, look_at
 from drgs.viewer.frames import (
     FRAME_CONTENTS,
@@ -245,10 +245,9 @@ class Page:
 
     def add_cameras(self, views: Sequence[Viewpoint], visible: bool) -> None:
         """Draw camera frustums and a checkbox that hides them; a click moves to a camera."""
-        chosen = np.linspace(0, len(views) - 1, min(MAX_FRUSTUMS, len(views))).round().astype(int)
         self._cameras = self.server.gui.add_checkbox("Cameras", visible)
         self._cameras.on_update(event_handler(self._show_frustums))
-        for view in (views[index] for index in chosen):
+        for view in evenly_spaced(views, MAX_FRUSTUMS):
             frustum = self.server.scene.add_camera_frustum(
                 f"/cameras/{view.name}",
                 fov=2 * math.atan(0.5 * view.height / view.fy),
