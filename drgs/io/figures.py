@@ -6,14 +6,11 @@ Matplotlib, which takes half a second, is imported when a figure is made.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from drgs.core.files import atomic_path
 
 if TYPE_CHECKING:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
 
@@ -32,10 +29,3 @@ def write_figure(path: Path, figure: Figure) -> None:
     """Write a figure as PNG."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
-
-
-def pixels_of(figure: Figure) -> np.ndarray:
-    """Return the pixels of a figure as it is written: (H, W, 3) uint8."""
-    canvas = cast("FigureCanvasAgg", figure.canvas)  # see new_figure()
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[:, :, :3]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from drgs.io.figures import new_figure, write_figure
@@ -15,32 +17,25 @@ from drgs.results.history import FitHistory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SMOOTHING_PARTS = 50  # a running mean averages this fraction of all rows
 NUM_PANELS = 6
-PAGE_DPI = 160  # of a curve in the page, 3.7 inches wide
 
 
-@dataclass(frozen=True)
-class Theme:
-    """Colours of the curves."""
+PAPER, INK, FAINT, RAW, LINE = "#ffffff", "#1d2330", "#e3e6ec", "#b9cdf0", "#1f5fd0"
+"""Colours of the background, the text, the grid, single iterations and the line."""
 
-    paper: str
-    ink: str
-    faint: str
-    raw: str  # single iterations
-    line: str
-    others: tuple[str, ...]  # further lines of a panel
+OTHERS = "#2b8a57", "#c2543a", "#8b5cb8"  # further lines of a panel
 
-
-LIGHT = Theme(
-    "#ffffff", "#1d2330", "#e3e6ec", "#b9cdf0", "#1f5fd0", ("#2b8a57", "#c2543a", "#8b5cb8")
-)
-DARK = Theme(
-    "#1a1e27", "#d8dde8", "#333a48", "#34507f", "#7fb0ff", ("#6fca98", "#f0937b", "#c3a2ea")
-)
-THEMES = (LIGHT, DARK)
+DARK = {
+    PAPER: "#1a1e27",
+    INK: "#d8dde8",
+    FAINT: "#333a48",
+    RAW: "#34507f",
+    LINE: "#7fb0ff",
+    **dict(zip(OTHERS, ("#6fca98", "#f0937b", "#c3a2ea"), strict=True)),
+}
+"""The colours in the page's dark theme."""
 
 
 @dataclass(frozen=True)
@@ -98,43 +93,51 @@ def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarr
 
 def write_curves(path: Path, history: FitHistory) -> None:
     """Write an image of all curves."""
-    figure = new_figure(11, 6, paper=LIGHT.paper)
+    figure = new_figure(11, 6, paper=PAPER)
     layout = figure.get_layout_engine()
     assert isinstance(layout, ConstrainedLayoutEngine), "new_figure sets it"
     layout.set(w_pad=0.1, h_pad=0.1)
     for axis, panel in zip(figure.subplots(2, 3).flat, panels_of(history), strict=True):
-        _draw(axis, panel, LIGHT)
+        _draw(axis, panel)
     write_figure(path, figure)
 
 
-def draw_curve(panel: Panel, theme: Theme) -> Figure:
-    """Return a matplotlib figure of one panel, for the page."""
-    figure = new_figure(3.7, 2.8, paper=theme.paper, dpi=PAGE_DPI)
-    _draw(figure.subplots(), panel, theme)
-    return figure
+def draw_curve(panel: Panel) -> str:
+    """Return an SVG of one panel, for the page; its colours follow the theme that is in use."""
+    figure, text = new_figure(3.7, 2.8, paper=PAPER), io.StringIO()
+    _draw(figure.subplots(), panel)
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": panel.title}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    svg, light, dark = text.getvalue(), "", ""
+    for number, color in enumerate(DARK):
+        svg = svg.replace(color, f"var(--c{number})")
+        light += f"--c{number}: {color}; "
+        dark += f"--c{number}: {DARK[color]}; "
+    themes = f":root {{ {light}}} @media (prefers-color-scheme: dark) {{ :root {{ {dark}}} }}"
+    return svg.replace("<defs>", f"<style>{themes}</style><defs>", 1)
 
 
-def _draw(axis: Axes, panel: Panel, theme: Theme) -> None:
+def _draw(axis: Axes, panel: Panel) -> None:
     y = panel.y
-    axis.set_title(panel.title, fontsize=10, color=theme.ink, loc="left")
+    axis.set_title(panel.title, fontsize=10, color=INK, loc="left")
     axis.set_yscale(panel.scale)
     if panel.noisy:
-        axis.plot(panel.x, y, color=theme.raw, linewidth=0.7)
+        axis.plot(panel.x, y, color=RAW, linewidth=0.7)
         y = _running_mean(y)
-    for (name, line), color in zip(panel.others.items(), theme.others, strict=False):
+    for (name, line), color in zip(panel.others.items(), OTHERS, strict=False):
         axis.step(*line, where="post", color=color, linewidth=1.1, label=f"{name} so far")
     if panel.others:
-        axis.legend(fontsize=8, frameon=False, labelcolor=theme.ink)
+        axis.legend(fontsize=8, frameon=False, labelcolor=INK)
     marker = {"marker": "o", "markersize": 3.5} if panel.marked else {}
-    axis.plot(panel.x, y, color=theme.line, linewidth=1.7, **marker)
+    axis.plot(panel.x, y, color=LINE, linewidth=1.7, **marker)
     if panel.bottom is not None:
         axis.set_ylim(bottom=panel.bottom)
     if panel.thousands:
         axis.yaxis.set_major_formatter("{x:,.0f}")
-    axis.set_xlabel(panel.x_label, fontsize=8.5, color=theme.ink)
-    axis.set_facecolor(theme.paper)
-    axis.grid(color=theme.faint, linewidth=0.7)
-    axis.tick_params(colors=theme.ink, labelsize=8, length=0, which="both")
+    axis.set_xlabel(panel.x_label, fontsize=8.5, color=INK)
+    axis.set_facecolor(PAPER)
+    axis.grid(color=FAINT, linewidth=0.7)
+    axis.tick_params(colors=INK, labelsize=8, length=0, which="both")
     axis.spines[:].set_visible(False)
 
 

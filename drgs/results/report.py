@@ -28,9 +28,8 @@ from drgs.datasets.types import Dataset, View, evenly_spaced
 from drgs.datasets.viewpoints import field_of_view
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
-from drgs.io.figures import pixels_of
 from drgs.io.images import encode, write_animation, write_png
-from drgs.results.curves import NUM_PANELS, THEMES, Panel, draw_curve, panels_of, write_curves
+from drgs.results.curves import NUM_PANELS, Panel, draw_curve, panels_of, write_curves
 from drgs.results.files import (
     CURVES,
     GAUSSIANS,
@@ -174,12 +173,12 @@ def seconds_of_curves() -> float:
     _seconds_of_curve(log)  # loads libraries and fonts
     # A third of the curves are logarithmic, with slower labels.
     mean = (_seconds_of_curve(log) + 2 * _seconds_of_curve(linear)) / 3
-    return NUM_PANELS * mean * (1 + len(THEMES))
+    return NUM_PANELS * mean * 2
 
 
 def _seconds_of_curve(panel: Panel) -> float:
     start = time.perf_counter()
-    _data_uri(pixels_of(draw_curve(panel, THEMES[0])), lossless=True)
+    draw_curve(panel)
     return time.perf_counter() - start
 
 
@@ -325,14 +324,9 @@ def _truth(dataset: Dataset) -> str:
 
 
 def _curve(panel: Panel) -> str:
-    """Return HTML of a curve in light and dark themes."""
-    light, dark = (
-        _data_uri(pixels_of(draw_curve(panel, theme)), lossless=True) for theme in THEMES
-    )
-    return (
-        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
-        f'<img alt="{panel.title} over {panel.x_label}" src="{light}"></picture>'
-    )
+    """Return HTML of a curve."""
+    source = _uri("image/svg+xml", draw_curve(panel).encode())
+    return f'<img alt="{panel.title} over {panel.x_label}" src="{source}">'
 
 
 def _first_frame(animation: bytes) -> np.ndarray:

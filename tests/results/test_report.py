@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -153,7 +154,7 @@ def test_orbit_has_the_aspect_ratio_of_the_photographs_and_shows_the_scene(out, 
 def test_curves_are_drawn(out):
     pixels = np.asarray(Image.open(out / "curves.png").convert("RGB"))
     assert pixels.shape[0] > 400 and pixels.shape[1] > 800
-    line = np.array([int(curves.LIGHT.line[i : i + 2], 16) for i in (1, 3, 5)])
+    line = np.array([int(curves.LINE[i : i + 2], 16) for i in (1, 3, 5)])
     for row in np.array_split(pixels, 2, axis=0):
         for panel in np.array_split(row, 3, axis=1):
             assert (np.abs(panel.astype(int) - line).max(axis=2) < 8).sum() > 100
@@ -187,8 +188,8 @@ def test_panels_show_the_history():
 
 def test_page_has_no_external_references_and_its_images_are_complete(page, out):
     embedded = [reference for reference in page.references if reference.startswith("data:")]
-    # The icon, the orbit and its first frame, comparisons, curves for light and dark pages.
-    assert len(embedded) == 1 + 2 + 3 * 3 + 6 * 2
+    # The icon, the orbit and its first frame, comparisons, curves.
+    assert len(embedded) == 1 + 2 + 3 * 3 + 6
     # To be downloaded, and to walk around in.
     links = {"point_cloud.ply", "point_cloud_viewers.ply", "viewer.html"}
     assert set(page.references) - set(embedded) == links
@@ -202,6 +203,12 @@ def test_page_has_no_external_references_and_its_images_are_complete(page, out):
             with Image.open(io.BytesIO(contents[-1])) as image:
                 image.load()
                 assert image.format.lower() == kind[1]
+        elif reference.startswith("data:image/svg+xml;base64,"):
+            curve = base64.b64decode(reference.partition(",")[2], validate=True).decode()
+            texts = ElementTree.fromstring(curve).iter("{http://www.w3.org/2000/svg}text")
+            assert any(text.text == "iteration" or text.text == "time [min]" for text in texts)
+            colors = set(re.findall(r"#[0-9a-f]{6}", curve))
+            assert colors == {*curves.DARK, *curves.DARK.values()}  # both themes, and no others
     assert (out / "orbit.webp").read_bytes() in contents
     assert '<input type="checkbox" id="orbit">' in page.source  # pauses it
     reduced = page.source.partition("prefers-reduced-motion: reduce")[2].partition("\n}\n")[0]
