@@ -285,7 +285,7 @@ class OptimizerConfig(Section):
     opacities_lr: Rate = Field(
         0.05, ge=0, description="Rate of the logit opacities (0.025 in newer references)."
     )
-    scales_lr: Rate = Field(1e-2, ge=0, description="Rate of the log scales.")
+    scales_lr: Rate = Field(2e-2, ge=0, description="Rate of the log scales.")
     quats_lr: Rate = Field(2e-3, ge=0, description="Rate of the quaternions.")
     decay: Resolved[float] = Field(
         UNRESOLVED,

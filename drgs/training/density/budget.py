@@ -9,14 +9,13 @@ with the weights w of compositing, measured in every tenth view by default: the 
 compute s with the errors as cotangent. Two halves replace a Gaussian along its longest axis.
 Transparent Gaussians are removed, and there are no opacity resets.
 
-The curve of growth and the split along the longest axis are from Improved-GS (Deng et al. 2025),
-the sum of errors from Rota Bulo et al. 2024 ("Revising Densification in Gaussian Splatting"). Rows
-are chosen on the host. Nothing is random, and ties are broken by index.
+The split along the longest axis is from Improved-GS (Deng et al. 2025), the sum of errors from Rota
+Bulo et al. 2024 ("Revising Densification in Gaussian Splatting"). Rows are chosen on the host.
+Nothing is random, and ties are broken by index.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -135,7 +134,7 @@ class GrowthToNumber(DensityStrategy):
         return min(self._uncapped_goal(iteration), max(self.config.max_gaussians, self.first))
 
     def _uncapped_goal(self, iteration: int) -> int:
-        """N_0 + (N - N_0) sqrt(u) / r^(2 - u), where u rises from 0 at ``start`` to 1 at ``stop``.
+        """N_0 + (N - N_0) u / r^(2 - u), where u rises from 0 at ``start`` to 1 at ``stop``.
 
         r: what the images' sizes are divided by: coarse images need fewer (DashGaussian, Chen
         et al. 2025). 1 at ``stop``: no change comes after it.
@@ -145,7 +144,7 @@ class GrowthToNumber(DensityStrategy):
         size = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
         r = size if iteration < stop else 1
         final = max(self.config.budget.gaussians, self.first)
-        return self.first + round((final - self.first) * math.sqrt(u) / r ** (2 - u))
+        return self.first + round((final - self.first) * u / r ** (2 - u))
 
     @override
     def state(self) -> dict[str, np.ndarray]:
