@@ -24,7 +24,7 @@ DEFAULT_SCHEDULE = Schedule(1 / 20, 1 / 2)
 
 SCHEDULES = {
     "adc": Schedule(1 / 2, 5 / 7, rate_decay=1.0),
-    "budget": DEFAULT_SCHEDULE,
+    "budget": Schedule(1 / 20, 3 / 4, rate_decay=0.03),
     "mcmc": Schedule(1 / 20, 5 / 7),
 }
 """Schedules by strategy. Of 7,000 iterations, adc leaves 2,000 for the last opacities to settle."""
@@ -77,15 +77,17 @@ class BudgetConfig(Section):
     gaussians: Resolved[Count] = Field(
         UNRESOLVED,
         ge=4,
-        description="Number of Gaussians at densify.stop. null: 250 times the square root of an "
-        "image's number of pixels, 100,000 for 400 x 400 px.",
+        description="Number of Gaussians after two thirds of the changes. null: 250 times the "
+        "square root of an image's number of pixels, 100,000 for 400 x 400 px.",
     )
     error_every: Count = Field(
         10,
         ge=1,
         description="Iterations between measurements of errors; each takes half an iteration.",
     )
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Remove less opaque Gaussians.")
+    prune_opacity: float = Field(
+        0.05, ge=0, lt=1, description="Replace less opaque Gaussians by halves of others."
+    )
 
 
 class McmcConfig(Section):
@@ -183,8 +185,8 @@ class DensifyConfig(Section):
         REFERENCE_STOP,
         ge=1,
         description="Changes and resets end before this iteration; with budget, the last change is "
-        "at this iteration. Not given, or null: 15,000, but at most half of the iterations with "
-        "budget, and 5/7 of them otherwise.",
+        "at this iteration. Not given, or null: 3/4 of the iterations with budget, else 5/7 of "
+        "them; with adc at most 15,000.",
     )
     stop_aims: list[StopAim] = Field(
         default_factory=list,

@@ -291,11 +291,11 @@ class OptimizerConfig(Section):
         UNRESOLVED,
         ge=1e-6,
         le=1,
-        description="Ratio of final to initial rates, except for the means. null: 0.1; 1 with the "
-        "strategy adc, as in the paper.",
+        description="Ratio of final to initial rates, except for the means. null: 0.03 with the "
+        "strategy budget, 0.1 with mcmc; 1 with adc, as in the paper.",
     )
     decay_from: float = Field(
-        0.5,
+        0.75,
         ge=0,
         lt=1,
         description="Start of their decay, as a fraction of the iterations after coarse stages.",
@@ -480,7 +480,8 @@ class FitConfig(Section):
         changes, first = {}, densify.start
         if _is_open(densify, "stop"):
             least = 1 if _is_open(densify, "start") else first + 1
-            changes["stop"] = max(least, min(REFERENCE_STOP, round(stop_share * n)))
+            most = REFERENCE_STOP if densify.strategy == "adc" else n
+            changes["stop"] = max(least, min(most, round(stop_share * n)))
         if _is_open(densify, "start"):
             first = max(1, round(start_share * n))
             changes["start"] = min(REFERENCE_START, first, changes.get("stop", densify.stop) // 2)

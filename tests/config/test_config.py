@@ -55,10 +55,12 @@ def test_lego_paper_is_the_reference_recipe():
 @pytest.mark.parametrize(
     ("text", "start", "stop", "degree"),
     [
-        ("iterations: 60000", 500, 15_000, 1000),
-        ("iterations: 7000", 350, 3500, 175),
+        ("iterations: 60000", 500, 45_000, 1000),
+        ("iterations: 7000", 350, 5250, 175),
         ("iterations: 3", 1, 2, 1),
         ("iterations: 1", 0, 1, 1),
+        ("iterations: 60000\ndensify: {strategy: adc}", 500, 15_000, 1000),
+        ("iterations: 7000\ndensify: {strategy: mcmc}", 350, 5000, 175),
         ("iterations: 7000\ndensify: {strategy: adc}", 500, 5000, 175),
         ("iterations: 700\ndensify: {strategy: adc}", 250, 500, 18),
         ("densify: {start: 400}\nmodel: {sh_increase_every: 900}\niterations: 500", 400, 401, 900),
@@ -69,7 +71,8 @@ def test_schedule_and_decay_follow_from_iterations_and_strategy(load, text, star
     config = load(MINIMAL + text)
     assert (config.densify.start, config.densify.stop) == (start, stop)
     assert config.model.sh_increase_every == degree
-    assert config.optimizer.decay == (1 if "adc" in text else 0.1)
+    expected = {"adc": 1, "mcmc": 0.1, "budget": 0.03}
+    assert config.optimizer.decay == expected[config.densify.strategy]
 
 
 def test_shorter_schedule_is_scaled_in_proportion():
@@ -83,7 +86,7 @@ def test_shorter_schedule_is_scaled_in_proportion():
     )
     short = with_iterations(config, 6000)
     assert short.iterations == 6000 and short.seed == 7
-    assert (short.densify.start, short.densify.stop, short.densify.every) == (100, 3000, 100)
+    assert (short.densify.start, short.densify.stop, short.densify.every) == (100, 4500, 100)
     assert short.cameras.start == 200
     assert (short.densify.adc.reset_every, short.densify.adc.white_background_reset) == (600, 100)
     assert short.densify.adc.grad_threshold == config.densify.adc.grad_threshold
@@ -92,7 +95,7 @@ def test_shorter_schedule_is_scaled_in_proportion():
     config = FitConfig(data={"path": "."}, densify={"adc": {"white_background_reset": None}})
     short = with_iterations(config, 30)
     assert short.densify.adc.white_background_reset is None
-    assert (short.densify.start, short.densify.stop, short.model.sh_increase_every) == (1, 15, 1)
+    assert (short.densify.start, short.densify.stop, short.model.sh_increase_every) == (1, 22, 1)
 
 
 def test_values_cannot_be_changed(load):

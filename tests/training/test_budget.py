@@ -81,7 +81,7 @@ def test_best_strategy_within_the_time_is_chosen():
     result = planned(100)
     assert [(c.iterations, c.psnr) for c in result.candidates] == [(1000, 30.0), (2000, 30.5)]
     assert result.chosen.strategy is plan.STRATEGIES[1]
-    assert result.config.iterations == 2000 and result.config.densify.stop == 1000
+    assert result.config.iterations == 2000 and result.config.densify.stop == 1500
     assert [(s.until, s.factor) for s in result.config.coarse] == [(500, 2)]
     assert "1,000 iterations, 30.00 dB there: as shipped" in result.reasons
     assert "half size for the first quarter (chosen)" in result.reasons

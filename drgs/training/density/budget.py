@@ -42,6 +42,9 @@ from drgs.training.density.strategy import (
     displace_means,
 )
 
+GROWTH_SHARE = 2 / 3
+"""Share of the changes after which there are as many as allowed; later ones replace some."""
+
 HALF_OFFSET = 1.35
 """Distance of the halves' means from the Gaussian's, in standard deviations of its longest axis."""
 
@@ -134,13 +137,15 @@ class GrowthToNumber(DensityStrategy):
         return min(self._uncapped_goal(iteration), max(self.config.max_gaussians, self.first))
 
     def _uncapped_goal(self, iteration: int) -> int:
-        """N_0 + (N - N_0) u / r^(2 - u), where u rises from 0 at ``start`` to 1 at ``stop``.
+        """N_0 + (N - N_0) u / r^(2 - u), where u rises from 0 at ``start`` to 1.
+
+        u is 1 after ``GROWTH_SHARE`` of the time until ``stop``.
 
         r: what the images' sizes are divided by: coarse images need fewer (DashGaussian, Chen
         et al. 2025). 1 at ``stop``: no change comes after it.
         """
         start, stop = self.config.start, self.config.stop_at_iteration(iteration)
-        u = min(max((iteration - start) / max(stop - start, 1), 0), 1)
+        u = min(max((iteration - start) / max(GROWTH_SHARE * (stop - start), 1), 0), 1)
         size = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
         r = size if iteration < stop else 1
         final = max(self.config.budget.gaussians, self.first)

@@ -32,7 +32,7 @@ def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
     assert (schedule.start, schedule.stop) == (2000, 3000)
     config = FitConfig(data={"path": "."}, densify={"prune": {"to": 9}})
     reference = Importance(config)
-    assert (reference.start, reference.stop) == (15_000, 22_500)
+    assert (reference.start, reference.stop) == (22_500, 26_250)
     assert [i for i in range(5000) if schedule.is_due(i)] == list(range(2050, 3001, 50))
     config = config_of(to=100, start=2500, stop=2730, every=100)
     assert [i for i in range(5000) if Importance(config).is_due(i)] == [2600, 2700, 2730]
