@@ -124,7 +124,7 @@ CONFIG = {
     "init": {"num_points": 40, "half_extent": 0.5},
     "model": {"sh_degree": 1},
     "iterations": 7,
-    "densify": {"start": 1, "stop": 6, "every": 2},
+    "densify": {"start": 1, "stop": 6, "every": 2, "budget": {"prune_opacity": 0.005}},
     "output": {"history_every": 3, "save_renders": False},
 }
 
