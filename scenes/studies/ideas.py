@@ -1,0 +1,711 @@
+"""Fit what was thought of to show test views better, or in less time; takes hours.
+
+Each idea is added to the recipe that the study ended with, or, if it is a part of that one, left
+out of it: on the shipped scene and the original Lego at 200x200, and on photographs. ``--data``
+names the folder of those that are not shipped. Results: ``ideas.md``.
+
+An idea is other values, or a change of a trainer between its iterations. Those of the second kind
+are here alone, because none of them helped. The recipe is written out, so that later defaults do
+not change the comparison.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import drgs  # noqa: F401  first: finds libLLVM
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drgs.bench.output import machine, markdown_table, write_rows
+from drgs.cli.execution import select_variant
+from drgs.config.changes import with_changes
+from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
+from drgs.core.types import Float, UInt32
+from drgs.datasets import load_dataset
+from drgs.datasets.types import View, evenly_spaced
+from drgs.initialization.defaults import resolve_defaults
+from drgs.initialization.start import initial_gaussians
+from drgs.results.metrics import psnr
+from drgs.training.density.budget import GROWTH_SHARE, GrowthToNumber
+from drgs.training.losses import Loss, LossTerm, PhotometricLoss
+from drgs.training.optimizer import LeanAdam, Population
+from drgs.training.steps import Stage
+from drgs.training.trainer import Trainer
+from fits import SCENES as SCENES_FOLDER
+from fits import add_case_option, make_parser
+from typing_extensions import override
+
+Values = Mapping[str, object]
+"""Values of a configuration, by names such as ``densify.every``."""
+
+ITERATIONS, NUM_TRAINING_VIEWS = 2000, 15
+"""Of a fit; and training views that its training PSNR is measured on."""
+
+RECIPE: Values = {
+    "optimizer.means_lr": 3.2e-4,
+    "optimizer.means_lr_final": 3.2e-6,
+    "optimizer.sh0_lr": 5e-3,
+    "optimizer.shN_lr": 1e-3,
+    "optimizer.opacities_lr": 0.05,
+    "optimizer.scales_lr": 2e-2,
+    "optimizer.quats_lr": 2e-3,
+    "optimizer.decay": 0.03,
+    "optimizer.decay_from": 0.75,
+    "densify.start": ITERATIONS // 20,
+    "densify.stop": ITERATIONS * 3 // 4,
+    "densify.every": 100,
+    "densify.budget.prune_opacity": 0.05,
+}
+"""The recipe of the study; what is not given follows from the scene."""
+
+
+# ----------------------------------------------------------------------------------------------
+# Scenes
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A dataset, at a size that an idea can be tried at in minutes."""
+
+    name: str
+    title: str
+    config: str  # for its data
+    size: int  # px
+    folder: str | None = None  # in that of ``--data``; None: shipped
+
+
+SHIPPED = Scene("shipped", "the shipped scene", "lego_mini.yml", 200)
+LEGO = Scene("lego", "the original Lego", "lego.yml", 200, "nerf_synthetic/lego")
+FOX = Scene("fox", "the fox", "fox.yml", 240, "fox")
+HEAD = Scene("head", "the robot head", "photos.yml", 240, "colmap_robothead")
+
+THREE, PHOTOGRAPHS, ALL = (SHIPPED, LEGO, FOX), (FOX, HEAD), (SHIPPED, LEGO, FOX, HEAD)
+
+
+# ----------------------------------------------------------------------------------------------
+# Changes of a fit
+# ----------------------------------------------------------------------------------------------
+
+
+class Change:
+    """A change of a fit; subclasses define some of the methods."""
+
+    def values(self, config: FitConfig) -> Values:
+        """Return other values, given a configuration without open ones."""
+        return {}
+
+    def attach(self, trainer: Trainer) -> None:
+        """Change a trainer before its first iteration."""
+
+    def before(self, trainer: Trainer, iteration: int) -> None:
+        """Called before each iteration."""
+
+    def after(self, trainer: Trainer, iteration: int) -> None:
+        """Called after each iteration."""
+
+
+@dataclass(frozen=True)
+class Given(Change):
+    """Other values; functions of the configuration compute those that depend on it."""
+
+    given: Mapping[str, object]
+
+    @override
+    def values(self, config: FitConfig) -> Values:
+        return {k: v(config) if callable(v) else v for k, v in self.given.items()}
+
+
+def times_gaussians(factor: float) -> Callable[[FitConfig], int]:
+    """Return a value that is a multiple of the number of Gaussians."""
+    return lambda config: round(factor * (config.densify.budget.gaussians or 0))
+
+
+@dataclass(frozen=True)
+class GrowthByPower(Change):
+    """The number of Gaussians grows with a power of the time."""
+
+    power: float
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        power = self.power
+
+        class Growth(GrowthToNumber):
+            def _uncapped_goal(self, iteration: int) -> int:
+                start, stop = self.config.start, self.config.stop
+                u = min(max((iteration - start) / max(GROWTH_SHARE * (stop - start), 1), 0), 1)
+                return super()._uncapped_goal(
+                    start + round(u**power * GROWTH_SHARE * (stop - start))
+                )
+
+        replace_strategy(trainer, Growth)
+
+
+def replace_strategy(trainer: Trainer, kind: type[GrowthToNumber]) -> None:
+    """Give a trainer another variant of its strategy."""
+    former = trainer.density
+    assert isinstance(former, GrowthToNumber), "the study's fits have this one"
+    trainer.density = kind(former.config, former.coarse)
+    trainer.density.begin(trainer.population)
+
+
+# ----------------------------------------------------------------------------------------------
+# Changes of the optimizer's steps
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class State:
+    """A parameter, flat and detached, and its moments."""
+
+    value: Float
+    first: Float
+    second: Float
+
+
+class StepChange(Change):
+    """Changes Adam's steps of some parameters."""
+
+    names: ClassVar[Sequence[str]] = (
+        *("means", "quats", "log_scales", "logit_opacities"),
+        *("sh0", "shN"),
+    )
+
+    def changed(self, trainer: Trainer, name: str, old: State, new: State, grad: Float) -> State:
+        """Return the state after a step in place of ``new``, Adam's."""
+        raise NotImplementedError
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        change = self
+
+        class Changed(LeanAdam):
+            def _update(self, key: str, rates: object) -> list[dr.ArrayBase]:
+                if key not in change.names:
+                    return super()._update(key, rates)
+                value, *_, (_, first, second, _) = self.state[key]
+                old, grad = State(flat(value), type(first)(first), type(second)(second)), value.grad
+                super()._update(key, rates)
+                value, promoted, rate, (count, first, second, _) = self.state[key]
+                new = State(flat(value), first, second)
+                new = change.changed(trainer, key, old, new, flat(grad))
+                value = like(value, new.value)
+                dr.enable_grad(value)
+                self.state[key] = value, promoted, rate, (count, new.first, new.second, None)
+                return [new.value, new.first, new.second]
+
+        trainer.optimizer.__class__ = Changed
+
+
+def flat(value: dr.ArrayBase) -> Float:
+    """Return the numbers of a tensor or an array, detached."""
+    value = dr.detach(value)
+    return value.array if dr.is_tensor_v(value) else value
+
+
+def like(value: dr.ArrayBase, numbers: Float) -> dr.ArrayBase:
+    """Return ``numbers`` in the shape of ``value``."""
+    return type(value)(numbers, value.shape) if dr.is_tensor_v(value) else type(value)(numbers)
+
+
+class UnseenRowsRest(StepChange):
+    """Numbers without a gradient keep their value and their moments."""
+
+    @override
+    def changed(self, trainer: Trainer, name: str, old: State, new: State, grad: Float) -> State:
+        moves = grad != 0
+        pairs = zip(vars(new).values(), vars(old).values(), strict=True)
+        return State(*(dr.select(moves, after, before) for after, before in pairs))
+
+
+@dataclass(frozen=True)
+class OtherPower(StepChange):
+    """Steps of m / v^(1/2 + p) in place of Adam's m / v^(1/2), within a tenth and ten times those.
+
+    The gradient of an L1 loss is J^T s with signs s, so that v estimates the diagonal of J^T J: the
+    step of Gauss and Newton has p = 1/2.
+    """
+
+    power: float
+    names = ("means", "log_scales", "quats")
+
+    @override
+    def changed(self, trainer: Trainer, name: str, old: State, new: State, grad: Float) -> State:
+        is_known = new.second > 1e-25
+        logarithm = dr.log(dr.maximum(new.second, 1e-25))
+        total = dr.sum(dr.select(is_known, logarithm, 0))
+        mean = total / dr.maximum(dr.sum(dr.select(is_known, type(total)(1), 0)), 1)
+        factor = dr.clip(dr.exp(self.power * (mean - logarithm)), 0.1, 10)
+        return replace(new, value=old.value + factor * (new.value - old.value))
+
+
+class StepsInSigmas(StepChange):
+    """Steps of the means in proportion to the root of the Gaussian's largest scale."""
+
+    names = ("means",)
+
+    @override
+    def changed(self, trainer: Trainer, name: str, old: State, new: State, grad: Float) -> State:
+        scales, number = flat(trainer.optimizer["log_scales"]), type(old.value)
+        first = dr.arange(dr.uint32_array_t(number), dr.width(scales)) // 3 * 3
+        largest = dr.gather(number, scales, first)
+        for k in (1, 2):
+            largest = dr.maximum(largest, dr.gather(number, scales, first + k))
+        factor = dr.clip(dr.exp(0.5 * (largest - dr.mean(largest))), 0.2, 5)
+        return replace(new, value=old.value + factor * (new.value - old.value))
+
+
+class DecayOfHarmonics(StepChange):
+    """Decoupled decay of the higher degrees, by their rate a step (AdamW)."""
+
+    names = ("shN",)
+
+    @override
+    def changed(self, trainer: Trainer, name: str, old: State, new: State, grad: Float) -> State:
+        rate = dr.opaque(type(old.value), trainer.rates(trainer.iteration)[name])
+        return replace(new, value=new.value - rate * old.value)
+
+
+# ----------------------------------------------------------------------------------------------
+# Changes of what is rendered
+# ----------------------------------------------------------------------------------------------
+
+SETTLED_SHARE = 0.85  # of the iterations, after which nothing is left out
+
+
+@dataclass
+class GaussiansLeftOut(Change):
+    """A random share of the Gaussians is transparent in an iteration (DropGaussian)."""
+
+    share: float
+    offset: Float | None = None
+
+    @override
+    def before(self, trainer: Trainer, iteration: int) -> None:
+        config = trainer.config
+        self.offset = None
+        if iteration > SETTLED_SHARE * config.iterations or trainer.density.is_due(iteration):
+            return
+        random = np.random.default_rng([config.seed, iteration])
+        left_out = random.random(trainer.num_gaussians) < self.share
+        self.offset = type(trainer.population.zeros())(np.float32(20) * left_out)
+        self._move(trainer, -self.offset)
+
+    @override
+    def after(self, trainer: Trainer, iteration: int) -> None:
+        if self.offset is not None:
+            self._move(trainer, self.offset)
+
+    def _move(self, trainer: Trainer, offset: Float) -> None:
+        value = trainer.population.value("logit_opacities")
+        trainer.population.set_values("logit_opacities", like(value, flat(value) + offset))
+
+
+@dataclass(frozen=True)
+class DegreesLeftOut(Change):
+    """A lower degree of the harmonics in a random share of the iterations (DropAnSH-GS)."""
+
+    share: float
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        degree_at, config = trainer.sh_degree_at, trainer.config
+
+        def random_degree_at(iteration: int) -> int:
+            degree = degree_at(iteration)
+            random = np.random.default_rng([config.seed, iteration])
+            if iteration > SETTLED_SHARE * config.iterations or random.random() >= self.share:
+                return degree
+            return int(random.integers(0, max(degree, 1)))
+
+        trainer.sh_degree_at = random_degree_at  # type: ignore[method-assign]
+
+
+class EverySecondAtHalfSize(Change):
+    """Half the image size in every second of the first 70 % of the iterations."""
+
+    @override
+    def values(self, config: FitConfig) -> Values:
+        return {"coarse": [{"until": 1, "factor": 2}]}
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        coarse, full = trainer.stages
+        plan, end = trainer.plan, 0.7 * trainer.config.iterations
+        trainer.stages = [_Kept(**vars(stage)) for stage in (coarse, full)]
+        coarse, full = trainer.stages
+
+        def alternating(iteration: int) -> object:
+            step = plan(iteration)
+            stage = coarse if iteration % 2 == 1 and iteration < end else full
+            views = tuple(replace(v, view=stage.views[v.view.index]) for v in step.views)
+            return replace(step, stage=stage, views=views)
+
+        trainer.plan = alternating  # type: ignore[method-assign]
+        replace_strategy(trainer, GrowthToNumber)
+        trainer.density.coarse = ()
+
+
+class _Kept(Stage):
+    """A stage that keeps its targets when another one begins."""
+
+    @override
+    def end(self) -> None:
+        pass
+
+
+class ViewsApart(Change):
+    """Each view is one that few of the last ones are close to."""
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        from drgs.training import steps
+
+        centers = np.array([view.center for view in trainer.dataset.train])
+        centers = (centers - centers.mean(axis=0)) / centers.std()
+        closeness = np.exp(-2 * np.sum((centers[:, None] - centers) ** 2, axis=-1))
+        rounds: list[list[int]] = []
+
+        def order(number: int, seed: int) -> list[int]:
+            while len(rounds) <= number:
+                recent = np.zeros(len(centers))
+                for view in rounds[-1][-10:] if rounds else []:
+                    recent = 0.9 * recent + closeness[view]
+                random = np.random.default_rng([seed, len(rounds)])
+                left, views = list(random.permutation(len(centers))), []
+                while left:
+                    views.append(min(left, key=lambda view: recent[view]))
+                    left.remove(views[-1])
+                    recent = 0.9 * recent + closeness[views[-1]]
+                rounds.append(views)
+            return rounds[number]
+
+        def view_of(iteration: int, num_views: int, seed: int, views_per_step: int = 1) -> int:
+            number, place = divmod(iteration - 1, num_views)
+            return int(order(number, seed)[place])
+
+        steps.view_of = view_of
+
+
+# ----------------------------------------------------------------------------------------------
+# Changes of the loss
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class HuberLoss(Loss):
+    """The photometric loss, quadratic in differences below a width."""
+
+    width: float
+
+    @override
+    def __call__(self, image: mi.TensorXf, target: object) -> Float:
+        return self.with_squared_error(image, target)[0]
+
+    @override
+    def with_squared_error(self, image: mi.TensorXf, target: object) -> tuple[Float, Float]:
+        loss, error = PhotometricLoss(0.2).with_squared_error(image, target)
+        x = dr.abs(image.array - target.image.array)
+        excess = dr.select(x < self.width, dr.square(x) / (2 * self.width) - x, -self.width / 2)
+        return loss + 0.8 * dr.mean(excess), error
+
+
+@dataclass(frozen=True)
+class OtherLoss(Change):
+    """Another loss of images."""
+
+    loss: Loss
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        trainer.loss = self.loss
+
+
+class SmallAndTransparent(LossTerm):
+    """Terms of MCMC's loss: mean opacity and mean scale, in scene extents."""
+
+    @override
+    def of_gaussians(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Float:
+        opacities = parameters["logit_opacities"]
+        if dr.is_tensor_v(opacities):
+            opacities = opacities.array
+        scales = dr.exp(parameters["log_scales"].array)
+        transparency = dr.sum(1 / (1 + dr.exp(-opacities)))
+        return (0.005 * transparency + 0.005 * dr.sum(scales)) / num_rows
+
+
+class OtherTerms(Change):
+    """Further terms of the loss."""
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        trainer.terms = [*trainer.terms, SmallAndTransparent()]
+
+
+# ----------------------------------------------------------------------------------------------
+# Changes of the population
+# ----------------------------------------------------------------------------------------------
+
+
+class InheritedMoments(Change):
+    """Halves take over the second moments of the Gaussian that is split."""
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        class Inheriting(Population):
+            def take(self, rows: UInt32) -> dict[str, dr.ArrayBase]:
+                self.__dict__["parents"] = rows
+                return super().take(rows)
+
+            def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
+                state = self.optimizer.state
+                before = {name: (value.shape[1:], m[2]) for name, (value, _, _, m) in state.items()}
+                super().edit(keep, append)
+                for name, (shape, second) in before.items() if append is not None else ():
+                    width, number = math.prod(shape), type(second)
+                    rows = dr.repeat(self.__dict__["parents"], width) * width
+                    element = dr.arange(type(rows), dr.width(rows))
+                    inherited = dr.gather(number, second, rows + element % width)
+                    value, promoted, rate, (count, m, v, _) = state[name]
+                    dr.scatter(v, inherited, element + dr.width(keep) * width)
+                    state[name] = value, promoted, rate, (count, m, v, None)
+
+        trainer.population = Inheriting(*vars(trainer.population).values())
+        trainer.density.begin(trainer.population)
+
+
+# ----------------------------------------------------------------------------------------------
+# Ideas
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Idea:
+    """What was thought of, and what became of it."""
+
+    name: str
+    change: Change
+    why: str  # it was kept, or not
+    is_kept: bool = False  # in the recipe: the change takes it out
+    scenes: Sequence[Scene] = THREE
+    iterations: int = ITERATIONS
+
+
+FORMER: Values = {
+    "optimizer.scales_lr": 1e-2,
+    "optimizer.decay": 0.1,
+    "optimizer.decay_from": 0.5,
+    "densify.budget.prune_opacity": 0.005,
+}
+
+IDEAS = (
+    Idea("the recipe", Change(), "", scenes=ALL),
+    Idea(
+        "Gaussians less opaque than 0.05 are replaced, not 0.005",
+        Given({"densify.budget.prune_opacity": 0.005}),
+        "they are where they help more",
+        is_kept=True,
+        scenes=ALL,
+    ),
+    Idea(
+        "rates fall in the last quarter, to 0.03, not in the second half, to 0.1",
+        Given({"optimizer.decay": 0.1, "optimizer.decay_from": 0.5}),
+        "the fit learns fast for longer",
+        is_kept=True,
+        scenes=ALL,
+    ),
+    Idea(
+        "scales have twice their former rate",
+        Given({"optimizer.scales_lr": 1e-2}),
+        "halves adapt sooner",
+        is_kept=True,
+        scenes=ALL,
+    ),
+    Idea(
+        "the number grows in proportion to the time, not to its root",
+        GrowthByPower(0.5),
+        "less time, as good",
+        is_kept=True,
+    ),
+    Idea("... to the square of the time", GrowthByPower(2), "worse"),
+    Idea("all of these", Given(FORMER), "", is_kept=True, scenes=ALL),
+    # Against memorising.
+    Idea("no Gaussian below 0.12", Given({"densify.budget.prune_opacity": 0.12}), "no better"),
+    Idea("a tenth of the Gaussians left out at random", GaussiansLeftOut(0.1), "trains less"),
+    Idea("lower degrees at random, in 30 %", DegreesLeftOut(0.3), "trains less"),
+    Idea("harmonics of degree 2", Given({"model.sh_degree": 2}), "trains less"),
+    Idea("decoupled decay of the harmonics", DecayOfHarmonics(), "trains less"),
+    Idea("harmonics at half of the rate", Given({"optimizer.shN_lr": 5e-4}), "trains less"),
+    Idea("opacities and scales in the loss", OtherTerms(), "no better"),
+    Idea("low-pass of 0.2 px^2", Given({"model.low_pass": 0.2}), "worse"),
+    # Fewer iterations.
+    Idea("towards Gauss-Newton: v^0.65", OtherPower(0.15), "worse"),
+    Idea("away from it: v^0.35", OtherPower(-0.15), "no better"),
+    Idea("steps of means in sigmas", StepsInSigmas(), "no better"),
+    Idea("unseen rows rest", UnseenRowsRest(), "no better"),
+    Idea("halves inherit second moments", InheritedMoments(), "much worse: new rows have to move"),
+    Idea("beta_2 of 0.9997", Given({"optimizer.beta_2": 0.9997}), "no better"),
+    Idea("opacities at twice the rate", Given({"optimizer.opacities_lr": 0.1}), "no better"),
+    Idea("means: five times the final rate", Given({"optimizer.means_lr_final": 1.6e-5}), "open"),
+    Idea("a Huber loss of width 0.05", OtherLoss(HuberLoss(0.05)), "little, for a kernel more"),
+    Idea("each view far from the last ones", ViewsApart(), "no better"),
+    # Less work.
+    Idea("every second image at half size, until 70 %", EverySecondAtHalfSize(), "worse"),
+    Idea(
+        "twice as many Gaussians, three quarters of the iterations",
+        Given({"densify.budget.gaussians": times_gaussians(2)}),
+        "as good in the same time, but larger files",
+        iterations=ITERATIONS * 3 // 4,
+    ),
+    Idea("splats end at an alpha of 3/255", Given({"model.alpha_cut": 3 / 255}), "worse"),
+    Idea("changes every 50 iterations", Given({"densify.every": 50}), "open"),
+    Idea("errors in every fifth view", Given({"densify.budget.error_every": 5}), "open"),
+    # More exact.
+    Idea("peaks along rays", Given({"model.projection": "exact"}), "no better"),
+    Idea("order per pixel", Given({"model.order": "pixel"}), "no better, twice the time"),
+    # Photographs.
+    Idea("a colour transform each", Given({"colors.lr": 0.02}), "open", scenes=PHOTOGRAPHS),
+    Idea("refined cameras", Given({"cameras.optimise": True}), "open", scenes=PHOTOGRAPHS),
+    Idea("random start", Given({"init.start": "random"}), "open", scenes=(HEAD,)),
+)
+
+
+# ----------------------------------------------------------------------------------------------
+# Fits
+# ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Point:
+    """A finished fit."""
+
+    scene: str
+    idea: str
+    psnr: float  # dB, test views
+    train_psnr: float  # dB, of some training views
+    seconds: float  # of a core
+    gaussians: int
+
+
+def fit_point(scene: Scene, idea: Idea, data: Path | None) -> Point:
+    """Fit with one thread."""
+    select_variant("llvm_ad_rgb")
+    dr.set_thread_count(1)
+    overrides = [f"data.image_size={scene.size}", f"iterations={idea.iterations}"]
+    if scene.folder is not None and data is not None:
+        overrides.append(f"data.path={data / scene.folder}")
+    config = load_config(SCENES_FOLDER / scene.config, overrides)
+    dataset = load_dataset(config.data)
+    config = resolve_defaults(with_changes(config, RECIPE), dataset)
+    config = with_changes(config, idea.change.values(config))
+    trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
+    idea.change.attach(trainer)
+    start = time.process_time()
+    for iteration in range(1, config.iterations + 1):
+        idea.change.before(trainer, iteration)
+        trainer.step()
+        idea.change.after(trainer, iteration)
+    trainer.check()  # waits for the device
+    seconds = time.process_time() - start
+    trainer.sync_scene()
+    return Point(
+        scene=scene.name,
+        idea=idea.name,
+        psnr=mean_psnr(trainer, dataset.test),
+        train_psnr=mean_psnr(trainer, evenly_spaced(dataset.train, NUM_TRAINING_VIEWS)),
+        seconds=seconds,
+        gaussians=trainer.num_gaussians,
+    )
+
+
+def mean_psnr(trainer: Trainer, views: tuple[View, ...]) -> float:
+    """Return the mean PSNR of rendered views, dB."""
+    pairs = zip(trainer.images(views), views, strict=True)
+    return float(np.mean([psnr(image, view.image, view.mask) for image, view in pairs]))
+
+
+def finished_point(scene: Scene, idea: Idea, data: Path | None, out: Path) -> Point:
+    """Fit in a process of its own, unless that is done."""
+    number = str(IDEAS.index(idea) + 1)
+    path = out / scene.name / f"{re.sub('[^a-z0-9]+', '_', idea.name.lower()).strip('_')}.json"
+    if not path.is_file():
+        print(f"{scene.name}: {idea.name}", flush=True)
+        words = [sys.executable, __file__, "--fit", scene.name, number]
+        words += ["--data", str(data)] if data is not None else []
+        done = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(done.stdout.splitlines()[-1])
+    return Point(**json.loads(path.read_text()))
+
+
+def table(points: Sequence[Point], ideas: Sequence[Idea]) -> str:
+    """Format all fits: a row for each idea and scene."""
+    found = {(p.idea, p.scene): p for p in points}
+    rows = []
+    for idea in ideas:
+        for scene in ALL:
+            point, recipe = (
+                found.get((idea.name, scene.name)),
+                found.get((IDEAS[0].name, scene.name)),
+            )
+            if point is None or recipe is None:
+                continue
+            sign = -1 if idea.is_kept else 1  # what it gives, either way
+            gains = [
+                sign * (getattr(point, n) - getattr(recipe, n)) for n in ("psnr", "train_psnr")
+            ]
+            ratio = (point.seconds / recipe.seconds) ** sign
+            rows.append(
+                [
+                    idea.name if scene is idea.scenes[0] else "",
+                    scene.title,
+                    f"{point.psnr:.2f} dB",
+                    *(f"{gain:+.2f}" if point is not recipe else "" for gain in gains),
+                    f"{ratio:.2f}",
+                    "yes" if idea.is_kept else "no",
+                    idea.why,
+                ]
+            )
+    header = ["idea", "scene", "test views", "its gain", "in training", "time", "kept", "why"]
+    return markdown_table(header, rows)
+
+
+def main() -> None:
+    """Fit, and print a table."""
+    parser = make_parser(__doc__, "ideas")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the other datasets")
+    parser.add_argument("--fit", nargs=2, metavar=("SCENE", "K"), help="one fit, as JSON")
+    add_case_option(parser, [idea.name for idea in IDEAS])
+    args = parser.parse_args()
+    if args.fit:
+        (scene,) = (scene for scene in ALL if scene.name == args.fit[0])
+        print(json.dumps(asdict(fit_point(scene, IDEAS[int(args.fit[1]) - 1], args.data))))
+        return
+    cases = [
+        (scene, IDEAS[k - 1])
+        for k in args.only
+        for scene in IDEAS[k - 1].scenes
+        if scene.folder is None or args.data is not None
+    ]
+    with ThreadPoolExecutor(args.threads or os.cpu_count()) as pool:
+        points = list(pool.map(lambda case: finished_point(*case, args.data, args.out), cases))
+    write_rows(args.out / "ideas.csv", Point, points)
+    print(f"\n{machine()}, one thread a fit\n\n{table(points)}")
+
+
+if __name__ == "__main__":
+    main()
