@@ -286,11 +286,11 @@ def plan_fit(
         config = with_changes(config, {"output.report": False, "output.save_renders": False})
     else:
         end -= images
-    has_one_file = config.model.approximations.is_default
-    end -= results.measuring * (1 if has_one_file else 2)
-    if not has_one_file:
+    end -= results.measuring
+    if not config.model.approximations.is_default:
         from drgs.training.viewers import TIME_SHARE
 
+        end -= results.viewers
         end -= TIME_SHARE * max(0.0, end - time.perf_counter())
     side = min(min(view.width, view.height) for view in dataset.train)
     seconds = end - time.perf_counter()

@@ -542,7 +542,7 @@ IDEAS = (
         is_kept=True,
     ),
     Idea("... to the square of the time", GrowthByPower(2), "worse"),
-    Idea("all of these", Given(FORMER), "", is_kept=True, scenes=ALL),
+    Idea("all of these values", Given(FORMER), "", is_kept=True, scenes=ALL),
     # Against memorising.
     Idea("no Gaussian below 0.12", Given({"densify.budget.prune_opacity": 0.12}), "no better"),
     Idea("a tenth of the Gaussians left out at random", GaussiansLeftOut(0.1), "trains less"),

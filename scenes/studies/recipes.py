@@ -71,6 +71,7 @@ PAPER: Values = {
     "densify.adc.prune_scale": 0.1,
     "densify.adc.reset_every": 3000,
     "densify.adc.reset_opacity": 0.01,
+    "densify.budget.prune_opacity": 0.005,
     "densify.prune.to": None,
     "coarse": [],
 }

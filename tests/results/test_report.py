@@ -118,6 +118,17 @@ def test_one_image_is_in_memory_at_a_time(tmp_path, dataset):
         assert np.abs(written - image).max() < ROUNDING
 
 
+def test_all_views_are_scored_and_evenly_spaced_ones_are_pictured(tmp_path, dataset, monkeypatch):
+    monkeypatch.setattr(report, "MAX_PICTURES", 3)
+    image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    views = tuple(replace(dataset.test[0], name=f"r_{k}") for k in range(5))
+    many, switches = replace(dataset, test=views), {"with_renders": True, "with_comparisons": True}
+    assert len(report.write_images(tmp_path, many, lambda views: [image] * 5, **switches)) == 5
+    for folder in ("renders", "side_by_side"):
+        names = sorted(path.name for path in (tmp_path / folder / "test").iterdir())
+        assert names == ["r_0.png", "r_2.png", "r_4.png"]
+
+
 def test_comparison_shows_fitted_photograph_and_difference(out, dataset, images):
     """Masked pixels show no difference."""
     pixels = np.asarray(Image.open(out / "side_by_side" / "test" / "r_2.png")) / 255
@@ -221,7 +232,7 @@ def test_page_contains_the_metrics_and_the_best_median_and_worst_view(page, data
         "1 min 15 s", "1,200 iterations", "A <Processor>, 2 threads", "2026-11-23 01:02 (UTC+0100)",
         "drgs fit 'my scene.yml' --data <DIR>", "Seed 7", "drgs 1.2.3, Mitsuba 3.9.1",
         "16.0", "LLVM 19.1.7", "sh_increase_every: 750", "path: photographs",
-        "Population budget: 1,000 \u2192 2,400 Gaussians", "they show the test views at 29.88 dB",
+        "Population budget: 1,000 \u2192 2,400 Gaussians", "they show 4 test views at 29.88 dB",
     ):  # fmt: skip
         assert stated in page.text, stated
     pairs = zip(dataset.test, images, strict=True)
