@@ -25,6 +25,9 @@ TESTS = str(REPOSITORY / "tests")
 
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 
+CHOSEN_LLVM = {k: v for k, v in os.environ.items() if k == "DRJIT_LIBLLVM_PATH"}
+"""What drgs chose, for ``run_python`` of programs that import Mitsuba before drgs."""
+
 
 def pytest_configure(config):
     """Dr.Jit computes on one thread in each worker: they share the cores, and idle threads spin."""

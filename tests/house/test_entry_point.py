@@ -7,7 +7,7 @@ group ``mitsuba`` name when the first variant becomes active, and reloads them a
 import importlib.metadata
 
 import pytest
-from conftest import REPOSITORY
+from conftest import CHOSEN_LLVM, REPOSITORY
 
 tomllib = pytest.importorskip("tomllib")  # from Python 3.11 on
 
@@ -88,5 +88,5 @@ def test_each_way_to_register_gives_one_class_for_each_variant(run_python, progr
     text = program.format(
         discovery=DISCOVERY.format(module=entry_points()["drgs"]), trip=ROUND_TRIP, plain=PLAIN
     )
-    result = run_python(text)
+    result = run_python(text, **CHOSEN_LLVM)
     assert result.stdout == "fine\n", result.stderr

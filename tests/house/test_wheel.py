@@ -165,7 +165,7 @@ from charbonnier import Charbonnier, CharbonnierSection
 from halving import Halving, HalvingSection
 from vignetting import Vignetting, VignettingSection
 
-config = load_config("fit.yml", ["densify.strategy=budget", "loss.type=photometric"])
+config = load_config("fit.yml", ["densify.strategy=budget", "loss.type=photometric", "optimizer.decay=0.1"])
 config = config.model_copy(update={"extensions": {
     name: section for name, section in config.extensions.items() if name != "vignetting"
 }})

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from conftest import CHOSEN_LLVM, REPOSITORY
 from support.helpers import clear
 from support.splats_checks import GRADIENTS, assert_images_agree, fresh_image, write_gaussians
 from support.views import VIEWS, Scene, View, gradients_of, image_of, pose, tensors, to_linear
@@ -133,7 +133,7 @@ for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
     ids=["drgs first", "variant first"],
 )
 def test_variants_can_be_switched_and_unsupported_ones_are_refused(order, run_python):
-    result = run_python(SWITCHING_PROGRAM.format(order=order))
+    result = run_python(SWITCHING_PROGRAM.format(order=order), **CHOSEN_LLVM)
     assert result.returncode == 0, result.stderr
     assert result.stdout.splitlines() == [
         f"PluginError: {plugin}: the variant '{variant}' is not supported, "

@@ -23,7 +23,7 @@ def test_sh_degree_increases_by_one_at_fixed_intervals():
 @pytest.mark.slow
 def test_only_sh_steps_compile_kernels_after_the_first_change_of_the_population():
     """Kernels by hash, as Dr.Jit's caches do: what they hold from other runs does not matter."""
-    densify = {"start": 3, "stop": 45, "every": 4, "budget": {"gaussians": 90, "error_every": 3}}
+    densify = {"start": 3, "stop": 66, "every": 4, "budget": {"gaussians": 90, "error_every": 3}}
     trainer = make_trainer(
         model={"sh_degree": 3, "sh_increase_every": 12}, densify={"strategy": "budget", **densify}
     )

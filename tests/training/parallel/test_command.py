@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from support import parallel_processes
@@ -142,12 +144,24 @@ def wait_for(process, is_reached):
         time.sleep(0.05)
 
 
+def memory_map(process):
+    """The files that a running process has loaded, among them libraries (Linux)."""
+    with suppress(OSError):
+        return Path(f"/proc/{process}/maps").read_text()
+    return ""
+
+
 @pytest.mark.slow
 def test_ctrl_c_during_a_rehearsal_ends_all_processes(config, tmp_path):
     """In a rehearsal: nothing is to be saved, and nobody is left behind."""
     path, out = config(iterations=100_000), tmp_path / "out"
     process = parallel_processes.start(2, command(path, "--out", out, "--budget", "1h"))
-    wait_for(process, lambda: len(parallel_processes.ranks_of(str(out))) >= 2)
+
+    def have_imported():
+        ranks = parallel_processes.ranks_of(str(out))
+        return len(ranks) >= 2 and all("scipy/ndimage" in memory_map(rank) for rank in ranks)
+
+    wait_for(process, have_imported)
     time.sleep(2.5)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
