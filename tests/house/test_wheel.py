@@ -165,7 +165,8 @@ from charbonnier import Charbonnier, CharbonnierSection
 from halving import Halving, HalvingSection
 from vignetting import Vignetting, VignettingSection
 
-config = load_config("fit.yml", ["densify.strategy=budget", "loss.type=photometric", "optimizer.decay=0.1"])
+settings = ["densify.strategy=budget", "loss.type=photometric", "optimizer.decay=0.1"]
+config = load_config("fit.yml", settings)
 config = config.model_copy(update={"extensions": {
     name: section for name, section in config.extensions.items() if name != "vignetting"
 }})
