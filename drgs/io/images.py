@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -247,7 +248,9 @@ def _open_image(path: Path) -> Iterator[ImageFile.ImageFile]:
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Return the image rounded to 8 bits."""
+    """Return the image, 0..1 or already uint8, rounded to 8 bits."""
+    if image.dtype == np.uint8:
+        return image
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
@@ -272,8 +275,9 @@ def encode(image: np.ndarray, suffix: str, **options: Any) -> bytes:
     """Return a PNG or WebP file of an image or the frames of an animation, by Pillow's options."""
     if suffix == "png":
         options = {"compress_level": PNG_LEVEL, **options}
-    pixels = image if image.dtype == np.uint8 else to_uint8(image)
-    return iio.imwrite("<bytes>", pixels, extension=f".{suffix}", plugin="pillow", **options)
+    return iio.imwrite(
+        "<bytes>", to_uint8(image), extension=f".{suffix}", plugin="pillow", **options
+    )
 
 
 def check_animation(frames: int, width: int, height: int) -> None:
@@ -294,18 +298,21 @@ def check_animation(frames: int, width: int, height: int) -> None:
 def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
     """Write ``path``, an animated WebP that loops, and beside it a GIF of at most 300 px width.
 
-    The GIF is for mail, slides and old viewers. frames: at least one, of one size.
+    The GIF is for mail, slides and old viewers. frames: at least one, of one size,
+    in 0..1 or uint8.
     """
     large = np.stack([to_uint8(frame) for frame in frames])
-    data = _encode_lossless(large)
-    if data is None:
-        for quality in WEBP_QUALITIES:
-            data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
-            if len(data) <= WEBP_BYTES:
-                break
-    assert data is not None, "there is at least one quality"
-    _write(path, data)
-    _write_gif(path.with_suffix(".gif"), large)
+    with ThreadPoolExecutor(1) as pool:
+        writing = pool.submit(_write_gif, path.with_suffix(".gif"), large)
+        data = _encode_lossless(large)
+        if data is None:
+            for quality in WEBP_QUALITIES:
+                data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
+                if len(data) <= WEBP_BYTES:
+                    break
+        assert data is not None, "there is at least one quality"
+        _write(path, data)
+        writing.result()
 
 
 def _encode_lossless(frames: np.ndarray) -> bytes | None:

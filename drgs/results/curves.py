@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.history import FitHistory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SMOOTHING_PARTS = 50  # a running mean averages this fraction of all rows
 NUM_PANELS = 6
@@ -94,9 +94,7 @@ def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarr
 def write_curves(path: Path, history: FitHistory) -> None:
     """Write an image of all curves."""
     figure = new_figure(11, 6, paper=PAPER)
-    layout = figure.get_layout_engine()
-    assert isinstance(layout, ConstrainedLayoutEngine), "new_figure sets it"
-    layout.set(w_pad=0.1, h_pad=0.1)
+    _fix_margins(figure)
     for axis, panel in zip(figure.subplots(2, 3).flat, panels_of(history), strict=True):
         _draw(axis, panel)
     write_figure(path, figure)
@@ -105,6 +103,7 @@ def write_curves(path: Path, history: FitHistory) -> None:
 def draw_curve(panel: Panel) -> str:
     """Return an SVG of one panel, for the page; its colours follow the theme that is in use."""
     figure, text = new_figure(3.7, 2.8, paper=PAPER), io.StringIO()
+    _fix_margins(figure)
     _draw(figure.subplots(), panel)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": panel.title}):
         figure.savefig(text, format="svg", metadata={"Date": None})
@@ -115,6 +114,20 @@ def draw_curve(panel: Panel) -> str:
         dark += f"--c{number}: {DARK[color]}; "
     themes = f":root {{ {light}}} @media (prefers-color-scheme: dark) {{ :root {{ {dark}}} }}"
     return svg.replace("<defs>", f"<style>{themes}</style><defs>", 1)
+
+
+def _fix_margins(figure: Figure) -> None:
+    """Leave 0.6 inches for labels: matplotlib's layouts take as long as all else."""
+    width, height = figure.get_size_inches()
+    figure.set_layout_engine(None)
+    figure.subplots_adjust(
+        left=0.6 / width,
+        right=1 - 0.2 / width,
+        bottom=0.45 / height,
+        top=1 - 0.35 / height,
+        wspace=0.25,
+        hspace=0.4,
+    )
 
 
 def _draw(axis: Axes, panel: Panel) -> None:

@@ -5,9 +5,11 @@ Shares no code with ``drgs.training.losses``: one checks the other. Not differen
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +21,10 @@ if TYPE_CHECKING:
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 """The Gaussian window of Wang et al. 2004, section III.B: 11 pixels, sigma 1.5, unit sum."""
 WINDOW /= WINDOW.sum()
+
+NUM_WAITING = 2  # images that are scored while the next one is rendered
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,26 @@ def mean_quality(
 
     pairs: (image, target[, mask]) of each view; may be a generator.
     """
-    return mean_of([(psnr(x, y, *mask), ssim(x, y, *mask)) for x, y, *mask in pairs])
+
+    def scores(x: ArrayLike, y: ArrayLike, *mask: ArrayLike | None) -> tuple[float, float]:
+        return psnr(x, y, *mask), ssim(x, y, *mask)
+
+    return mean_of(list(overlapped(scores, pairs)))
+
+
+def overlapped(function: Callable[..., T], items: Iterable[tuple]) -> Iterator[T]:
+    """Yield ``function(*item)`` of all items in order, computed while the next ones are made.
+
+    Few items are in memory at a time.
+    """
+    waiting: deque[Future[T]] = deque()
+    with ThreadPoolExecutor(NUM_WAITING) as pool:
+        for item in items:
+            waiting.append(pool.submit(function, *item))
+            if len(waiting) > NUM_WAITING:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def mean_of(scores: Sequence[tuple[float, float]]) -> Quality:

@@ -8,6 +8,7 @@ import io
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib import resources
@@ -28,7 +29,7 @@ from drgs.datasets.types import Dataset, View, evenly_spaced
 from drgs.datasets.viewpoints import field_of_view
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
-from drgs.io.images import encode, write_animation, write_png
+from drgs.io.images import encode, to_uint8, write_animation, write_png
 from drgs.results.curves import NUM_PANELS, Panel, draw_curve, panels_of, write_curves
 from drgs.results.files import (
     CURVES,
@@ -41,7 +42,7 @@ from drgs.results.files import (
     VIEWER,
 )
 from drgs.results.history import FitHistory, summarize_density
-from drgs.results.metrics import FitMetrics, psnr, ssim
+from drgs.results.metrics import FitMetrics, overlapped, psnr, ssim
 from drgs.results.viewer import DisplaySettings, seconds_of_page, write_viewer
 
 MAX_PICTURES = 25
@@ -75,17 +76,20 @@ def write_images(
     out: Path, dataset: Dataset, render: Render, with_renders: bool, with_comparisons: bool
 ) -> list[Score]:
     """Score the test views, and write ``renders/`` and ``side_by_side/`` if requested."""
-    scores, split = [], dataset.test_split
+    split = dataset.test_split
     pictured = {view.name for view in evenly_spaced(dataset.test, MAX_PICTURES)}
-    for view, image in zip(dataset.test, render(dataset.test), strict=True):
+
+    def finish(view: View, image: np.ndarray) -> Score:
         view = replace(view, image=np.asarray(view.image))  # converted once
         is_pictured = view.name in pictured
         if with_renders and is_pictured:
             write_png(out / RENDERS / split / f"{view.name}.png", image)
         if with_comparisons and is_pictured:
             write_png(out / SIDE_BY_SIDE / split / f"{view.name}.png", side_by_side(image, view))
-        scores.append(score(image, view))
-    return scores
+        return score(image, view)
+
+    pairs = zip(dataset.test, render(dataset.test), strict=True)
+    return list(overlapped(finish, pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +114,15 @@ def write_results(
 
     scores: of the test views, in order.
     """
-    write_curves(out / CURVES, history)
     orbit = orbit_of_views(dataset.train, fitted.gaussians)
     size, fov = orbit_size(dataset.train), field_of_view(dataset.train)
     cameras = orbit.viewpoints(ORBIT_FRAMES, *size, fov)
-    write_animation(out / ORBIT, render_views(fitted.scene, cameras))
-    write_viewer(out, dataset, fitted.shown)
+    frames = [to_uint8(frame) for frame in render_views(fitted.scene, cameras)]
+    with ThreadPoolExecutor(1) as pool:
+        encoding = pool.submit(write_animation, out / ORBIT, frames)
+        write_curves(out / CURVES, history)
+        write_viewer(out, dataset, fitted.shown)
+        encoding.result()
     animation, title = (out / ORBIT).read_bytes(), out.resolve().name
     write_report(out / REPORT, title, dataset, fitted.render, scores, history, metrics, animation)
 

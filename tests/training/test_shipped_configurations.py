@@ -29,6 +29,7 @@ NUMBER = "densify.budget.gaussians"
 
 FASTER_OR_BETTER = {
     "lego_fast": (NUMBER,),
+    "lego_800": (NUMBER,),
     "lego_best": (NUMBER, "optimizer.shN_lr"),
 }
 """Further keys in which these configurations differ."""
