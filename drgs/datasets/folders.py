@@ -25,7 +25,7 @@ MAX_PIXELS = 600_000
 """Pixels of an image that is fitted, as 894 x 671. The width of larger ones is divided by the
 smallest whole number that brings them there, and rounded down."""
 
-ITERATIONS = {"nerf_synthetic": 4500, "nerfstudio": 4000, "colmap": 4000}
+ITERATIONS = {"nerf_synthetic": 3000, "nerfstudio": 4000, "colmap": 4000}
 """Iterations by layout, as ``scenes/lego.yml`` and ``scenes/photos.yml`` have them."""
 
 NAMES = {

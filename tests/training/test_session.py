@@ -171,7 +171,7 @@ def test_callback_receives_each_iteration_and_may_end_the_fit(folder):
 
 def test_folder_is_fitted_with_the_settings_of_its_data(folder):
     config = drgs.train("data", callback=lambda report: True).trainer.config
-    assert config.data.path == folder / "data" and config.iterations == 4500
+    assert config.data.path == folder / "data" and config.iterations == 3000
 
 
 @pytest.mark.parametrize(
