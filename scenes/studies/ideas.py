@@ -11,6 +11,7 @@ not change the comparison.
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
@@ -21,8 +22,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import drgs  # noqa: F401  first: finds libLLVM
 import drjit as dr
@@ -38,6 +40,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.types import View, evenly_spaced
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import initial_gaussians
+from drgs.results.files import HISTORY
 from drgs.results.metrics import psnr
 from drgs.training.density.budget import GROWTH_SHARE, GrowthToNumber
 from drgs.training.losses import Loss, LossTerm, PhotometricLoss
@@ -45,8 +48,11 @@ from drgs.training.optimizer import LeanAdam, Population
 from drgs.training.steps import Stage
 from drgs.training.trainer import Trainer
 from fits import SCENES as SCENES_FOLDER
-from fits import add_case_option, make_parser
+from fits import add_case_option, make_parser, write_curves
 from typing_extensions import override
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Values = Mapping[str, object]
 """Values of a configuration, by names such as ``densify.every``."""
@@ -684,16 +690,37 @@ def table(points: Sequence[Point], ideas: Sequence[Idea]) -> str:
     return markdown_table(header, rows)
 
 
+def draw_histories(axes: Axes, fits: Sequence[Sequence[str]]) -> None:
+    """Draw PSNR over time of finished fits: before, dashed, and after, for each title."""
+    for k, (title, *folders) in enumerate(fits):
+        for when, style, folder in zip(("before", "after"), ("--", "-"), folders, strict=True):
+            with (Path(folder) / HISTORY).open(newline="") as file:
+                rows = [row for row in csv.DictReader(file) if row["test_psnr"]]
+            x, y = ([float(row[name]) for row in rows] for name in ("wall_s", "test_psnr"))
+            axes.plot(x, y, style, color=f"C{k}", marker=".", label=f"{title}, {when}")
+
+
 def main() -> None:
     """Fit, and print a table."""
     parser = make_parser(__doc__, "ideas")
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the other datasets")
     parser.add_argument("--fit", nargs=2, metavar=("SCENE", "K"), help="one fit, as JSON")
+    parser.add_argument(
+        "--histories",
+        nargs=3,
+        action="append",
+        metavar=("TITLE", "BEFORE", "AFTER"),
+        help="only draw curves of finished fits, from two folders for each title",
+    )
     add_case_option(parser, [idea.name for idea in IDEAS])
     args = parser.parse_args()
     if args.fit:
         (scene,) = (scene for scene in ALL if scene.name == args.fit[0])
         print(json.dumps(asdict(fit_point(scene, IDEAS[int(args.fit[1]) - 1], args.data))))
+        return
+    if args.histories:
+        draw = partial(draw_histories, fits=args.histories)
+        write_curves(args.out / "ideas.png", "seconds", "PSNR of some test views [dB]", draw)
         return
     cases = [
         (scene, IDEAS[k - 1])
