@@ -109,10 +109,10 @@ def mean_quality(
     def scores(x: ArrayLike, y: ArrayLike, *mask: ArrayLike | None) -> tuple[float, float]:
         return psnr(x, y, *mask), ssim(x, y, *mask)
 
-    return mean_of(list(overlapped(scores, pairs)))
+    return mean_of(list(map_ahead(scores, pairs)))
 
 
-def overlapped(function: Callable[..., T], items: Iterable[tuple]) -> Iterator[T]:
+def map_ahead(function: Callable[..., T], items: Iterable[tuple]) -> Iterator[T]:
     """Yield ``function(*item)`` of all items in order, computed while the next ones are made.
 
     Few items are in memory at a time.

@@ -42,7 +42,7 @@ from drgs.results.files import (
     VIEWER,
 )
 from drgs.results.history import FitHistory, summarize_density
-from drgs.results.metrics import FitMetrics, overlapped, psnr, ssim
+from drgs.results.metrics import FitMetrics, map_ahead, psnr, ssim
 from drgs.results.viewer import DisplaySettings, seconds_of_page, write_viewer
 
 MAX_PICTURES = 25
@@ -89,7 +89,7 @@ def write_images(
         return score(image, view)
 
     pairs = zip(dataset.test, render(dataset.test), strict=True)
-    return list(overlapped(finish, pairs))
+    return list(map_ahead(finish, pairs))
 
 
 @dataclass(frozen=True, eq=False)
